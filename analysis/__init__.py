@@ -1,0 +1,1 @@
+"""Analyses of what lies in the results database."""

@@ -1,0 +1,409 @@
+"""The command line. Results go to stdout, progress and messages to stderr."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import json
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from merge_runner.errors import MergeRunnerError, UsageError
+
+if TYPE_CHECKING:
+    from merge_runner.estimate import Estimate
+    from merge_runner.plan import Choice, Plan
+    from merge_runner.sweep import Options
+
+DB = Path("results/merge.duckdb")
+CACHE = Path("cache/responses")
+
+app = typer.Typer(
+    name="merge-runner",
+    help="Finds out whether a language model drives like a human.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+recording_app = typer.Typer(
+    help="Portable recordings: one Parquet file that anyone can replay.", no_args_is_help=True
+)
+app.add_typer(recording_app, name="recording")
+
+
+class Format(StrEnum):
+    """Output formats of a table."""
+
+    TEXT = "text"
+    CSV = "csv"
+    JSON = "json"
+
+
+DbOption = Annotated[Path, typer.Option("--db", help="The results database.")]
+CacheOption = Annotated[Path, typer.Option("--cache", help="The folder of recorded replies.")]
+ModelOption = Annotated[
+    str, typer.Option("--model", help="A model of the registry, a program, or LEFT+RIGHT.")
+]
+RepsOption = Annotated[
+    int | None, typer.Option("--reps", help="Repetitions per condition, for every variant.")
+]
+ConditionsOption = Annotated[
+    str | None, typer.Option("--conditions", help="Conditions, separated by commas.")
+]
+VariantsOption = Annotated[
+    str | None, typer.Option("--variants", help="Prompt variants, separated by commas.")
+]
+SampleSetOption = Annotated[
+    int, typer.Option("--sample-set", help="Another number draws a fresh set of samples.")
+]
+InFlightOption = Annotated[int, typer.Option("--in-flight", help="Trials at once.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object.")]
+NameArgument = Annotated[
+    str, typer.Argument(metavar="NAME", help="experiments/NAME.toml, or a path.")
+]
+RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
+RecordingOption = Annotated[
+    Path | None,
+    typer.Option("--recording", help="Replay from this file too, without importing it."),
+]
+
+
+def main() -> None:
+    """Run the command line and exit with the contract's code."""
+    debug = "--debug" in sys.argv
+    sys.argv = [argument for argument in sys.argv if argument != "--debug"]
+    try:
+        app()
+    except MergeRunnerError as exc:
+        if debug:
+            raise
+        _say(f"error: {exc}")
+        sys.exit(exc.exit_code)
+
+
+@app.callback()
+def common(
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show a traceback on errors.")
+    ] = False,  # typer's way to declare a flag
+) -> None:
+    """Finds out whether a language model drives like a human."""
+
+
+@app.command()
+def sweep(
+    name: NameArgument,
+    model: ModelOption = "emulator",
+    reps: RepsOption = None,
+    conditions: ConditionsOption = None,
+    variants: VariantsOption = None,
+    sample_set: SampleSetOption = 0,
+    db: DbOption = DB,
+    cache: CacheOption = CACHE,
+    in_flight: InFlightOption = 200,
+    rpm: Annotated[int | None, typer.Option(help="Requests a minute.", min=1)] = None,
+    tpm: Annotated[int | None, typer.Option(help="Tokens a minute.", min=1)] = None,
+    max_cost: Annotated[
+        float | None, typer.Option(help="Stop before more than this many USD are spent.", min=0)
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only estimate.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before spending.")] = False,
+    replay: Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")] = False,
+    recording: RecordingOption = None,
+    fault_rate: Annotated[
+        float, typer.Option(help="Emulator only: share of attempts with a transient fault.")
+    ] = 0.0,
+    faults: Annotated[Path | None, typer.Option(help="Emulator only: a file of faults.")] = None,
+    seed: Annotated[int, typer.Option(help="Emulator only: seed of the faults.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Play all trials of a sweep that are not stored yet."""
+    from merge_runner.clients import Limits
+    from merge_runner.plan import Choice
+    from merge_runner.sweep import Options
+
+    if recording is not None and not replay:
+        raise UsageError("--recording goes with a replay; to keep its replies: recording import")
+    options = Options(
+        db=db,
+        cache=cache,
+        in_flight=in_flight,
+        limits=Limits(rpm=rpm, tpm=tpm, max_cost_usd=max_cost, connections=2 * max(in_flight, 1)),
+        replay=replay,
+        recording=recording,
+        emulator_options=_emulator_options(fault_rate, faults, seed),
+    )
+    choice = Choice(
+        sweep=name,
+        model=model,
+        repetitions=reps,
+        conditions=_listed(conditions),
+        variants=_listed(variants),
+        sample_set=sample_set,
+    )
+    _run(choice, options, dry_run=dry_run, yes=yes, as_json=as_json)
+
+
+@app.command()
+def replay(
+    name: NameArgument,
+    model: ModelOption = "emulator",
+    reps: RepsOption = None,
+    conditions: ConditionsOption = None,
+    variants: VariantsOption = None,
+    sample_set: SampleSetOption = 0,
+    db: DbOption = DB,
+    cache: CacheOption = CACHE,
+    in_flight: InFlightOption = 200,
+    recording: RecordingOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Play a sweep from recorded replies alone: no key, no network."""
+    sweep(
+        name=name,
+        model=model,
+        reps=reps,
+        conditions=conditions,
+        variants=variants,
+        sample_set=sample_set,
+        db=db,
+        cache=cache,
+        in_flight=in_flight,
+        replay=True,
+        recording=recording,
+        as_json=as_json,
+    )
+
+
+@app.command()
+def sql(
+    query: Annotated[str, typer.Argument(metavar="QUERY", help="One SQL query.")],
+    db: DbOption = DB,
+    output: Annotated[Format, typer.Option("--format", help="Form of the result.")] = Format.TEXT,
+) -> None:
+    """Query the results; also while a sweep runs. Nothing can be changed."""
+    from merge_runner.store import query as run_query
+
+    names, rows = run_query(db, query)
+    if output is Format.JSON:
+        records = [dict(zip(names, row, strict=True)) for row in rows]
+        _print(json.dumps(records, indent=2, default=str, ensure_ascii=False))
+    elif output is Format.CSV:
+        writer = csv.writer(sys.stdout)
+        writer.writerow(names)
+        writer.writerows(rows)
+    else:
+        _print_table(names, rows)
+
+
+@app.command()
+def digest(db: DbOption = DB) -> None:
+    """Print one line: a hash of all results, equal for equal results."""
+    from merge_runner.store import results_digest
+
+    value, trials = results_digest(db)
+    _print(f"{value}  {trials} trials")
+
+
+@app.command()
+def models() -> None:
+    """List the registry: provider, id, key, price, known shutdown date."""
+    from merge_runner.config import Price, has_key, load_models
+    from merge_runner.llm.prices import pricing
+    from merge_runner.records import Usage
+
+    million = 1_000_000
+    rows = []
+    for name, entry in load_models().items():
+        price = pricing(entry)
+        costs = [
+            price.cost_usd(Usage(input_tokens=i, output_tokens=o))
+            for i, o in ((1000, 0), (0, 1000))
+        ]
+        shown = ["unknown" if c is None else f"{c * million / 1000:g}" for c in costs]
+        source = entry.price.source if isinstance(entry.price, Price) else entry.price
+        rows.append(
+            (
+                name,
+                entry.provider,
+                entry.id,
+                "yes" if has_key(name, entry) else "no",
+                *shown,
+                source,
+                str(entry.shutdown or ""),
+                entry.note,
+            )
+        )
+    headings = ["name", "provider", "id", "usable", "USD/M in", "USD/M out", "prices", "shutdown"]
+    _print_table([*headings, "note"], rows)
+
+
+@app.command()
+def emulate(
+    port: Annotated[int, typer.Option(help="0: any free port.", min=0, max=65535)] = 8765,
+    fault_rate: Annotated[float, typer.Option(help="Share of attempts with a fault.")] = 0.0,
+    faults: Annotated[Path | None, typer.Option(help="A TOML file of faults.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the faults.")] = 0,
+    until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
+) -> None:
+    """Run the local stand-in for a language model on 127.0.0.1; prints its base URL."""
+    from merge_runner.emulator.faults import load_faults, transient_faults
+    from merge_runner.emulator.server import run
+
+    plan = load_faults(faults) if faults else transient_faults(fault_rate, seed)
+    asyncio.run(run(port, plan, announce=_print, until_stdin_closes=until_stdin_closes))
+
+
+@recording_app.command("export")
+def recording_export(
+    file: RecordingFile,
+    db: DbOption = DB,
+    cache: CacheOption = CACHE,
+    sweep_id: Annotated[
+        str | None, typer.Option("--sweep", help="A sweep_id; the newest sweep if not given.")
+    ] = None,
+) -> None:
+    """Write what a sweep asked and was answered into one file."""
+    from merge_runner.llm.cache import ResponseCache
+    from merge_runner.recording import export_recording
+    from merge_runner.store import sweep_row, used_call_keys
+
+    found, keys = used_call_keys(db, sweep_id)
+    row = sweep_row(db, found)
+    provenance = {name: str(value) for name, value in row.items() if value is not None}
+    calls = export_recording(file, ResponseCache(cache), keys, provenance)
+    _say(f"{calls} calls of {found} are in {file}")
+
+
+@recording_app.command("import")
+def recording_import(file: RecordingFile, cache: CacheOption = CACHE) -> None:
+    """Verify a recording and add it to the cache."""
+    from merge_runner.llm.cache import ResponseCache
+    from merge_runner.recording import import_recording
+
+    added, there = import_recording(file, ResponseCache(cache))
+    _say(f"{added} calls added to {cache}, {there} were there already")
+
+
+@recording_app.command("verify")
+def recording_verify(file: RecordingFile) -> None:
+    """Check that every reply belongs to its key."""
+    from merge_runner.recording import summarise
+
+    _say(f"{file} is whole: {summarise(file).calls} calls, every key belongs to its content")
+
+
+@recording_app.command("info")
+def recording_info(file: RecordingFile) -> None:
+    """Verify a recording and print what it holds, as JSON."""
+    from dataclasses import asdict
+
+    from merge_runner.recording import summarise
+
+    _print(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
+
+
+def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json: bool) -> None:
+    from merge_runner.estimate import estimate
+    from merge_runner.plan import make_plan
+    from merge_runner.summary import Summary
+    from merge_runner.sweep import INTERRUPTED, Sweep
+
+    plan = make_plan(choice)
+    if dry_run:
+        _print_estimate(estimate(plan, plan.trials, in_flight=options.in_flight), as_json=as_json)
+        return
+    prepared = Sweep(plan, options, say=_say)
+    if not options.replay and prepared.trials_to_play:
+        _confirm(plan, prepared.trials_to_play, options, yes=yes)
+    try:
+        outcome = asyncio.run(prepared.run())
+    except KeyboardInterrupt:  # before the trials began or after they ended
+        _say("interrupted: run the same command again to go on")
+        sys.exit(INTERRUPTED)
+    summary = Summary(plan, outcome, options.db)
+    if as_json:
+        _print(json.dumps(summary.as_dict(), ensure_ascii=False))
+    else:
+        for line in summary.lines():
+            _print(line)
+    for message in outcome.messages:
+        _say(f"error: {message}")
+    sys.exit(outcome.exit_code)
+
+
+def _confirm(plan: Plan, trials: int, options: Options, *, yes: bool) -> None:
+    """Check the keys, say what a live run of a paid model will cost, and ask once."""
+    from merge_runner.config import resolve_endpoint
+    from merge_runner.estimate import estimate
+
+    for name, entry in plan.entries.items():
+        resolve_endpoint(name, entry)
+        if entry.shutdown:
+            _say(f"note: {name} ({entry.id}) is announced to shut down on {entry.shutdown}")
+    expected = estimate(plan, trials, in_flight=options.in_flight)
+    if expected.free:
+        return
+    cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
+    _say(
+        f"{trials} trials, about {expected.calls} calls, {cost}, "
+        f"{expected.minutes} minutes or more, if nothing is recorded yet"
+    )
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise UsageError(
+            "this run spends money and there is no terminal to ask at: add --yes to go ahead, or "
+            "--dry-run to only see the estimate"
+        )
+    if not typer.confirm("Go ahead?", err=True):
+        raise UsageError("nothing was sent")
+
+
+def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
+    from dataclasses import asdict
+
+    if as_json:
+        _print(json.dumps(asdict(expected)))
+        return
+    cost = "unknown" if expected.cost_usd is None else f"{expected.cost_usd:.2f} USD"
+    for name, text in (
+        ("trials", str(expected.trials)),
+        ("calls", f"about {expected.calls}"),
+        ("tokens", f"about {expected.input_tokens} in, {expected.output_tokens} out"),
+        ("cost", f"about {cost}, less what is recorded already"),
+        ("time", f"about {expected.minutes} minutes"),
+    ):
+        _print(f"{name:<8}{text}")
+    _print("Nothing was sent.")
+
+
+def _emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list[str]:
+    options = ["--fault-rate", str(fault_rate), "--seed", str(seed)]
+    return [*options, "--faults", str(faults)] if faults else options
+
+
+def _listed(text: str | None) -> list[str] | None:
+    return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _print_table(names: list[str], rows: list[tuple[Any, ...]]) -> None:
+    cells = [names, *(["" if value is None else str(value) for value in row] for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(names))]
+    for row in cells:
+        _print(
+            "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        )
+
+
+def _print(text: str) -> None:
+    print(text, flush=True)  # noqa: T201 # the command line's output
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)  # noqa: T201 # the command line's messages

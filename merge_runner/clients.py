@@ -1,0 +1,134 @@
+"""Makes the clients of a sweep's language models, with their connections or sealed."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Mapping, Sequence
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+
+from merge_runner.config import ModelEntry, resolve_endpoint, running_emulator_url
+from merge_runner.emulator.process import emulator_process
+from merge_runner.errors import UsageError
+from merge_runner.llm.budget import Budget
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.client import LlmClient
+from merge_runner.llm.limiter import Limiter, Pause
+from merge_runner.llm.prices import pricing
+from merge_runner.llm.transport import SealedTransport, Transport
+
+SPARE_FILES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What bounds the calls; ``rpm`` and ``tpm`` replace those of the registry."""
+
+    rpm: int | None = None
+    tpm: int | None = None
+    max_cost_usd: float | None = None
+    connections: int = 400
+
+
+def sealed_clients(
+    entries: Mapping[str, ModelEntry], endpoints: Mapping[str, str], cache: ResponseCache
+) -> dict[str, LlmClient]:
+    """Clients that answer from recordings alone: no key, no connection."""
+    return {
+        name: _client(
+            name,
+            entry,
+            endpoint=endpoints[name],
+            cache=cache,
+            transport=SealedTransport(),
+            limiter=Limiter(),
+            budget=Budget(),
+        )
+        for name, entry in entries.items()
+    }
+
+
+async def live_clients(
+    entries: Mapping[str, ModelEntry],
+    endpoints: Mapping[str, str],
+    cache: ResponseCache,
+    limits: Limits,
+    *,
+    emulator_options: Sequence[str],
+    stack: AsyncExitStack,
+) -> dict[str, LlmClient]:
+    """Clients with connections, closed with ``stack``; starts the emulator where it is asked.
+
+    Raises UsageError where a key is missing.
+    """
+    from merge_runner.llm.http import HttpTransport
+
+    _allow_open_files(limits.connections + SPARE_FILES)
+    budget = Budget(limits.max_cost_usd)
+    pauses: dict[str, Pause] = {}
+    clients = {}
+    for name, entry in entries.items():
+        environment = None
+        if entry.provider == "emulator" and running_emulator_url() is None:
+            url = await stack.enter_async_context(emulator_process(emulator_options))
+            environment = {"EMULATOR_BASE_URL": f"{url}/v1"}
+        transport = HttpTransport(
+            resolve_endpoint(name, entry, environment), connections=limits.connections
+        )
+        stack.push_async_callback(transport.close)
+        limiter = Limiter(
+            rpm=limits.rpm or entry.rpm,
+            tpm=limits.tpm or entry.tpm,
+            pause=pauses.setdefault(endpoints[name], Pause()),
+        )
+        clients[name] = _client(
+            name,
+            entry,
+            endpoint=endpoints[name],
+            cache=cache,
+            transport=transport,
+            limiter=limiter,
+            budget=budget,
+        )
+    return clients
+
+
+def _client(
+    name: str,
+    entry: ModelEntry,
+    *,
+    endpoint: str,
+    cache: ResponseCache,
+    transport: Transport,
+    limiter: Limiter,
+    budget: Budget,
+) -> LlmClient:
+    price = pricing(entry)
+    if budget.cap_usd is not None and not price.known:
+        raise UsageError(
+            f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
+            "experiments/models.toml"
+        )
+    return LlmClient(
+        name=name,
+        entry=entry,
+        endpoint=endpoint,
+        cache=cache,
+        transport=transport,
+        limiter=limiter,
+        pricing=price,
+        budget=budget,
+    )
+
+
+def _allow_open_files(wanted: int) -> None:
+    """Raise this process's limit of open files to what the connections need."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft >= wanted or soft == resource.RLIM_INFINITY:
+        return
+    if hard != resource.RLIM_INFINITY and hard < wanted:
+        raise UsageError(
+            f"{wanted} connections exceed this system's limit of {hard} open files: choose a lower "
+            "--in-flight or raise `ulimit -n`"
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

@@ -1,0 +1,340 @@
+"""Every knob as a field of a frozen model; the only reader of TOML files and the environment."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import date
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+from urllib.parse import urlsplit
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
+
+from merge_runner.errors import UsageError
+
+PROJECT = Path(__file__).resolve().parent.parent
+DEFAULT_DB = Path("results/merge.duckdb")
+DEFAULT_CACHE = Path("cache/responses")
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(gt=0)]
+Format = Literal["openai-chat", "openai-responses", "gemini", "anthropic"]
+CollisionRule = Literal["euclid2d", "rectangle", "shared_lane"]
+Resistance = Literal["none", "human"]
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+class Frozen(BaseModel):
+    """A configuration object: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Scenario(Frozen):
+    """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
+
+    ``collision_rule``: ``euclid2d`` (centres closer than a vehicle length), ``rectangle`` (the
+    oriented 4.5 x 1.8 m boxes of the human experiment overlap) or ``shared_lane`` (|s_L - s_R|
+    below a vehicle length once either has passed the merge point).
+    ``control_start``: ``both_exits`` starts where both vehicles are out of their tunnels,
+    ``own_exit`` at the earlier exit, the other vehicle cruising until its own.
+    ``resistance``: ``human`` adds the drag of the human simulator, 0.5 + 0.005 v^2 in m/s^2.
+    ``history_start``: before t = 0 the history shows ``cruise`` (a = 0, constant speeds) or is
+    ``empty``. ``fallback``: after an invalid reply the last valid plan ``continue``s where it
+    was left, or ``restart``s at its first action. ``straight_after``: the prompt says "straight"
+    once the ``own`` vehicle, or once ``both``, have passed the merge point.
+    """
+
+    horizon_s: Positive = 4.0
+    step_s: Positive = 0.2
+    prompt_rate_hz: Positive = 1.0
+    memory_s: Positive = 2.0
+    max_acceleration_mps2: Positive = 2.5
+    vehicle_length_m: Positive = 4.5
+    vehicle_width_m: Positive = 1.8
+    timeout_s: Positive = 30.0
+    collision_rule: CollisionRule = "euclid2d"
+    control_start: Literal["both_exits", "own_exit"] = "both_exits"
+    resistance: Resistance = "none"
+    history_start: Literal["cruise", "empty"] = "cruise"
+    fallback: Literal["continue", "restart"] = "continue"
+    straight_after: Literal["own", "both"] = "own"
+
+    @cached_property
+    def plan_actions(self) -> int:
+        """N, the number of actions of a plan."""
+        return round(self.horizon_s / self.step_s)
+
+    @cached_property
+    def executed_actions(self) -> int:
+        """How many actions of a plan are driven before the next prompt."""
+        return round(1 / (self.prompt_rate_hz * self.step_s))
+
+    @cached_property
+    def memory_samples(self) -> int:
+        """The number of samples in each history."""
+        return round(self.memory_s / self.step_s)
+
+    @cached_property
+    def timeout_steps(self) -> int:
+        """The number of steps after which a trial is over."""
+        return round(self.timeout_s / self.step_s)
+
+    @model_validator(mode="after")
+    def _whole_steps(self) -> Scenario:
+        for name, seconds in (
+            ("horizon_s", self.horizon_s),
+            ("memory_s", self.memory_s),
+            ("timeout_s", self.timeout_s),
+            ("1 / prompt_rate_hz", 1 / self.prompt_rate_hz),
+        ):
+            steps = seconds / self.step_s
+            if abs(steps - round(steps)) > 1e-9 or round(steps) < 1:
+                raise ValueError(f"{name} = {seconds:g} s is no whole number of {self.step_s} s")
+        if self.executed_actions > self.plan_actions:
+            raise ValueError("the horizon is shorter than the time between two prompts")
+        return self
+
+
+class Price(Frozen):
+    """USD per million tokens, and where the figures were read."""
+
+    input: Annotated[float, Field(ge=0)]
+    cached_input: Annotated[float, Field(ge=0)] | None = None
+    output: Annotated[float, Field(ge=0)]
+    source: str
+
+
+class ModelEntry(Frozen):
+    """One model of ``experiments/models.toml``.
+
+    ``id`` is what is sent; a served model that is neither it nor one of ``aliases`` is reported
+    as a mismatch. ``parameters`` go into the request as they are; what is not listed is not
+    sent, so that the provider's default applies. ``price`` is ``free``, ``genai-prices`` (the
+    table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
+    minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of
+    ``--dry-run`` alone.
+    """
+
+    provider: str
+    format: Format
+    id: str
+    aliases: tuple[str, ...] = ()
+    parameters: dict[str, JsonValue] = {}
+    max_output_tokens: Count
+    cap_field: Literal["max_completion_tokens", "max_tokens"] = "max_completion_tokens"
+    rpm: Count | None = None
+    tpm: Count | None = None
+    shutdown: date | None = None
+    price: Literal["free", "genai-prices"] | Price = "genai-prices"
+    base_url: str | None = None
+    path: str | None = None
+    key_env: str | None = None
+    auth: Literal["bearer", "api-key"] | None = None
+    timeout_s: Positive = 600.0
+    deadline_s: Positive = 1200.0
+    typical_output_tokens: Count = 1000
+    typical_latency_s: Positive = 10.0
+    note: str = ""
+
+
+class SweepFile(Frozen):
+    """One sweep: its prompt variants with their repetitions per condition, and the scenario."""
+
+    description: str = ""
+    repetitions: dict[str, Count]
+    conditions: tuple[str, ...] | None = None
+    scenario: Scenario = Scenario()
+
+
+@dataclass(frozen=True, slots=True)
+class Provider:
+    """Where a provider is reached and which variables configure it."""
+
+    base_url: str
+    base_url_env: str | None = None
+    key_envs: tuple[str, ...] = ()
+    auth: Literal["bearer", "api-key", "x-goog-api-key", "x-api-key"] = "bearer"
+    key_needed: bool = True
+
+
+PROVIDERS: dict[str, Provider] = {
+    "openai": Provider("https://api.openai.com/v1", "OPENAI_BASE_URL", ("OPENAI_API_KEY",)),
+    # The official SDK prefers GOOGLE_API_KEY where both are set.
+    "gemini": Provider(
+        "https://generativelanguage.googleapis.com",
+        "GOOGLE_GEMINI_BASE_URL",
+        ("GOOGLE_API_KEY", "GEMINI_API_KEY"),
+        auth="x-goog-api-key",
+    ),
+    "anthropic": Provider(
+        "https://api.anthropic.com",
+        "ANTHROPIC_BASE_URL",
+        ("ANTHROPIC_API_KEY",),
+        auth="x-api-key",
+    ),
+    "openrouter": Provider("https://openrouter.ai/api/v1", None, ("OPENROUTER_API_KEY",)),
+    "local": Provider(
+        "http://localhost:8000/v1", "LOCAL_BASE_URL", ("LOCAL_API_KEY",), key_needed=False
+    ),
+    "emulator": Provider("http://127.0.0.1/v1", "EMULATOR_BASE_URL", key_needed=False),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where the calls of one model go.
+
+    ``identity`` enters every cache key: the provider's name at its default URL, ``emulator`` for
+    our own server, otherwise the normalised base URL. ``auth_headers`` hold the secret and are
+    neither hashed nor stored.
+    """
+
+    provider: str
+    identity: str
+    base_url: str
+    auth_headers: Mapping[str, str]
+
+    def __repr__(self) -> str:
+        return f"Endpoint({self.provider}, {self.identity})"
+
+
+def resolve_endpoint(
+    name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None
+) -> Endpoint:
+    """The endpoint of a model, from its entry and the environment.
+
+    Raises UsageError where a key is needed and none is set.
+    """
+    env = os.environ if environment is None else environment
+    provider = _provider(name, entry)
+    key_envs = (entry.key_env,) if entry.key_env else provider.key_envs
+    key = next((env[variable] for variable in key_envs if env.get(variable)), None)
+    if key is None and provider.key_needed:
+        raise UsageError(
+            f"{name} needs a key: set {' or '.join(key_envs)}. Without one: `make sweep` runs the "
+            f"emulator, and `make replay MODEL={name} RECORDING=FILE.parquet` replays a recording."
+        )
+    return Endpoint(
+        provider=entry.provider,
+        identity=endpoint_identity(name, entry, env),
+        base_url=_base_url(entry, provider, env),
+        auth_headers=_auth_headers(entry.auth or provider.auth, key),
+    )
+
+
+def endpoint_identity(
+    name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None
+) -> str:
+    """What stands for the endpoint in cache keys; see Endpoint."""
+    env = os.environ if environment is None else environment
+    provider = _provider(name, entry)
+    base_url = _base_url(entry, provider, env)
+    if entry.provider == "emulator":
+        return "emulator"
+    return entry.provider if base_url == normalised_url(provider.base_url) else base_url
+
+
+def has_key(name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None) -> bool:
+    """Whether the environment holds what a live run of the model needs."""
+    try:
+        resolve_endpoint(name, entry, environment)
+    except UsageError:
+        return False
+    return True
+
+
+def normalised_url(url: str) -> str:
+    """A base URL in one spelling: lower-case scheme and host, no default port, no last slash."""
+    parts = urlsplit(url.strip())
+    if parts.scheme not in ("http", "https") or not parts.hostname:
+        raise UsageError(f"{url!r} is no base URL: it must begin with http:// or https://")
+    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
+    default_port = 443 if parts.scheme == "https" else 80
+    port = "" if parts.port in (None, default_port) else f":{parts.port}"
+    return f"{parts.scheme}://{host}{port}{parts.path.rstrip('/')}"
+
+
+def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | None:
+    """The URL of an emulator that already runs (EMULATOR_BASE_URL), or None."""
+    env = os.environ if environment is None else environment
+    return env.get("EMULATOR_BASE_URL") or None
+
+
+def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
+    """The registry, name to entry; raises UsageError."""
+    path = path or find_experiments() / "models.toml"
+    return {
+        name: _validate(ModelEntry, table, f"{path}: [{name}]")
+        for name, table in read_toml(path).items()
+    }
+
+
+def load_sweep(name: str) -> tuple[str, SweepFile]:
+    """The name and content of ``experiments/NAME.toml``, or of a path; raises UsageError."""
+    path = Path(name)
+    if path.suffix != ".toml":
+        folder = find_experiments()
+        path = folder / f"{name}.toml"
+        if not path.is_file():
+            known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "models")
+            raise UsageError(f"there is no sweep {name!r}; valid: {', '.join(known)}, or a path")
+    return path.stem, _validate(SweepFile, read_toml(path), str(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file as a dict; raises UsageError."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError(f"{path} does not exist") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as exc:
+        raise UsageError(f"{path}: {exc}") from exc
+
+
+def find_experiments() -> Path:
+    """The experiments folder: of the working directory, else of the project."""
+    here = Path("experiments")
+    return here if here.is_dir() else PROJECT / "experiments"
+
+
+def _provider(name: str, entry: ModelEntry) -> Provider:
+    if entry.provider not in PROVIDERS:
+        raise UsageError(
+            f"model {name}: unknown provider {entry.provider!r}; valid: {', '.join(PROVIDERS)}"
+        )
+    return PROVIDERS[entry.provider]
+
+
+def _base_url(entry: ModelEntry, provider: Provider, env: Mapping[str, str]) -> str:
+    from_env = env.get(provider.base_url_env, "") if provider.base_url_env else ""
+    return normalised_url(entry.base_url or from_env or provider.base_url)
+
+
+def _auth_headers(scheme: str, key: str | None) -> dict[str, str]:
+    if key is None:
+        return {}
+    return {"authorization": f"Bearer {key}"} if scheme == "bearer" else {scheme: key}
+
+
+def _validate(model: type[ModelT], value: object, where: str) -> ModelT:
+    try:
+        return model.model_validate(value)
+    except ValidationError as exc:
+        raise UsageError(f"{where}: {'; '.join(_explain(exc, model))}") from exc
+
+
+def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
+    lines = []
+    for error in exc.errors():
+        place = ".".join(str(part) for part in error["loc"])
+        if error["type"] == "extra_forbidden":
+            owner: type[BaseModel] = Scenario if error["loc"][0] == "scenario" else model
+            lines.append(f"unknown key {place!r}; valid: {', '.join(owner.model_fields)}")
+        else:
+            lines.append(f"{place}: {error['msg']}" if place else error["msg"])
+    return lines

@@ -1,0 +1,1 @@
+"""Whoever decides how a vehicle accelerates: a language model or a plain program."""

@@ -1,0 +1,63 @@
+"""A language model as a driver: observation, prompt, reply, validated plan, five actions."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from merge_runner.config import Scenario
+from merge_runner.prompts.parse import ParsedReply, parse_reply
+from merge_runner.prompts.render import render_prompt
+from merge_runner.records import ChatReply, Decision, Observation
+
+Ask = Callable[[str, int], Awaitable[ChatReply]]
+"""Asks the model with a prompt, for a decision number; raises CallFailed."""
+
+
+@dataclass(slots=True)
+class LlmDriver:
+    """Keeps the plan between prompts; everything else is in the prompt."""
+
+    ask: Ask
+    variant: str
+    scenario: Scenario
+    _plan: tuple[float, ...] | None = None
+    _executed: int = 0
+
+    async def decide(self, observation: Observation, number: int) -> Decision:
+        """Ask the model and drive its plan, or go on with the last valid one."""
+        prompt = render_prompt(
+            observation, self._remaining(), variant=self.variant, scenario=self.scenario
+        )
+        reply = await self.ask(prompt, number)
+        # A refusal or a truncated answer is an outcome of its own; it is not searched for a plan.
+        parsed = (
+            parse_reply(reply.text, self.scenario.plan_actions)
+            if reply.outcome == "ok"
+            else ParsedReply(None, None, reply.text, reply.outcome)
+        )
+        fallback = parsed.plan is None
+        if parsed.plan is not None:
+            self._plan, self._executed = parsed.plan, 0
+        elif self.scenario.fallback == "restart":
+            self._executed = 0
+        return Decision(
+            plan=parsed.plan,
+            applied=self._take(),
+            tactical=parsed.tactical,
+            rationale=parsed.rationale,
+            failure=parsed.failure,
+            fallback=fallback,
+            prompt=prompt,
+            reply=reply,
+        )
+
+    def _remaining(self) -> tuple[float, ...] | None:
+        return None if self._plan is None else self._plan[self._executed :]
+
+    def _take(self) -> tuple[float, ...]:
+        """The next actions of the plan, and 0 where it is exhausted or there is none."""
+        wanted = self.scenario.executed_actions
+        actions = (self._remaining() or ())[:wanted]
+        self._executed += wanted
+        return actions + (0.0,) * (wanted - len(actions))

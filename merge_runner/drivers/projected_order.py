@@ -1,0 +1,55 @@
+"""First come, first served: the projected earlier arrival keeps its speed, the later yields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from merge_runner.config import Scenario
+from merge_runner.drivers.base import held
+from merge_runner.records import Decision, Observation, Side
+
+# The mean human gap at the merge point (arXiv 2604.09609, Table V).
+TARGET_GAP_M = 3.85
+GENTLEST_MPS2 = -1.5
+TIE_S = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectedOrderDriver:
+    """Yields to whoever would arrive first at present speeds; on a tie the right one yields.
+
+    The yielding vehicle brakes evenly so that the net gap is 3.85 m when the other reaches the
+    merge point, with at most 1.5 m/s^2 while that suffices, and then follows at that gap.
+    """
+
+    scenario: Scenario
+    side: Side
+
+    async def decide(self, observation: Observation, number: int) -> Decision:
+        """Keep speed, open a gap, or follow."""
+        scenario = self.scenario
+        action = self._acceleration(observation) / scenario.max_acceleration_mps2
+        return held(min(1.0, max(-1.0, action)), scenario.plan_actions, scenario.executed_actions)
+
+    def _acceleration(self, seen: Observation) -> float:
+        distance = seen.distance_to_merge_m
+        other_distance = None if distance is None else distance - seen.relative_distance_m
+        if distance is None or other_distance is None or other_distance <= 0:
+            return self._follow(seen) if seen.relative_distance_m > 0 else 0.0
+        if self._goes_first(seen, distance, other_distance):
+            return 0.0
+        seconds = other_distance / max(seen.other_speed_mps, 0.1)
+        spare = distance - seen.own_speed_mps * seconds
+        wanted = TARGET_GAP_M + self.scenario.vehicle_length_m
+        return min(0.0, max(GENTLEST_MPS2, 2 * (spare - wanted) / seconds**2))
+
+    def _goes_first(self, seen: Observation, distance: float, other_distance: float) -> bool:
+        own_s = distance / max(seen.own_speed_mps, 0.1)
+        other_s = other_distance / max(seen.other_speed_mps, 0.1)
+        return own_s < other_s - TIE_S or (abs(own_s - other_s) <= TIE_S and self.side == "left")
+
+    def _follow(self, seen: Observation) -> float:
+        """Close the differences in speed and gap within a second and four seconds."""
+        gap = seen.relative_distance_m - self.scenario.vehicle_length_m
+        closing = seen.own_speed_mps - seen.other_speed_mps
+        return -closing + (min(gap, TARGET_GAP_M) - TARGET_GAP_M) / 4

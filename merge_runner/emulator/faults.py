@@ -1,0 +1,78 @@
+"""Faults on purpose, each a function of the seed, the slot and the attempt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from merge_runner.config import read_toml
+from merge_runner.emulator.chance import draw, draw_between
+from merge_runner.errors import UsageError
+
+Fault = Literal[
+    "rate_limit",
+    "request_timeout",
+    "server_error",
+    "bad_gateway",
+    "overloaded",
+    "hang",
+    "reset",
+    "truncated_body",
+    "truncated_json",
+    "empty",
+    "refused",
+    "malformed",
+]
+FAULTS: tuple[Fault, ...] = get_args(Fault)
+# Faults that pass, so that a sweep with them ends like one without.
+TRANSIENT: tuple[Fault, ...] = FAULTS[: FAULTS.index("truncated_json")]
+
+
+class FaultPlan(BaseModel):
+    """How often which fault occurs; ``rates`` are probabilities per attempt.
+
+    ``latency_s`` delays every answer. ``delay_s`` is what a rate limit asks to wait. A hang is
+    silent for ``hang_s``, longer than a client's patience, and then closes.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seed: int = 0
+    rates: dict[Fault, Annotated[float, Field(ge=0, le=1)]] = {}
+    latency_s: Annotated[float, Field(ge=0)] = 0.0
+    delay_s: Annotated[float, Field(ge=0)] = 0.05
+    hang_s: Annotated[float, Field(ge=0)] = 30.0
+
+    def fault(self, where: str, attempt: int) -> Fault | None:
+        """The fault of an attempt, None for none; ``where`` names the request."""
+        chance = draw("fault", self.seed, where, attempt)
+        for fault in FAULTS:
+            chance -= self.rates.get(fault, 0.0)
+            if chance < 0:
+                return fault
+        return None
+
+    def wait_s(self, where: str, attempt: int) -> float:
+        """The delay that a rate limit asks for."""
+        return round(draw_between(0.5, 1.5, "delay", self.seed, where, attempt) * self.delay_s, 6)
+
+
+def transient_faults(rate: float, seed: int) -> FaultPlan:
+    """Every transient fault equally often, ``rate`` in all."""
+    if not 0 <= rate <= 1:
+        raise UsageError(f"--fault-rate {rate} is no probability between 0 and 1")
+    return FaultPlan(seed=seed, rates=dict.fromkeys(TRANSIENT, rate / len(TRANSIENT)))
+
+
+def load_faults(path: Path) -> FaultPlan:
+    """A fault plan from a TOML file; raises UsageError."""
+    try:
+        return FaultPlan.model_validate(read_toml(path))
+    except ValidationError as exc:
+        first = exc.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise UsageError(
+            f"{path}: {place}: {first['msg']}; valid faults: {', '.join(FAULTS)}"
+        ) from exc

@@ -1,0 +1,164 @@
+"""The emulator's HTTP server, on loopback alone."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import sys
+from collections import Counter
+from collections.abc import Callable
+
+from aiohttp import web
+
+from merge_runner.config import Format
+from merge_runner.emulator.faults import Fault, FaultPlan
+from merge_runner.emulator.scripted import answer
+from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
+from merge_runner.records import Slot
+
+SLOT_HEADER = "x-merge-runner-slot"
+ATTEMPT_HEADER = "x-merge-runner-attempt"
+HOST = "127.0.0.1"
+MODELS = ("scripted-driver",)
+RATE_LIMIT_KIND: dict[Format, str] = {
+    "openai-chat": "rate_limit_exceeded",
+    "openai-responses": "rate_limit_exceeded",
+    "gemini": "resource_exhausted",
+    "anthropic": "rate_limit",
+}
+STATUS_FAULTS: dict[Fault, tuple[int, str]] = {
+    "request_timeout": (408, "timeout"),
+    "server_error": (500, "server_error"),
+    "overloaded": (503, "overloaded"),
+}
+ENDINGS: dict[Fault, Ending] = {"refused": "refused", "empty": "empty"}
+MALFORMED = "M\n\nI would rather describe my plan in words than write a list of numbers."
+
+
+class Emulator:
+    """Answers chat requests of all four formats; ``faults`` decides what goes wrong."""
+
+    def __init__(self, faults: FaultPlan | None = None) -> None:
+        self._faults = faults or FaultPlan()
+        self._asked: Counter[str] = Counter()
+        self.app = web.Application(client_max_size=2**22)
+        self.app.add_routes(
+            [
+                web.post("/v1/chat/completions", self._chat),
+                web.post("/v1/responses", self._responses),
+                web.post("/v1/messages", self._anthropic),
+                web.post("/v1beta/models/{model}:generateContent", self._gemini),
+                web.get("/v1/models", self._models),
+            ]
+        )
+
+    async def _chat(self, request: web.Request) -> web.StreamResponse:
+        return await self._serve(request, "openai-chat")
+
+    async def _responses(self, request: web.Request) -> web.StreamResponse:
+        return await self._serve(request, "openai-responses")
+
+    async def _anthropic(self, request: web.Request) -> web.StreamResponse:
+        return await self._serve(request, "anthropic")
+
+    async def _gemini(self, request: web.Request) -> web.StreamResponse:
+        return await self._serve(request, "gemini")
+
+    async def _models(self, request: web.Request) -> web.StreamResponse:
+        listed = [{"id": model, "object": "model", "owned_by": "emulator"} for model in MODELS]
+        return web.json_response({"object": "list", "data": listed})
+
+    async def _serve(self, request: web.Request, wire: Format) -> web.StreamResponse:
+        raw = await request.read()
+        try:
+            body = json.loads(raw)
+            slot = _slot(request.headers.get(SLOT_HEADER))
+            prompt = prompt_of(wire, body)
+        except (ValueError, TypeError, AttributeError):
+            return _send(error_in(wire, 400, "invalid_request_error", "The body is not valid."))
+        model = request.match_info.get("model") or str(body.get("model", MODELS[0]))
+        where = request.headers.get(SLOT_HEADER) or hashlib.sha256(raw).hexdigest()
+        attempt = self._attempt(request, where)
+        fault = self._faults.fault(where, attempt)
+        if self._faults.latency_s:
+            await asyncio.sleep(self._faults.latency_s)
+        if fault in ("hang", "reset", "truncated_body"):
+            return await self._break_off(request, fault)
+        if fault == "bad_gateway":
+            return web.Response(status=502, text="<html>502 Bad Gateway</html>")
+        if fault == "rate_limit":
+            wait = self._faults.wait_s(where, attempt)
+            kind = RATE_LIMIT_KIND[wire]
+            return _send(error_in(wire, 429, kind, "Rate limit reached.", wait))
+        if fault is not None and fault in STATUS_FAULTS:
+            status, kind = STATUS_FAULTS[fault]
+            return _send(error_in(wire, status, kind, "An emulated fault."))
+        text = MALFORMED if fault == "malformed" else answer(prompt, slot)
+        ending = ENDINGS.get(fault, "stop") if fault else "stop"
+        reply = answer_in(wire, model, prompt, text, ending)
+        if fault == "truncated_json":
+            return web.Response(body=dumps(reply.body)[:-20], content_type="application/json")
+        return _send(reply)
+
+    def _attempt(self, request: web.Request, where: str) -> int:
+        """The attempt's number: the client's own count, else how often this was asked."""
+        told = request.headers.get(ATTEMPT_HEADER, "")
+        self._asked[where] += 1
+        return int(told) if told.isdigit() else self._asked[where]
+
+    async def _break_off(self, request: web.Request, fault: Fault) -> web.StreamResponse:
+        """Say nothing for long, or cut the connection before or within the reply."""
+        if fault == "hang":
+            await asyncio.sleep(self._faults.hang_s)
+        elif fault == "truncated_body" and request.transport is not None:
+            request.transport.write(
+                b"HTTP/1.1 200 OK\r\ncontent-type: application/json\r\n"
+                b'content-length: 5000\r\n\r\n{"id": "cut'
+            )
+            request.transport.close()
+        if request.transport is not None and fault != "truncated_body":
+            request.transport.abort()
+        return web.Response(status=500)
+
+
+def _slot(header: str | None) -> Slot | None:
+    return Slot(**json.loads(header)) if header else None
+
+
+def _send(reply: Answer) -> web.Response:
+    return web.Response(
+        body=dumps(reply.body),
+        status=reply.status,
+        headers=reply.headers,
+        content_type="application/json",
+    )
+
+
+async def serve(port: int, faults: FaultPlan | None = None) -> tuple[web.AppRunner, str]:
+    """Start the emulator on a loopback port (0: any free one); returns it with its base URL."""
+    runner = web.AppRunner(Emulator(faults).app, access_log=None, shutdown_timeout=0.1)
+    await runner.setup()
+    site = web.TCPSite(runner, HOST, port, backlog=4096)
+    await site.start()
+    bound: int = runner.addresses[0][1]
+    return runner, f"http://{HOST}:{bound}"
+
+
+async def run(
+    port: int,
+    faults: FaultPlan,
+    *,
+    announce: Callable[[str], None],
+    until_stdin_closes: bool,
+) -> None:
+    """Serve until cancelled, or until standard input closes; announces the base URL."""
+    runner, url = await serve(port, faults)
+    announce(url)
+    try:
+        if until_stdin_closes:
+            await asyncio.to_thread(sys.stdin.read)
+        else:
+            await asyncio.Event().wait()
+    finally:
+        await runner.cleanup()

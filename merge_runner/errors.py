@@ -1,0 +1,84 @@
+"""Everything that can go wrong, as one tree.
+
+MergeRunnerError
+├── UsageError             wrong usage or configuration, a missing key          exit 2
+├── CallFailed             one call has no answer: its trial becomes a row      exit 1
+│   └── ReplayMiss         no recorded reply for a call of a sealed replay      exit 4
+├── SweepStopped           the sweep cannot go on; what is done is kept
+│   ├── EndpointRefused    bad key, unknown or retired model                    exit 2
+│   ├── QuotaExhausted     the account has nothing left                         exit 3
+│   └── BudgetExhausted    --max-cost is reached                                exit 3
+├── StoreError             the database cannot be written or read               exit 1
+│   └── StoreLocked        another program holds the database
+└── RecordingError         a recording is damaged or not one of ours            exit 1
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from merge_runner.records import Attempt, ChatRequest
+
+
+class MergeRunnerError(Exception):
+    """The base of all errors that reach a user as one line; ``exit_code`` is the process's."""
+
+    exit_code = 1
+
+
+class UsageError(MergeRunnerError):
+    """Wrong usage or configuration; the message says what is valid and what to type next."""
+
+    exit_code = 2
+
+
+class CallFailed(MergeRunnerError):
+    """A call ended without an answer; ``attempts`` holds what was tried."""
+
+    def __init__(
+        self, message: str, request: ChatRequest, attempts: tuple[Attempt, ...] = ()
+    ) -> None:
+        super().__init__(message)
+        self.request = request
+        self.attempts = attempts
+
+
+class ReplayMiss(CallFailed):
+    """A sealed replay needs a reply that is not recorded."""
+
+    exit_code = 4
+
+
+class SweepStopped(MergeRunnerError):
+    """The whole sweep stops; finished trials and saved replies are kept."""
+
+
+class EndpointRefused(SweepStopped):
+    """The endpoint refuses every call: a bad key, or a model that is unknown or retired."""
+
+    exit_code = 2
+
+
+class QuotaExhausted(SweepStopped):
+    """The account has no quota or credit left; waiting does not help."""
+
+    exit_code = 3
+
+
+class BudgetExhausted(SweepStopped):
+    """The next call could exceed ``--max-cost``."""
+
+    exit_code = 3
+
+
+class StoreError(MergeRunnerError):
+    """The database cannot be written or read."""
+
+
+class StoreLocked(StoreError):
+    """Another program holds the database for longer than we wait."""
+
+
+class RecordingError(MergeRunnerError):
+    """A recording is damaged, or is not one of ours."""

@@ -1,0 +1,66 @@
+"""Writes ended trials to the store in batches, in a thread, while the trials go on."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from merge_runner.errors import StoreLocked
+from merge_runner.records import TrialRecord
+from merge_runner.store import Store
+
+EVERY_S = 1.0
+LOCK_PATIENCE_S = 2.0
+LAST_PATIENCE_S = 60.0
+
+
+class Flusher:
+    """Collects ended trials and stores them about once a second."""
+
+    def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
+        self._store = store
+        self._sweep_id = sweep_id
+        self._say = say
+        self._pending: list[TrialRecord] = []
+        self._closing = asyncio.Event()
+        self._task = asyncio.create_task(self._run())
+
+    def add(self, record: TrialRecord) -> None:
+        """Store this trial with the next batch."""
+        self._pending.append(record)
+
+    async def close(self) -> None:
+        """Store what is left; raises StoreLocked if the database stays locked for a minute."""
+        self._closing.set()
+        await self._task
+        give_up = asyncio.get_running_loop().time() + LAST_PATIENCE_S
+        while self._pending and not await self._flush():
+            if asyncio.get_running_loop().time() >= give_up:
+                raise StoreLocked(
+                    f"{len(self._pending)} trials are not stored: {self._store.path} is locked by "
+                    "another program. Close it and run the same command again: it writes them "
+                    "from the recorded replies without a call."
+                )
+
+    async def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                async with asyncio.timeout(EVERY_S):
+                    await self._closing.wait()
+            except TimeoutError:
+                await self._flush()
+
+    async def _flush(self) -> bool:
+        """Write one batch; False if the database is locked."""
+        batch, self._pending = self._pending, []
+        if not batch:
+            return True
+        try:
+            await asyncio.to_thread(
+                self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
+            )
+        except StoreLocked:
+            self._pending = batch + self._pending
+            self._say(f"{self._store.path} is locked by another program: waiting for it")
+            return False
+        return True

@@ -1,0 +1,1 @@
+"""Calls to language models: cache, retry, limiter, transport, in this order."""

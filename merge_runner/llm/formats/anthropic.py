@@ -1,0 +1,76 @@
+"""Anthropic Messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from merge_runner.config import ModelEntry
+from merge_runner.llm.formats.base import (
+    Reading,
+    WireRequest,
+    as_count,
+    as_dict,
+    as_list,
+    as_text,
+    outcome_of,
+    total,
+)
+from merge_runner.records import Usage
+
+# The version whose sampling default is temperature 1.0; later ones reject the parameter.
+VERSION = "2023-06-01"
+
+
+class AnthropicMessages:
+    """``POST /v1/messages`` with the API version as a header."""
+
+    retries_empty = False
+
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """One user message; ``max_tokens`` is required."""
+        return WireRequest(
+            path=entry.path or "/v1/messages",
+            body={
+                "model": entry.id,
+                "max_tokens": entry.max_output_tokens,
+                "messages": [{"role": "user", "content": prompt}],
+                **entry.parameters,
+            },
+            headers={"anthropic-version": VERSION},
+        )
+
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Join the text blocks; thinking blocks are left out."""
+        text = "".join(
+            as_text(as_dict(block).get("text")) or ""
+            for block in as_list(payload.get("content"))
+            if as_dict(block).get("type") == "text"
+        )
+        finish = as_text(payload.get("stop_reason"))
+        usage = as_dict(payload.get("usage"))
+        cached = as_count(usage.get("cache_read_input_tokens"))
+        return Reading(
+            outcome="error"
+            if payload.get("type") == "error"
+            else outcome_of(
+                text,
+                truncated=finish in ("max_tokens", "model_context_window_exceeded"),
+                refused=finish == "refusal",
+            ),
+            text=text,
+            finish_reason=finish,
+            model_served=as_text(payload.get("model")),
+            usage=Usage(
+                # Anthropic counts cached tokens apart; here the input includes them.
+                input_tokens=total(
+                    as_count(usage.get("input_tokens")),
+                    cached,
+                    as_count(usage.get("cache_creation_input_tokens")),
+                ),
+                cached_input_tokens=cached,
+                output_tokens=as_count(usage.get("output_tokens")),
+                reasoning_tokens=as_count(
+                    as_dict(usage.get("output_tokens_details")).get("thinking_tokens")
+                ),
+            ),
+        )

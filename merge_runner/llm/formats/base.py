@@ -1,0 +1,85 @@
+"""What every wire format offers, and how to read JSON that servers send in many shapes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from pydantic import JsonValue
+
+from merge_runner.config import ModelEntry
+from merge_runner.records import Usage
+
+
+@dataclass(frozen=True, slots=True)
+class WireRequest:
+    """A request without its secret: ``headers`` are those that change its meaning."""
+
+    path: str
+    body: dict[str, JsonValue]
+    headers: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What a JSON body of status 200 says.
+
+    ``outcome`` is ``ok``, ``refusal``, ``truncated``, ``empty``, or ``error`` where the body
+    reports a failure after all. ``finish_reason`` is the provider's own word.
+    """
+
+    outcome: str
+    text: str = ""
+    finish_reason: str | None = None
+    model_served: str | None = None
+    usage: Usage = field(default_factory=Usage)
+
+
+class WireFormat(Protocol):
+    """One provider's request and reply."""
+
+    retries_empty: bool
+    """Whether an empty answer is a known fault of the service that asking again may mend."""
+
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """The request for a prompt."""
+        ...
+
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Read a body of status 200; unknown keys and missing ones are normal."""
+        ...
+
+
+def outcome_of(text: str, *, truncated: bool, refused: bool) -> str:
+    """The outcome of an answer, from its text and what its finish reason means."""
+    if refused:
+        return "refusal"
+    if truncated:
+        return "truncated"
+    return "ok" if text.strip() else "empty"
+
+
+def as_dict(value: object) -> dict[str, Any]:
+    """A JSON object, or an empty one where the server sent something else."""
+    return value if isinstance(value, dict) else {}
+
+
+def as_list(value: object) -> list[Any]:
+    """A JSON array, or an empty one where the server sent something else."""
+    return value if isinstance(value, list) else []
+
+
+def as_text(value: object) -> str | None:
+    """A JSON string, or None where the server sent something else."""
+    return value if isinstance(value, str) else None
+
+
+def as_count(value: object) -> int | None:
+    """A token count, or None where it is absent."""
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+def total(*counts: int | None) -> int | None:
+    """The sum of the counts that are there; None where none is."""
+    known = [count for count in counts if count is not None]
+    return sum(known) if known else None

@@ -1,0 +1,86 @@
+"""Google Gemini generateContent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import JsonValue
+
+from merge_runner.config import ModelEntry
+from merge_runner.llm.formats.base import (
+    Reading,
+    WireRequest,
+    as_count,
+    as_dict,
+    as_list,
+    as_text,
+    outcome_of,
+    total,
+)
+from merge_runner.records import Usage
+
+REFUSALS = frozenset(
+    {
+        "SAFETY",
+        "RECITATION",
+        "LANGUAGE",
+        "OTHER",
+        "BLOCKLIST",
+        "PROHIBITED_CONTENT",
+        "SPII",
+        "MODEL_ARMOR",
+    }
+)
+
+
+class GeminiGenerateContent:
+    """``POST /v1beta/models/MODEL:generateContent``: the model is in the path alone.
+
+    The parameters are members of ``generationConfig``.
+    """
+
+    # A STOP without content is a known intermittent fault of Gemini 2.5 Pro.
+    retries_empty = True
+
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """One user turn; the cap covers thoughts and visible tokens."""
+        config: dict[str, JsonValue] = {
+            "maxOutputTokens": entry.max_output_tokens,
+            **entry.parameters,
+        }
+        return WireRequest(
+            path=entry.path or f"/v1beta/models/{entry.id}:generateContent",
+            body={
+                "contents": [{"role": "user", "parts": [{"text": prompt}]}],
+                "generationConfig": config,
+            },
+        )
+
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Join the parts of the first candidate that are no thoughts."""
+        candidate = as_dict(next(iter(as_list(payload.get("candidates"))), None))
+        text = "".join(
+            as_text(as_dict(part).get("text")) or ""
+            for part in as_list(as_dict(candidate.get("content")).get("parts"))
+            if not as_dict(part).get("thought")
+        )
+        finish = as_text(candidate.get("finishReason"))
+        blocked = as_text(as_dict(payload.get("promptFeedback")).get("blockReason"))
+        usage = as_dict(payload.get("usageMetadata"))
+        thoughts = as_count(usage.get("thoughtsTokenCount"))
+        return Reading(
+            outcome=outcome_of(
+                text,
+                truncated=finish == "MAX_TOKENS",
+                refused=bool(blocked) or finish in REFUSALS,
+            ),
+            text=text,
+            finish_reason=finish or blocked,
+            model_served=as_text(payload.get("modelVersion")),
+            usage=Usage(
+                input_tokens=as_count(usage.get("promptTokenCount")),
+                cached_input_tokens=as_count(usage.get("cachedContentTokenCount")),
+                output_tokens=total(as_count(usage.get("candidatesTokenCount")), thoughts),
+                reasoning_tokens=thoughts,
+            ),
+        )

@@ -1,0 +1,75 @@
+"""OpenAI Chat Completions, and the many servers that speak it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from merge_runner.config import ModelEntry
+from merge_runner.llm.formats.base import (
+    Reading,
+    WireRequest,
+    as_count,
+    as_dict,
+    as_list,
+    as_text,
+    outcome_of,
+)
+from merge_runner.records import Usage
+
+
+class OpenAIChat:
+    """``POST /chat/completions``; the path can be overridden, as Azure's classic form needs."""
+
+    retries_empty = False
+
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """One user message; the cap covers reasoning and visible tokens."""
+        return WireRequest(
+            path=entry.path or "/chat/completions",
+            body={
+                "model": entry.id,
+                "messages": [{"role": "user", "content": prompt}],
+                entry.cap_field: entry.max_output_tokens,
+                **entry.parameters,
+            },
+        )
+
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Read the first choice."""
+        choice = as_dict(next(iter(as_list(payload.get("choices"))), None))
+        message = as_dict(choice.get("message"))
+        finish = as_text(choice.get("finish_reason"))
+        text = _content(message.get("content"))
+        refusal = as_text(message.get("refusal"))
+        usage = as_dict(payload.get("usage"))
+        # Routers answer 200 and put the failure of a generation into the body.
+        failed = payload.get("error") or choice.get("error") or finish == "error"
+        return Reading(
+            outcome="error"
+            if failed
+            else outcome_of(
+                text,
+                truncated=finish == "length",
+                refused=bool(refusal) or finish == "content_filter",
+            ),
+            text=text or refusal or "",
+            finish_reason=finish,
+            model_served=as_text(payload.get("model")),
+            usage=Usage(
+                input_tokens=as_count(usage.get("prompt_tokens")),
+                cached_input_tokens=as_count(
+                    as_dict(usage.get("prompt_tokens_details")).get("cached_tokens")
+                ),
+                output_tokens=as_count(usage.get("completion_tokens")),
+                reasoning_tokens=as_count(
+                    as_dict(usage.get("completion_tokens_details")).get("reasoning_tokens")
+                ),
+            ),
+        )
+
+
+def _content(content: object) -> str:
+    """The text of a message, which some servers send as a list of parts."""
+    if isinstance(content, str):
+        return content
+    return "".join(as_text(as_dict(part).get("text")) or "" for part in as_list(content))

@@ -1,0 +1,65 @@
+"""The live transport: httpx on aiohttp's connections."""
+
+from __future__ import annotations
+
+import asyncio
+
+import httpx
+from httpx_aiohttp import HttpxAiohttpClient
+
+from merge_runner.config import Endpoint
+from merge_runner.llm.keys import canonical_json
+from merge_runner.llm.transport import TransportFailure
+from merge_runner.llm.verdicts import RawReply
+from merge_runner.records import ChatRequest
+
+SLOT_HEADER = "x-merge-runner-slot"
+ATTEMPT_HEADER = "x-merge-runner-attempt"
+LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+
+
+class HttpTransport:
+    """Sends requests to one endpoint over at most ``connections`` connections.
+
+    Proxies are those that httpx reads from the environment; loopback never goes through one.
+    Our own emulator, and nobody else, is told the slot.
+    """
+
+    def __init__(self, endpoint: Endpoint, *, connections: int) -> None:
+        self._endpoint = endpoint
+        # A provider may echo the key in its error; it must not get into a log or a database.
+        self._secrets = [v.removeprefix("Bearer ") for v in endpoint.auth_headers.values()]
+        limits = httpx.Limits(max_connections=connections, max_keepalive_connections=connections)
+        self._client = HttpxAiohttpClient(
+            limits=limits,
+            mounts={f"all://{host}": None for host in LOOPBACK},
+            timeout=None,  # every attempt runs under its own timeout
+        )
+
+    async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
+        """Post the hashed bytes; raises TransportFailure."""
+        headers = {
+            "content-type": "application/json",
+            **request.headers,
+            **self._endpoint.auth_headers,
+        }
+        if self._endpoint.identity == "emulator":
+            headers[SLOT_HEADER] = canonical_json(request.slot.as_dict())
+            headers[ATTEMPT_HEADER] = str(attempt)
+        url = self._endpoint.base_url + request.path
+        try:
+            async with asyncio.timeout(timeout_s):
+                reply = await self._client.post(url, content=request.body.encode(), headers=headers)
+        except TimeoutError as exc:
+            raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
+        except httpx.TransportError as exc:
+            # The library reports refused, reset and cut connections alike.
+            raise TransportFailure("connection_lost", str(exc) or type(exc).__name__) from exc
+        body = reply.text
+        for secret in self._secrets:
+            body = body.replace(secret, "[key]")
+        return RawReply(reply.status_code, {k.lower(): v for k, v in reply.headers.items()}, body)
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._client.aclose()

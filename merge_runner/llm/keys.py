@@ -1,0 +1,63 @@
+"""The content hash under which a reply is kept.
+
+The key covers the key version, the endpoint's identity, the path, the headers that change the
+meaning of a request, its exact body and the slot. All stand in one canonical JSON object, so no
+two of them can run into each other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+from pydantic import JsonValue
+
+from merge_runner.records import ChatRequest, Slot
+
+KEY_VERSION = 1
+
+
+def canonical_json(value: object) -> str:
+    """The one spelling of a JSON value: sorted keys, no spaces; NaN raises ValueError."""
+    return json.dumps(
+        value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
+
+
+def make_request(
+    *,
+    provider: str,
+    endpoint: str,
+    model: str,
+    path: str,
+    headers: dict[str, str],
+    body: dict[str, JsonValue],
+    slot: Slot,
+) -> ChatRequest:
+    """A request with its key; see ChatRequest."""
+    text = canonical_json(body)
+    return ChatRequest(
+        key=call_key(endpoint=endpoint, path=path, headers=headers, body=text, slot=slot),
+        provider=provider,
+        endpoint=endpoint,
+        model=model,
+        path=path,
+        headers=headers,
+        body=text,
+        slot=slot,
+    )
+
+
+def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, slot: Slot) -> str:
+    """SHA-256 over the canonical JSON of all parts; ``body`` is canonical JSON already."""
+    rest = canonical_json(
+        {
+            "endpoint": endpoint,
+            "headers": headers,
+            "key_version": KEY_VERSION,
+            "path": path,
+            "slot": slot.as_dict(),
+        }
+    )
+    # "body" sorts before the other names, so this is the canonical JSON of the whole.
+    return hashlib.sha256(f'{{"body":{body},{rest[1:]}'.encode()).hexdigest()

@@ -1,0 +1,158 @@
+"""Requests and tokens a minute, behind one dispatcher that serves the oldest trial first.
+
+asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
+only the dispatcher ever waits on it: whatever the queue, one poller. Tokens are counted in a
+sliding window of a minute: an estimate at dispatch, settled to the actual usage afterwards.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import heapq
+from collections import deque
+from dataclasses import dataclass, field
+
+from merge_runner.errors import UsageError
+
+WINDOW_S = 60.0
+
+
+@dataclass(slots=True, eq=False)
+class Permit:
+    """A dispatched request's tokens; they count while the window holds it."""
+
+    dispatched_at: float
+    tokens: int
+    limiter: Limiter
+    counts: bool = True
+
+    def settle(self, tokens: int) -> None:
+        """Replace the estimate by the actual usage."""
+        self.limiter.settle(self, tokens)
+
+
+@dataclass(order=True, slots=True)
+class _Waiter:
+    order: int
+    arrival: int
+    tokens: int = field(compare=False)
+    turn: asyncio.Future[Permit] = field(compare=False)
+
+
+@dataclass(slots=True)
+class Pause:
+    """Until when nothing is dispatched, on the event loop's clock; shared by all of one key."""
+
+    until: float = 0.0
+
+
+class Limiter:
+    """Hands out permits: lowest ``order`` first, first come first served within one order.
+
+    A waiter whose tokens do not fit yet holds back all behind it, so a heavy request never
+    starves behind light ones.
+    """
+
+    def __init__(
+        self,
+        *,
+        rpm: float | None = None,
+        tpm: int | None = None,
+        pause: Pause | None = None,
+        window_s: float = WINDOW_S,
+    ) -> None:
+        self._tpm = tpm
+        self._window_s = window_s
+        self._throttle = None
+        if rpm is not None:
+            from asyncio_throttle.throttler import Throttler
+
+            # Half a second's worth at a time: a whole window at once would trip finer limits.
+            burst = max(1, int(rpm / 120))
+            period = burst * window_s / rpm
+            self._throttle = Throttler(burst, period, retry_interval=min(0.05, period / 200))
+        self._waiters: list[_Waiter] = []
+        self._arrivals = 0
+        self._window: deque[Permit] = deque()
+        self._tokens_in_window = 0
+        self._pause = pause or Pause()
+        self._changed = asyncio.Event()
+        self._dispatcher: asyncio.Task[None] | None = None
+
+    @property
+    def waiting(self) -> int:
+        """How many requests wait for their turn."""
+        return len(self._waiters)
+
+    async def acquire(self, tokens: int, *, order: int = 0) -> Permit:
+        """Wait for a turn; ``tokens`` is the estimate of what the request will use."""
+        if self._tpm is not None and tokens > self._tpm:
+            raise UsageError(
+                f"one request may use {tokens} tokens, more than the limit of {self._tpm} tokens "
+                "a minute: raise --tpm to your account's limit or lower max_output_tokens in "
+                "experiments/models.toml"
+            )
+        loop = asyncio.get_running_loop()
+        waiter = _Waiter(order, self._arrivals, tokens, loop.create_future())
+        self._arrivals += 1
+        heapq.heappush(self._waiters, waiter)
+        self._changed.set()
+        if self._dispatcher is None or self._dispatcher.done():
+            self._dispatcher = asyncio.create_task(self._dispatch())
+        return await waiter.turn
+
+    def settle(self, permit: Permit, tokens: int) -> None:
+        """Correct a permit's tokens; see Permit.settle."""
+        if permit.counts:
+            self._tokens_in_window += tokens - permit.tokens
+        permit.tokens = tokens
+        self._changed.set()
+
+    def pause(self, seconds: float) -> None:
+        """Dispatch nothing for a while: the server asked everybody on this key to wait."""
+        now = asyncio.get_running_loop().time()
+        self._pause.until = max(self._pause.until, now + seconds)
+
+    async def _dispatch(self) -> None:
+        """Serve the queue until it is empty."""
+        loop = asyncio.get_running_loop()
+        has_turn = self._throttle is None
+        while waiter := self._head():
+            wait = self._blocked_for(waiter, loop.time())
+            if wait > 0:
+                await self._wait(wait)
+            elif not has_turn and self._throttle is not None:
+                await self._throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
+                has_turn = True
+            else:
+                heapq.heappop(self._waiters)
+                permit = Permit(loop.time(), waiter.tokens, self, counts=self._tpm is not None)
+                if permit.counts:
+                    self._window.append(permit)
+                    self._tokens_in_window += permit.tokens
+                waiter.turn.set_result(permit)
+                has_turn = self._throttle is None
+
+    def _head(self) -> _Waiter | None:
+        while self._waiters and self._waiters[0].turn.done():
+            heapq.heappop(self._waiters)
+        return self._waiters[0] if self._waiters else None
+
+    def _blocked_for(self, waiter: _Waiter, now: float) -> float:
+        """How long in s the head of the queue has to wait at least."""
+        while self._window and now - self._window[0].dispatched_at >= self._window_s:
+            expired = self._window.popleft()
+            expired.counts = False
+            self._tokens_in_window -= expired.tokens
+        paused = self._pause.until - now
+        if self._tpm is None or self._tokens_in_window + waiter.tokens <= self._tpm:
+            return paused
+        return max(paused, self._window[0].dispatched_at + self._window_s - now)
+
+    async def _wait(self, seconds: float) -> None:
+        """Wait, or until a new waiter or a settlement changes what can be done."""
+        self._changed.clear()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._changed.wait()

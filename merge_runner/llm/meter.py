@@ -1,0 +1,54 @@
+"""What a client has done so far, for the display and the summary."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, field
+
+from merge_runner.records import Attempt, ChatReply
+
+MINUTE_S = 60.0
+
+
+@dataclass(slots=True)
+class Meter:
+    """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts."""
+
+    calls_live: int = 0
+    calls_cached: int = 0
+    cost_usd: float = 0.0
+    cost_unknown: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    mismatches: Counter[str] = field(default_factory=Counter)
+    notes: deque[str] = field(default_factory=deque)
+    events: deque[tuple[float, int]] = field(default_factory=deque)
+
+    def count_attempt(self, attempt: Attempt) -> None:
+        """Count one live attempt."""
+        self.outcomes[attempt.outcome] += 1
+        usage = attempt.usage
+        self.events.append(
+            (time.monotonic(), (usage.input_tokens or 0) + (usage.output_tokens or 0))
+        )
+        if attempt.cost_usd is not None:
+            self.cost_usd += attempt.cost_usd
+        elif usage.output_tokens:
+            self.cost_unknown += 1
+
+    def count_reply(self, reply: ChatReply, accepted_models: frozenset[str]) -> None:
+        """Count an answer that a trial uses, and a served model that was not asked for."""
+        if reply.cached:
+            self.calls_cached += 1
+        else:
+            self.calls_live += 1
+        served = reply.attempts[-1].model_served
+        if served is not None and served not in accepted_models:
+            self.mismatches[f"{reply.request.model} -> {served}"] += 1
+
+    def last_minute(self) -> tuple[int, int]:
+        """Requests and tokens of the last minute."""
+        now = time.monotonic()
+        while self.events and now - self.events[0][0] > MINUTE_S:
+            self.events.popleft()
+        return len(self.events), sum(tokens for _, tokens in self.events)

@@ -1,0 +1,78 @@
+"""When a call is tried again: after what, for how long, and when to give up."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
+
+from tenacity import AsyncRetrying, RetryCallState, RetryError, retry_if_exception_type
+from tenacity.wait import wait_exponential_jitter
+
+from merge_runner.errors import MergeRunnerError
+
+AnswerT = TypeVar("AnswerT")
+TurnT = TypeVar("TurnT")
+_BACKOFF = wait_exponential_jitter(initial=0.5, max=60, jitter=0.5)
+
+
+class TryAgain(MergeRunnerError):
+    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for."""
+
+    def __init__(self, message: str, delay_s: float | None = None) -> None:
+        super().__init__(message)
+        self.delay_s = delay_s
+
+
+class RequestFailed(MergeRunnerError):
+    """The provider rejects this one request; asking again would not help."""
+
+
+class OutOfTime(MergeRunnerError):
+    """A call's deadline would pass before the next attempt."""
+
+
+async def call_with_retries(
+    take_turn: Callable[[], Awaitable[TurnT]],
+    attempt: Callable[[TurnT, int, float], Awaitable[AnswerT]],
+    *,
+    deadline_s: float,
+    sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+) -> AnswerT:
+    """Take a turn and make an attempt, again while it raises TryAgain; raises OutOfTime.
+
+    ``attempt`` gets the turn, its number from 1 and the seconds left. The deadline counts the
+    attempts and the waits between them, but not the wait for a turn: standing in the limiter's
+    queue is no fault of the provider.
+    """
+    loop = asyncio.get_running_loop()
+    used_s = 0.0
+
+    def wait(state: RetryCallState) -> float:
+        error = state.outcome.exception() if state.outcome else None
+        asked = error.delay_s if isinstance(error, TryAgain) else None
+        return max(asked or 0.0, _BACKOFF(state))
+
+    def stop(state: RetryCallState) -> bool:
+        return used_s + state.upcoming_sleep >= deadline_s
+
+    async def counted_sleep(seconds: float) -> None:
+        nonlocal used_s
+        used_s += seconds
+        await sleep(seconds)
+
+    try:
+        async for state in AsyncRetrying(
+            retry=retry_if_exception_type(TryAgain), wait=wait, stop=stop, sleep=counted_sleep
+        ):
+            with state:
+                turn = await take_turn()
+                started = loop.time()
+                try:
+                    number = state.retry_state.attempt_number
+                    return await attempt(turn, number, deadline_s - used_s)
+                finally:
+                    used_s += loop.time() - started
+    except RetryError as exc:
+        raise OutOfTime(f"no answer within {deadline_s:.0f} s") from exc.last_attempt.exception()
+    raise AssertionError("unreachable: the loop returns or raises")

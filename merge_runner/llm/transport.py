@@ -1,0 +1,44 @@
+"""What carries a request: HTTP, or nothing at all in a sealed replay."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from merge_runner.errors import MergeRunnerError, ReplayMiss
+from merge_runner.llm.verdicts import RawReply
+from merge_runner.records import ChatRequest
+
+
+class TransportFailure(MergeRunnerError):
+    """An attempt brought no reply; ``outcome`` names it in the calls table."""
+
+    def __init__(self, outcome: str, message: str) -> None:
+        super().__init__(message)
+        self.outcome = outcome
+
+
+class Transport(Protocol):
+    """Sends one attempt."""
+
+    async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
+        """The raw reply; raises TransportFailure."""
+        ...
+
+    async def close(self) -> None:
+        """Close all connections."""
+        ...
+
+
+class SealedTransport:
+    """Refuses every request and keeps what was asked for, so that a replay stays offline."""
+
+    def __init__(self) -> None:
+        self.misses: list[ChatRequest] = []
+
+    async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
+        """Raise ReplayMiss."""
+        self.misses.append(request)
+        raise ReplayMiss("no recorded reply", request)
+
+    async def close(self) -> None:
+        """Do nothing: there is no connection."""

@@ -1,0 +1,188 @@
+"""What a raw HTTP reply means: an answer, something to try again, or a reason to stop."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from merge_runner.llm.delays import server_delay_s
+from merge_runner.llm.formats.base import Reading, WireFormat, as_dict, as_list, as_text
+
+Action = Literal["accept", "retry", "fail", "quota", "refused"]
+
+QUOTA_CODES = frozenset(
+    {
+        "insufficient_quota",
+        "billing_hard_limit_reached",
+        "credit_balance_exhausted",
+        "organization_spend_limit_exceeded",
+        "project_spend_limit_exceeded",
+        "organization_usage_limit_exceeded",
+        "enforced_spend_limit_reached",
+        "contract_spend_limit_reached",
+    }
+)
+TRANSIENT = {
+    408: "request_timeout",
+    409: "conflict",
+    500: "server_error",
+    502: "server_error",
+    503: "overloaded",
+    504: "server_timeout",
+    520: "server_error",
+    521: "server_error",
+    522: "server_error",
+    523: "server_error",
+    524: "server_timeout",
+    529: "overloaded",
+}
+TRANSIENT_CODES = frozenset({"server_error", "rate_limit_exceeded"})
+
+
+@dataclass(frozen=True, slots=True)
+class RawReply:
+    """A reply as received: ``headers`` have lower-case names, ``body`` is the text."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What to do with a reply.
+
+    ``accept`` it as the answer, ``retry`` after ``delay_s`` (all calls of the key wait where
+    ``pause``), ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the
+    endpoint ``refused`` the key or the model. ``outcome`` names it in the calls table.
+    """
+
+    action: Action
+    outcome: str
+    reading: Reading
+    message: str | None = None
+    delay_s: float | None = None
+    pause: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorInfo:
+    """An error body in one shape: servers send nested, flat, listed and string errors."""
+
+    message: str
+    names: frozenset[str]
+    details: tuple[dict[str, Any], ...]
+
+
+def judge(raw: RawReply, wire: WireFormat) -> Verdict:
+    """The verdict on a reply, by the rules of docs/providers.md."""
+    payload = _json(raw.body)
+    if raw.status == 200:
+        return _judge_success(raw, payload, wire)
+    error = error_info(payload, raw.body)
+    delay = server_delay_s(raw.headers, payload)
+    return _judge_error(raw.status, raw.headers, error, delay)
+
+
+def error_info(payload: object, body: str) -> ErrorInfo:
+    """Read an error body of any known shape; the text itself serves where it is no JSON."""
+    if isinstance(payload, list):
+        payload = payload[0] if payload else None
+    top = as_dict(payload)
+    nested = top.get("error")
+    if nested is None:
+        choice = as_dict(next(iter(as_list(top.get("choices"))), None))
+        nested = choice.get("error")
+    error = as_dict(nested) or ({"message": nested} if isinstance(nested, str) else top)
+    details = error.get("details")
+    listed = [as_dict(detail) for detail in as_list(details)] or [as_dict(details)]
+    names = {
+        str(name)
+        for name in (
+            error.get("type"),
+            error.get("code"),
+            error.get("status"),
+            *(detail.get("error_code") for detail in listed),
+            *(detail.get("reason") for detail in listed),
+        )
+        if name is not None
+    }
+    message = as_text(error.get("message")) or " ".join(body.split())[:200]
+    return ErrorInfo(message, frozenset(names), tuple(listed))
+
+
+def _json(body: str) -> object:
+    try:
+        return json.loads(body)
+    except ValueError:
+        return None
+
+
+def _judge_success(raw: RawReply, payload: object, wire: WireFormat) -> Verdict:
+    if not isinstance(payload, dict):
+        return Verdict("retry", "bad_body", Reading("error"), "the body is no JSON object")
+    reading = wire.read(payload)
+    if reading.outcome != "error":
+        return Verdict("accept", reading.outcome, reading)
+    error = error_info(payload, raw.body)
+    status = next((int(n) for n in error.names if n.isdigit()), None)
+    if status is None:
+        transient = not error.names or error.names & TRANSIENT_CODES
+        status = 500 if transient else 400
+    delay = server_delay_s(raw.headers, payload)
+    verdict = _judge_error(status, raw.headers, error, delay)
+    return Verdict(
+        verdict.action, verdict.outcome, reading, verdict.message, verdict.delay_s, verdict.pause
+    )
+
+
+def _judge_error(
+    status: int, headers: Mapping[str, str], error: ErrorInfo, delay: float | None
+) -> Verdict:
+    message = f"HTTP {status}: {error.message}"
+    reading = Reading("error")
+    if status == 400 and "content_filter" in error.names:
+        return Verdict("accept", "refusal", Reading("refusal"), message)
+    if _quota_exhausted(status, headers, error):
+        return Verdict("quota", "quota_exhausted", reading, message)
+    if _endpoint_refuses(status, error):
+        outcome = "unknown_model" if _names_model(status, error) else "not_allowed"
+        return Verdict("refused", outcome, reading, message)
+    if status in (402, 429):
+        too_large = error.message.startswith("Request too large")
+        action: Action = "fail" if too_large else "retry"
+        outcome = "request_too_large" if too_large else "rate_limited"
+        return Verdict(action, outcome, reading, message, delay, pause=not too_large)
+    should_retry = headers.get("x-should-retry")
+    if should_retry == "true" or (status in TRANSIENT and should_retry != "false"):
+        outcome = TRANSIENT.get(status, f"http_{status}")
+        return Verdict("retry", outcome, reading, message, delay)
+    return Verdict("fail", TRANSIENT.get(status, "bad_request"), reading, message)
+
+
+def _quota_exhausted(status: int, headers: Mapping[str, str], error: ErrorInfo) -> bool:
+    if status == 402:
+        in_flight_only = "openrouter_in_flight_budget" in str(error.details) + error.message
+        return not (in_flight_only and "retry-after" in headers)
+    if error.names & QUOTA_CODES:
+        return True
+    if status == 400:
+        return "credit balance is too low" in error.message
+    per_day = any(
+        "PerDay" in str(as_dict(violation).get("quotaId"))
+        for detail in error.details
+        for violation in as_list(detail.get("violations"))
+    )
+    return status == 429 and per_day
+
+
+def _endpoint_refuses(status: int, error: ErrorInfo) -> bool:
+    return status in (401, 403, 404) or (
+        status == 400 and bool(error.names & {"model_not_found", "API_KEY_INVALID"})
+    )
+
+
+def _names_model(status: int, error: ErrorInfo) -> bool:
+    return status == 404 or "model_not_found" in error.names

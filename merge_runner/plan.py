@@ -1,0 +1,190 @@
+"""What a sweep consists of: its trials in order, their readable ids, and what their hash covers."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from merge_runner.config import ModelEntry, Scenario, SweepFile, load_models, load_sweep
+from merge_runner.errors import UsageError
+from merge_runner.llm.keys import canonical_json
+from merge_runner.prompts.blocks import VARIANTS, block_digests
+from merge_runner.records import Side, TrialSpec
+from merge_runner.simulator.conditions import CONDITIONS
+
+SPEC_VERSION = 1
+PROGRAMS = ("constant", "projected-order")
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What a user asks for on top of the sweep's file; None keeps the file's value."""
+
+    sweep: str
+    model: str
+    repetitions: int | None = None
+    conditions: Sequence[str] | None = None
+    variants: Sequence[str] | None = None
+    sample_set: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A sweep before it runs. ``entries`` are the language models on either side."""
+
+    name: str
+    model: str
+    sides: dict[Side, str]
+    entries: dict[str, ModelEntry]
+    scenario: Scenario
+    repetitions: dict[str, int]
+    conditions: tuple[str, ...]
+    sample_set: int
+
+    @property
+    def trials(self) -> int:
+        """The number of trials."""
+        return sum(self.repetitions.values()) * len(self.conditions)
+
+    @property
+    def llm_sides(self) -> int:
+        """How many of the two drivers are language models."""
+        return sum(name in self.entries for name in self.sides.values())
+
+    @property
+    def source(self) -> Literal["llm", "driver"]:
+        """Whether any language model takes part."""
+        return "llm" if self.entries else "driver"
+
+    def specs(self, endpoints: Mapping[str, str]) -> dict[str, str]:
+        """Variant to the canonical JSON that its spec hash covers."""
+        return {
+            variant: canonical_json(
+                {
+                    "spec_version": SPEC_VERSION,
+                    "scenario": self.scenario.model_dump(),
+                    "prompt_blocks": block_digests(variant) if self.entries else {},
+                    "left": self._driver(self.sides["left"], endpoints),
+                    "right": self._driver(self.sides["right"], endpoints),
+                    "sample_set": self.sample_set,
+                }
+            )
+            for variant in self.repetitions
+        }
+
+    def trial_specs(self, endpoints: Mapping[str, str]) -> list[TrialSpec]:
+        """All trials, repetition by repetition, so that what is finished is balanced."""
+        hashes = {variant: spec_hash(text) for variant, text in self.specs(endpoints).items()}
+        cells = [
+            (repetition, variant, condition)
+            for repetition in range(1, max(self.repetitions.values()) + 1)
+            for variant, wanted in self.repetitions.items()
+            if repetition <= wanted
+            for condition in self.conditions
+        ]
+        suffix = f"/set{self.sample_set}" if self.sample_set else ""
+        return [
+            TrialSpec(
+                trial_id=f"{self.model}/{variant}/{condition}/rep{repetition:02d}{suffix}",
+                spec_hash=hashes[variant],
+                source=self.source,
+                model_left=self.sides["left"],
+                model_right=self.sides["right"],
+                variant=variant,
+                condition=condition,
+                repetition=repetition,
+                sample_set=self.sample_set,
+                order=order,
+            )
+            for order, (repetition, variant, condition) in enumerate(cells)
+        ]
+
+    def config(self, endpoints: Mapping[str, str]) -> dict[str, object]:
+        """The sweep's configuration for its row in the database."""
+        entries = {name: entry.model_dump(mode="json") for name, entry in self.entries.items()}
+        prompt_blocks = {variant: block_digests(variant) for variant in self.repetitions}
+        return {
+            "model": self.model,
+            "models": entries,
+            "endpoints": dict(endpoints),
+            "scenario": self.scenario.model_dump(),
+            "repetitions": dict(self.repetitions),
+            "conditions": list(self.conditions),
+            "sample_set": self.sample_set,
+            "prompt_blocks": prompt_blocks,
+        }
+
+    def _driver(self, name: str, endpoints: Mapping[str, str]) -> dict[str, object]:
+        entry = self.entries.get(name)
+        if entry is None:
+            return {"program": name}
+        sent = entry.model_dump(
+            include={
+                "provider",
+                "format",
+                "id",
+                "parameters",
+                "max_output_tokens",
+                "cap_field",
+                "path",
+            }
+        )
+        return {**sent, "endpoint": endpoints[name]}
+
+
+def spec_hash(text: str) -> str:
+    """The short hash of a spec's canonical JSON."""
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def make_plan(choice: Choice) -> Plan:
+    """Resolve a choice against the sweep's file and the registry; raises UsageError."""
+    name, file = load_sweep(choice.sweep)
+    models = load_models()
+    left, _, right = choice.model.partition("+")
+    sides: dict[Side, str] = {"left": left, "right": right or left}
+    valid = (*models, *PROGRAMS)
+    for side in sides.values():
+        _require(side, valid, "model", "two joined by + drive left and right")
+    conditions = tuple(choice.conditions or file.conditions or CONDITIONS)
+    for condition in conditions:
+        _require(condition, tuple(CONDITIONS), "condition")
+    if choice.sample_set < 0:
+        raise UsageError("--sample-set is a whole number from 0")
+    return Plan(
+        name=name,
+        model=left if left == sides["right"] else f"{left}+{right}",
+        sides=sides,
+        entries={side: models[side] for side in sides.values() if side in models},
+        scenario=file.scenario,
+        repetitions=_repetitions(name, file, choice),
+        conditions=conditions,
+        sample_set=choice.sample_set,
+    )
+
+
+def _repetitions(name: str, file: SweepFile, choice: Choice) -> dict[str, int]:
+    for variant in (*file.repetitions, *(choice.variants or ())):
+        _require(variant, tuple(VARIANTS), "variant")
+    if choice.repetitions is not None and choice.repetitions < 1:
+        raise UsageError("--reps is a whole number from 1")
+    wanted: dict[str, int] = {}
+    for variant in choice.variants or file.repetitions:
+        repetitions = choice.repetitions or file.repetitions.get(variant)
+        if repetitions is None:
+            raise UsageError(
+                f"the sweep {name} has no variant {variant}; it has {', '.join(file.repetitions)}. "
+                "With --reps N any variant can be run."
+            )
+        wanted[variant] = repetitions
+    if not wanted:
+        raise UsageError(f"the sweep {name} has no variant: add one under [repetitions]")
+    return wanted
+
+
+def _require(name: str, valid: Sequence[str], what: str, hint: str = "") -> None:
+    if name not in valid:
+        listed = ", ".join(valid) + (f" ({hint})" if hint else "")
+        raise UsageError(f"unknown {what} {name!r}; valid: {listed}")

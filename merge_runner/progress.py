@@ -1,0 +1,134 @@
+"""What a user sees while a sweep runs: a live table on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from merge_runner.llm.meter import Meter
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+LIVE_EVERY_S = 0.25
+PLAIN_EVERY_S = 5.0
+
+
+@dataclass(slots=True)
+class Progress:
+    """Where a sweep stands; the meters are those of its clients."""
+
+    title: str
+    total: int
+    meters: Sequence[Meter] = ()
+    cap_usd: float | None = None
+    done: Counter[str] = field(default_factory=Counter)
+    running: int = 0
+    stored_before: int = 0
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def ended(self) -> int:
+        """How many trials of this run have ended, in whatever way."""
+        return self.done.total()
+
+    def fields(self) -> list[tuple[str, str]]:
+        """Name and text of every figure that is shown."""
+        elapsed = time.monotonic() - self.started
+        live = sum(meter.calls_live for meter in self.meters)
+        cached = sum(meter.calls_cached for meter in self.meters)
+        rates = [meter.last_minute() for meter in self.meters]
+        requests, tokens = (sum(rate[i] for rate in rates) for i in (0, 1))
+        cost = sum(meter.cost_usd for meter in self.meters)
+        window = min(60.0, max(elapsed, 1.0)) / 60
+        cap = "" if self.cap_usd is None else f" of {self.cap_usd:.2f}"
+        before = f" (+{self.stored_before} stored before)" if self.stored_before else ""
+        return [
+            ("trials", f"{self.ended}/{self.total} ended{before}, {self.running} running"),
+            ("failed", str(self.done["failed"])),
+            ("calls", f"{live} live, {cached} from recordings"),
+            ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
+            ("cost", f"{cost:.2f}{cap} USD"),
+            ("time", f"{elapsed:.0f} s{self._left(elapsed)}"),
+        ]
+
+    def _left(self, elapsed: float) -> str:
+        if not self.ended or self.ended == self.total:
+            return ""
+        left = elapsed / self.ended * (self.total - self.ended)
+        return f", about {left:.0f} s left"
+
+
+@asynccontextmanager
+async def shown(progress: Progress) -> AsyncIterator[None]:
+    """Show the progress on stderr while the body runs, and once more at its end."""
+    show = _show_live if sys.stderr.isatty() else _show_plain
+    stop = asyncio.Event()
+    display = asyncio.create_task(show(progress, stop))
+    try:
+        yield
+    finally:
+        stop.set()
+        await display
+
+
+async def _show_live(progress: Progress, stop: asyncio.Event) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(stderr=True)
+    with Live(_table(progress), console=console, auto_refresh=False) as live:
+        while not await _stopped(stop, LIVE_EVERY_S):
+            for note in _notes(progress):
+                console.print(note)
+            live.update(_table(progress), refresh=True)
+        live.update(_table(progress), refresh=True)
+
+
+async def _show_plain(progress: Progress, stop: asyncio.Event) -> None:
+    while not await _stopped(stop, PLAIN_EVERY_S):
+        for note in _notes(progress):
+            _say(note)
+        _say(_line(progress))
+    _say(_line(progress))
+
+
+def _table(progress: Progress) -> Table:
+    from rich.table import Table
+
+    table = Table(title=progress.title, title_justify="left", show_header=False, box=None)
+    for name, text in progress.fields():
+        table.add_row(name, text)
+    return table
+
+
+def _line(progress: Progress) -> str:
+    return "; ".join(f"{name}: {text}" for name, text in progress.fields())
+
+
+def _notes(progress: Progress) -> list[str]:
+    """What the clients had to say since the last look, equal lines once."""
+    notes: dict[str, None] = {}
+    for meter in progress.meters:
+        while meter.notes:
+            notes[meter.notes.popleft()] = None
+    return list(notes)
+
+
+async def _stopped(stop: asyncio.Event, seconds: float) -> bool:
+    try:
+        async with asyncio.timeout(seconds):
+            await stop.wait()
+    except TimeoutError:
+        return False
+    return True
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)  # noqa: T201 # the display

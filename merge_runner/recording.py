@@ -1,0 +1,246 @@
+"""Portable recordings: what a sweep asked and was answered, as one Parquet file.
+
+One row per call: the parts of its key, the exact request body, and all attempts as JSON. The
+file's key-value metadata hold where it comes from. Any Parquet tool can query it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import duckdb
+
+from merge_runner.errors import RecordingError, UsageError
+from merge_runner.llm.cache import Entry, ResponseCache, attempt_from
+from merge_runner.llm.keys import KEY_VERSION, call_key
+from merge_runner.records import ChatRequest, Slot
+
+FORMAT = "merge-runner recording 1"
+COLUMNS = {
+    "call_key": "VARCHAR",
+    "provider": "VARCHAR",
+    "endpoint": "VARCHAR",
+    "model": "VARCHAR",
+    "path": "VARCHAR",
+    "headers": "VARCHAR",
+    "condition": "VARCHAR",
+    "repetition": "BIGINT",
+    "side": "VARCHAR",
+    "decision": "BIGINT",
+    "sample_set": "BIGINT",
+    "body": "VARCHAR",
+    "attempts": "VARCHAR",
+}
+BATCH = 1_000
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a recording holds. ``cost_usd`` is what its replies cost when they were made."""
+
+    calls: int
+    attempts: int
+    cost_usd: float
+    models_requested: dict[str, int]
+    models_served: dict[str, int]
+    endpoints: dict[str, int]
+    outcomes: dict[str, int]
+    provenance: dict[str, str]
+
+
+def export_recording(
+    file: Path, cache: ResponseCache, keys: list[str], provenance: dict[str, str]
+) -> int:
+    """Write the entries of these keys; returns their number. Raises RecordingError."""
+    missing = [key for key in keys if cache.get(key) is None]
+    if missing:
+        raise RecordingError(
+            f"{len(missing)} of {len(keys)} replies are not in the cache {cache.folder}, the first "
+            f"is {missing[0]}: run the sweep again with this cache"
+        )
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_name(file.name + ".partial")
+    metadata = {**provenance, "format": FORMAT, "key_version": str(KEY_VERSION)}
+    with duckdb.connect() as connection:
+        columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
+        connection.execute(f"CREATE TABLE calls ({columns})")
+        appender = connection.appender("calls")
+        for key in keys:
+            entry = cache.get(key)
+            assert entry is not None
+            appender.append_row(*_row(entry))
+        appender.flush()
+        pairs = ", ".join(f"{_quoted(name)}: {_quoted(text)}" for name, text in metadata.items())
+        connection.execute(
+            "COPY (FROM calls ORDER BY condition, repetition, side, decision, call_key) "
+            f"TO {_quoted(str(partial))} "
+            f"(FORMAT parquet, COMPRESSION zstd, KV_METADATA {{{pairs}}})"
+        )
+    os.replace(partial, file)
+    return len(keys)
+
+
+def read_recording(file: Path) -> Iterator[Entry]:
+    """All entries of a recording, each verified against its key; raises RecordingError."""
+    with _opened(file) as connection:
+        rows = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM recording")  # noqa: S608 # constants
+        seen: set[str] = set()
+        number = 0
+        while batch := _fetch(rows, file):
+            for values in batch:
+                number += 1
+                entry = _verified(file, number, dict(zip(COLUMNS, values, strict=True)))
+                if entry.request.key in seen:
+                    raise RecordingError(f"{file}: row {number} repeats {entry.request.key}")
+                seen.add(entry.request.key)
+                yield entry
+
+
+def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
+    """Verify the whole file, then add what the cache lacks; returns (added, already there)."""
+    for _ in read_recording(file):
+        pass
+    added = there = 0
+    batch: list[Entry] = []
+    for entry in read_recording(file):
+        if cache.get(entry.request.key) is None:
+            batch.append(entry)
+            added += 1
+        else:
+            there += 1
+        if len(batch) == BATCH:
+            cache.put_now(batch)
+            batch = []
+    cache.put_now(batch)
+    return added, there
+
+
+def summarise(file: Path) -> Summary:
+    """Verify a recording and count what it holds."""
+    requested, served, endpoints, outcomes = (Counter[str]() for _ in range(4))
+    calls = attempts = 0
+    cost = 0.0
+    for entry in read_recording(file):
+        calls += 1
+        attempts += len(entry.attempts)
+        cost += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
+        requested[entry.request.model] += 1
+        served[entry.attempts[-1].model_served or "unknown"] += 1
+        endpoints[entry.request.endpoint] += 1
+        outcomes[entry.attempts[-1].outcome] += 1
+    return Summary(
+        calls=calls,
+        attempts=attempts,
+        cost_usd=round(cost, 6),
+        models_requested=dict(requested),
+        models_served=dict(served),
+        endpoints=dict(endpoints),
+        outcomes=dict(outcomes),
+        provenance=_metadata(file),
+    )
+
+
+def _row(entry: Entry) -> tuple[Any, ...]:
+    request, slot = entry.request, entry.request.slot
+    return (
+        request.key,
+        request.provider,
+        request.endpoint,
+        request.model,
+        request.path,
+        json.dumps(request.headers, sort_keys=True),
+        slot.condition,
+        slot.repetition,
+        slot.side,
+        slot.decision,
+        slot.sample_set,
+        request.body,
+        json.dumps([asdict(attempt) for attempt in entry.attempts], ensure_ascii=False),
+    )
+
+
+def _verified(file: Path, number: int, row: dict[str, Any]) -> Entry:
+    try:
+        slot = Slot(
+            row["condition"], row["repetition"], row["side"], row["decision"], row["sample_set"]
+        )
+        headers: dict[str, str] = json.loads(row["headers"])
+        key = call_key(
+            endpoint=row["endpoint"],
+            path=row["path"],
+            headers=headers,
+            body=row["body"],
+            slot=slot,
+        )
+        attempts = tuple(attempt_from(attempt) for attempt in json.loads(row["attempts"]))
+    except (ValueError, TypeError, KeyError) as exc:
+        raise RecordingError(f"{file}: row {number} is damaged: {exc!r}") from exc
+    if key != row["call_key"]:
+        raise RecordingError(
+            f"{file}: the content of row {number} does not belong to its key {row['call_key']}"
+        )
+    if not attempts:
+        raise RecordingError(f"{file}: row {number} holds no reply")
+    request = ChatRequest(
+        key=key,
+        provider=row["provider"],
+        endpoint=row["endpoint"],
+        model=row["model"],
+        path=row["path"],
+        headers=headers,
+        body=row["body"],
+        slot=slot,
+    )
+    return Entry(request, attempts)
+
+
+def _opened(file: Path) -> duckdb.DuckDBPyConnection:
+    """A connection with the view ``recording``; raises for anything but one of our files."""
+    if not file.is_file():
+        raise UsageError(f"there is no recording {file}")
+    connection = duckdb.connect()
+    try:
+        connection.execute(
+            f"CREATE VIEW recording AS FROM read_parquet({_quoted(str(file.resolve()))})"
+        )
+        found = {
+            name: kind for name, kind, *_ in connection.execute("DESCRIBE recording").fetchall()
+        }
+    except duckdb.Error as exc:
+        raise RecordingError(f"{file} is no Parquet file that can be read: {exc}") from exc
+    if found != COLUMNS:
+        raise RecordingError(
+            f"{file} is no recording of ours: it has the columns {', '.join(found)}, "
+            f"a recording has {', '.join(COLUMNS)}"
+        )
+    version = _metadata(file).get("key_version")
+    if version != str(KEY_VERSION):
+        raise RecordingError(
+            f"{file} has keys of version {version}, this program reads version {KEY_VERSION}"
+        )
+    return connection
+
+
+def _metadata(file: Path) -> dict[str, str]:
+    with duckdb.connect() as connection:
+        rows = connection.execute(
+            f"SELECT key, value FROM parquet_kv_metadata({_quoted(str(file.resolve()))})"  # noqa: S608 # quoted
+        ).fetchall()
+    return {key.decode(): value.decode() for key, value in rows}
+
+
+def _fetch(rows: duckdb.DuckDBPyConnection, file: Path) -> list[tuple[Any, ...]]:
+    try:
+        return rows.fetchmany(BATCH)
+    except duckdb.Error as exc:
+        raise RecordingError(f"{file} is damaged: {exc}") from exc
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"

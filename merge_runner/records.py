@@ -1,0 +1,206 @@
+"""Frozen records that cross layers. SI units; ``left`` and ``right`` are the two branches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+Side = Literal["left", "right"]
+Road = Literal["merge", "straight"]
+Tactical = Literal["M", "Y"]
+Status = Literal["finished", "collided", "timeout", "failed"]
+
+SIDES: tuple[Side, Side] = ("left", "right")
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """Where in a sweep a sample stands: two slots never share a sample by accident.
+
+    ``decision`` counts from 0 within a trial, ``repetition`` from 1, ``sample_set`` from 0.
+    """
+
+    condition: str
+    repetition: int
+    side: Side
+    decision: int
+    sample_set: int
+
+    def as_dict(self) -> dict[str, str | int]:
+        """The slot as plain JSON values."""
+        return {
+            "condition": self.condition,
+            "decision": self.decision,
+            "repetition": self.repetition,
+            "sample_set": self.sample_set,
+            "side": self.side,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What one driver sees at a decision instant; ``own`` is the ego vehicle.
+
+    ``relative_distance_m`` is the other's travelled distance minus the own one, so that it is
+    positive while the other is ahead. ``distance_to_merge_m`` is None on the straight road.
+    The histories are oldest first, one value per simulation step: the accelerations that the own
+    vehicle executed, and the speeds at which the other was seen before now. ``remaining_plan``
+    is the unexecuted rest of the last valid plan (normalised), None before the first.
+    """
+
+    road: Road
+    own_speed_mps: float
+    other_speed_mps: float
+    relative_distance_m: float
+    distance_to_merge_m: float | None
+    own_accelerations_mps2: tuple[float, ...]
+    other_speeds_mps: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """Tokens of one attempt; ``input`` includes the cached ones, ``output`` the reasoning ones."""
+
+    input_tokens: int | None = None
+    cached_input_tokens: int | None = None
+    output_tokens: int | None = None
+    reasoning_tokens: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One HTTP attempt at a call.
+
+    ``outcome`` is ``ok``, ``refusal``, ``truncated`` or ``empty`` for an answer, else the named
+    reason of the failure. ``reply`` is the body as received, None if there was none.
+    ``started_at`` is UTC in ISO 8601.
+    """
+
+    number: int
+    outcome: str
+    http_status: int | None = None
+    model_served: str | None = None
+    finish_reason: str | None = None
+    usage: Usage = field(default_factory=Usage)
+    latency_s: float | None = None
+    started_at: str | None = None
+    reply: str | None = None
+    error: str | None = None
+    cost_usd: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ChatRequest:
+    """One request as it is hashed and sent.
+
+    ``headers`` are those that change the meaning of the request, never a secret. ``body`` is
+    canonical JSON: the bytes that are hashed are the bytes that are sent. ``model`` is the id
+    asked for; it and ``provider`` are labels, and not hashed by themselves.
+    """
+
+    key: str
+    provider: str
+    endpoint: str
+    model: str
+    path: str
+    headers: dict[str, str]
+    body: str
+    slot: Slot
+
+
+@dataclass(frozen=True, slots=True)
+class ChatReply:
+    """The answer to a call: its text and outcome, and every attempt, the answering one last."""
+
+    text: str
+    outcome: str
+    request: ChatRequest
+    attempts: tuple[Attempt, ...]
+    cached: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What a driver decided at one instant.
+
+    ``plan`` holds the normalised accelerations of a valid decision over the whole horizon, None
+    where it was invalid; ``applied`` the ones to execute now. ``fallback`` says that ``applied``
+    comes from an older plan, or is 0 because there is none. ``failure`` names why a decision is
+    invalid.
+    """
+
+    plan: tuple[float, ...] | None
+    applied: tuple[float, ...]
+    tactical: Tactical | None = None
+    rationale: str | None = None
+    failure: str | None = None
+    fallback: bool = False
+    prompt: str | None = None
+    reply: ChatReply | None = None
+
+    @property
+    def valid(self) -> bool:
+        """Whether the driver gave a plan that satisfies the schema."""
+        return self.plan is not None
+
+
+@dataclass(frozen=True, slots=True)
+class TrialSpec:
+    """One trial to play. ``order`` is its place in the sweep: lower goes first."""
+
+    trial_id: str
+    spec_hash: str
+    source: Literal["llm", "driver"]
+    model_left: str
+    model_right: str
+    variant: str
+    condition: str
+    repetition: int
+    sample_set: int
+    order: int
+
+
+@dataclass(frozen=True, slots=True)
+class StateRow:
+    """One vehicle at one sample; the acceleration is the one realised over the step before it."""
+
+    step: int
+    time_s: float
+    side: Side
+    position_m: float
+    velocity_mps: float
+    acceleration_mps2: float
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionRow:
+    """One decision of one driver, at its number and time in the trial."""
+
+    number: int
+    time_s: float
+    side: Side
+    decision: Decision
+
+
+@dataclass(frozen=True, slots=True)
+class FailedCall:
+    """A call without an answer, and what was tried."""
+
+    number: int
+    side: Side
+    request: ChatRequest
+    attempts: tuple[Attempt, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TrialRecord:
+    """A played trial with its whole trace."""
+
+    spec: TrialSpec
+    status: Status
+    merged_first: Side | None
+    end_time_s: float
+    error: str | None
+    states: tuple[StateRow, ...]
+    decisions: tuple[DecisionRow, ...]
+    failed_calls: tuple[FailedCall, ...] = ()

@@ -1,0 +1,133 @@
+"""A trial's record as rows of the tables, in the order of their columns (schema.sql)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from typing import Any
+
+from merge_runner.records import Attempt, ChatRequest, DecisionRow, FailedCall, TrialRecord
+from merge_runner.simulator.conditions import CONDITIONS
+
+Row = tuple[Any, ...]
+
+
+def trial_row(record: TrialRecord) -> Row:
+    """The row of ``trials``."""
+    spec = record.spec
+    condition = CONDITIONS[spec.condition]
+    return (
+        spec.trial_id,
+        spec.spec_hash,
+        None,
+        spec.source,
+        spec.model_left,
+        spec.model_right,
+        spec.variant,
+        spec.condition,
+        condition.projected_headway_m,
+        condition.relative_velocity_mps,
+        spec.repetition,
+        spec.sample_set,
+        record.status,
+        record.merged_first,
+        record.end_time_s,
+        record.error,
+    )
+
+
+def state_rows(record: TrialRecord) -> Iterator[Row]:
+    """Rows of ``states``."""
+    key = (record.spec.trial_id, record.spec.spec_hash)
+    for row in record.states:
+        yield (
+            *key,
+            row.step,
+            row.time_s,
+            row.side,
+            row.position_m,
+            row.velocity_mps,
+            row.acceleration_mps2,
+        )
+
+
+def decision_rows(record: TrialRecord) -> Iterator[Row]:
+    """Rows of ``decisions``."""
+    for row in record.decisions:
+        decision = row.decision
+        prompt = decision.prompt
+        yield (
+            record.spec.trial_id,
+            record.spec.spec_hash,
+            row.number,
+            row.time_s,
+            row.side,
+            decision.valid,
+            decision.failure,
+            decision.tactical,
+            decision.rationale,
+            None if decision.plan is None else list(decision.plan),
+            list(decision.applied),
+            decision.fallback,
+            prompt,
+            None if prompt is None else hashlib.sha256(prompt.encode()).hexdigest(),
+            None if decision.reply is None else decision.reply.request.key,
+        )
+
+
+def call_rows(record: TrialRecord) -> Iterator[Row]:
+    """Rows of ``calls``: every attempt of every call, also of those that failed."""
+    for row in record.decisions:
+        reply = row.decision.reply
+        if reply is not None:
+            for attempt in reply.attempts:
+                yield _call_row(record, row, reply.request, attempt, cached=reply.cached)
+    for failed in record.failed_calls:
+        for attempt in failed.attempts:
+            yield _call_row(record, failed, failed.request, attempt, cached=False)
+
+
+def _call_row(
+    record: TrialRecord,
+    place: DecisionRow | FailedCall,
+    request: ChatRequest,
+    attempt: Attempt,
+    *,
+    cached: bool,
+) -> Row:
+    return (
+        request.key,
+        record.spec.trial_id,
+        record.spec.spec_hash,
+        place.side,
+        place.number,
+        attempt.number,
+        request.provider,
+        request.model,
+        attempt.model_served,
+        attempt.http_status,
+        attempt.outcome,
+        cached,
+        attempt.latency_s,
+        attempt.usage.input_tokens,
+        attempt.usage.cached_input_tokens,
+        attempt.usage.output_tokens,
+        attempt.usage.reasoning_tokens,
+        0.0 if cached else attempt.cost_usd,
+        attempt.finish_reason,
+        request.body,
+        _as_json(attempt.reply),
+        attempt.error,
+    )
+
+
+def _as_json(text: str | None) -> str | None:
+    """A reply that is no JSON, as a proxy's HTML page, becomes a JSON string."""
+    if text is None:
+        return None
+    try:
+        json.loads(text)
+    except ValueError:
+        return json.dumps(text)
+    return text

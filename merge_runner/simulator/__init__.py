@@ -1,0 +1,1 @@
+"""The driving task: pure functions of positions and speeds, without I/O."""

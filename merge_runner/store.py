@@ -1,0 +1,330 @@
+"""Results in DuckDB. The file is open only while a batch is written, so that others can read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import duckdb
+
+from merge_runner.errors import StoreError, StoreLocked, UsageError
+from merge_runner.records import TrialRecord
+from merge_runner.rows import call_rows, decision_rows, state_rows, trial_row
+
+SCHEMA_VERSION = 1
+SCHEMA = Path(__file__).with_name("schema.sql")
+LOCK_RETRY_S = 0.05
+PATIENCE_S = 30.0
+TrialKey = tuple[str, str]
+"""(trial_id, spec_hash)"""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepRow:
+    """One row of the sweeps table; ``config`` and ``versions`` are JSON texts."""
+
+    sweep_id: str
+    name: str
+    started_at: datetime
+    config: str
+    git_commit: str | None
+    git_dirty: bool | None
+    versions: str
+
+
+@contextmanager
+def open_database(
+    path: Path, *, read_only: bool, patience_s: float
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open the database, waiting for others to close it; raises StoreLocked or UsageError."""
+    give_up = time.monotonic() + patience_s
+    while True:
+        try:
+            connection = duckdb.connect(str(path), read_only=read_only)
+            break
+        except duckdb.IOException as exc:
+            if "lock" not in str(exc).lower():
+                raise UsageError(f"{path} cannot be opened as a database: {exc}") from exc
+            if time.monotonic() >= give_up:
+                raise StoreLocked(f"{path} is locked by another program") from exc
+            time.sleep(LOCK_RETRY_S)
+        except duckdb.Error as exc:
+            raise UsageError(f"{path} cannot be opened as a database: {exc}") from exc
+    try:
+        yield connection
+    finally:
+        connection.close()
+
+
+@contextmanager
+def read_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open an existing database of our schema for reading; raises UsageError."""
+    if not path.is_file():
+        raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
+    with open_database(path, read_only=True, patience_s=PATIENCE_S) as connection:
+        _check_version(connection, path)
+        yield connection
+
+
+class Store:
+    """Writes sweeps and whole trials; every method is one short transaction."""
+
+    def __init__(self, path: Path) -> None:
+        """Open or make the database; raises UsageError for one that is not ours."""
+        self.path = path
+        self._one_at_a_time = threading.Lock()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as exc:
+            raise UsageError(f"{path.parent} cannot be made: {exc}") from exc
+        with self._writing() as connection:
+            tables = {name for (name,) in connection.execute("SHOW TABLES").fetchall()}
+            if tables:
+                _check_version(connection, path)
+            connection.execute(SCHEMA.read_text(encoding="utf-8"))
+            if not tables:
+                connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
+
+    def begin_sweep(
+        self, sweep: SweepRow, specs: dict[str, str], stored: Iterable[TrialKey]
+    ) -> None:
+        """Add a sweep, what its spec hashes stand for, and its trials that are stored already."""
+        with self._writing() as connection:
+            connection.execute(
+                "INSERT INTO sweeps VALUES (?, ?, ?, NULL, ?, ?, ?, ?)",
+                [
+                    sweep.sweep_id,
+                    sweep.name,
+                    sweep.started_at,
+                    sweep.config,
+                    sweep.git_commit,
+                    sweep.git_dirty,
+                    sweep.versions,
+                ],
+            )
+            for item in specs.items():
+                connection.execute("INSERT OR IGNORE INTO specs VALUES (?, ?)", list(item))
+            _append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
+
+    def end_sweep(self, sweep_id: str, ended_at: datetime) -> None:
+        """Note when a sweep ended."""
+        with self._writing() as connection:
+            connection.execute(
+                "UPDATE sweeps SET ended_at = ? WHERE sweep_id = ?", [ended_at, sweep_id]
+            )
+
+    def ended_trials(self, keys: Iterable[TrialKey]) -> set[TrialKey]:
+        """Which of these trials are stored and did not fail."""
+        with self._writing() as connection:
+            return {
+                key
+                for key, status in _statuses(connection, list(keys)).items()
+                if status != "failed"
+            }
+
+    def write(self, sweep_id: str, records: Sequence[TrialRecord], *, patience_s: float) -> None:
+        """Store whole trials of a sweep; one that has ended already is only linked."""
+        with self._writing(patience_s) as connection:
+            keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
+            stored = _statuses(connection, keys)
+            _delete(connection, [key for key, status in stored.items() if status == "failed"])
+            new = [
+                record
+                for record, key in zip(records, keys, strict=True)
+                if stored.get(key, "failed") == "failed"
+            ]
+            _append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
+            _append(connection, "trials", map(trial_row, new))
+            _append(connection, "states", chain.from_iterable(map(state_rows, new)))
+            _append(connection, "decisions", chain.from_iterable(map(decision_rows, new)))
+            _append(connection, "calls", chain.from_iterable(map(call_rows, new)))
+
+    @contextmanager
+    def _writing(self, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
+        with (
+            self._one_at_a_time,
+            open_database(self.path, read_only=False, patience_s=patience_s) as connection,
+        ):
+            try:
+                connection.begin()
+                yield connection
+                connection.commit()
+            except duckdb.Error as exc:
+                raise StoreError(f"{self.path} cannot be written: {exc}") from exc
+
+
+def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Run one read-only query; returns the column names and the rows. Raises UsageError."""
+    with read_database(path) as connection:
+        connection.execute("SET enable_external_access = false; SET lock_configuration = true")
+        try:
+            result = connection.execute(sql)
+            names = [column[0] for column in result.description or ()]
+            return names, result.fetchall() if names else []
+        except duckdb.Error as exc:
+            raise UsageError(f"the query failed: {exc}") from exc
+
+
+def results_digest(path: Path) -> tuple[str, int]:
+    """A hash of all results, and the number of trials in it.
+
+    It covers what happened (trials, states, decisions), in an order of its own, and not when,
+    where or at what price: no clock times, latencies, costs, cache keys or spec hashes.
+    """
+    digests: dict[TrialKey, Any] = {}
+    with read_database(path) as connection:
+        for columns, table, order in (
+            (
+                "pair, source, model_left, model_right, variant, condition, rep, sample_set, "
+                "status, merged_first, end_time_s, error",
+                "trials",
+                "trial_id, spec_hash",
+            ),
+            (
+                "step, time_s, side, position_m, velocity_mps, acceleration_mps2",
+                "states",
+                "trial_id, spec_hash, step, side",
+            ),
+            (
+                "decision, time_s, side, valid, failure, tactical, rationale, plan, applied, "
+                "fallback, prompt",
+                "decisions",
+                "trial_id, spec_hash, decision, side",
+            ),
+        ):
+            rows = connection.execute(
+                f"SELECT trial_id, spec_hash, {columns} FROM {table} ORDER BY {order}"  # noqa: S608 # constants
+            )
+            while batch := rows.fetchmany(10_000):
+                for trial_id, spec_hash, *values in batch:
+                    key = (trial_id, spec_hash)
+                    digest = digests.setdefault(key, hashlib.sha256(trial_id.encode()))
+                    digest.update(json.dumps(values).encode())
+    whole = hashlib.sha256("".join(sorted(d.hexdigest() for d in digests.values())).encode())
+    return whole.hexdigest(), len(digests)
+
+
+def used_call_keys(path: Path, sweep_id: str | None) -> tuple[str, list[str]]:
+    """The sweep (the newest where None is named) and the keys of the calls that it used."""
+    with read_database(path) as connection:
+        found = connection.execute(
+            "SELECT sweep_id FROM sweeps WHERE sweep_id = coalesce(?, sweep_id) "
+            "ORDER BY started_at DESC LIMIT 1",
+            [sweep_id],
+        ).fetchone()
+        if found is None:
+            known = connection.execute("SELECT sweep_id FROM sweeps ORDER BY ALL").fetchall()
+            names = ", ".join(name for (name,) in known) or "none"
+            raise UsageError(f"{path} holds no sweep {sweep_id or ''}; valid: {names}")
+        keys = connection.execute(
+            "SELECT DISTINCT call_key FROM decisions SEMI JOIN sweep_trials "
+            "ON decisions.trial_id = sweep_trials.trial_id "
+            "AND decisions.spec_hash = sweep_trials.spec_hash AND sweep_id = ? "
+            "WHERE call_key IS NOT NULL ORDER BY call_key",
+            [found[0]],
+        ).fetchall()
+    return found[0], [key for (key,) in keys]
+
+
+def sweep_row(path: Path, sweep_id: str) -> dict[str, Any]:
+    """One row of the sweeps table, column to value."""
+    with read_database(path) as connection:
+        result = connection.execute("SELECT * FROM sweeps WHERE sweep_id = ?", [sweep_id])
+        names = [column[0] for column in result.description or ()]
+        row = result.fetchone()
+    return dict(zip(names, row or (), strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class SweepFacts:
+    """What the database says of one sweep.
+
+    ``outcomes`` holds (variant, condition, status, merged_first, trials), ``failed`` (trial_id,
+    error), ``served`` (model requested, model served, answers).
+    """
+
+    outcomes: list[tuple[str, str, str, str | None, int]]
+    failed: list[tuple[str, str]]
+    served: list[tuple[str, str | None, int]]
+    decisions: int
+    invalid: int
+    fallbacks: int
+
+
+def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
+    """Count a sweep's trials, decisions and answers."""
+    of_sweep = (
+        "SEMI JOIN (SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?) "
+        "USING (trial_id, spec_hash)"
+    )
+    with read_database(path) as connection:
+
+        def rows(select: str, rest: str) -> list[tuple[Any, ...]]:
+            return connection.execute(f"{select} {of_sweep} {rest}", [sweep_id]).fetchall()
+
+        decisions = rows(
+            "SELECT count(*), count_if(NOT valid), count_if(fallback) FROM decisions", ""
+        )[0]
+        return SweepFacts(
+            outcomes=rows(
+                "SELECT variant, condition, status, merged_first, count(*) FROM trials",
+                "GROUP BY ALL ORDER BY ALL",
+            ),
+            failed=rows(
+                "SELECT trial_id, error FROM trials", "WHERE status = 'failed' ORDER BY ALL"
+            ),
+            served=rows(
+                "SELECT model_requested, model_served, count(*) FROM calls",
+                "WHERE http_status = 200 GROUP BY ALL ORDER BY ALL",
+            ),
+            decisions=decisions[0],
+            invalid=decisions[1],
+            fallbacks=decisions[2],
+        )
+
+
+def _check_version(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
+    try:
+        row = connection.execute("SELECT schema_version FROM meta").fetchone()
+    except duckdb.CatalogException:
+        raise UsageError(f"{path} is no database of merge-runner: name another with --db") from None
+    if row is None or row[0] != SCHEMA_VERSION:
+        raise UsageError(
+            f"{path} has schema version {row[0] if row else 'none'}, this program writes "
+            f"{SCHEMA_VERSION}: name another file with --db; a sweep into it is rebuilt from the "
+            "cache without a call"
+        )
+
+
+def _statuses(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> dict[TrialKey, str]:
+    rows = connection.execute(
+        "SELECT trial_id, spec_hash, status FROM trials SEMI JOIN "
+        "(SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)",
+        [[key[0] for key in keys], [key[1] for key in keys]],
+    ).fetchall()
+    return {(trial_id, spec_hash): status for trial_id, spec_hash, status in rows}
+
+
+def _delete(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:
+    for table in ("calls", "decisions", "states", "trials") if keys else ():
+        connection.executemany(
+            f"DELETE FROM {table} WHERE trial_id = ? AND spec_hash = ?",  # noqa: S608 # constants
+            keys,
+        )
+
+
+def _append(
+    connection: duckdb.DuckDBPyConnection, table: str, rows: Iterable[tuple[Any, ...]]
+) -> None:
+    appender = connection.appender(table)
+    appender.append_rows(list(rows))
+    appender.flush()

@@ -1,0 +1,259 @@
+"""The composition root: wires drivers, clients, store and display, and runs a sweep."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from merge_runner.clients import Limits, live_clients, sealed_clients
+from merge_runner.config import ModelEntry, endpoint_identity
+from merge_runner.drivers.base import Driver
+from merge_runner.drivers.constant import ConstantDriver
+from merge_runner.drivers.llm_driver import LlmDriver
+from merge_runner.drivers.projected_order import ProjectedOrderDriver
+from merge_runner.errors import ReplayMiss, StoreError, SweepStopped, UsageError
+from merge_runner.flusher import Flusher
+from merge_runner.interrupt import on_interrupt
+from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.client import LlmClient
+from merge_runner.llm.keys import canonical_json
+from merge_runner.misses import Miss, explain, misses_of
+from merge_runner.plan import Plan, spec_hash
+from merge_runner.progress import Progress, shown
+from merge_runner.provenance import git_state, versions
+from merge_runner.recording import read_recording
+from merge_runner.records import SIDES, ChatReply, Side, Slot, TrialRecord, TrialSpec
+from merge_runner.scheduler import run_bounded
+from merge_runner.store import Store, SweepFacts, SweepRow, sweep_facts
+from merge_runner.trial import play_trial
+
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a sweep runs; nothing here changes a result."""
+
+    db: Path
+    cache: Path
+    in_flight: int = 200
+    limits: Limits = field(default_factory=Limits)
+    replay: bool = False
+    recording: Path | None = None
+    emulator_options: Sequence[str] = ()
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a run did.
+
+    ``stored_before`` trials were not played because they are stored. ``facts`` are those of the
+    database over all trials of the sweep, None where they are not stored.
+    """
+
+    sweep_id: str
+    trials: int
+    stored_before: int
+    exit_code: int = 0
+    messages: list[str] = field(default_factory=list)
+    calls_live: int = 0
+    calls_cached: int = 0
+    cost_usd: float = 0.0
+    calls_of_unknown_cost: int = 0
+    attempts: dict[str, int] = field(default_factory=dict)
+    facts: SweepFacts | None = None
+
+    def fail(self, exit_code: int, message: str) -> None:
+        """Note a problem; the first one decides the exit code."""
+        self.exit_code = self.exit_code or exit_code
+        self.messages.append(message)
+
+
+class Sweep:
+    """One run of a plan. Making it opens the cache and the database, and nothing else."""
+
+    def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
+        """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
+        self._plan = plan
+        self._options = options
+        self._say = say
+        self._cache = ResponseCache(options.cache, overlay=_overlay(options.recording))
+        self._endpoints = {name: self._endpoint(name, e) for name, e in plan.entries.items()}
+        self._store = Store(options.db)
+        specs = {
+            (spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs(self._endpoints)
+        }
+        # A replay derives everything from the recorded replies alone, so it plays every trial.
+        ended = set() if options.replay else self._store.ended_trials(specs)
+        self._stored = [key for key in specs if key in ended]
+        self._todo = [spec for key, spec in specs.items() if key not in ended]
+        self._clients: dict[str, LlmClient] = {}
+        self._misses: list[Miss] = []
+        self._progress = Progress(
+            title=f"{plan.name}: {plan.model}",
+            total=len(self._todo),
+            cap_usd=options.limits.max_cost_usd,
+            stored_before=len(self._stored),
+        )
+
+    @property
+    def trials_to_play(self) -> int:
+        """How many trials are not stored yet."""
+        return len(self._todo)
+
+    async def run(self) -> Outcome:
+        """Play what is missing and store it; what goes wrong is in the outcome."""
+        outcome = Outcome(self._begin(), self._plan.trials, len(self._stored))
+        async with AsyncExitStack() as stack:
+            stack.callback(self._cache.close)
+            self._clients = await self._connect(stack)
+            meters = [client.meter for client in self._clients.values()]
+            self._progress.meters = meters
+            flusher = Flusher(self._store, outcome.sweep_id, self._say)
+            try:
+                async with shown(self._progress):
+                    await self._play(flusher, outcome)
+            finally:
+                await self._finish(flusher, outcome)
+            for line in explain(self._misses, self._cache.entries()) if self._misses else ():
+                outcome.fail(ReplayMiss.exit_code, line)
+        for meter in meters:
+            outcome.calls_live += meter.calls_live
+            outcome.calls_cached += meter.calls_cached
+            outcome.cost_usd += meter.cost_usd
+            outcome.calls_of_unknown_cost += meter.cost_unknown
+            for name, count in meter.outcomes.items():
+                outcome.attempts[name] = outcome.attempts.get(name, 0) + count
+        if self._progress.done["failed"] and not self._misses:
+            outcome.fail(1, f"{self._progress.done['failed']} trials failed")
+        return outcome
+
+    def _begin(self) -> str:
+        """Add the sweep to the database, with the trials that are stored already."""
+        started_at = datetime.now(UTC).replace(tzinfo=None)
+        sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
+        commit, dirty = git_state()
+        self._store.begin_sweep(
+            SweepRow(
+                sweep_id=sweep_id,
+                name=self._plan.name,
+                started_at=started_at,
+                config=canonical_json(self._plan.config(self._endpoints)),
+                git_commit=commit,
+                git_dirty=dirty,
+                versions=canonical_json(versions()),
+            ),
+            {spec_hash(text): text for text in self._plan.specs(self._endpoints).values()},
+            self._stored,
+        )
+        return sweep_id
+
+    async def _connect(self, stack: AsyncExitStack) -> dict[str, LlmClient]:
+        entries, endpoints = self._plan.entries, self._endpoints
+        if self._options.replay or not self._todo or not entries:
+            return sealed_clients(entries, endpoints, self._cache)
+        return await live_clients(
+            entries,
+            endpoints,
+            self._cache,
+            self._options.limits,
+            emulator_options=self._options.emulator_options,
+            stack=stack,
+        )
+
+    async def _play(self, flusher: Flusher, outcome: Outcome) -> None:
+        """Run the trials until all have ended, or the sweep is stopped or interrupted."""
+
+        def ended(record: TrialRecord) -> None:
+            self._progress.done[record.status] += 1
+            if self._options.replay:
+                self._misses += misses_of(record)
+            flusher.add(record)
+
+        work = asyncio.create_task(
+            run_bounded(
+                (partial(self._trial, spec) for spec in self._todo),
+                in_flight=self._options.in_flight,
+                on_done=ended,
+            )
+        )
+        drain = asyncio.create_task(self._drain(work))
+
+        def interrupted() -> None:
+            flying = sum(client.flying for client in self._clients.values())
+            self._say(
+                f"Stopping: {flying} calls in flight are saved first; Ctrl-C again drops them."
+            )
+            work.cancel()
+
+        with on_interrupt(interrupted, drain.cancel):
+            await asyncio.wait([drain])
+        if work.cancelled():
+            outcome.fail(INTERRUPTED, "Interrupted. Run the same command again to go on.")
+        elif isinstance(error := work.exception(), SweepStopped):
+            outcome.fail(error.exit_code, str(error))
+        elif error is not None:
+            raise error
+
+    async def _drain(self, work: asyncio.Task[None]) -> None:
+        """When the work has ended, in whatever way, save the calls that are in flight."""
+        await asyncio.wait([work])
+        for client in self._clients.values():
+            await client.drain()
+
+    async def _finish(self, flusher: Flusher, outcome: Outcome) -> None:
+        """Store what has ended, and read back what the database holds of the sweep."""
+        try:
+            await flusher.close()
+            self._store.end_sweep(outcome.sweep_id, datetime.now(UTC).replace(tzinfo=None))
+            outcome.facts = sweep_facts(self._options.db, outcome.sweep_id)
+        except StoreError as exc:
+            outcome.fail(exc.exit_code, str(exc))
+
+    async def _trial(self, spec: TrialSpec) -> TrialRecord:
+        drivers = {side: self._driver(spec, side) for side in SIDES}
+        self._progress.running += 1
+        try:
+            return await play_trial(spec, self._plan.scenario, drivers)
+        finally:
+            self._progress.running -= 1
+
+    def _driver(self, spec: TrialSpec, side: Side) -> Driver:
+        name, scenario = self._plan.sides[side], self._plan.scenario
+        if name == "constant":
+            return ConstantDriver(scenario)
+        if name == "projected-order":
+            return ProjectedOrderDriver(scenario, side)
+        client = self._clients[name]
+
+        async def ask(prompt: str, number: int) -> ChatReply:
+            slot = Slot(spec.condition, spec.repetition, side, number, spec.sample_set)
+            return await client.ask(prompt, slot, order=spec.order)
+
+        return LlmDriver(ask, spec.variant, scenario)
+
+    def _endpoint(self, name: str, entry: ModelEntry) -> str:
+        """The endpoint's identity: in a replay, the one under which the model is recorded."""
+        configured = endpoint_identity(name, entry)
+        if not self._options.replay:
+            return configured
+        recorded = self._cache.recorded_endpoints(entry.id)
+        if configured in recorded or not recorded:
+            return configured
+        if len(recorded) > 1:
+            raise UsageError(
+                f"replies of {name} are recorded from several endpoints: {', '.join(recorded)}. "
+                "Set the base URL variable of its provider to the one to replay."
+            )
+        return recorded[0]
+
+
+def _overlay(recording: Path | None) -> Mapping[str, Entry]:
+    if recording is None:
+        return {}
+    return {entry.request.key: entry for entry in read_recording(recording)}
