@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner.places import DEFAULT_CACHE, DEFAULT_DB
 
 if TYPE_CHECKING:
     from merge_runner.estimate import Estimate
     from merge_runner.plan import Choice, Plan
     from merge_runner.sweep import Options
 
-DB = Path("results/merge.duckdb")
-CACHE = Path("cache/responses")
 
 app = typer.Typer(
     name="merge-runner",
@@ -61,7 +60,7 @@ VariantsOption = Annotated[
 SampleSetOption = Annotated[
     int, typer.Option("--sample-set", help="Another number draws a fresh set of samples.")
 ]
-InFlightOption = Annotated[int, typer.Option("--in-flight", help="Trials at once.")]
+InFlightOption = Annotated[int, typer.Option("--in-flight", help="Trials at once.", min=1)]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object.")]
 NameArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="experiments/NAME.toml, or a path.")
@@ -103,8 +102,8 @@ def sweep(
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
     sample_set: SampleSetOption = 0,
-    db: DbOption = DB,
-    cache: CacheOption = CACHE,
+    db: DbOption = DEFAULT_DB,
+    cache: CacheOption = DEFAULT_CACHE,
     in_flight: InFlightOption = 200,
     rpm: Annotated[int | None, typer.Option(help="Requests a minute.", min=1)] = None,
     tpm: Annotated[int | None, typer.Option(help="Tokens a minute.", min=1)] = None,
@@ -133,7 +132,7 @@ def sweep(
         db=db,
         cache=cache,
         in_flight=in_flight,
-        limits=Limits(rpm=rpm, tpm=tpm, max_cost_usd=max_cost, connections=2 * max(in_flight, 1)),
+        limits=Limits(rpm=rpm, tpm=tpm, max_cost_usd=max_cost, connections=2 * in_flight),
         replay=replay,
         recording=recording,
         emulator_options=_emulator_options(fault_rate, faults, seed),
@@ -157,8 +156,8 @@ def replay(
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
     sample_set: SampleSetOption = 0,
-    db: DbOption = DB,
-    cache: CacheOption = CACHE,
+    db: DbOption = DEFAULT_DB,
+    cache: CacheOption = DEFAULT_CACHE,
     in_flight: InFlightOption = 200,
     recording: RecordingOption = None,
     as_json: JsonOption = False,
@@ -183,7 +182,7 @@ def replay(
 @app.command()
 def sql(
     query: Annotated[str, typer.Argument(metavar="QUERY", help="One SQL query.")],
-    db: DbOption = DB,
+    db: DbOption = DEFAULT_DB,
     output: Annotated[Format, typer.Option("--format", help="Form of the result.")] = Format.TEXT,
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
@@ -202,7 +201,7 @@ def sql(
 
 
 @app.command()
-def digest(db: DbOption = DB) -> None:
+def digest(db: DbOption = DEFAULT_DB) -> None:
     """Print one line: a hash of all results, equal for equal results."""
     from merge_runner.store import results_digest
 
@@ -262,8 +261,8 @@ def emulate(
 @recording_app.command("export")
 def recording_export(
     file: RecordingFile,
-    db: DbOption = DB,
-    cache: CacheOption = CACHE,
+    db: DbOption = DEFAULT_DB,
+    cache: CacheOption = DEFAULT_CACHE,
     sweep_id: Annotated[
         str | None, typer.Option("--sweep", help="A sweep_id; the newest sweep if not given.")
     ] = None,
@@ -281,7 +280,7 @@ def recording_export(
 
 
 @recording_app.command("import")
-def recording_import(file: RecordingFile, cache: CacheOption = CACHE) -> None:
+def recording_import(file: RecordingFile, cache: CacheOption = DEFAULT_CACHE) -> None:
     """Verify a recording and add it to the cache."""
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.recording import import_recording
@@ -384,8 +383,14 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
 
 
 def _emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list[str]:
-    options = ["--fault-rate", str(fault_rate), "--seed", str(seed)]
-    return [*options, "--faults", str(faults)] if faults else options
+    """The options for the emulator's own process, refused here if they are wrong."""
+    from merge_runner.emulator.faults import load_faults, transient_faults
+
+    if faults is not None:
+        load_faults(faults)
+        return ["--faults", str(faults.resolve())]
+    transient_faults(fault_rate, seed)
+    return ["--fault-rate", str(fault_rate), "--seed", str(seed)]
 
 
 def _listed(text: str | None) -> list[str] | None:

@@ -15,10 +15,7 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
 
 from merge_runner.errors import UsageError
-
-PROJECT = Path(__file__).resolve().parent.parent
-DEFAULT_DB = Path("results/merge.duckdb")
-DEFAULT_CACHE = Path("cache/responses")
+from merge_runner.places import PROJECT
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(gt=0)]

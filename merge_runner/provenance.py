@@ -6,7 +6,7 @@ import platform
 import subprocess
 from importlib.metadata import version
 
-from merge_runner.config import PROJECT
+from merge_runner.places import PROJECT
 
 PACKAGES = ("merge-runner", "diskcache", "duckdb", "httpx", "httpx-aiohttp", "pydantic", "tenacity")
 

@@ -134,7 +134,7 @@ def _go_first(seen: Seen, temper: Temper, slot: Slot | None) -> tuple[float, str
             "car, which should let me in. I keep an eye on it.",
         )
     leading = _projected_lead_m(seen)
-    lacking = temper.target_gap_m + seen.vehicle_length - leading
+    lacking = _lacking_m(leading, seen, temper)
     push = _even_acceleration(temper.leader_share * lacking, seen.distance_to_merge, seen.own_speed)
     action = min(HARDEST_PUSH_MPS2, max(0.0, push))
     return _settled(action, seen, slot), _phrase(
@@ -149,7 +149,7 @@ def _yield(seen: Seen, temper: Temper, slot: Slot | None) -> tuple[float, str]:
     if other_distance <= 0:
         return _on_straight(seen)
     behind = -_projected_lead_m(seen)
-    lacking = temper.target_gap_m + seen.vehicle_length - behind
+    lacking = _lacking_m(behind, seen, temper)
     share = 1 - temper.leader_share
     brake = -_even_acceleration(share * lacking, other_distance, seen.other_speed)
     action = min(0.0, max(HARDEST_BRAKING_MPS2, brake))
@@ -176,10 +176,15 @@ def _on_straight(seen: Seen) -> tuple[float, str]:
 def _settled(action: float, seen: Seen, slot: Slot | None) -> float:
     """Hold the level of the previous plan unless the need has moved away from it."""
     held = None if seen.previous is None else seen.previous * MAX_ACCELERATION_MPS2
-    if held is not None and abs(action - held) < 0.35:
+    if held is not None and abs(action - held) < 0.25:
         return held
     wobble = 0.0 if slot is None else draw_between(-0.05, 0.05, "wobble", *slot.as_dict().values())
     return action + wobble
+
+
+def _lacking_m(lead: float, seen: Seen, temper: Temper) -> float:
+    """How far the leader's projected lead falls short; a leader from behind acts at once."""
+    return temper.target_gap_m + seen.vehicle_length - lead + max(0.0, 1.0 - lead)
 
 
 def _projected_lead_m(seen: Seen) -> float:

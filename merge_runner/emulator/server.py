@@ -15,6 +15,7 @@ from merge_runner.config import Format
 from merge_runner.emulator.faults import Fault, FaultPlan
 from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
+from merge_runner.errors import UsageError
 from merge_runner.records import Slot
 
 SLOT_HEADER = "x-merge-runner-slot"
@@ -139,8 +140,11 @@ async def serve(port: int, faults: FaultPlan | None = None) -> tuple[web.AppRunn
     """Start the emulator on a loopback port (0: any free one); returns it with its base URL."""
     runner = web.AppRunner(Emulator(faults).app, access_log=None, shutdown_timeout=0.1)
     await runner.setup()
-    site = web.TCPSite(runner, HOST, port, backlog=4096)
-    await site.start()
+    try:
+        await web.TCPSite(runner, HOST, port, backlog=4096).start()
+    except OSError as exc:
+        await runner.cleanup()
+        raise UsageError(f"port {port} cannot be used: {exc}; --port 0 takes any") from exc
     bound: int = runner.addresses[0][1]
     return runner, f"http://{HOST}:{bound}"
 

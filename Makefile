@@ -1,0 +1,59 @@
+# Needs GNU make and python3 >= 3.11. `make help` lists what there is.
+
+MODEL ?= emulator
+SWEEP ?= baseline
+ARGS ?=
+RECORDING ?= $(wildcard cache/recordings/$(MODEL)-$(SWEEP).parquet)
+Q ?= select model_left, variant, status, count(*) as trials from trials group by all order by all
+PYTHON ?= python3
+RUN := .venv/bin/merge-runner
+export Q
+
+.PHONY: help sweep replay sql test lint check lock
+
+help:
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
+
+sweep: .venv/runtime ## the main job: MODEL=, SWEEP=, ARGS=
+	@$(RUN) sweep $(SWEEP) --model $(MODEL) $(ARGS)
+
+replay: .venv/runtime ## the same from recorded replies alone: MODEL=, SWEEP=, RECORDING=, ARGS=
+	@$(RUN) replay $(SWEEP) --model $(MODEL) $(if $(RECORDING),--recording $(RECORDING)) $(ARGS)
+
+sql: .venv/runtime ## a query over the results: Q="select ...", ARGS=
+	@$(RUN) sql "$$Q" $(ARGS)
+
+test: .venv/dev ## the tests
+	@.venv/bin/pytest $(ARGS)
+
+lint: .venv/dev ## formatting, lint, types, import contract
+	@.venv/bin/ruff format --check .
+	@.venv/bin/ruff check .
+	@.venv/bin/mypy
+	@.venv/bin/lint-imports
+
+check: lint test ## formatting, lint, types, import contract and tests
+
+lock: ## renew the lock files (needs uv)
+	uv pip compile $(LOCK) --group dev -o requirements-dev.lock pyproject.toml
+	uv pip compile $(LOCK) --group build -c requirements-dev.lock -o requirements.lock pyproject.toml
+
+LOCK := --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
+	--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock"
+PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
+
+.venv/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "merge-runner needs Python 3.11 or newer: make PYTHON=...")'
+	@$(PYTHON) -m venv .venv
+	@touch $@
+
+.venv/runtime: .venv/python requirements.lock pyproject.toml
+	@echo "installing the pinned packages into .venv" >&2
+	@$(PIP) install --require-hashes -r requirements.lock
+	@$(PIP) install --no-deps --no-build-isolation --editable .
+	@touch $@
+
+.venv/dev: .venv/runtime requirements-dev.lock
+	@echo "installing the pinned development packages into .venv" >&2
+	@$(PIP) install --require-hashes -r requirements-dev.lock
+	@touch $@

@@ -1,0 +1,32 @@
+from __future__ import annotations
+
+import pytest
+
+from merge_runner.config import Scenario
+from merge_runner.emulator.server import serve
+from merge_runner.prompts.render import render_prompt
+from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.simulator.world import World
+
+
+@pytest.fixture
+async def emulator():
+    """A function that starts an emulator with the given faults and returns its base URL."""
+    runners = []
+
+    async def start(faults=None):
+        runner, url = await serve(0, faults)
+        runners.append(runner)
+        return url
+
+    yield start
+    for runner in runners:
+        await runner.cleanup()
+
+
+@pytest.fixture(scope="session")
+def driving_prompt():
+    """What the left driver is asked first in a symmetric trial."""
+    scenario = Scenario()
+    seen = World(scenario, CONDITIONS["N_0_0"]).observe("left")
+    return render_prompt(seen, None, variant="baseline", scenario=scenario)

@@ -1,0 +1,326 @@
+import asyncio
+import json
+import os
+import sqlite3
+import stat
+import subprocess
+import sys
+
+import diskcache
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.errors import MergeRunnerError, RecordingError
+from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.keys import make_request
+from merge_runner.records import Attempt, ChatRequest, Slot, Usage
+
+
+def entry(number=0, *, model="m", endpoint="openai", reply="{}", **attempt):
+    request = make_request(
+        provider="openai",
+        endpoint=endpoint,
+        model=model,
+        path="/chat/completions",
+        headers={},
+        body={"prompt": number},
+        slot=Slot("A1", 1, "left", number, 0),
+    )
+    return Entry(request, (Attempt(1, "ok", 200, reply=reply, **attempt),))
+
+
+async def put(cache, *entries):
+    # The limit only ends a test whose write is lost.
+    async with asyncio.timeout(2):
+        await asyncio.gather(*(cache.put(each) for each in entries))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "responses"
+
+
+@pytest.fixture
+def cache(folder):
+    opened = ResponseCache(folder)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def stock(cache, folder):
+    """What any other program makes of the folder."""
+    with diskcache.Cache(str(folder)) as opened:
+        yield opened
+
+
+texts = st.text(st.characters(exclude_categories=["Cs"]))
+counts = st.none() | st.integers(0, 10**9)
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+attempts = st.builds(
+    Attempt,
+    number=st.integers(1, 99),
+    outcome=texts,
+    http_status=st.none() | st.integers(100, 599),
+    model_served=st.none() | texts,
+    finish_reason=st.none() | texts,
+    usage=st.builds(Usage, counts, counts, counts, counts),
+    latency_s=st.none() | numbers,
+    started_at=st.none() | texts,
+    reply=st.none() | texts,
+    error=st.none() | texts,
+    cost_usd=st.none() | numbers,
+)
+requests = st.builds(
+    ChatRequest,
+    key=texts,
+    provider=texts,
+    endpoint=texts,
+    model=texts,
+    path=texts,
+    headers=st.dictionaries(texts, texts, max_size=3),
+    body=texts,
+    slot=st.builds(
+        Slot, texts, st.integers(), st.sampled_from(["left", "right"]), st.integers(), st.integers()
+    ),
+)
+
+
+@settings(deadline=None)
+@given(
+    st.builds(Entry, requests, st.lists(attempts, min_size=1, max_size=3).map(tuple)),
+)
+def test_an_entry_survives_its_text_form(recorded):
+    assert Entry.from_json(recorded.to_json()) == recorded
+
+
+async def test_a_reply_is_readable_by_others_as_soon_as_put_returns(cache, folder):
+    other = ResponseCache(folder)
+    assert other.get(entry(1).request.key) is None
+    await put(cache, entry(1))
+    assert other.get(entry(1).request.key) == entry(1)
+    other.close()
+
+
+async def test_a_reply_outlives_a_process_that_dies_after_put(folder):
+    program = f"""
+import asyncio, os, sys
+from pathlib import Path
+sys.path.insert(0, {os.path.dirname(__file__)!r})
+from test_cache import entry
+from merge_runner.llm.cache import ResponseCache
+asyncio.run(ResponseCache(Path({str(folder)!r})).put(entry(1)))
+os._exit(7)
+"""
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 7
+    reopened = ResponseCache(folder)
+    assert reopened.get(entry(1).request.key) == entry(1)
+    reopened.close()
+
+
+async def test_many_concurrent_puts_are_all_kept(cache, folder):
+    written = [entry(number, reply="x" * 5000) for number in range(200)]
+    await put(cache, *written)
+    other = ResponseCache(folder)
+    assert [other.get(each.request.key) for each in written] == written
+    assert {each.request.key for each in other.entries()} == {w.request.key for w in written}
+    other.close()
+
+
+async def test_a_put_that_is_cancelled_disturbs_no_other(cache):
+    given_up = asyncio.create_task(cache.put(entry(1)))
+    kept = asyncio.create_task(put(cache, entry(2)))
+    await asyncio.sleep(0)
+    given_up.cancel()
+    await kept
+    await put(cache, entry(3))
+    assert cache.get(entry(2).request.key)
+    assert cache.get(entry(3).request.key)
+
+
+async def test_a_write_that_fails_is_told_to_all_who_wait(cache, folder):
+    with sqlite3.connect(folder / "cache.db") as database:
+        database.execute("DROP TABLE Cache")
+    async with asyncio.timeout(2):
+        results = await asyncio.gather(
+            cache.put(entry(1)), cache.put(entry(2)), return_exceptions=True
+        )
+    assert [isinstance(result, MergeRunnerError) for result in results] == [True, True]
+
+
+async def test_letters_that_no_file_can_hold_lose_no_reply(cache):
+    """JSON can spell half a surrogate pair, so a server's message may hold one."""
+    odd = entry(1, error=json.loads(r'"\ud800"'))
+    await put(cache, odd, entry(2))
+    assert cache.get(odd.request.key).attempts[0].reply == "{}"
+
+
+def test_the_folder_is_for_its_owner_alone(folder):
+    ResponseCache(folder).close()
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    folder.chmod(0o755)
+    ResponseCache(folder).close()
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+class Bomb:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+# The stock library keeps a long value in a file of its own.
+@pytest.mark.parametrize("padding", ["", "x" * 100_000], ids=["row", "file"])
+def test_a_planted_value_is_refused_and_not_executed(cache, stock, tmp_path, padding):
+    key = entry().request.key
+    stock[key] = [Bomb(tmp_path / "mark"), padding]
+    with pytest.raises(RecordingError):
+        cache.get(key)
+    with pytest.raises(RecordingError):
+        list(cache.entries())
+    assert not (tmp_path / "mark").exists()
+
+
+def test_a_planted_key_is_refused_and_not_executed(cache, stock, tmp_path):
+    stock[Bomb(tmp_path / "mark")] = entry().to_json()
+    with pytest.raises(RecordingError):
+        list(cache.entries())
+    assert not (tmp_path / "mark").exists()
+
+
+def test_only_text_can_be_stored(cache, stock, monkeypatch):
+    for value in (1, 1.5, None, b"{}", {"a": 1}):
+        monkeypatch.setattr(Entry, "to_json", lambda self, value=value: value)
+        with pytest.raises(TypeError):
+            cache.put_now([entry()])
+    assert list(stock) == []
+
+
+def test_nothing_is_ever_evicted(folder):
+    """Also not from a folder that another program made with a limit."""
+    small = diskcache.Cache(str(folder), size_limit=1, cull_limit=10)
+    assert small.eviction_policy == "least-recently-stored"
+    small.close()
+    cache = ResponseCache(folder)
+    for number in range(20):
+        cache.put_now([entry(number, reply="x" * 10_000)])
+    assert len(list(cache.entries())) == 20
+    cache.close()
+    with diskcache.Cache(str(folder)) as after:
+        assert (after.eviction_policy, after.cull_limit) == ("none", 0)
+
+
+def test_each_write_is_synchronous(stock):
+    """An acknowledged reply survives a power cut only with SQLite's FULL."""
+    assert stock.sqlite_synchronous == 2
+
+
+def damaged(**changes):
+    return json.dumps({**json.loads(entry().to_json()), **changes})
+
+
+def without(name):
+    value = json.loads(entry().to_json())
+    del value[name]
+    return json.dumps(value)
+
+
+DAMAGED = [
+    "",
+    "no JSON",
+    entry().to_json()[:-20],
+    "[]",
+    "1",
+    "null",
+    damaged(version=2),
+    damaged(slot={}),
+    damaged(slot="A1"),
+    damaged(attempts=None),
+    damaged(attempts=[]),
+    damaged(attempts=[{"number": 1}]),
+    damaged(attempts=[{"number": 1, "outcome": "ok", "usage": None}]),
+    damaged(attempts=["ok"]),
+    *(without(name) for name in json.loads(entry().to_json())),
+]
+
+
+def is_refused(cache, key):
+    try:
+        cache.get(key)
+    except RecordingError:
+        return True
+    return False
+
+
+def test_a_damaged_entry_is_an_error_and_no_reply(cache, stock):
+    for number, text in enumerate(DAMAGED):
+        stock[f"key {number}"] = text
+    assert [t for n, t in enumerate(DAMAGED) if not is_refused(cache, f"key {n}")] == []
+    with pytest.raises(RecordingError):
+        list(cache.entries())
+
+
+def test_a_damaged_list_of_endpoints_is_an_error(cache, stock):
+    cache.put_now([entry()])
+    for name in list(stock):
+        stock[name] = "no JSON"
+    with pytest.raises(RecordingError):
+        cache.recorded_endpoints("m")
+
+
+def test_a_damaged_database_is_an_error_of_ours(folder):
+    folder.mkdir()
+    (folder / "cache.db").write_bytes(b"no database" * 1000)
+    with pytest.raises(MergeRunnerError):
+        ResponseCache(folder)
+
+
+def test_a_folder_that_is_a_file_is_an_error_of_ours(folder):
+    folder.write_text("a file")
+    with pytest.raises(MergeRunnerError, match="cannot be used"):
+        ResponseCache(folder)
+
+
+def test_an_overlay_answers_after_the_folder(folder):
+    recorded = {number: entry(number, reply="overlay") for number in (1, 2)}
+    cache = ResponseCache(folder, overlay={e.request.key: e for e in recorded.values()})
+    cache.put_now([entry(1, reply="folder"), entry(3)])
+    replies = {n: cache.get(entry(n).request.key) for n in (1, 2, 3, 4)}
+    assert replies[1].attempts[0].reply == "folder"
+    assert replies[2].attempts[0].reply == "overlay"
+    assert replies[3] == entry(3)
+    assert replies[4] is None
+    assert {each.request.slot.decision for each in cache.entries()} == {1, 2, 3}
+    cache.close()
+
+
+def test_an_overlay_is_never_written(folder):
+    overlaid = entry(1)
+    cache = ResponseCache(folder, overlay={overlaid.request.key: overlaid})
+    cache.put_now([entry(2)])
+    cache.close()
+    plain = ResponseCache(folder)
+    assert [each.request.slot.decision for each in plain.entries()] == [2]
+    plain.close()
+
+
+def test_endpoints_are_listed_per_model(folder):
+    overlaid = entry(9, model="a", endpoint="http://overlay/v1")
+    cache = ResponseCache(folder, overlay={overlaid.request.key: overlaid})
+    cache.put_now(
+        [
+            entry(1, model="a"),
+            entry(2, model="a"),
+            entry(3, model="a", endpoint="http://b/v1"),
+            entry(4, model="b", endpoint="emulator"),
+        ]
+    )
+    assert cache.recorded_endpoints("a") == ["http://b/v1", "http://overlay/v1", "openai"]
+    assert cache.recorded_endpoints("b") == ["emulator"]
+    assert cache.recorded_endpoints("c") == []
+    cache.close()

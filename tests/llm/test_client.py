@@ -1,0 +1,587 @@
+import asyncio
+import functools
+import json
+import sqlite3
+from collections import Counter
+
+import pytest
+
+from merge_runner.config import ModelEntry, Price
+from merge_runner.errors import (
+    BudgetExhausted,
+    CallFailed,
+    EndpointRefused,
+    QuotaExhausted,
+    ReplayMiss,
+)
+from merge_runner.llm.budget import Budget
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.client import LlmClient
+from merge_runner.llm.limiter import Limiter, Pause
+from merge_runner.llm.prices import pricing
+from merge_runner.llm.transport import SealedTransport, TransportFailure
+from merge_runner.llm.verdicts import RawReply
+from merge_runner.records import Slot
+
+
+class ClockLoop(asyncio.SelectorEventLoop):
+    """An event loop whose clock jumps to the next timer; work in threads is waited for."""
+
+    def __init__(self):
+        self.now = 0.0
+        self.working = 0
+        super().__init__()
+        self.select, self._selector.select = self._selector.select, self.jump
+
+    def time(self):
+        return self.now
+
+    def run_in_executor(self, *args):
+        work = super().run_in_executor(*args)
+        self.working += 1
+        work.add_done_callback(self.worked)
+        return work
+
+    def worked(self, work):
+        self.working -= 1
+
+    def jump(self, timeout=None):
+        ready = self.select(0 if timeout == 0 or (timeout and not self.working) else None)
+        if not ready:
+            self.now += timeout
+        return ready
+
+
+def on_a_clock(test):
+    """Run a test in time that passes at once; whoever would wait for ever waits for an hour."""
+
+    async def limited(*args, **kwargs):
+        async with asyncio.timeout(3600):
+            await test(*args, **kwargs)
+
+    @functools.wraps(test)
+    def run(*args, **kwargs):
+        with asyncio.Runner(loop_factory=ClockLoop) as runner:
+            runner.run(limited(*args, **kwargs))
+
+    return run
+
+
+def now():
+    return asyncio.get_running_loop().time()
+
+
+class Server:
+    """Stands in for the network: gives its replies in order, the last one for ever."""
+
+    def __init__(self, *replies):
+        self.replies = list(replies)
+        self.sent = []
+        self.times = []
+        self.timeouts = []
+        self.open = asyncio.Event()
+        self.open.set()
+
+    async def send(self, request, *, attempt, timeout_s):
+        self.sent.append(request)
+        self.times.append(now())
+        self.timeouts.append(timeout_s)
+        reply = self.replies.pop(0) if len(self.replies) > 1 else self.replies[0]
+        await self.open.wait()
+        if isinstance(reply, Exception):
+            raise reply
+        return reply
+
+    async def close(self):
+        pass
+
+
+def raw(body, status=200, **headers):
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    return RawReply(status, named, body if isinstance(body, str) else json.dumps(body))
+
+
+def answer(text="M", finish="stop", model="m-1", usage=(10, 5), **message):
+    body = {
+        "model": model,
+        "choices": [{"message": {"content": text, **message}, "finish_reason": finish}],
+    }
+    if usage:
+        body["usage"] = {"prompt_tokens": usage[0], "completion_tokens": usage[1]}
+    return raw(body)
+
+
+def error(status, message="m", code=None, **headers):
+    return raw({"error": {"message": message, "type": code, "code": code}}, status, **headers)
+
+
+def gemini(*texts):
+    parts = {"parts": [{"text": text} for text in texts]} if texts else {}
+    return raw({"candidates": [{"content": parts, "finishReason": "STOP"}]})
+
+
+def slot(repetition=1, side="left", decision=0):
+    return Slot("A1", repetition, side, decision, 0)
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory):
+    """One folder for all tests: to make a durable one takes a while."""
+    cache = ResponseCache(tmp_path_factory.mktemp("responses"))
+    yield cache
+    cache.close()
+
+
+@pytest.fixture
+def cache(opened):
+    with sqlite3.connect(opened.folder / "cache.db") as database:
+        database.execute("DELETE FROM Cache")
+    return opened
+
+
+@pytest.fixture
+def make(cache):
+    """A client whose server gives these replies."""
+
+    def make(*replies, transport=None, limiter=None, cap=None, **changes):
+        fields = {
+            "provider": "openai",
+            "format": "openai-chat",
+            "id": "m-1",
+            "max_output_tokens": 100,
+            "price": "free",
+        }
+        entry = ModelEntry(**{**fields, **changes})
+        return LlmClient(
+            name="my-model",
+            entry=entry,
+            endpoint="openai",
+            cache=cache,
+            transport=transport or Server(*replies),
+            limiter=limiter or Limiter(),
+            pricing=pricing(entry),
+            budget=Budget(cap),
+        )
+
+    return make
+
+
+def outcomes(attempts):
+    return [attempt.outcome for attempt in attempts]
+
+
+@on_a_clock
+async def test_a_second_ask_is_answered_from_the_cache(make):
+    client = make(answer("first"), answer("second"))
+    first = await client.ask("prompt", slot())
+    second = await client.ask("prompt", slot())
+    assert (first.text, second.text) == ("first", "first")
+    assert (first.cached, second.cached) == (False, True)
+    assert first.attempts == second.attempts
+    assert len(client.transport.sent) == 1
+    assert (client.meter.calls_live, client.meter.calls_cached) == (1, 1)
+    later = make(answer("second"))
+    assert (await later.ask("prompt", slot())).text == "first"
+    assert later.transport.sent == []
+
+
+@on_a_clock
+async def test_two_who_ask_the_same_at_once_share_one_call(make):
+    client = make(answer("first"), answer("second"))
+    replies = await asyncio.gather(*(client.ask("prompt", slot()) for _ in range(2)))
+    assert [reply.text for reply in replies] == ["first", "first"]
+    assert [reply.cached for reply in replies] == [False, True]
+    assert len(client.transport.sent) == 1
+    assert (client.meter.calls_live, client.meter.calls_cached) == (1, 1)
+
+
+@on_a_clock
+async def test_every_slot_is_a_sample_of_its_own(make):
+    client = make(*(answer(str(number)) for number in range(20)))
+    slots = [slot(repetition, side) for repetition in range(1, 11) for side in ("left", "right")]
+    replies = await asyncio.gather(*(client.ask("prompt", each) for each in slots))
+    assert len(client.transport.sent) == 20
+    assert len({reply.text for reply in replies}) == 20
+    assert [request.slot for request in client.transport.sent] == slots
+    assert len({request.body for request in client.transport.sent}) == 1
+
+
+@on_a_clock
+async def test_what_is_sent_is_what_is_kept(make, cache):
+    client = make(answer())
+    reply = await client.ask("Où?", slot())
+    (sent,) = client.transport.sent
+    assert sent == reply.request == cache.get(sent.key).request
+    assert json.loads(sent.body)["messages"] == [{"role": "user", "content": "Où?"}]
+    assert (sent.endpoint, sent.model, sent.path) == ("openai", "m-1", "/chat/completions")
+    assert cache.get(sent.key).attempts == reply.attempts
+    assert reply.attempts[0].reply == client.transport.replies[0].body
+
+
+@on_a_clock
+async def test_passing_failures_are_tried_again_and_all_attempts_are_kept(make, cache):
+    client = make(
+        TransportFailure("timeout", "no reply within 600 s"),
+        error(503),
+        raw("<html>", 502),
+        raw('{"choices": [', 200),
+        TransportFailure("connection_lost", "reset"),
+        answer("M"),
+    )
+    reply = await client.ask("prompt", slot())
+    assert outcomes(reply.attempts) == [
+        "timeout",
+        "overloaded",
+        "server_error",
+        "bad_body",
+        "connection_lost",
+        "ok",
+    ]
+    assert [a.number for a in reply.attempts] == [1, 2, 3, 4, 5, 6]
+    assert [a.http_status for a in reply.attempts] == [None, 503, 502, 200, None, 200]
+    assert [a.reply for a in reply.attempts][:3] == [None, error(503).body, "<html>"]
+    assert reply.attempts[0].error == "no reply within 600 s"
+    assert all(a.started_at and a.latency_s is not None for a in reply.attempts)
+    assert cache.get(reply.request.key).attempts == reply.attempts
+    assert client.meter.outcomes == Counter(outcomes(reply.attempts))
+    assert reply.text == "M"
+
+
+@on_a_clock
+async def test_an_exhausted_quota_stops_at_once(make, cache):
+    client = make(error(429, "the account is empty", "insufficient_quota"))
+    with pytest.raises(QuotaExhausted, match=r"my-model.*the account is empty"):
+        await client.ask("prompt", slot())
+    assert len(client.transport.sent) == 1
+    assert list(cache.entries()) == []
+
+
+@on_a_clock
+async def test_a_refused_key_stops_at_once(make):
+    client = make(error(401, code="invalid_api_key"))
+    with pytest.raises(EndpointRefused, match=r"my-model.*key"):
+        await client.ask("prompt", slot())
+    assert len(client.transport.sent) == 1
+
+
+@pytest.mark.parametrize("shutdown", [None, "2026-12-11"])
+@on_a_clock
+async def test_an_unknown_model_stops_at_once_and_its_shutdown_is_named(make, shutdown):
+    client = make(error(404, code="model_not_found"), shutdown=shutdown)
+    with pytest.raises(EndpointRefused) as caught:
+        await client.ask("prompt", slot())
+    assert "'m-1'" in str(caught.value)
+    assert ("2026-12-11" in str(caught.value)) == bool(shutdown)
+    assert len(client.transport.sent) == 1
+
+
+@on_a_clock
+async def test_a_rejected_request_fails_this_call_alone(make, cache):
+    client = make(error(500), error(400, "bad temperature"), answer())
+    with pytest.raises(CallFailed, match="bad temperature") as caught:
+        await client.ask("prompt", slot())
+    assert outcomes(caught.value.attempts) == ["server_error", "bad_request"]
+    assert caught.value.request == client.transport.sent[0]
+    assert list(cache.entries()) == []
+    assert (await client.ask("prompt", slot(2))).outcome == "ok"
+
+
+@on_a_clock
+async def test_at_its_deadline_a_call_fails_with_all_that_was_tried(make):
+    client = make(error(500, "out of order"), deadline_s=20, timeout_s=9)
+    with pytest.raises(CallFailed, match=r"20 s.*out of order") as caught:
+        await client.ask("prompt", slot())
+    assert len(caught.value.attempts) == len(client.transport.sent) >= 4
+    assert set(outcomes(caught.value.attempts)) == {"server_error"}
+    assert client.transport.times[-1] <= 20
+    for sent_at, timeout in zip(client.transport.times, client.transport.timeouts, strict=True):
+        assert timeout == pytest.approx(min(9, 20 - sent_at))
+
+
+@on_a_clock
+async def test_the_wait_for_a_turn_does_not_count_against_the_deadline(make):
+    client = make(answer(), limiter=Limiter(tpm=150), deadline_s=5)
+    client.transport.replies = [answer(usage=None)]
+    await asyncio.gather(*(client.ask("prompt", slot(n)) for n in range(1, 4)))
+    assert client.transport.times == [0, 60, 120]
+
+
+@pytest.mark.parametrize(
+    ("reply", "outcome", "text"),
+    [
+        (answer(None, refusal="I cannot."), "refusal", "I cannot."),
+        (answer("", "content_filter"), "refusal", ""),
+        # Azure's filter: the one answer that does not come with status 200.
+        (error(400, code="content_filter"), "refusal", ""),
+        (answer("", "length"), "truncated", ""),
+        (answer(""), "empty", ""),
+    ],
+)
+@on_a_clock
+async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make, reply, outcome, text):
+    client = make(reply, answer("a better one"))
+    for cached in (False, True):
+        got = await client.ask("prompt", slot())
+        assert (got.outcome, got.text, got.cached) == (outcome, text, cached)
+    assert len(client.transport.sent) == 1
+
+
+@pytest.mark.parametrize(
+    ("replies", "expected"),
+    [
+        ([gemini()], ["empty"] * 3),
+        ([gemini(), gemini("M")], ["empty", "ok"]),
+        ([gemini(), gemini(), gemini("M")], ["empty", "empty", "ok"]),
+        ([gemini(), gemini(), gemini(), gemini("M")], ["empty"] * 3),
+        ([raw({"usageMetadata": {}}), gemini("M")], ["empty", "ok"]),
+        # Other failures in between do not use up the two.
+        ([gemini(), error(500), gemini(), gemini("M")], ["empty", "server_error", "empty", "ok"]),
+    ],
+)
+@on_a_clock
+async def test_an_empty_answer_of_gemini_is_asked_at_most_twice_again(
+    make, cache, replies, expected
+):
+    client = make(*replies, format="gemini")
+    reply = await client.ask("prompt", slot())
+    assert outcomes(reply.attempts) == expected
+    assert reply.outcome == expected[-1]
+    assert len(client.transport.sent) == len(expected)
+    assert cache.get(reply.request.key).attempts == reply.attempts
+
+
+@pytest.mark.parametrize("wire", ["openai-chat", "openai-responses", "anthropic"])
+@on_a_clock
+async def test_an_empty_answer_of_others_is_not_asked_again(make, wire):
+    client = make(raw({}), format=wire)
+    assert (await client.ask("prompt", slot())).outcome == "empty"
+    assert len(client.transport.sent) == 1
+
+
+async def ticks(count=20):
+    """Let everybody run who can without time passing."""
+    for _ in range(count):
+        await asyncio.sleep(0)
+
+
+@on_a_clock
+async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
+    client = make(answer("paid for"))
+    client.transport.open.clear()
+    asked = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    assert client.flying == 1
+    asked.cancel()
+    drained = asyncio.create_task(client.drain())
+    await ticks()
+    assert asked.cancelled()
+    assert not drained.done()
+    client.transport.open.set()
+    await drained
+    assert client.flying == 0
+    (kept,) = cache.entries()
+    assert kept.request == client.transport.sent[0]
+    assert outcomes(kept.attempts) == ["ok"]
+
+
+@on_a_clock
+async def test_one_of_two_who_gives_up_does_not_take_the_answer_from_the_other(make):
+    client = make(answer("shared"))
+    client.transport.open.clear()
+    first, second = (asyncio.create_task(client.ask("prompt", slot())) for _ in range(2))
+    await ticks()
+    first.cancel()
+    await ticks()
+    client.transport.open.set()
+    assert (await second).text == "shared"
+    assert len(client.transport.sent) == 1
+
+
+@on_a_clock
+async def test_drain_gives_up_calls_that_wait_for_their_turn(make, cache):
+    limiter = Limiter()
+    client = make(answer(), limiter=limiter)
+    limiter.pause(300)
+    asked = [asyncio.create_task(client.ask("prompt", slot(n))) for n in (1, 2)]
+    await ticks()
+    await client.drain()
+    results = await asyncio.gather(*asked, return_exceptions=True)
+    assert not any(hasattr(result, "text") for result in results)
+    assert client.transport.sent == []
+    assert now() == 0
+    with pytest.raises(CallFailed, match="stopped"):
+        await client.ask("prompt", slot(3))
+
+
+@on_a_clock
+async def test_drain_gives_up_calls_that_wait_to_try_again(make):
+    client = make(error(503, retry_after="300"), answer())
+    asked = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    await client.drain()
+    await asyncio.gather(asked, return_exceptions=True)
+    assert len(client.transport.sent) == 1
+    assert now() == 0
+
+
+@on_a_clock
+async def test_drain_does_not_wait_for_another_attempt_of_a_call_in_flight(make):
+    client = make(error(503, retry_after="300"), answer())
+    client.transport.open.clear()
+    asked = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    drained = asyncio.create_task(client.drain())
+    await ticks()
+    client.transport.open.set()
+    await drained
+    await asyncio.gather(asked, return_exceptions=True)
+    assert len(client.transport.sent) == 1
+    assert now() == 0
+
+
+@on_a_clock
+async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, cache):
+    client = make(answer("paid for"))
+    asked = [asyncio.create_task(client.ask("prompt", slot(n))) for n in (1, 2)]
+    while client.flying or len(client.transport.sent) < 2:
+        await asyncio.sleep(0)
+    await client.drain()
+    assert len(list(cache.entries())) == 2
+    assert [(await each).text for each in asked] == ["paid for", "paid for"]
+
+
+@pytest.mark.parametrize(
+    ("served", "mismatches"),
+    [
+        ("m-1", {}),
+        ("m", {}),
+        ("m-2", {"m-1 -> m-2": 1}),
+        (None, {}),
+    ],
+)
+@on_a_clock
+async def test_a_model_that_was_not_asked_for_is_counted(make, served, mismatches):
+    client = make(answer(model=served), aliases=("m",))
+    reply = await client.ask("prompt", slot())
+    assert reply.attempts[0].model_served == served
+    assert client.meter.mismatches == mismatches
+
+
+PRICE = Price(input=2.0, output=8.0, source="contract")
+
+
+@on_a_clock
+async def test_what_an_attempt_costs_comes_from_its_tokens(make):
+    client = make(error(500), answer(usage=(1000, 500)), answer(usage=None), price=PRICE)
+    reply = await client.ask("prompt", slot())
+    assert [a.cost_usd for a in reply.attempts] == [0.0, pytest.approx(0.006)]
+    assert client.meter.cost_usd == pytest.approx(0.006)
+    assert (await client.ask("prompt", slot(2))).attempts[0].cost_usd is None
+    assert client.meter.cost_usd == pytest.approx(0.006)
+
+
+@on_a_clock
+async def test_a_price_that_nobody_knows_is_counted_and_not_guessed(make):
+    client = make(answer(), id="no-such-model", price="genai-prices")
+    assert (await client.ask("prompt", slot())).attempts[0].cost_usd is None
+    assert (client.meter.cost_usd, client.meter.cost_unknown) == (0.0, 1)
+
+
+def worst_case_usd(client):
+    """A token for each byte that is sent, and the whole cap."""
+    return len(client.transport.sent[0].body.encode()) * 2e-6 + 100 * 8e-6
+
+
+@on_a_clock
+async def test_no_call_is_made_that_could_pass_the_cap(make):
+    client = make(answer(usage=(10, 5)), price=PRICE)
+    await client.ask("prompt", slot())
+    worst = worst_case_usd(client)
+    enough = make(answer(), price=PRICE, cap=worst * 1.001)
+    assert (await enough.ask("prompt", slot(2))).outcome == "ok"
+    too_little = make(answer(), price=PRICE, cap=worst * 0.999)
+    with pytest.raises(BudgetExhausted):
+        await too_little.ask("prompt", slot(3))
+    assert too_little.transport.sent == []
+
+
+@on_a_clock
+async def test_calls_in_flight_are_waited_for_and_their_actual_cost_counts(make):
+    client = make(answer(usage=(10, 5)), price=PRICE, cap=0.0015)
+    await asyncio.gather(*(client.ask("prompt", slot(n)) for n in range(1, 6)))
+    assert len(client.transport.sent) == 5
+    assert worst_case_usd(client) * 2 > 0.0015
+
+
+@on_a_clock
+async def test_an_attempt_without_a_reply_may_have_been_charged(make):
+    failure = TransportFailure("timeout", "no reply")
+    client = make(failure, answer(), price=PRICE, cap=0.0015)
+    with pytest.raises(BudgetExhausted):
+        await client.ask("prompt", slot())
+    assert len(client.transport.sent) == 1
+    # The server that refuses does not charge.
+    refused = make(error(500), answer(), price=PRICE, cap=0.0015)
+    assert (await refused.ask("prompt", slot())).outcome == "ok"
+
+
+@on_a_clock
+async def test_a_rate_limit_makes_all_calls_of_the_key_wait(make):
+    shared = Pause()
+    client = make(error(429, retry_after="30"), answer(), limiter=Limiter(pause=shared))
+    other = make(answer(), limiter=Limiter(pause=shared), id="m-2")
+    first = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    await asyncio.gather(first, client.ask("prompt", slot(2)), other.ask("prompt", slot()))
+    assert client.transport.times == [0, 30, 30]
+    assert other.transport.times == [30]
+    assert any("30.0 s" in note for note in client.meter.notes)
+
+
+@on_a_clock
+async def test_a_failing_server_makes_only_its_own_call_wait(make):
+    client = make(error(503, retry_after="30"), answer())
+    first = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    await asyncio.gather(first, client.ask("prompt", slot(2)))
+    assert client.transport.times == [0, 0, 30]
+
+
+@pytest.mark.parametrize("status", [429, 503])
+@on_a_clock
+async def test_a_delay_longer_than_the_deadline_stops_the_sweep(make, status):
+    client = make(error(status, "come back tomorrow", retry_after="86400"), answer())
+    with pytest.raises(QuotaExhausted, match=r"86400 s.*come back tomorrow"):
+        await client.ask("prompt", slot())
+    assert len(client.transport.sent) == 1
+    assert now() == 0
+
+
+@on_a_clock
+async def test_a_sealed_replay_misses_what_is_not_recorded_and_notes_it(make):
+    await make(answer("recorded")).ask("prompt", slot())
+    client = make(transport=SealedTransport())
+    assert (await client.ask("prompt", slot())).text == "recorded"
+    with pytest.raises(ReplayMiss) as caught:
+        await client.ask("prompt", slot(2))
+    assert client.transport.misses == [caught.value.request]
+    assert caught.value.request.slot == slot(2)
+
+
+@on_a_clock
+async def test_the_actual_tokens_take_the_place_of_the_estimate(make):
+    """The estimate is the whole cap; the tokens that a reply tells free the rest at once."""
+    client = make(answer(usage=(10, 5)), limiter=Limiter(tpm=200))
+    for repetition in range(1, 4):
+        await client.ask("prompt", slot(repetition))
+    assert client.transport.times == [0, 0, 0]
+
+
+@on_a_clock
+async def test_the_call_with_the_lowest_order_is_sent_first(make):
+    limiter = Limiter()
+    client = make(answer(), limiter=limiter)
+    limiter.pause(1)
+    orders = [3, 1, 2, 0]
+    await asyncio.gather(*(client.ask("prompt", slot(n + 1), order=n) for n in orders))
+    assert [request.slot.repetition for request in client.transport.sent] == [1, 2, 3, 4]

@@ -1,0 +1,307 @@
+"""Replies as models write them: what is read, what is refused by name, and nothing is run."""
+
+import signal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.prompts.parse import parse_reply
+
+N = 20
+PLAN = tuple(round(0.05 * k - 0.5, 2) for k in range(N))
+LIST = str(list(PLAN))
+REFUSALS = {
+    "no_array",
+    "several_arrays",
+    "wrong_length",
+    "not_a_number",
+    "not_finite",
+    "out_of_range",
+}
+MB = 1_000_000
+
+law = settings(deadline=None, derandomize=True)  # the gate must not depend on luck or load
+
+
+def fenced(code, tag="python"):
+    return f"M\nI go first because I am ahead.\n```{tag}\n{code}\n```"
+
+
+def with_first(entry):
+    """A plan of the right length whose first entry is ``entry``."""
+    return fenced(f"[{entry}, {', '.join(['0.0'] * (N - 1))}]")
+
+
+@pytest.mark.parametrize("tag", ["python", "Python", "py", "json", "", " python "])
+def test_the_language_tag_of_the_fence_does_not_matter(tag):
+    assert parse_reply(fenced(LIST, tag), N).plan == PLAN
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        f"  {LIST}  ",
+        LIST.replace(",", " ,  "),
+        LIST.replace(", ", ","),
+        LIST.replace(", ", ",\n    "),
+        LIST.replace("[", "[\n").replace("]", "\n]"),
+        LIST.replace("]", ",]"),
+        LIST.replace("]", ",\n]"),
+        f"np.array({LIST})",
+        f"import numpy as np\nplan = np.array({LIST}, dtype=float)",
+        f"plan = {LIST}",
+        f"[{LIST}]",
+        f"# the plan, first action first\n{LIST}  # [m/s^2] / 2.5",
+        LIST.replace(", ", ",  # 0.2 s later\n", 1),
+        f"{LIST}\n\n{LIST}",
+        LIST.replace("-0.5,", "-0.50,", 1) + "\n" + LIST,
+        LIST.replace("-0.5,", "- 0.5,", 1),
+        LIST.replace("-", "\u2212"),
+        LIST.replace("-", "\u2013"),
+        LIST.replace("0.", "."),
+        LIST.replace("0.05", "5e-2"),
+        LIST.replace(" 0.45", " +0.45"),
+    ],
+)
+def test_a_sloppily_written_list_is_read(code):
+    for reply in (fenced(code), fenced(code).replace("\n", "\r\n")):
+        parsed = parse_reply(reply, N)
+        assert (parsed.plan, parsed.failure) == (PLAN, None)
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        LIST,
+        f"M\nI go first.\n{LIST}",
+        f"M\nI go first: {LIST} is my plan.",
+        f"M\nI go first.\n```python\n{LIST}",
+        f"M\n```\n{LIST}\n```\nI stay ahead by about 5 m [see above].",
+        f"M\nThe [other] car, at [0.1, 0.2], is behind.\n```python\n{LIST}\n```",
+        f"```python\n{LIST}\n```\nAgain:\n```python\n{LIST}\n```",
+    ],
+)
+def test_the_list_is_found_wherever_it_is_unambiguous(reply):
+    assert parse_reply(reply, N).plan == PLAN
+
+
+def test_whole_numbers_and_both_bounds_are_valid():
+    assert parse_reply(with_first("-1"), N).plan == (-1.0,) + (0.0,) * (N - 1)
+    assert parse_reply(with_first("1"), N).plan == (1.0,) + (0.0,) * (N - 1)
+
+
+def test_the_length_that_is_wanted_is_the_callers():
+    assert parse_reply("[0.1, 0.2]", 2).plan == (0.1, 0.2)
+    assert parse_reply("[0.1, 0.2]", 3).failure == "wrong_length"
+
+
+@pytest.mark.parametrize(
+    ("reply", "failure"),
+    [
+        ("", "no_array"),
+        ("I cannot help with that.", "no_array"),
+        (fenced("0.1, 0.2"), "no_array"),
+        (fenced("(" + LIST[1:-1] + ")"), "no_array"),
+        (fenced(LIST[:-1]), "no_array"),  # cut off in the middle of the list
+        (fenced("") + LIST, "no_array"),  # there is a code block, and the list is not in it
+        (fenced(LIST + LIST.replace("0.45", "0.46")), "several_arrays"),
+        (f"{fenced(LIST)}\n{fenced('[0.0]')}", "several_arrays"),
+        (f"[a safe gap] {LIST}", "several_arrays"),
+        (fenced("[0.5] * 5 + [0.0] * 15"), "several_arrays"),
+        (fenced("[]"), "wrong_length"),
+        (fenced("[0.1]*20"), "wrong_length"),
+        (fenced(str([0.0] * 19)), "wrong_length"),
+        (fenced(str([0.0] * 21)), "wrong_length"),
+        (with_first("nan"), "not_finite"),
+        (with_first("NaN"), "not_finite"),
+        (with_first("inf"), "not_finite"),
+        (with_first("-Infinity"), "not_finite"),
+        (with_first("np.nan"), "not_finite"),
+        (with_first("math.inf"), "not_finite"),
+        (with_first("float('inf')"), "not_finite"),
+        (with_first('float("-nan")'), "not_finite"),
+        (with_first("1e999"), "not_finite"),
+        (with_first("-1e999"), "not_finite"),
+        (with_first("1.0001"), "out_of_range"),
+        (with_first("-1.0001"), "out_of_range"),
+        (with_first("2.5"), "out_of_range"),
+        (with_first("1e300"), "out_of_range"),
+        (with_first("1.0000000000000002"), "out_of_range"),  # the next float above 1
+        (with_first("True"), "not_a_number"),
+        (with_first("None"), "not_a_number"),
+        (with_first("'0.1'"), "not_a_number"),
+        (with_first("0.1 m/s^2"), "not_a_number"),
+        (with_first("..."), "not_a_number"),
+        (with_first(""), "not_a_number"),
+        (with_first("1/2"), "not_a_number"),
+        (with_first("0.5 * 2"), "not_a_number"),
+        (with_first("--0.5"), "not_a_number"),
+        (with_first("0 .5"), "not_a_number"),
+        (with_first("1_0e-2"), "not_a_number"),
+        (with_first("0x1"), "not_a_number"),
+        (with_first("1j"), "not_a_number"),
+        (with_first("\u0967"), "not_a_number"),  # a digit, but not an ASCII one
+        (with_first("__import__('os').getpid()"), "not_a_number"),
+        (fenced("[0.1 for _ in range(20)]"), "not_a_number"),
+        (fenced(LIST.replace(", ", "; ")), "not_a_number"),
+    ],
+)
+def test_what_is_not_one_plan_is_refused_by_name(reply, failure):
+    parsed = parse_reply(reply, N)
+    assert (parsed.plan, parsed.failure) == (None, failure)
+
+
+def test_an_expression_is_never_evaluated(tmp_path):
+    trace = tmp_path / "trace"
+    parse_reply(with_first(f"__import__('pathlib').Path({str(trace)!r}).touch()"), N)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize(
+    ("head", "token", "rationale"),
+    [
+        ("M\nI am ahead.", "M", "I am ahead."),
+        ("Y\n\nI yield.", "Y", "I yield."),
+        ("m\nI am ahead.", "M", "I am ahead."),
+        ("**Y**\nI yield.", "Y", "I yield."),
+        ("`M`\nI am ahead.", "M", "I am ahead."),
+        ('"M"\nI am ahead.', "M", "I am ahead."),
+        ("(Y)\nI yield.", "Y", "I yield."),
+        ("M.\nI am ahead.", "M", "I am ahead."),
+        ("Decision: M\nI am ahead.", "M", "I am ahead."),
+        ("**Decision:** Y\nI yield.", "Y", "I yield."),
+        ("**Tactical decision: M**\nI am ahead.", "M", "I am ahead."),
+        ("### Tactical decision: Y\nI yield.", "Y", "I yield."),
+        ("M (merge first)\nI am ahead.", "M", "I am ahead."),
+        ("Y (yield)\nI am behind.", "Y", "I am behind."),
+        ("Y - I yield because I am behind.", "Y", "I yield because I am behind."),
+        ("**M** - I am ahead.", "M", "I am ahead."),
+        ("M: I am ahead.", "M", "I am ahead."),
+        ("Y, because I am behind.", "Y", "because I am behind."),
+        ("M", "M", ""),
+    ],
+)
+def test_the_token_is_read_in_its_usual_dressings_and_left_out_of_the_rationale(
+    head, token, rationale
+):
+    parsed = parse_reply(f"{head}\n```python\n{LIST}\n```", N)
+    assert (parsed.tactical, parsed.rationale, parsed.plan) == (token, rationale, PLAN)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "Y \u2014 I yield because I am behind.",
+        "Y\u2014I yield because I am behind.",
+    ],
+)
+def test_an_em_dash_parts_the_token_from_the_rationale_as_a_hyphen_does(head):
+    parsed = parse_reply(f"{head}\n{LIST}", N)
+    assert (parsed.tactical, parsed.rationale) == ("Y", "I yield because I am behind.")
+
+
+@pytest.mark.parametrize(
+    "prose",
+    [
+        "",
+        "Maybe I go first.",
+        "May I go first?",
+        "My car is ahead.",
+        "Merging first is safe.",
+        "Yes, I go first.",
+        "Yielding is safe.",
+        "Yield",
+        "You see me ahead.",
+        "Decision: Maybe",
+        "I merge first (M).",
+        "The other car yields.\nM",
+        "M/Y",
+        "MY",
+    ],
+)
+def test_a_word_or_a_late_letter_is_no_token_and_stays_in_the_rationale(prose):
+    parsed = parse_reply(f"{prose}\n```python\n{LIST}\n```", N)
+    assert (parsed.tactical, parsed.rationale, parsed.plan) == (None, prose, PLAN)
+
+
+def test_the_rationale_holds_all_prose_and_no_list():
+    before, after = "I am ahead.", "I check again in a second."
+    assert parse_reply(f"M\n{before}\n```\n{LIST}\n```\n{after}", N).rationale == (
+        f"{before}\n{after}"
+    )
+    assert parse_reply(f"M\n{before}\n{LIST}", N).rationale == before
+
+
+def test_token_and_rationale_survive_an_invalid_plan():
+    parsed = parse_reply(fenced("[0.1]"), N)
+    assert (parsed.plan, parsed.failure) == (None, "wrong_length")
+    assert (parsed.tactical, parsed.rationale) == ("M", "I go first because I am ahead.")
+
+
+@law
+@given(st.text() | st.text("[]`#,.-+0123456789eEinfMY \r\n\"'*:"))
+def test_any_text_gives_a_plan_or_a_named_refusal(text):
+    parsed = parse_reply(text, 1)
+    if parsed.plan is None:
+        assert parsed.failure in REFUSALS
+    else:
+        assert parsed.failure is None
+        assert len(parsed.plan) == 1
+        assert -1 <= parsed.plan[0] <= 1
+
+
+@law
+@given(st.lists(st.floats(-1, 1), min_size=N, max_size=N))
+def test_a_plan_that_is_written_out_in_full_survives_exactly(plan):
+    parsed = parse_reply(fenced(repr(plan)), N)
+    # By their spelling, since 0.0 == -0.0.
+    assert list(map(repr, parsed.plan)) == list(map(repr, plan))
+
+
+@pytest.fixture
+def _watchdog():
+    """A pattern that backtracks would need hours for a megabyte: fail instead of hanging."""
+
+    def give_up(signum, frame):
+        raise TimeoutError("the parser does not come to an end")
+
+    previous = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(30)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, previous)
+
+
+@pytest.mark.usefixtures("_watchdog")
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * MB,
+        "]" * MB,
+        "[]" * (MB // 2),
+        "[[" * (MB // 4) + "]]" * (MB // 4),
+        "[0," * (MB // 3),
+        "[" + "0," * (MB // 2) + "]",
+        "```" * (MB // 3),
+        "```\n[" * (MB // 5),
+        "#" * MB,
+        "\r\n" * (MB // 2),
+        " " * MB,
+        "*" * MB,
+        "M" * MB,
+        "M " * (MB // 2),
+        "decision: " * (MB // 10),
+        "[" + " " * MB + "x]",
+        "[-" + " " * MB + "]",
+        "[" + "-" * MB + "]",
+        "[0." + "1" * MB + "]",
+        "[0." + "1" * MB + "x]",
+        "[1e" + "1" * MB + "]",
+        "[" + "1" * MB + "]",
+        "[" + "1" * MB + "x]",
+    ],
+    ids=lambda text: f"{text[:12]!r}...{text[-3:]!r}",
+)
+def test_a_megabyte_of_hostile_text_is_refused(text):
+    assert parse_reply(text, N).failure in REFUSALS

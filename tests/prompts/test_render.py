@@ -1,0 +1,196 @@
+"""The text of the prompts, byte for byte, and that an ablation changes nothing but its block.
+
+To rewrite the golden files after a wanted change of the text, set UPDATE_GOLDEN_PROMPTS=1 and
+run this file; then read the difference, since it is a new experiment.
+"""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.config import Scenario
+from merge_runner.prompts.blocks import BLOCKS, VARIANTS, block_digests
+from merge_runner.prompts.render import render_prompt
+from merge_runner.records import SIDES, Observation
+from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.simulator.world import World
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "prompts"
+UPDATE = os.environ.get("UPDATE_GOLDEN_PROMPTS") == "1"
+
+FIRST = Observation(
+    road="merge",
+    own_speed_mps=9.6,
+    other_speed_mps=10.4,
+    relative_distance_m=-7.538461538461533,
+    distance_to_merge_m=42.46153846153847,
+    own_accelerations_mps2=(0.0,) * 10,
+    other_speeds_mps=(10.4,) * 10,
+)
+MID_RUN = Observation(
+    road="merge",
+    own_speed_mps=10.85,
+    other_speed_mps=9.0125,
+    relative_distance_m=-3.1416,
+    distance_to_merge_m=12.3456,
+    own_accelerations_mps2=(0.0,) * 5 + (0.5, 0.75, 1.0, 1.25, 2.5),
+    other_speeds_mps=(10.4, 10.3, 10.1, 9.9, 9.75, 9.6, 9.45, 9.3, 9.2, 9.1),
+)
+STRAIGHT = replace(MID_RUN, road="straight", relative_distance_m=8.375, distance_to_merge_m=None)
+REST_OF_PLAN = (0.3, 0.25, 0.2, 0.15, 0.1, 0.05, 0.0, 0.0, -0.05, -0.1, -1.0, -0.5, 0.0, 1.0, 0.5)
+
+FORMS = {
+    "first": (FIRST, None),
+    "mid_run": (MID_RUN, REST_OF_PLAN),
+    "straight": (STRAIGHT, REST_OF_PLAN),
+}
+# How the paragraph begins that a variant leaves out.
+REMOVED = {
+    "A1": "History of the last",
+    "A2": "Previous plan",
+    "A3": "Avoid a collision",
+    "A4": "Drive the way a human",
+    "A5": "Be risk-averse",
+    "A6": "Reassess",
+    "A7": "Tactical decision",
+}
+CASES = [(variant, form) for variant in VARIANTS for form in FORMS]
+
+law = settings(deadline=None, derandomize=True)  # the gate must not depend on luck or load
+
+
+def render(variant, form, **scenario):
+    observation, rest = FORMS[form]
+    return render_prompt(observation, rest, variant=variant, scenario=Scenario(**scenario))
+
+
+@pytest.mark.parametrize(("variant", "form"), CASES)
+def test_the_prompt_is_the_golden_text(variant, form):
+    file = GOLDEN / f"{variant}_{form}.txt"
+    prompt = render(variant, form)
+    if UPDATE:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(prompt.encode())
+    assert prompt == file.read_bytes().decode()
+
+
+def test_every_golden_file_is_checked():
+    assert {file.stem for file in GOLDEN.iterdir()} == {f"{v}_{form}" for v, form in CASES}
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(("variant", "beginning"), REMOVED.items())
+def test_an_ablation_removes_its_paragraph_and_changes_no_other_byte(variant, beginning, form):
+    paragraphs = render("baseline", form).split("\n\n")
+    kept = [paragraph for paragraph in paragraphs if not paragraph.startswith(beginning)]
+    asked_here = not (variant == "A7" and form == "straight")
+    assert len(paragraphs) - len(kept) == (1 if asked_here else 0)
+    assert render(variant, form) == "\n\n".join(kept)
+
+
+def test_without_a_tactical_question_on_the_straight_road_a7_is_the_baseline():
+    assert render("A7", "straight") == render("baseline", "straight")
+    assert render("A7", "mid_run") != render("baseline", "mid_run")
+
+
+def test_the_straight_form_names_no_distance_to_the_merge_point():
+    assert "distance to the merge" in render("baseline", "mid_run")
+    assert "distance to the merge" not in render("baseline", "straight")
+
+
+def test_the_first_decision_is_told_that_it_has_no_previous_plan():
+    line = next(x for x in render("baseline", "first").splitlines() if x.startswith("Previous"))
+    assert line.endswith(": none, this is your first decision")
+
+
+def test_both_sides_of_the_symmetric_condition_get_the_identical_prompt():
+    scenario = Scenario()
+    world = World(scenario, CONDITIONS["N_0_0"])
+    for action in (0.0, 0.3, -0.7):
+        left, right = (
+            render_prompt(world.observe(side), None, variant="baseline", scenario=scenario)
+            for side in SIDES
+        )
+        assert left == right
+        world.advance({"left": action, "right": action})
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_prompt_tells_left_from_right(form):
+    words = render("baseline", form).lower().replace("the right of way", "").split()
+    assert not {"left", "right"} & set(words)
+
+
+@pytest.mark.parametrize("value", [-0.0, -0.001, -0.00499])
+def test_a_value_that_rounds_to_zero_has_no_sign(value):
+    seen = Observation("merge", value, value, value, value, (value,) * 10, (value,) * 10)
+    prompt = render_prompt(seen, (value,) * 15, variant="baseline", scenario=Scenario())
+    assert "-0.00" not in prompt
+    # Three speeds and distances, one to the merge point, two histories and the plan.
+    assert prompt.count("0.00") == 4 + 2 * 10 + 15
+
+
+@law
+@given(st.floats(-200, 200))
+def test_every_value_is_shown_to_two_decimals(value):
+    seen = replace(FIRST, relative_distance_m=value)
+    prompt = render_prompt(seen, None, variant="baseline", scenario=Scenario())
+    line = next(x for x in prompt.splitlines() if x.startswith("- Relative distance"))
+    shown = line.split("): ")[1].removesuffix(" m")
+    assert abs(float(shown) - value) <= 0.005 + 1e-9
+    assert len(shown.split(".")[1]) == 2
+
+
+def test_the_numbers_of_the_task_come_from_the_scenario():
+    prompt = render(
+        "baseline",
+        "first",
+        horizon_s=3,
+        step_s=0.25,
+        prompt_rate_hz=2,
+        memory_s=1.5,
+        max_acceleration_mps2=3.5,
+        vehicle_length_m=5.2,
+    )
+    for words in (
+        "a new plan every 0.5 s",
+        "Length of each car: 5.2 m",
+        "History of the last 1.5 s, one value every 0.25 s",
+        "plan for the next 3 s as a list of exactly 12 numbers, one for every 0.25 s",
+        "an acceleration of 3.5 m/s^2 and -1 for a deceleration of 3.5 m/s^2",
+    ):
+        assert words in prompt
+
+
+def test_no_two_blocks_share_a_digest():
+    assert len(set(block_digests("baseline").values())) == len(BLOCKS)
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.name)
+def test_a_changed_text_on_either_road_changes_the_digest(block):
+    changed = {
+        block.digest,
+        replace(block, merge=f"{block.merge} ").digest,
+        replace(block, straight=f"{block.straight or ''} ").digest,
+        replace(block, merge=block.straight, straight=block.merge).digest,
+    }
+    # Where both roads share one text, swapping them changes nothing.
+    assert len(changed) == (3 if block.merge == block.straight else 4)
+
+
+@pytest.mark.parametrize("variant", REMOVED)
+def test_a_variant_keeps_the_digests_of_all_blocks_but_its_own(variant):
+    (removed,) = VARIANTS[variant]
+    kept = dict(block_digests("baseline"))
+    del kept[removed]
+    assert block_digests(variant) == kept
+
+
+def test_the_seven_ablations_remove_seven_different_blocks():
+    assert set(VARIANTS) == {"baseline", *REMOVED}
+    assert VARIANTS["baseline"] == frozenset()
+    assert len(set().union(*VARIANTS.values())) == len(REMOVED)

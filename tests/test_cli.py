@@ -1,0 +1,94 @@
+"""The command line: its menu, its errors, its outputs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from importlib.metadata import entry_points
+
+import pytest
+import typer.main
+
+import merge_runner as package
+from merge_runner.cli import app
+
+COMMANDS = {"sweep", "replay", "sql", "digest", "models", "emulate", "recording"}
+# The promised options; more may be there.
+SWEEP_OPTIONS = {
+    *("--model", "--reps", "--conditions", "--variants", "--sample-set", "--db", "--cache"),
+    *("--in-flight", "--rpm", "--tpm", "--max-cost", "--dry-run", "--yes", "--replay", "--json"),
+}
+
+
+def test_the_menu_is_what_was_promised():
+    command = typer.main.get_command(app)
+    assert set(command.commands) == COMMANDS
+    options = {o for p in command.commands["sweep"].params for o in p.opts}
+    assert options >= SWEEP_OPTIONS
+    assert set(command.commands["recording"].commands) == {"export", "import", "verify", "info"}
+    assert package.__all__ == ["__version__"]
+    assert [e.value for e in entry_points(name="merge-runner")] == ["merge_runner.cli:main"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["swep"], "Did you mean 'sweep'?"),
+        (["sweep"], "Missing argument 'NAME'"),
+        (["sweep", "baseline", "--reps", "x"], "--reps"),
+        (["sweep", "baseline", "--reps", "0"], "--reps is a whole number from 1"),
+        (["sweep", "nope"], "valid: ablations, baseline"),
+        (["sweep", "none.toml"], "none.toml does not exist"),
+        (["sweep", "baseline", "--model", "gpt9"], "valid: emulator, o3"),
+        (["sweep", "baseline", "--model", "o3+gpt9"], "unknown model 'gpt9'"),
+        (["sweep", "baseline", "--conditions", "X"], "valid: R_-4_-8"),
+        (["sweep", "baseline", "--variants", "A1"], "With --reps N"),
+        (["sweep", "baseline", "--in-flight", "0"], "--in-flight"),
+        (["sweep", "baseline", "--in-flight", "99999999"], "ulimit"),
+        (["sweep", "baseline", "--rpm", "0"], "--rpm"),
+        (["sweep", "baseline", "--sample-set", "-1"], "--sample-set"),
+        (["sweep", "baseline", "--recording", "x.parquet"], "recording import"),
+        (["sweep", "baseline", "--fault-rate", "2"], "no probability"),
+        (["replay", "baseline", "--recording", "x.parquet"], "there is no recording x.parquet"),
+        (["sql", "select 1"], "there is no database results/merge.duckdb"),
+        (["digest", "--db", "no.duckdb"], "there is no database no.duckdb"),
+        (["sql", "select 1", "--format", "xml"], "csv"),
+        (["recording", "export", "x.parquet"], "there is no database"),
+    ],
+)
+async def test_bad_input_exits_2_with_a_clear_line_and_no_traceback(merge_runner, arguments, says):
+    run = await merge_runner(*arguments)
+    assert run.code == 2
+    assert says in run.err
+    assert "Traceback" not in run.err
+    assert len(run.err.strip().splitlines()) <= 4
+
+
+async def test_debug_shows_the_traceback(merge_runner):
+    run = await merge_runner("sweep", "nope", "--debug")
+    assert run.code != 0
+    assert "Traceback" in run.err
+
+
+async def test_sql_prints_text_csv_and_json_alike(merge_runner):
+    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--reps", 1)).code == 0
+    sql = "select condition, count(*) as n from trials group by all order by all limit 2"
+    text = (await merge_runner("sql", sql)).out
+    assert [line.split() for line in text.splitlines()] == [
+        ["condition", "n"], ["L_0_-8", "1"], ["L_2_-8", "1"],
+    ]  # fmt: skip
+    table = list(csv.reader(io.StringIO((await merge_runner("sql", sql, "--format", "csv")).out)))
+    assert table == [["condition", "n"], ["L_0_-8", "1"], ["L_2_-8", "1"]]
+    records = json.loads((await merge_runner("sql", sql, "--format", "json")).out)
+    assert records == [{"condition": "L_0_-8", "n": 1}, {"condition": "L_2_-8", "n": 1}]
+
+
+async def test_models_lists_keys_prices_and_shutdown_dates(merge_runner):
+    out = (await merge_runner("models", OPENAI_API_KEY="k")).out
+    o3 = next(line for line in out.splitlines() if line.startswith("o3 ")).split()
+    assert o3[:6] == ["o3", "openai", "o3-2025-04-16", "yes", "2", "8"]
+    assert "2026-12-11" in o3
+    gemini = next(line for line in out.splitlines() if line.startswith("gemini-2.5-pro ")).split()
+    assert gemini[3] == "no"
+    assert "k" not in out.replace("OPENAI_API_KEY", "").split()

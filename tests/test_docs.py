@@ -1,0 +1,122 @@
+"""Every command of the README and the docs, run as it stands there, by hand and by make."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pty
+import re
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+import typer.main
+from conftest import PROJECT, environment, watched
+
+from merge_runner.cli import app
+
+PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
+LINKED = (".venv", "Makefile", "pyproject.toml", "requirements.lock", "requirements-dev.lock")
+
+
+def commands(page: Path) -> list[str]:
+    """The commands of a page's sh blocks, comments cut off."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    lines = [line.split("  #")[0].strip() for block in blocks for line in block.splitlines()]
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A checkout with the project's environment and short sweeps."""
+    for name in LINKED:
+        (tmp_path / name).symlink_to(PROJECT / name)
+    shutil.copytree(PROJECT / "experiments", tmp_path / "experiments")
+    for sweep in (tmp_path / "experiments").glob("*.toml"):
+        # One repetition each; and no account's limits, which would make the sweeps take minutes.
+        change = (r"^[rt]pm = .*$", "") if sweep.stem == "models" else (r" = \d+$", " = 1")
+        sweep.write_text(re.sub(*change, sweep.read_text(), flags=re.MULTILINE))
+    shutil.copytree(PROJECT / "cache/recordings", tmp_path / "cache/recordings")
+    return tmp_path
+
+
+async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
+    """Run a command at a terminal, and answer its question with yes."""
+    screen, terminal = pty.openpty()
+    process = await asyncio.create_subprocess_shell(
+        command,
+        cwd=folder,
+        env=environment(PATH=f"{PROJECT}/.venv/bin:{os.environ['PATH']}", **changes),
+        stdin=terminal,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+        start_new_session=True,
+    )
+    os.write(screen, b"y\n")
+    if " emulate " in command:  # runs until it is stopped: its first line is all there is
+        out = await process.stdout.readline()
+        os.killpg(process.pid, signal.SIGTERM)
+        await process.wait()
+        code = 0
+    else:
+        out, _ = await process.communicate()
+        code = process.returncode
+    os.close(screen)
+    os.close(terminal)
+    return code, out.decode()
+
+
+@pytest.mark.skipif(not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv")
+async def test_every_command_of_the_docs_does_what_it_says(folder):
+    done = []
+    async with watched() as server:
+        for page in PAGES:
+            for command in commands(page):
+                if command == "make test" or command.startswith("export "):
+                    continue
+                code, out = await shell(
+                    command, folder, OPENAI_API_KEY="k", OPENAI_BASE_URL=f"{server.url}/v1"
+                )
+                assert code == 0, f"{page.name}: {command}\n{out}"
+                assert "Traceback" not in out
+                done.append(command)
+    assert "make sweep" in done
+    assert len(done) >= 14
+
+
+@pytest.mark.skipif(not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv")
+def test_make_test_runs_the_tests():
+    run = subprocess.run(
+        ["make", "--dry-run", "test"], cwd=PROJECT, capture_output=True, text=True, check=True
+    )
+    assert ".venv/bin/pytest" in run.stdout
+
+
+def test_every_command_and_every_make_target_is_in_the_docs():
+    text = "\n".join(page.read_text() for page in PAGES)
+    command = typer.main.get_command(app)
+    for name in command.commands:
+        assert f"merge-runner {name}" in text or f"make {name}" in text, name
+    targets = re.findall(r"^([a-z]+):.*## ", (PROJECT / "Makefile").read_text(), re.MULTILINE)
+    for target in targets:
+        assert f"make {target}" in text, target
+
+
+def test_links_of_the_docs_lead_somewhere():
+    for page in PAGES:
+        for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_project_names_no_path_and_no_index_of_its_maker():
+    lists = subprocess.run(
+        ["git", "ls-files"], cwd=PROJECT, capture_output=True, text=True, check=True
+    )
+    for name in lists.stdout.split():
+        path = PROJECT / name
+        if path.suffix in (".parquet", ".duckdb", ".png") or name == "tests/test_docs.py":
+            continue
+        found = re.search(r"--(extra-)?index-url|/simple/|\.\./shared", path.read_text())
+        assert not found, f"{name}: {found}"

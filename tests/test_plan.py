@@ -1,0 +1,95 @@
+"""Which trials a sweep has, how they are named, and what their hash covers."""
+
+from __future__ import annotations
+
+import pytest
+
+from merge_runner.errors import UsageError
+from merge_runner.plan import Choice, make_plan
+
+EMULATOR = {"emulator": "emulator"}
+
+
+def hashes(plan, endpoints=EMULATOR):
+    return {spec.variant: spec.spec_hash for spec in plan.trial_specs(endpoints)}
+
+
+def test_the_ablations_are_495_trials_as_the_paper_says():
+    plan = make_plan(Choice("ablations", "emulator"))
+    specs = plan.trial_specs(EMULATOR)
+    assert plan.trials == len(specs) == 110 + 7 * 55
+    assert len({spec.trial_id for spec in specs}) == 495
+    assert sum(spec.variant == "baseline" for spec in specs) == 110
+    assert make_plan(Choice("ablations", "emulator", repetitions=10)).trials == 880
+
+
+def test_finished_parts_of_a_sweep_are_balanced_over_conditions_and_variants():
+    specs = make_plan(Choice("ablations", "emulator")).trial_specs(EMULATOR)
+    assert [spec.order for spec in specs] == list(range(495))
+    first = specs[:88]
+    assert {spec.repetition for spec in first} == {1}
+    assert len({(spec.variant, spec.condition) for spec in first}) == 88
+
+
+def test_ids_are_readable():
+    mixed = make_plan(Choice("baseline", "o3+constant", repetitions=3, sample_set=1))
+    specs = mixed.trial_specs({"o3": "openai"})
+    assert specs[-1].trial_id == "o3+constant/baseline/L_4_8/rep03/set1"
+    assert (specs[0].model_left, specs[0].model_right) == ("o3", "constant")
+    assert make_plan(Choice("baseline", "o3+o3")).model == "o3"
+
+
+def test_the_spec_hash_covers_what_determines_a_result_and_nothing_else(tmp_path):
+    plan = make_plan(Choice("baseline", "emulator"))
+    base = hashes(plan)["baseline"]
+    assert hashes(make_plan(Choice("baseline", "emulator", repetitions=2)))["baseline"] == base
+    assert hashes(make_plan(Choice("baseline", "emulator", conditions=["N_0_0"]))) == {
+        "baseline": base
+    }
+    changed = {
+        hashes(make_plan(Choice("baseline", "emulator", sample_set=1)))["baseline"],
+        hashes(plan, {"emulator": "http://127.0.0.1:1/v1"})["baseline"],
+        hashes(make_plan(Choice("baseline", "emulator+constant")))["baseline"],
+        hashes(make_plan(Choice("baseline", "constant+emulator")))["baseline"],
+        *hashes(make_plan(Choice("baseline", "emulator", 1, variants=["A1", "A7"]))).values(),
+    }
+    for key, value in (
+        ("collision_rule", '"rectangle"'),
+        ("timeout_s", "20.0"),
+        ("straight_after", '"both"'),
+        ("fallback", '"restart"'),
+    ):
+        file = tmp_path / f"{key}.toml"
+        file.write_text(f"[repetitions]\nbaseline = 1\n[scenario]\n{key} = {value}\n")
+        changed.add(hashes(make_plan(Choice(str(file), "emulator")))["baseline"])
+    assert base not in changed
+    assert len(changed) == 10
+
+
+def test_the_spec_hash_of_the_baseline_is_pinned():
+    # It changes only where the prompt, a parameter or a rule changes: then this is the reminder
+    # that results of before and after are told apart, and that the recording is made anew.
+    assert hashes(make_plan(Choice("baseline", "emulator"))) == {"baseline": "PINNED"}
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[repetitions]\nA9 = 1", "unknown variant 'A9'; valid: baseline, A1"),
+        ("[repetitions]\nbaseline = 0", "repetitions.baseline"),
+        ("[repetitions]\nbaseline = 1.5", "repetitions.baseline"),
+        ("[repetitions]", "has no variant"),
+        ("repetition = 3", "unknown key 'repetition'; valid: description, repetitions"),
+        ("[repetitions]\nbaseline = 1\n[scenario]\nstep = 1", "valid: horizon_s"),
+        ("[repetitions]\nbaseline = 1\n[scenario]\nstep_s = 0.3", "no whole number"),
+        ("conditions = ['L_9_9']\n[repetitions]\nbaseline = 1", "unknown condition 'L_9_9'"),
+        ("[repetitions", "Expected ']'"),
+    ],
+)
+def test_a_bad_sweep_file_gets_one_line_with_the_valid_choices(tmp_path, text, says):
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    with pytest.raises(UsageError) as caught:
+        make_plan(Choice(str(file), "emulator"))
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)

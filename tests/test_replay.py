@@ -1,0 +1,164 @@
+"""Sealed replay and portable recordings."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import duckdb
+import pytest
+from conftest import PROJECT, RECORDING, environment
+
+# The digest of the committed recording: results, and so this text, never change by themselves.
+GOLDEN = (PROJECT / "tests/golden/emulator-baseline.digest").read_text()
+SEALED = """
+import socket, sys
+real = socket.socket
+class Sealed(real):
+    def __init__(self, family=-1, *rest, **more):
+        assert family == socket.AF_UNIX, "a network socket was opened"
+        super().__init__(family, *rest, **more)
+socket.socket = Sealed
+sys.argv = ["merge-runner", *sys.argv[1:]]
+from merge_runner.cli import main
+main()
+"""
+REPLAY = ("replay", "baseline", "--recording", RECORDING, "--json")
+
+
+async def test_the_committed_recording_replays_to_its_digest(merge_runner):
+    run = await merge_runner(*REPLAY)
+    assert run.code == 0, run.err
+    assert run.summary["calls"]["live"] == 0
+    assert 1 <= run.summary["trials"]["collided"] <= 6
+    assert (await merge_runner("digest")).out == GOLDEN
+
+
+async def test_the_recording_is_what_the_emulator_answers_today(merge_runner):
+    part = ("--reps", 1, "--json")
+    live = await merge_runner("sweep", "baseline", *part)
+    assert live.code == 0, live.err
+    replay = await merge_runner(*REPLAY, "--reps", 1, "--db", "replay.duckdb", "--cache", "empty")
+    assert replay.code == 0, replay.err
+    digests = [(await merge_runner("digest", "--db", db)).out
+               for db in ("results/merge.duckdb", "replay.duckdb")]  # fmt: skip
+    assert digests[0] == digests[1]
+
+
+async def test_a_replay_opens_no_network_socket_and_needs_no_key(tmp_path):
+    done = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", SEALED, *map(str, REPLAY), "--reps", "1",
+        cwd=tmp_path, env=environment(), stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    out, err = await done.communicate()
+    assert done.returncode == 0, err
+    assert json.loads(out)["calls"]["live"] == 0
+
+
+def test_a_replay_imports_no_http_library():
+    code = (
+        "import sys, merge_runner.cli, merge_runner.sweep, merge_runner.summary;"
+        "print([m for m in ('httpx', 'aiohttp', 'pandas', 'statsmodels') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+async def test_missing_replies_are_all_listed_with_what_differs_and_the_rest_finishes(
+    merge_runner, tmp_path
+):
+    run = await merge_runner(*REPLAY, "--reps", 11)
+    assert run.code == 4
+    assert run.summary["trials"]["failed"] == 11
+    assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] == 110
+    misses = [m for m in run.summary["messages"] if "decision 0" in m]
+    assert len(misses) == 22, "both sides of every trial that lacks its first reply"
+    text = (
+        "emulator/baseline/N_0_0/rep11, left, decision 0: the nearest recorded request differs in "
+    )
+    found = next(m for m in misses if m.startswith(text))
+    assert found.startswith(text + "repetition (recorded ")
+    assert found.endswith(", wanted 11)")
+    ablated = await merge_runner(*REPLAY, "--reps", 1, "--variants", "A1", "--conditions", "N_0_0")
+    assert ablated.code == 4
+    assert "body.messages[0].content (recorded 'History of the last 2 s" in ablated.err
+    other = await merge_runner(*REPLAY, "--conditions", "N_0_0", "--reps", 1, "--sample-set", 2)
+    assert "sample_set (recorded 0, wanted 2)" in other.err
+
+
+async def test_an_exported_sweep_goes_round_through_a_file(merge_runner, tmp_path):
+    sweep = ("sweep", "baseline", "--reps", 1, "--json")
+    assert (await merge_runner(*sweep)).code == 0
+    assert (await merge_runner("recording", "export", "sweep.parquet")).code == 0
+    assert (await merge_runner("recording", "verify", "sweep.parquet")).code == 0
+    info = json.loads((await merge_runner("recording", "info", "sweep.parquet")).out)
+    assert info["endpoints"] == {"emulator": info["calls"]}
+    assert json.loads(info["provenance"]["config"])["repetitions"] == {"baseline": 1}
+    elsewhere = ("--cache", "elsewhere")
+    added = await merge_runner("recording", "import", "sweep.parquet", *elsewhere)
+    assert f"{info['calls']} calls added" in added.err
+    again = await merge_runner("recording", "import", "sweep.parquet", *elsewhere)
+    assert "0 calls added" in again.err
+    replay = await merge_runner(
+        "replay", "baseline", "--reps", 1, "--db", "replay.duckdb", *elsewhere
+    )
+    assert replay.code == 0
+    digests = {(await merge_runner("digest", "--db", db)).out
+               for db in ("results/merge.duckdb", "replay.duckdb")}  # fmt: skip
+    assert len(digests) == 1
+
+
+def changed(file, change: str) -> None:
+    """Rewrite a recording with one thing changed."""
+    with duckdb.connect() as connection:
+        connection.execute(f"CREATE TABLE calls AS FROM '{RECORDING}' LIMIT 20")
+        connection.execute(change)
+        connection.execute(
+            f"COPY calls TO '{file}' (FORMAT parquet, KV_METADATA {{key_version: '1'}})"
+        )
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("UPDATE calls SET body = replace(body, 'merge', 'marge')", "does not belong to its key"),
+        ("UPDATE calls SET side = 'right' WHERE side = 'left'", "does not belong to its key"),
+        ("UPDATE calls SET endpoint = 'openai'", "does not belong to its key"),
+        ("UPDATE calls SET attempts = '[]'", "holds no reply"),
+        ("UPDATE calls SET attempts = 'import os'", "is damaged"),
+        ("INSERT INTO calls FROM calls LIMIT 1", "repeats"),
+        ("ALTER TABLE calls ADD COLUMN extra INTEGER", "is no recording of ours"),
+    ],
+)
+async def test_a_recording_that_was_tampered_with_is_refused_whole(
+    merge_runner, tmp_path, change, says
+):
+    changed(tmp_path / "bad.parquet", change)
+    for command in ("verify", "import"):
+        run = await merge_runner("recording", command, "bad.parquet")
+        assert run.code == 1
+        assert says in run.err
+        assert "Traceback" not in run.err
+    left = await merge_runner("replay", "baseline", "--reps", 1, "--conditions", "N_0_0")
+    assert left.code == 4, "nothing of it entered the cache"
+
+
+async def test_a_recording_holds_no_secret(merge_runner, tmp_path):
+    from conftest import watched
+
+    async with watched() as server:
+        env = {"OPENAI_API_KEY": "sk-very-secret-1", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        part = ("--reps", 1, "--conditions", "N_0_0", "--model", "o3", "--yes")
+        assert (await merge_runner("sweep", "baseline", *part, **env)).code == 0
+        assert (await merge_runner("recording", "export", "o3.parquet", **env)).code == 0
+    for folder, _, names in os.walk(tmp_path):
+        for name in names:
+            assert b"sk-very-secret" not in Path(folder, name).read_bytes(), name
+    with duckdb.connect() as connection:
+        rows = connection.execute(f"FROM '{tmp_path / 'o3.parquet'}'").fetchall()
+    assert "sk-very-secret" not in str(rows)

@@ -1,0 +1,239 @@
+"""The loop of a trial: observe, decide together, drive, and keep what there is when it ends."""
+
+import asyncio
+
+import pytest
+
+from merge_runner.config import Scenario
+from merge_runner.drivers.base import held
+from merge_runner.drivers.constant import ConstantDriver
+from merge_runner.errors import CallFailed
+from merge_runner.records import SIDES, Attempt, ChatRequest, Decision, Slot, TrialSpec
+from merge_runner.trial import play_trial
+
+PLAN_ACTIONS = 20
+EXECUTED = 5
+ATTEMPTS = (Attempt(1, "http_500"), Attempt(2, "timeout"))
+REQUEST = ChatRequest(
+    key="key",
+    provider="test",
+    endpoint="test",
+    model="model",
+    path="/chat",
+    headers={},
+    body="{}",
+    slot=Slot("N_0_0", 1, "left", 0, 0),
+)
+
+
+def spec_of(condition):
+    return TrialSpec(
+        trial_id="test",
+        spec_hash="test",
+        source="driver",
+        model_left="test",
+        model_right="test",
+        variant="baseline",
+        condition=condition,
+        repetition=1,
+        sample_set=0,
+        order=0,
+    )
+
+
+async def play(left, right, condition="N_0_0", **scenario):
+    drivers = {"left": left, "right": right}
+    return await play_trial(spec_of(condition), Scenario(**scenario), drivers)
+
+
+class Holding:
+    """Holds one action, and remembers what it saw."""
+
+    def __init__(self, action):
+        self.action = action
+        self.seen = {}
+
+    async def decide(self, observation, number):
+        assert number not in self.seen
+        self.seen[number] = observation
+        return held(self.action, PLAN_ACTIONS, EXECUTED)
+
+
+class Meeting(Holding):
+    """Notes before its answer whether the other driver has been asked as well."""
+
+    def __init__(self, action):
+        super().__init__(action)
+        self.asked = 0
+        self.met = []
+        self.other = None
+
+    async def decide(self, observation, number):
+        self.asked += 1
+        await asyncio.sleep(0)  # lets every other task begin, and none that nobody has made
+        self.met.append(self.other.asked == self.asked)
+        return await super().decide(observation, number)
+
+
+class Failing(Holding):
+    """Gets no answer at one decision."""
+
+    def __init__(self, action, at, error=None):
+        super().__init__(action)
+        self.at = at
+        self.error = error or CallFailed("no answer", REQUEST, ATTEMPTS)
+
+    async def decide(self, observation, number):
+        if number == self.at:
+            raise self.error
+        return await super().decide(observation, number)
+
+
+class Slow(Holding):
+    """Answers long after the other driver."""
+
+    async def decide(self, observation, number):
+        for _ in range(100):
+            await asyncio.sleep(0)
+        return await super().decide(observation, number)
+
+
+async def test_both_drivers_are_asked_before_either_has_answered():
+    left, right = Meeting(0.0), Meeting(-1.0)
+    left.other, right.other = right, left
+    trial = await play(left, right)
+    assert trial.status == "finished"
+    assert left.met == right.met == [True] * 10
+
+
+async def test_both_drivers_observe_the_same_state():
+    """Also where one of them answers late: neither sees what the other has decided."""
+    left, right = Slow(0.3), Holding(-0.6)
+    trial = await play(left, right, "R_-4_8")
+    assert len(left.seen) == len(right.seen) > 5
+    for number, from_left in left.seen.items():
+        from_right = right.seen[number]
+        at_step = {row.side: row for row in trial.states if row.step == number * EXECUTED}
+        assert from_left.own_speed_mps == from_right.other_speed_mps
+        assert from_right.own_speed_mps == from_left.other_speed_mps
+        assert from_left.relative_distance_m == -from_right.relative_distance_m
+        assert from_left.own_speed_mps == at_step["left"].velocity_mps
+        assert from_right.own_speed_mps == at_step["right"].velocity_mps
+
+
+async def test_each_side_is_driven_by_its_own_driver():
+    trial = await play(Holding(1.0), Holding(-0.5))
+    assert trial.merged_first == "left"
+    moved = [row for row in trial.states if row.step == 1]
+    assert {row.side: row.acceleration_mps2 for row in moved} == {"left": 2.5, "right": -1.25}
+
+
+async def test_decisions_are_made_once_a_second_from_time_0_on():
+    trial = await play(Holding(0.0), Holding(-1.0))
+    # The left car needs 10 s for 100 m; at the end of the track nobody is asked again.
+    expected = [(number, float(number), side) for number in range(10) for side in SIDES]
+    assert [(row.number, row.time_s, row.side) for row in trial.decisions] == expected
+    assert (trial.status, trial.end_time_s, trial.merged_first) == ("finished", 10.0, "left")
+
+
+async def test_the_prompt_rate_decides_when_the_drivers_are_asked():
+    scenario = Scenario(prompt_rate_hz=2.5)
+    drivers = {side: ConstantDriver(scenario) for side in SIDES}
+    trial = await play_trial(spec_of("N_0_0"), scenario, drivers)
+    times = [row.time_s for row in trial.decisions if row.side == "left"]
+    assert times[:4] == [0.0, 0.4, 0.8, 1.2]
+
+
+async def test_the_actions_of_a_decision_are_driven_in_their_order():
+    actions = (0.1, -0.2, 0.3, -0.4, 0.5)
+
+    class Wavering:
+        async def decide(self, observation, number):
+            return Decision(plan=actions * 4, applied=actions)
+
+    trial = await play(Wavering(), Holding(-1.0))
+    driven = [row.acceleration_mps2 for row in trial.states if row.side == "left"]
+    # The row of step 0 is the start of control; steps 1 to 10 are two decisions.
+    assert driven[1:11] == pytest.approx([2.5 * a for a in actions * 2])
+
+
+async def test_a_trial_ends_within_a_second_when_the_cars_collide():
+    scenario = Scenario()
+    trial = await play(ConstantDriver(scenario), ConstantDriver(scenario))
+    # Level cars at 10 m/s are closer than 4.5 m from 82 m on: after 3.2 s, at 3.4 s in steps.
+    assert (trial.status, trial.end_time_s, trial.merged_first) == ("collided", 3.4, None)
+    assert trial.states[-1].step == 17
+    assert len(trial.states) == 2 * 18
+    assert len(trial.decisions) == 2 * 4
+
+
+async def test_a_trial_in_which_both_stand_still_times_out():
+    trial = await play(Holding(-1.0), Holding(-1.0))
+    assert (trial.status, trial.end_time_s, trial.merged_first) == ("timeout", 30.0, None)
+    assert len(trial.decisions) == 2 * 30
+    assert trial.error is None
+
+
+@pytest.mark.parametrize("failing", SIDES)
+async def test_a_failed_call_ends_the_trial_and_keeps_what_was_played(failing):
+    drivers = {side: Slow(-0.1) for side in SIDES}
+    drivers[failing] = Failing(-0.1, at=2)
+    (other,) = set(SIDES) - {failing}
+    trial = await play(**drivers)
+    assert (trial.status, trial.merged_first, trial.end_time_s) == ("failed", None, 2.0)
+    assert trial.error == f"{failing}: no answer"
+    (call,) = trial.failed_calls
+    assert (call.number, call.side, call.request, call.attempts) == (2, failing, REQUEST, ATTEMPTS)
+    # Two decisions were driven; the third is kept for the side that got its answer.
+    assert [row.step for row in trial.states] == [step for step in range(11) for _ in SIDES]
+    assert [(row.number, row.side) for row in trial.decisions] == [
+        (0, "left"),
+        (0, "right"),
+        (1, "left"),
+        (1, "right"),
+        (2, other),
+    ]
+
+
+async def test_when_both_calls_fail_the_error_names_both_sides():
+    left, right = Failing(0.0, at=0), Failing(0.0, at=0)
+    trial = await play(left, right)
+    assert trial.status == "failed"
+    assert trial.error == "left: no answer; right: no answer"
+    assert [call.side for call in trial.failed_calls] == list(SIDES)
+    assert trial.decisions == ()
+    assert [(row.step, row.side) for row in trial.states] == [(0, "left"), (0, "right")]
+
+
+async def test_nobody_merged_first_in_a_trial_that_failed_after_the_merge():
+    """The left car passes the merge point after 5 s."""
+    trial = await play(Holding(0.0), Failing(-1.0, at=7))
+    assert (trial.status, trial.end_time_s, trial.merged_first) == ("failed", 7.0, None)
+
+
+async def test_an_error_that_is_no_failed_call_is_not_hidden():
+    with pytest.raises(ZeroDivisionError):
+        await play(Holding(0.0), Failing(0.0, at=1, error=ZeroDivisionError()))
+
+
+async def test_under_own_exit_the_driver_in_the_tunnel_is_not_asked():
+    """In L_4_-8 the right car leaves its tunnel 0.785 s after the left one."""
+    left, right = Holding(-0.5), Holding(-1.0)
+    trial = await play(left, right, "L_4_-8", control_start="own_exit")
+    assert list(left.seen)[:3] == [0, 1, 2]
+    assert list(right.seen)[:2] == [1, 2]
+    assert [(row.number, row.side) for row in trial.decisions[:3]] == [
+        (0, "left"),
+        (1, "left"),
+        (1, "right"),
+    ]
+    right_rows = [row for row in trial.states if row.side == "right"]
+    assert [row.velocity_mps for row in right_rows[:6]] == [10.4] * 6
+    assert right_rows[6].acceleration_mps2 == -2.5
+
+
+async def test_under_both_exits_both_are_asked_from_the_beginning():
+    left, right = Holding(-0.5), Holding(-1.0)
+    await play(left, right, "L_4_-8")
+    assert list(left.seen) == list(right.seen)
+    assert 0 in right.seen
