@@ -48,7 +48,7 @@ PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 	@touch $@
 
 .venv/runtime: .venv/python requirements.lock pyproject.toml
-	@echo "installing the pinned packages into .venv" >&2
+	@echo "installing the pinned packages into .venv (once, a minute or two)" >&2
 	@$(PIP) install --require-hashes -r requirements.lock
 	@$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@

@@ -212,7 +212,7 @@ def digest(db: DbOption = DEFAULT_DB) -> None:
 @app.command()
 def models() -> None:
     """List the registry: provider, id, key, price, known shutdown date."""
-    from merge_runner.config import Price, has_key, load_models
+    from merge_runner.config import Price, key_status, load_models
     from merge_runner.llm.prices import pricing
     from merge_runner.records import Usage
 
@@ -231,14 +231,14 @@ def models() -> None:
                 name,
                 entry.provider,
                 entry.id,
-                "yes" if has_key(name, entry) else "no",
+                key_status(name, entry),
                 *shown,
                 source,
                 str(entry.shutdown or ""),
                 entry.note,
             )
         )
-    headings = ["name", "provider", "id", "usable", "USD/M in", "USD/M out", "prices", "shutdown"]
+    headings = ["name", "provider", "id", "key", "USD/M in", "USD/M out", "prices", "shutdown"]
     _print_table([*headings, "note"], rows)
 
 

@@ -111,7 +111,8 @@ class ModelEntry(Frozen):
 
     ``id`` is what is sent; a served model that is neither it nor one of ``aliases`` is reported
     as a mismatch. ``parameters`` go into the request as they are; what is not listed is not
-    sent, so that the provider's default applies. ``price`` is ``free``, ``genai-prices`` (the
+    sent, so that the provider's default applies; ``applied_defaults`` puts on record which.
+    ``price`` is ``free``, ``genai-prices`` (the
     table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
     minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of
     ``--dry-run`` alone.
@@ -122,6 +123,7 @@ class ModelEntry(Frozen):
     id: str
     aliases: tuple[str, ...] = ()
     parameters: dict[str, JsonValue] = {}
+    applied_defaults: dict[str, JsonValue] = {}
     max_output_tokens: Count
     cap_field: Literal["max_completion_tokens", "max_tokens"] = "max_completion_tokens"
     rpm: Count | None = None
@@ -236,13 +238,17 @@ def endpoint_identity(
     return entry.provider if base_url == normalised_url(provider.base_url) else base_url
 
 
-def has_key(name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None) -> bool:
-    """Whether the environment holds what a live run of the model needs."""
+def key_status(
+    name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None
+) -> Literal["set", "missing", "not needed"]:
+    """Whether the environment holds the key that a live run of the model needs."""
+    if not _provider(name, entry).key_needed:
+        return "not needed"
     try:
         resolve_endpoint(name, entry, environment)
     except UsageError:
-        return False
-    return True
+        return "missing"
+    return "set"
 
 
 def normalised_url(url: str) -> str:

@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from merge_runner.llm.prices import pricing
-from merge_runner.plan import Plan
+from merge_runner.plan import PROMPTS_PER_DRIVER, Plan
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.simulator.world import World
-
-# A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
-PROMPTS_PER_DRIVER = 10.5
 
 
 @dataclass(frozen=True, slots=True)

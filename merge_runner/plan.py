@@ -15,6 +15,8 @@ from merge_runner.records import Side, TrialSpec
 from merge_runner.simulator.conditions import CONDITIONS
 
 SPEC_VERSION = 1
+# A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
+PROMPTS_PER_DRIVER = 10.5
 PROGRAMS = ("constant", "projected-order")
 
 

@@ -22,10 +22,15 @@ PLAIN_EVERY_S = 5.0
 
 @dataclass(slots=True)
 class Progress:
-    """Where a sweep stands; the meters are those of its clients."""
+    """Where a sweep stands; the meters are those of its clients.
+
+    ``expected_calls`` is about how many calls all trials take: trials that run in step all end
+    late, so the calls tell the time left better than the trials do.
+    """
 
     title: str
     total: int
+    expected_calls: int = 0
     meters: Sequence[Meter] = ()
     cap_usd: float | None = None
     done: Counter[str] = field(default_factory=Counter)
@@ -55,14 +60,15 @@ class Progress:
             ("calls", f"{live} live, {cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
             ("cost", f"{cost:.2f}{cap} USD"),
-            ("time", f"{elapsed:.0f} s{self._left(elapsed)}"),
+            ("time", f"{elapsed:.0f} s{self._left(elapsed, live + cached)}"),
         ]
 
-    def _left(self, elapsed: float) -> str:
-        if not self.ended or self.ended == self.total:
+    def _left(self, elapsed: float, calls: int) -> str:
+        if self.ended == self.total or not (self.ended or calls):
             return ""
-        left = elapsed / self.ended * (self.total - self.ended)
-        return f", about {left:.0f} s left"
+        by_calls = min(calls / self.expected_calls, 0.99) if self.expected_calls else 0.0
+        part = max(self.ended / self.total, by_calls)
+        return f", about {elapsed / part - elapsed:.0f} s left"
 
 
 @asynccontextmanager
@@ -88,6 +94,8 @@ async def _show_live(progress: Progress, stop: asyncio.Event) -> None:
             for note in _notes(progress):
                 console.print(note)
             live.update(_table(progress), refresh=True)
+        for note in _notes(progress):
+            console.print(note)
         live.update(_table(progress), refresh=True)
 
 
@@ -96,7 +104,8 @@ async def _show_plain(progress: Progress, stop: asyncio.Event) -> None:
         for note in _notes(progress):
             _say(note)
         _say(_line(progress))
-    _say(_line(progress))
+    for line in (*_notes(progress), _line(progress)):
+        _say(line)
 
 
 def _table(progress: Progress) -> Table:

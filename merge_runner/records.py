@@ -12,6 +12,10 @@ Status = Literal["finished", "collided", "timeout", "failed"]
 
 SIDES: tuple[Side, Side] = ("left", "right")
 
+# Tell the slot and the attempt to our own emulator, and to nobody else.
+SLOT_HEADER = "x-merge-runner-slot"
+ATTEMPT_HEADER = "x-merge-runner-attempt"
+
 
 @dataclass(frozen=True, slots=True)
 class Slot:

@@ -23,7 +23,7 @@ from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.keys import canonical_json
 from merge_runner.misses import Miss, explain, misses_of
-from merge_runner.plan import Plan, spec_hash
+from merge_runner.plan import PROMPTS_PER_DRIVER, Plan, spec_hash
 from merge_runner.progress import Progress, shown
 from merge_runner.provenance import git_state, versions
 from merge_runner.recording import read_recording
@@ -82,7 +82,7 @@ class Sweep:
         self._plan = plan
         self._options = options
         self._say = say
-        self._cache = ResponseCache(options.cache, overlay=_overlay(options.recording))
+        self._cache = ResponseCache(options.cache, overlay=partial(_overlay, options.recording))
         self._endpoints = {name: self._endpoint(name, e) for name, e in plan.entries.items()}
         self._store = Store(options.db)
         specs = {
@@ -97,6 +97,7 @@ class Sweep:
         self._progress = Progress(
             title=f"{plan.name}: {plan.model}",
             total=len(self._todo),
+            expected_calls=round(len(self._todo) * plan.llm_sides * PROMPTS_PER_DRIVER),
             cap_usd=options.limits.max_cost_usd,
             stored_before=len(self._stored),
         )

@@ -12,6 +12,7 @@ from merge_runner.records import (
     Decision,
     DecisionRow,
     FailedCall,
+    Observation,
     Side,
     TrialRecord,
     TrialSpec,
@@ -58,16 +59,17 @@ async def _decide(
     world: World, drivers: dict[Side, Driver], number: int
 ) -> dict[Side, Decision | CallFailed]:
     """Ask all drivers at once; where one call fails, the other's answer is still awaited."""
+
+    async def answer(driver: Driver, observation: Observation) -> Decision | CallFailed:
+        try:
+            return await driver.decide(observation, number)
+        except CallFailed as failure:
+            return failure
+
     answers = await asyncio.gather(
-        *(driver.decide(world.observe(side), number) for side, driver in drivers.items()),
-        return_exceptions=True,
+        *(answer(driver, world.observe(side)) for side, driver in drivers.items())
     )
-    decided: dict[Side, Decision | CallFailed] = {}
-    for side, answer in zip(drivers, answers, strict=True):
-        if isinstance(answer, BaseException) and not isinstance(answer, CallFailed):
-            raise answer
-        decided[side] = answer
-    return decided
+    return dict(zip(drivers, answers, strict=True))
 
 
 def _drive(world: World, decided: dict[Side, Decision], actions: int) -> None:

@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 from aiohttp import web
 
-from merge_runner.emulator.server import HOST, SLOT_HEADER, Emulator
+from merge_runner.emulator.server import HOST, Emulator
+from merge_runner.records import SLOT_HEADER
 
 PROJECT = Path(__file__).parent.parent
 RECORDING = PROJECT / "cache/recordings/emulator-baseline.parquet"

@@ -87,8 +87,8 @@ async def test_sql_prints_text_csv_and_json_alike(merge_runner):
 async def test_models_lists_keys_prices_and_shutdown_dates(merge_runner):
     out = (await merge_runner("models", OPENAI_API_KEY="k")).out
     o3 = next(line for line in out.splitlines() if line.startswith("o3 ")).split()
-    assert o3[:6] == ["o3", "openai", "o3-2025-04-16", "yes", "2", "8"]
+    assert o3[:6] == ["o3", "openai", "o3-2025-04-16", "set", "2", "8"]
     assert "2026-12-11" in o3
     gemini = next(line for line in out.splitlines() if line.startswith("gemini-2.5-pro ")).split()
-    assert gemini[3] == "no"
+    assert gemini[3] == "missing"
     assert "k" not in out.replace("OPENAI_API_KEY", "").split()

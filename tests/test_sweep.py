@@ -12,7 +12,7 @@ from aiohttp import web
 from conftest import watched
 
 from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.server import SLOT_HEADER
+from merge_runner.records import SLOT_HEADER
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--json")
 TWO = ("--conditions", "N_0_0,L_4_8")

@@ -16,10 +16,8 @@ from merge_runner.emulator.faults import Fault, FaultPlan
 from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
 from merge_runner.errors import UsageError
-from merge_runner.records import Slot
+from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot
 
-SLOT_HEADER = "x-merge-runner-slot"
-ATTEMPT_HEADER = "x-merge-runner-attempt"
 HOST = "127.0.0.1"
 MODELS = ("scripted-driver",)
 RATE_LIMIT_KIND: dict[Format, str] = {

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -95,10 +96,12 @@ class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
 class ResponseCache:
     """The cache folder. Reads are direct; writes are batched in a thread and awaited."""
 
-    def __init__(self, folder: Path, *, overlay: Mapping[str, Entry] | None = None) -> None:
-        """Open or make the folder; ``overlay`` holds a recording's entries by key."""
+    def __init__(
+        self, folder: Path, *, overlay: Callable[[], Mapping[str, Entry]] | None = None
+    ) -> None:
+        """Open or make the folder; ``overlay`` reads a recording, entries by key, when needed."""
         self.folder = folder
-        self._overlay = overlay or {}
+        self._read_overlay = overlay
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             folder.chmod(0o700)
@@ -115,6 +118,10 @@ class ResponseCache:
             raise UsageError(f"the cache {folder} cannot be used: {exc}") from exc
         self._pending: list[tuple[Entry, asyncio.Future[None]]] = []
         self._writer: asyncio.Task[None] | None = None
+
+    @cached_property
+    def _overlay(self) -> Mapping[str, Entry]:
+        return self._read_overlay() if self._read_overlay else {}
 
     def get(self, key: str) -> Entry | None:
         """The entry of a call key."""
@@ -144,10 +151,10 @@ class ResponseCache:
         yield from self._overlay.values()
 
     def recorded_endpoints(self, model: str) -> list[str]:
-        """The endpoint identities under which replies of a model id are recorded."""
-        recorded = set(json.loads(self._disk.get(_ENDPOINTS + model) or "[]"))
+        """The endpoint identities of a model's replies: the folder's, else the recording's."""
+        on_disk = json.loads(self._disk.get(_ENDPOINTS + model) or "[]")
         requests = (entry.request for entry in self._overlay.values())
-        return sorted(recorded | {r.endpoint for r in requests if r.model == model})
+        return on_disk or sorted({r.endpoint for r in requests if r.model == model})
 
     def close(self) -> None:
         """Close the folder."""

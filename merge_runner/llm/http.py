@@ -11,10 +11,10 @@ from merge_runner.config import Endpoint
 from merge_runner.llm.keys import canonical_json
 from merge_runner.llm.transport import TransportFailure
 from merge_runner.llm.verdicts import RawReply
-from merge_runner.records import ChatRequest
+from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
-SLOT_HEADER = "x-merge-runner-slot"
-ATTEMPT_HEADER = "x-merge-runner-attempt"
+# A shorter dummy key may be part of any text.
+SHORTEST_SECRET = 8
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
@@ -27,8 +27,11 @@ class HttpTransport:
 
     def __init__(self, endpoint: Endpoint, *, connections: int) -> None:
         self._endpoint = endpoint
-        # A provider may echo the key in its error; it must not get into a log or a database.
-        self._secrets = [v.removeprefix("Bearer ") for v in endpoint.auth_headers.values()]
+        self._secrets = [
+            secret
+            for value in endpoint.auth_headers.values()
+            if len(secret := value.removeprefix("Bearer ")) >= SHORTEST_SECRET
+        ]
         limits = httpx.Limits(max_connections=connections, max_keepalive_connections=connections)
         self._client = HttpxAiohttpClient(
             limits=limits,
@@ -56,8 +59,10 @@ class HttpTransport:
             # The library reports refused, reset and cut connections alike.
             raise TransportFailure("connection_lost", str(exc) or type(exc).__name__) from exc
         body = reply.text
-        for secret in self._secrets:
-            body = body.replace(secret, "[key]")
+        if reply.status_code != httpx.codes.OK:
+            # A provider may echo the key in its error; it must not get into a log or a database.
+            for secret in self._secrets:
+                body = body.replace(secret, "[key]")
         return RawReply(reply.status_code, {k.lower(): v for k, v in reply.headers.items()}, body)
 
     async def close(self) -> None:

@@ -106,8 +106,13 @@ def test_an_unknown_fault_is_refused_with_the_valid_ones(tmp_path):
     assert all(fault in str(refusal.value) for fault in FAULTS)
 
 
-def test_an_unknown_key_is_refused_with_the_valid_ones(tmp_path):
-    with pytest.raises(UsageError, match="pause_s") as refusal:
+def test_an_unknown_key_is_refused_by_name(tmp_path):
+    with pytest.raises(UsageError, match="pause_s"):
+        load(tmp_path, "pause_s = 1\n")
+
+
+def test_the_refusal_of_an_unknown_key_lists_the_valid_ones(tmp_path):
+    with pytest.raises(UsageError) as refusal:
         load(tmp_path, "pause_s = 1\n")
     assert all(key in str(refusal.value) for key in FaultPlan.model_fields)
 

@@ -140,14 +140,13 @@ def test_an_answer_depends_on_prompt_and_slot_alone():
 @pytest.mark.parametrize(
     "change", [{"repetition": 2}, {"sample_set": 1}, {"decision": 1}, {"side": "right"}]
 )
-def test_each_part_of_a_slot_matters(change):
-    slots = [Slot(condition, 1, "left", 0, 0) for condition in CONDITIONS]
-    prompts = [FIRST_PROMPTS[condition, "left"] for condition in CONDITIONS]
-    as_is = [answer(*asked) for asked in zip(prompts, slots, strict=True)]
-    changed = [
-        answer(prompt, replace(slot, **change)) for prompt, slot in zip(prompts, slots, strict=True)
-    ]
-    assert as_is != changed
+def test_each_part_of_a_slot_changes_some_plan(change):
+    def actions(**changes):
+        slots = [replace(Slot(condition, 1, "left", 0, 0), **changes) for condition in CONDITIONS]
+        return [first_action(FIRST_PROMPTS[s.condition, "left"], s) for s in slots]
+
+    assert actions() == actions()
+    assert actions() != actions(**change)
 
 
 def test_both_sides_agree_on_who_goes_first_unless_the_trial_is_contested():
@@ -186,6 +185,15 @@ def test_the_share_of_left_first_follows_the_human_odds(condition):
     assert abs(share - expected) < 3.5 * standard_error
 
 
+def test_who_goes_first_is_drawn_anew_for_each_trial():
+    def left_first(condition, sample_set=0):
+        return {n for n in range(1, 401) if first_tokens(condition, n, sample_set) == ("M", "Y")}
+
+    # Left goes first more rarely in N_0_0; were the draws shared, never in it alone.
+    assert left_first("N_0_0") - left_first("L_4_8")
+    assert left_first("N_0_0", 0) != left_first("N_0_0", 1)
+
+
 def test_one_to_six_of_110_trials_collide_and_none_times_out(trials):
     for sample_set in SAMPLE_SETS:
         statuses = [t.status for key, t in trials.items() if key[2] == sample_set]
@@ -203,6 +211,19 @@ def test_who_was_drawn_to_go_first_reaches_the_merge_point_first(trials):
     for key, trial in trials.items():
         if trial.status == "finished":
             assert trial.merged_first == ("left" if first_tokens(*key)[0] == "M" else "right")
+
+
+def test_the_trials_are_driven_gently_and_leave_a_gap(trials):
+    for trial in trials.values():
+        # The hardest that the driver means to do, and the wobble of its hand.
+        assert min(row.acceleration_mps2 for row in trial.states) >= -2.2 - 0.1
+        assert max(row.acceleration_mps2 for row in trial.states) <= 1.4 + 0.1
+        if trial.status == "finished":
+            left = [row.position_m for row in trial.states if row.side == "left"]
+            right = [row.position_m for row in trial.states if row.side == "right"]
+            merging = next(pair for pair in zip(left, right, strict=True) if max(pair) >= 100)
+            # Between the bumpers of two cars of 4.5 m.
+            assert 1 < abs(merging[0] - merging[1]) - 4.5 < 8
 
 
 def test_every_decision_of_the_trials_is_a_valid_plan(trials):
@@ -296,7 +317,7 @@ def test_without_a_slot_an_answer_depends_on_the_prompt_alone():
 @pytest.mark.parametrize("prompt", ["", "What is the capital of France?", "Your speed: x m/s"])
 def test_a_prompt_about_something_else_gets_a_polite_text(prompt, slot):
     text = answer(prompt, slot)
-    assert "can only answer driving prompts" in text
+    assert text.startswith("I am a scripted stand-in for a language model and can only answer")
     assert parse_reply(text, SCENARIO.plan_actions).plan is None
 
 
