@@ -253,12 +253,16 @@ def key_status(
 
 def normalised_url(url: str) -> str:
     """A base URL in one spelling: lower-case scheme and host, no default port, no last slash."""
-    parts = urlsplit(url.strip())
+    try:
+        parts = urlsplit(url.strip())
+        port_number = parts.port
+    except ValueError as exc:
+        raise UsageError(f"{url!r} is no base URL: {exc}") from exc
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise UsageError(f"{url!r} is no base URL: it must begin with http:// or https://")
     host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
     default_port = 443 if parts.scheme == "https" else 80
-    port = "" if parts.port in (None, default_port) else f":{parts.port}"
+    port = "" if port_number in (None, default_port) else f":{port_number}"
     return f"{parts.scheme}://{host}{port}{parts.path.rstrip('/')}"
 
 
@@ -331,12 +335,15 @@ def _validate(model: type[ModelT], value: object, where: str) -> ModelT:
         raise UsageError(f"{where}: {'; '.join(_explain(exc, model))}") from exc
 
 
+NESTED: dict[str, type[BaseModel]] = {"scenario": Scenario, "price": Price}
+
+
 def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
     lines = []
     for error in exc.errors():
         place = ".".join(str(part) for part in error["loc"])
         if error["type"] == "extra_forbidden":
-            owner: type[BaseModel] = Scenario if error["loc"][0] == "scenario" else model
+            owner = NESTED.get(str(error["loc"][0]), model) if len(error["loc"]) > 1 else model
             lines.append(f"unknown key {place!r}; valid: {', '.join(owner.model_fields)}")
         else:
             lines.append(f"{place}: {error['msg']}" if place else error["msg"])

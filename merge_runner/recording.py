@@ -10,16 +10,17 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import duckdb
+from pydantic import TypeAdapter
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import Entry, ResponseCache, attempt_from
+from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.keys import KEY_VERSION, call_key
-from merge_runner.records import ChatRequest, Slot
+from merge_runner.records import Attempt, ChatRequest, Slot
 
 FORMAT = "merge-runner recording 1"
 COLUMNS = {
@@ -38,6 +39,7 @@ COLUMNS = {
     "attempts": "VARCHAR",
 }
 BATCH = 1_000
+ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +163,7 @@ def _row(entry: Entry) -> tuple[Any, ...]:
         slot.decision,
         slot.sample_set,
         request.body,
-        json.dumps([asdict(attempt) for attempt in entry.attempts], ensure_ascii=False),
+        ATTEMPTS.dump_json(entry.attempts).decode(),
     )
 
 
@@ -178,7 +180,7 @@ def _verified(file: Path, number: int, row: dict[str, Any]) -> Entry:
             body=row["body"],
             slot=slot,
         )
-        attempts = tuple(attempt_from(attempt) for attempt in json.loads(row["attempts"]))
+        attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
     except (ValueError, TypeError, KeyError) as exc:
         raise RecordingError(f"{file}: row {number} is damaged: {exc!r}") from exc
     if key != row["call_key"]:

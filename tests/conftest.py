@@ -1,47 +1,13 @@
-"""The program as a user runs it, and a server that tests can watch."""
+"""Fixtures for the whole program."""
 
 from __future__ import annotations
 
 import asyncio
-import json
-import os
 import sys
-from collections import Counter
-from collections.abc import Awaitable, Callable
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from aiohttp import web
-
-from merge_runner.emulator.server import HOST, Emulator
-from merge_runner.records import SLOT_HEADER
-
-PROJECT = Path(__file__).parent.parent
-RECORDING = PROJECT / "cache/recordings/emulator-baseline.parquet"
-# Variables that would change what a run does.
-CONFIGURING = ("_API_KEY", "_BASE_URL", "_PROXY", "_proxy")
-Middle = Callable[[web.Request, Callable[[web.Request], Awaitable[web.StreamResponse]]], Awaitable]
-
-
-@dataclass
-class Run:
-    """What a command did."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def summary(self) -> dict:
-        return json.loads(self.out)
-
-
-def environment(**changes: str) -> dict[str, str]:
-    """The environment without keys, base URLs and proxies."""
-    kept = {k: v for k, v in os.environ.items() if not k.endswith(CONFIGURING)}
-    return {**kept, **changes}
+from harness import Run, environment
 
 
 @pytest.fixture
@@ -68,40 +34,3 @@ def merge_runner(tmp_path):
 
     run.start = start
     return run
-
-
-@dataclass
-class Watched:
-    """An emulator in the test's own process: who asked what, and how often."""
-
-    url: str = ""
-    asked: Counter[str] = field(default_factory=Counter)
-    headers: list[dict[str, str]] = field(default_factory=list)
-
-    @property
-    def requests(self) -> int:
-        return self.asked.total()
-
-
-@asynccontextmanager
-async def watched(middle: Middle | None = None, faults=None):
-    """Serve the emulator on loopback; ``middle`` may answer in its place."""
-    seen = Watched()
-
-    @web.middleware
-    async def watch(request, handler):
-        body = await request.text()
-        seen.asked[request.headers.get(SLOT_HEADER, "") + body] += 1
-        seen.headers.append({name.lower(): value for name, value in request.headers.items()})
-        return await (middle(request, handler) if middle else handler(request))
-
-    app = Emulator(faults).app
-    app.middlewares.append(watch)
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
-    await runner.setup()
-    await web.TCPSite(runner, HOST, 0).start()
-    seen.url = f"http://{HOST}:{runner.addresses[0][1]}"
-    try:
-        yield seen
-    finally:
-        await runner.cleanup()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import typer.main
-from conftest import PROJECT, environment, watched
+from harness import PROJECT, environment, watched
 
 from merge_runner.cli import app
 

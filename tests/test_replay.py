@@ -11,7 +11,7 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from conftest import PROJECT, RECORDING, environment
+from harness import PROJECT, RECORDING, environment
 
 # The digest of the committed recording: results, and so this text, never change by themselves.
 GOLDEN = (PROJECT / "tests/golden/emulator-baseline.digest").read_text()
@@ -149,7 +149,7 @@ async def test_a_recording_that_was_tampered_with_is_refused_whole(
 
 
 async def test_a_recording_holds_no_secret(merge_runner, tmp_path):
-    from conftest import watched
+    from harness import watched
 
     async with watched() as server:
         env = {"OPENAI_API_KEY": "sk-very-secret-1", "OPENAI_BASE_URL": f"{server.url}/v1"}

@@ -9,7 +9,7 @@ import signal
 import duckdb
 import pytest
 from aiohttp import web
-from conftest import watched
+from harness import watched
 
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.records import SLOT_HEADER

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from merge_runner.config import read_toml
 from merge_runner.emulator.chance import draw, draw_between
@@ -45,6 +45,12 @@ class FaultPlan(BaseModel):
     delay_s: Annotated[float, Field(ge=0)] = 0.05
     hang_s: Annotated[float, Field(ge=0)] = 30.0
 
+    @model_validator(mode="after")
+    def _at_most_one_fault(self) -> FaultPlan:
+        if sum(self.rates.values()) > 1 + 1e-9:
+            raise ValueError("the rates add up to more than 1")
+        return self
+
     def fault(self, where: str, attempt: int) -> Fault | None:
         """The fault of an attempt, None for none; ``where`` names the request."""
         chance = draw("fault", self.seed, where, attempt)
@@ -74,5 +80,6 @@ def load_faults(path: Path) -> FaultPlan:
         first = exc.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise UsageError(
-            f"{path}: {place}: {first['msg']}; valid faults: {', '.join(FAULTS)}"
+            f"{path}: {place or 'rates'}: {first['msg']}; valid keys: "
+            f"{', '.join(FaultPlan.model_fields)}; valid faults: {', '.join(FAULTS)}"
         ) from exc

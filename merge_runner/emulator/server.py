@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import re
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -16,21 +17,18 @@ from merge_runner.emulator.faults import Fault, FaultPlan
 from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
 from merge_runner.errors import UsageError
-from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot
+from merge_runner.records import ATTEMPT_HEADER, SIDES, SLOT_HEADER, Slot
+from merge_runner.simulator.conditions import CONDITIONS
 
 HOST = "127.0.0.1"
 MODELS = ("scripted-driver",)
-RATE_LIMIT_KIND: dict[Format, str] = {
-    "openai-chat": "rate_limit_exceeded",
-    "openai-responses": "rate_limit_exceeded",
-    "gemini": "resource_exhausted",
-    "anthropic": "rate_limit",
+STATUS_FAULTS: dict[Fault, int] = {
+    "request_timeout": 408,
+    "server_error": 500,
+    "overloaded": 503,
 }
-STATUS_FAULTS: dict[Fault, tuple[int, str]] = {
-    "request_timeout": (408, "timeout"),
-    "server_error": (500, "server_error"),
-    "overloaded": (503, "overloaded"),
-}
+# What a client can send that is no chat request: refused with 400, whatever it breaks.
+UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
 ENDINGS: dict[Fault, Ending] = {"refused": "refused", "empty": "empty"}
 MALFORMED = "M\n\nI would rather describe my plan in words than write a list of numbers."
 
@@ -47,7 +45,7 @@ class Emulator:
                 web.post("/v1/chat/completions", self._chat),
                 web.post("/v1/responses", self._responses),
                 web.post("/v1/messages", self._anthropic),
-                web.post("/v1beta/models/{model}:generateContent", self._gemini),
+                web.post(r"/{version:v1\w*}/models/{model}:generateContent", self._gemini),
                 web.get("/v1/models", self._models),
             ]
         )
@@ -74,9 +72,10 @@ class Emulator:
             body = json.loads(raw)
             slot = _slot(request.headers.get(SLOT_HEADER))
             prompt = prompt_of(wire, body)
-        except (ValueError, TypeError, AttributeError):
-            return _send(error_in(wire, 400, "invalid_request_error", "The body is not valid."))
-        model = request.match_info.get("model") or str(body.get("model", MODELS[0]))
+            model = request.match_info.get("model") or str(body.get("model", MODELS[0]))
+            (prompt + model).encode()
+        except UNREADABLE:
+            return _send(error_in(wire, 400, "The body is not valid."))
         where = request.headers.get(SLOT_HEADER) or hashlib.sha256(raw).hexdigest()
         attempt = self._attempt(request, where)
         fault = self._faults.fault(where, attempt)
@@ -88,11 +87,9 @@ class Emulator:
             return web.Response(status=502, text="<html>502 Bad Gateway</html>")
         if fault == "rate_limit":
             wait = self._faults.wait_s(where, attempt)
-            kind = RATE_LIMIT_KIND[wire]
-            return _send(error_in(wire, 429, kind, "Rate limit reached.", wait))
+            return _send(error_in(wire, 429, "Rate limit reached.", wait))
         if fault is not None and fault in STATUS_FAULTS:
-            status, kind = STATUS_FAULTS[fault]
-            return _send(error_in(wire, status, kind, "An emulated fault."))
+            return _send(error_in(wire, STATUS_FAULTS[fault], "An emulated fault."))
         text = MALFORMED if fault == "malformed" else answer(prompt, slot)
         ending = ENDINGS.get(fault, "stop") if fault else "stop"
         reply = answer_in(wire, model, prompt, text, ending)
@@ -104,7 +101,7 @@ class Emulator:
         """The attempt's number: the client's own count, else how often this was asked."""
         told = request.headers.get(ATTEMPT_HEADER, "")
         self._asked[where] += 1
-        return int(told) if told.isdigit() else self._asked[where]
+        return int(told) if re.fullmatch("[0-9]{1,6}", told) else self._asked[where]
 
     async def _break_off(self, request: web.Request, fault: Fault) -> web.StreamResponse:
         """Say nothing for long, or cut the connection before or within the reply."""
@@ -122,7 +119,15 @@ class Emulator:
 
 
 def _slot(header: str | None) -> Slot | None:
-    return Slot(**json.loads(header)) if header else None
+    """The slot that a client tells; raises ValueError or TypeError for one that cannot be."""
+    if header is None:
+        return None
+    slot = Slot(**json.loads(header))
+    numbers = (slot.repetition, slot.decision, slot.sample_set)
+    known = slot.condition in CONDITIONS and slot.side in SIDES
+    if not known or not all(type(number) is int for number in numbers):
+        raise ValueError("no such slot")
+    return slot
 
 
 def _send(reply: Answer) -> web.Response:

@@ -11,6 +11,32 @@ from merge_runner.config import Format
 from merge_runner.emulator.chance import draw_index
 
 CREATED = 1_760_000_000
+OPENAI_ERRORS = {
+    400: "invalid_request_error",
+    408: "timeout",
+    429: "rate_limit_exceeded",
+    500: "server_error",
+    503: "server_is_overloaded",
+}
+# How each provider names an error of a status.
+ERROR_NAMES: dict[Format, dict[int, str]] = {
+    "openai-chat": OPENAI_ERRORS,
+    "openai-responses": OPENAI_ERRORS,
+    "gemini": {
+        400: "INVALID_ARGUMENT",
+        408: "DEADLINE_EXCEEDED",
+        429: "RESOURCE_EXHAUSTED",
+        500: "INTERNAL",
+        503: "UNAVAILABLE",
+    },
+    "anthropic": {
+        400: "invalid_request_error",
+        408: "timeout_error",
+        429: "rate_limit_error",
+        500: "api_error",
+        503: "overloaded_error",
+    },
+}
 Ending = Literal["stop", "refused", "empty"]
 
 
@@ -70,8 +96,9 @@ def answer_in(wire: Format, model: str, prompt: str, text: str, ending: Ending) 
     return Answer(build(_Said(model, text, ending, tokens_in, visible, reasoning)))
 
 
-def error_in(wire: Format, status: int, kind: str, message: str, delay_s: float = 0.0) -> Answer:
+def error_in(wire: Format, status: int, message: str, delay_s: float = 0.0) -> Answer:
     """An error in a provider's envelope; a rate limit says in the provider's way how to wait."""
+    kind = ERROR_NAMES[wire][status]
     if wire == "gemini":
         details = []
         if delay_s:
@@ -88,12 +115,12 @@ def error_in(wire: Format, status: int, kind: str, message: str, delay_s: float 
                     "retryDelay": f"{delay_s:.9f}s",
                 },
             ]
-        error = {"code": status, "message": message, "status": kind.upper(), "details": details}
+        error = {"code": status, "message": message, "status": kind, "details": details}
         return Answer({"error": error}, status)
     if wire == "anthropic":
         body = {
             "type": "error",
-            "error": {"type": f"{kind}_error", "message": message},
+            "error": {"type": kind, "message": message},
             "request_id": "req_emulated",
         }
         return Answer(body, status, {"retry-after": str(delay_s)} if delay_s else {})

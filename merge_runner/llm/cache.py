@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import asyncio
 import json
+import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import diskcache
 from diskcache.core import MODE_PICKLE
+from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.records import Attempt, ChatRequest, Slot, Usage
+from merge_runner.records import Attempt, ChatRequest
 
 ENTRY_VERSION = 1
+_NAMES = TypeAdapter(list[str])
 _ENDPOINTS = "endpoints "
 """Prefix of the entries that list, per model id, the endpoint identities with recordings."""
 
@@ -31,50 +34,28 @@ class Entry:
 
     request: ChatRequest
     attempts: tuple[Attempt, ...]
+    version: int = ENTRY_VERSION
 
     def to_json(self) -> str:
         """The entry as one JSON text."""
-        request = self.request
-        return json.dumps(
-            {
-                "version": ENTRY_VERSION,
-                "key": request.key,
-                "provider": request.provider,
-                "endpoint": request.endpoint,
-                "model": request.model,
-                "path": request.path,
-                "headers": request.headers,
-                "slot": request.slot.as_dict(),
-                "body": request.body,
-                "attempts": [asdict(attempt) for attempt in self.attempts],
-            },
-            ensure_ascii=False,
-        )
+        return _ENTRY.dump_json(self).decode()
 
     @classmethod
     def from_json(cls, text: str) -> Entry:
         """Read an entry; raises RecordingError."""
         try:
-            value = json.loads(text)
-            if value["version"] != ENTRY_VERSION:
-                raise RecordingError(
-                    f"the entry has version {value['version']}, this program reads {ENTRY_VERSION}"
-                )
-            return cls(
-                request=ChatRequest(
-                    key=value["key"],
-                    provider=value["provider"],
-                    endpoint=value["endpoint"],
-                    model=value["model"],
-                    path=value["path"],
-                    headers=value["headers"],
-                    body=value["body"],
-                    slot=Slot(**value["slot"]),
-                ),
-                attempts=tuple(attempt_from(attempt) for attempt in value["attempts"]),
+            entry = _ENTRY.validate_json(text, strict=True)
+        except ValidationError as exc:
+            raise RecordingError(f"damaged cache entry: {exc}") from exc
+        if entry.version != ENTRY_VERSION or not entry.attempts:
+            raise RecordingError(
+                f"the cache entry has version {entry.version} and {len(entry.attempts)} attempts; "
+                f"this program reads version {ENTRY_VERSION}"
             )
-        except (ValueError, KeyError, TypeError) as exc:
-            raise RecordingError(f"damaged cache entry: {exc!r}") from exc
+        return entry
+
+
+_ENTRY = TypeAdapter(Entry)
 
 
 class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
@@ -85,6 +66,14 @@ class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
         if not isinstance(value, str):
             raise TypeError("the cache stores text only")
         return super().store(value, read, key=key)
+
+    def get(self, key: object, raw: bool) -> Any:  # noqa: ANN401 # diskcache's signature
+        """Read back a key."""
+        if not raw or not isinstance(key, str):
+            raise RecordingError(
+                "the cache holds a key that is no text, which is not ours: refused"
+            )
+        return super().get(key, raw)
 
     def fetch(self, mode: int, filename: str | None, value: object, read: bool) -> Any:  # noqa: ANN401 # diskcache's signature
         """Fetch a text."""
@@ -114,7 +103,7 @@ class ResponseCache:
                 sqlite_synchronous=2,  # FULL: an acknowledged reply survives a power cut
                 disk_min_file_size=2**40,  # everything in the one SQLite file
             )
-        except OSError as exc:
+        except (OSError, sqlite3.Error) as exc:
             raise UsageError(f"the cache {folder} cannot be used: {exc}") from exc
         self._pending: list[tuple[Entry, asyncio.Future[None]]] = []
         self._writer: asyncio.Task[None] | None = None
@@ -152,9 +141,10 @@ class ResponseCache:
 
     def recorded_endpoints(self, model: str) -> list[str]:
         """The endpoint identities of a model's replies: the folder's, else the recording's."""
-        on_disk = json.loads(self._disk.get(_ENDPOINTS + model) or "[]")
+        if on_disk := self._endpoints(model):
+            return on_disk
         requests = (entry.request for entry in self._overlay.values())
-        return on_disk or sorted({r.endpoint for r in requests if r.model == model})
+        return sorted({r.endpoint for r in requests if r.model == model})
 
     def close(self) -> None:
         """Close the folder."""
@@ -165,22 +155,31 @@ class ResponseCache:
             batch, self._pending = self._pending, []
             try:
                 await asyncio.to_thread(self.put_now, [entry for entry, _ in batch])
-            except (OSError, diskcache.Timeout) as exc:
+            except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
                 failure = UsageError(f"the cache {self.folder} cannot be written: {exc}")
-                for _, done in batch:
+                for done in _waited_for(batch):
                     done.set_exception(failure)
             else:
-                for _, done in batch:
+                for done in _waited_for(batch):
                     done.set_result(None)
         self._writer = None
 
     def _note_endpoint(self, request: ChatRequest) -> None:
-        name = _ENDPOINTS + request.model
-        known = json.loads(self._disk.get(name) or "[]")
+        known = self._endpoints(request.model)
         if request.endpoint not in known:
-            self._disk.set(name, json.dumps(sorted([*known, request.endpoint])))
+            text = json.dumps(sorted([*known, request.endpoint]))
+            self._disk.set(_ENDPOINTS + request.model, text)
+
+    def _endpoints(self, model: str) -> list[str]:
+        text = self._disk.get(_ENDPOINTS + model)
+        try:
+            return [] if text is None else _NAMES.validate_json(text)
+        except ValidationError as exc:
+            raise RecordingError(f"the cache's list of endpoints is damaged: {exc}") from exc
 
 
-def attempt_from(value: dict[str, Any]) -> Attempt:
-    """An attempt from its JSON object."""
-    return Attempt(**{**value, "usage": Usage(**value["usage"])})
+def _waited_for(
+    batch: list[tuple[Entry, asyncio.Future[None]]],
+) -> Iterator[asyncio.Future[None]]:
+    """The futures of a batch that nobody has cancelled."""
+    return (done for _, done in batch if not done.done())

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -54,7 +56,7 @@ class LlmClient:
     budget: Budget = field(default_factory=Budget)
     meter: Meter = field(default_factory=Meter)
     _calls: dict[str, asyncio.Task[Entry]] = field(default_factory=dict)
-    _flying: set[str] = field(default_factory=set)
+    _waiting: set[str] = field(default_factory=set)
     _stopping: bool = False
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
@@ -71,17 +73,16 @@ class LlmClient:
         return reply
 
     async def drain(self) -> None:
-        """Let attempts in flight end and be saved, and give up all other calls."""
+        """Let attempts in flight end and be saved, and give up calls that wait for one."""
         self._stopping = True
-        for key, call in list(self._calls.items()):
-            if key not in self._flying:
-                call.cancel()
+        for key in self._waiting:
+            self._calls[key].cancel()
         await asyncio.gather(*self._calls.values(), return_exceptions=True)
 
     @property
     def flying(self) -> int:
-        """How many attempts are in flight."""
-        return len(self._flying)
+        """How many calls are in flight or being saved."""
+        return len(self._calls) - len(self._waiting)
 
     def _request(self, prompt: str, slot: Slot) -> ChatRequest:
         wire = FORMATS[self.entry.format].request(self.entry, prompt)
@@ -113,22 +114,23 @@ class LlmClient:
         worst = self._worst_case(request)
 
         async def take_turn() -> Turn:
-            if self._stopping:
-                raise CallFailed("the sweep was stopped", request)
-            permit = await self.limiter.acquire(_estimated_tokens(worst), order=order)
-            worst_usd = self.pricing.cost_usd(worst) or 0.0
-            await self.budget.reserve(worst_usd)
-            return Turn(permit, worst_usd)
+            with self._giving_way(request):
+                permit = await self.limiter.acquire(_estimated_tokens(worst), order=order)
+                worst_usd = self.pricing.cost_usd(worst) or 0.0
+                await self.budget.reserve(worst_usd)
+                return Turn(permit, worst_usd)
 
         async def attempt(turn: Turn, number: int, seconds_left: float) -> None:
-            self._flying.add(request.key)
-            try:
-                await self._attempt(request, turn, number, seconds_left, attempts)
-            finally:
-                self._flying.discard(request.key)
+            await self._attempt(request, turn, number, seconds_left, attempts)
+
+        async def sleep(seconds: float) -> None:
+            with self._giving_way(request):
+                await asyncio.sleep(seconds)
 
         try:
-            await call_with_retries(take_turn, attempt, deadline_s=self.entry.deadline_s)
+            await call_with_retries(
+                take_turn, attempt, deadline_s=self.entry.deadline_s, sleep=sleep
+            )
         except (OutOfTime, RequestFailed) as exc:
             reason = attempts[-1].error or attempts[-1].outcome
             raise CallFailed(
@@ -139,6 +141,17 @@ class LlmClient:
         entry = Entry(request, tuple(attempts))
         await self.cache.put(entry)
         return entry
+
+    @contextmanager
+    def _giving_way(self, request: ChatRequest) -> Iterator[None]:
+        """Within this, nothing of the call is in flight, so that a drain gives it up."""
+        if self._stopping:
+            raise CallFailed("the sweep was stopped", request)
+        self._waiting.add(request.key)
+        try:
+            yield
+        finally:
+            self._waiting.discard(request.key)
 
     async def _attempt(
         self,

@@ -34,7 +34,7 @@ def server_delay_s(
         _openai_resets(headers),
         _anthropic_resets(headers, clock),
     )
-    return next((delay for delay in candidates if delay is not None and delay > 0), None)
+    return next((d for d in candidates if d is not None and 0 < d < float("inf")), None)
 
 
 def go_duration_s(text: str) -> float | None:

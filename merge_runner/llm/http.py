@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
+import aiohttp
 import httpx
 from httpx_aiohttp import HttpxAiohttpClient
 
@@ -55,8 +56,9 @@ class HttpTransport:
                 reply = await self._client.post(url, content=request.body.encode(), headers=headers)
         except TimeoutError as exc:
             raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
-        except httpx.TransportError as exc:
-            # The library reports refused, reset and cut connections alike.
+        except (httpx.RequestError, aiohttp.ClientError) as exc:
+            # The libraries report refused, reset and cut connections alike, and pass on some
+            # errors of the other's: whatever it is, there is no reply.
             raise TransportFailure("connection_lost", str(exc) or type(exc).__name__) from exc
         body = reply.text
         if reply.status_code != httpx.codes.OK:

@@ -12,8 +12,12 @@ import contextlib
 import heapq
 from collections import deque
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from merge_runner.errors import UsageError
+
+if TYPE_CHECKING:
+    from asyncio_throttle.throttler import Throttler
 
 WINDOW_S = 60.0
 
@@ -57,21 +61,14 @@ class Limiter:
     def __init__(
         self,
         *,
-        rpm: float | None = None,
+        rpm: int | None = None,
         tpm: int | None = None,
         pause: Pause | None = None,
         window_s: float = WINDOW_S,
     ) -> None:
         self._tpm = tpm
         self._window_s = window_s
-        self._throttle = None
-        if rpm is not None:
-            from asyncio_throttle.throttler import Throttler
-
-            # Half a second's worth at a time: a whole window at once would trip finer limits.
-            burst = max(1, int(rpm / 120))
-            period = burst * window_s / rpm
-            self._throttle = Throttler(burst, period, retry_interval=min(0.05, period / 200))
+        self._throttles = [] if rpm is None else _throttles(rpm, window_s)
         self._waiters: list[_Waiter] = []
         self._arrivals = 0
         self._window: deque[Permit] = deque()
@@ -96,6 +93,7 @@ class Limiter:
         loop = asyncio.get_running_loop()
         waiter = _Waiter(order, self._arrivals, tokens, loop.create_future())
         self._arrivals += 1
+        waiter.turn.add_done_callback(lambda _: self._changed.set())
         heapq.heappush(self._waiters, waiter)
         self._changed.set()
         if self._dispatcher is None or self._dispatcher.done():
@@ -117,13 +115,15 @@ class Limiter:
     async def _dispatch(self) -> None:
         """Serve the queue until it is empty."""
         loop = asyncio.get_running_loop()
-        has_turn = self._throttle is None
+        has_turn = False
         while waiter := self._head():
             wait = self._blocked_for(waiter, loop.time())
             if wait > 0:
                 await self._wait(wait)
-            elif not has_turn and self._throttle is not None:
-                await self._throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
+                has_turn = False  # a turn is counted when it is taken, so it does not keep
+            elif not has_turn:
+                for throttle in self._throttles:
+                    await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
                 has_turn = True
             else:
                 heapq.heappop(self._waiters)
@@ -132,7 +132,7 @@ class Limiter:
                     self._window.append(permit)
                     self._tokens_in_window += permit.tokens
                 waiter.turn.set_result(permit)
-                has_turn = self._throttle is None
+                has_turn = False
 
     def _head(self) -> _Waiter | None:
         while self._waiters and self._waiters[0].turn.done():
@@ -156,3 +156,19 @@ class Limiter:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self._changed.wait()
+
+
+def _throttles(rpm: int, window_s: float) -> list[Throttler]:
+    """Two that hold together: an even flow, and at most ``rpm`` in a window wherever it begins.
+
+    Half a second's worth goes at a time: a whole window at once would trip finer limits.
+    """
+    from asyncio_throttle.throttler import Throttler
+
+    burst = max(1, rpm // 120)
+    period = burst * window_s / rpm
+    poll = min(0.05, period / 200)
+    return [
+        Throttler(burst, period, retry_interval=poll),
+        Throttler(rpm, window_s, retry_interval=poll),
+    ]

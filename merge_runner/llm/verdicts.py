@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from merge_runner.llm.delays import server_delay_s
@@ -38,7 +39,6 @@ TRANSIENT = {
     524: "server_timeout",
     529: "overloaded",
 }
-TRANSIENT_CODES = frozenset({"server_error", "rate_limit_exceeded"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,15 +81,13 @@ def judge(raw: RawReply, wire: WireFormat) -> Verdict:
     payload = _json(raw.body)
     if raw.status == 200:
         return _judge_success(raw, payload, wire)
-    error = error_info(payload, raw.body)
-    delay = server_delay_s(raw.headers, payload)
-    return _judge_error(raw.status, raw.headers, error, delay)
+    if isinstance(payload, list):  # Gemini wraps its errors where it streams
+        payload = payload[0] if payload else None
+    return _judge_error(raw.status, raw, payload)
 
 
 def error_info(payload: object, body: str) -> ErrorInfo:
     """Read an error body of any known shape; the text itself serves where it is no JSON."""
-    if isinstance(payload, list):
-        payload = payload[0] if payload else None
     top = as_dict(payload)
     nested = top.get("error")
     if nested is None:
@@ -116,7 +114,7 @@ def error_info(payload: object, body: str) -> ErrorInfo:
 def _json(body: str) -> object:
     try:
         return json.loads(body)
-    except ValueError:
+    except (ValueError, RecursionError):  # the latter: nested beyond any honest reply
         return None
 
 
@@ -126,46 +124,46 @@ def _judge_success(raw: RawReply, payload: object, wire: WireFormat) -> Verdict:
     reading = wire.read(payload)
     if reading.outcome != "error":
         return Verdict("accept", reading.outcome, reading)
+    return replace(_judge_error(_status_within(payload, raw), raw, payload), reading=reading)
+
+
+def _status_within(payload: object, raw: RawReply) -> int:
+    """The status that an error within a 200 stands for."""
+    names = error_info(payload, raw.body).names
+    if "rate_limit_exceeded" in names:
+        return 429
+    numbers = [int(name) for name in names if re.fullmatch("[45][0-9][0-9]", name)]
+    return numbers[0] if numbers else 400 if names - {"server_error"} else 500
+
+
+def _judge_error(status: int, raw: RawReply, payload: object) -> Verdict:
     error = error_info(payload, raw.body)
-    status = next((int(n) for n in error.names if n.isdigit()), None)
-    if status is None:
-        transient = not error.names or error.names & TRANSIENT_CODES
-        status = 500 if transient else 400
     delay = server_delay_s(raw.headers, payload)
-    verdict = _judge_error(status, raw.headers, error, delay)
-    return Verdict(
-        verdict.action, verdict.outcome, reading, verdict.message, verdict.delay_s, verdict.pause
-    )
-
-
-def _judge_error(
-    status: int, headers: Mapping[str, str], error: ErrorInfo, delay: float | None
-) -> Verdict:
+    should_retry = raw.headers.get("x-should-retry")
     message = f"HTTP {status}: {error.message}"
     reading = Reading("error")
     if status == 400 and "content_filter" in error.names:
         return Verdict("accept", "refusal", Reading("refusal"), message)
-    if _quota_exhausted(status, headers, error):
+    if _quota_exhausted(status, raw, error):
         return Verdict("quota", "quota_exhausted", reading, message)
     if _endpoint_refuses(status, error):
         outcome = "unknown_model" if _names_model(status, error) else "not_allowed"
         return Verdict("refused", outcome, reading, message)
     if status in (402, 429):
-        too_large = error.message.startswith("Request too large")
-        action: Action = "fail" if too_large else "retry"
-        outcome = "request_too_large" if too_large else "rate_limited"
-        return Verdict(action, outcome, reading, message, delay, pause=not too_large)
-    should_retry = headers.get("x-should-retry")
+        if error.message.startswith("Request too large"):
+            return Verdict("fail", "request_too_large", reading, message)
+        action: Action = "fail" if should_retry == "false" else "retry"
+        return Verdict(action, "rate_limited", reading, message, delay, pause=action == "retry")
     if should_retry == "true" or (status in TRANSIENT and should_retry != "false"):
         outcome = TRANSIENT.get(status, f"http_{status}")
         return Verdict("retry", outcome, reading, message, delay)
     return Verdict("fail", TRANSIENT.get(status, "bad_request"), reading, message)
 
 
-def _quota_exhausted(status: int, headers: Mapping[str, str], error: ErrorInfo) -> bool:
+def _quota_exhausted(status: int, raw: RawReply, error: ErrorInfo) -> bool:
     if status == 402:
-        in_flight_only = "openrouter_in_flight_budget" in str(error.details) + error.message
-        return not (in_flight_only and "retry-after" in headers)
+        in_flight_only = "openrouter_in_flight_budget" in raw.body
+        return not (in_flight_only and "retry-after" in raw.headers)
     if error.names & QUOTA_CODES:
         return True
     if status == 400:

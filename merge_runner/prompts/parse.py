@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from merge_runner.records import Tactical
 
 _ARRAY = re.compile(r"\[([^\[\]]*)\]")
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 _NOT_FINITE = re.compile(r"[+-]?(?:(?:np|numpy|math)\.)?(?:nan|inf|infinity)", re.IGNORECASE)
 _NOT_FINITE_CALL = re.compile(r"float\((['\"])[+-]?(?:nan|inf|infinity)\1\)", re.IGNORECASE)
 _SIGN_APART = re.compile(r"^([+-])\s+")
@@ -22,7 +22,7 @@ _TOKEN_LINE = re.compile(
     r"(?:merge first|merge|yield)?[\W_]*",
     re.IGNORECASE,
 )
-_LEADING_TOKEN = re.compile(r"[*_`#>\s\"'(\[]{0,20}([MY])(?=[\s*_`\"'):.,;\]-]|$)")
+_LEADING_TOKEN = re.compile(r"[*_`#>\s\"'(\[]{0,20}([MY])(?=[\s*_`\"'):.,;\]\u2013\u2014-]|$)")
 # Models write these for the ASCII minus sign.
 _MINUSES = str.maketrans(dict.fromkeys("\u2212\u2012\u2013\ufe63\uff0d", "-"))
 
@@ -92,7 +92,9 @@ def _tactical(prose: str) -> tuple[Tactical | None, str]:
         return _token(whole), rest.strip()
     leading = _LEADING_TOKEN.match(first_line)
     if leading:
-        return _token(leading), prose[leading.end() :].lstrip("*_`\"'):.,;] \n-").strip()
+        return _token(leading), prose[leading.end() :].lstrip(
+            "*_`\"'):.,;] \n\u2013\u2014-"
+        ).strip()
     return None, prose
 
 

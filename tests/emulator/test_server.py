@@ -74,7 +74,8 @@ async def bytes_until_closed(url):
         b"POST /v1/chat/completions HTTP/1.1\r\nhost: emulator\r\ncontent-length: 2\r\n\r\n{}"
     )
     try:
-        return await reader.read()
+        async with asyncio.timeout(10):
+            return await reader.read()
     except ConnectionResetError:
         return b""
     finally:
@@ -466,7 +467,8 @@ async def test_without_a_count_the_emulator_counts_the_attempts_itself(
 
 async def test_requests_without_a_slot_have_faults_of_their_own(emulator):
     url = await emulator(FaultPlan(rates={"server_error": 0.5}))
-    statuses = {(await ask(url, "openai-chat", f"prompt {n}"))[0] for n in range(12)}
+    first = headers_for(None, attempt=1)
+    statuses = {(await ask(url, "openai-chat", f"prompt {n}", first))[0] for n in range(12)}
     assert statuses == {200, 500}
 
 

@@ -30,6 +30,10 @@ def entry(number=0, *, model="m", endpoint="openai", reply="{}", **attempt):
     return Entry(request, (Attempt(1, "ok", 200, reply=reply, **attempt),))
 
 
+def by_key(*entries):
+    return {each.request.key: each for each in entries}
+
+
 async def put(cache, *entries):
     # The limit only ends a test whose write is lost.
     async with asyncio.timeout(10):
@@ -103,17 +107,18 @@ async def test_a_reply_is_readable_by_others_as_soon_as_put_returns(cache, folde
     other.close()
 
 
-async def test_a_reply_outlives_a_process_that_dies_after_put(folder):
-    program = f"""
+PUT_AND_DIE = """
 import asyncio, os, sys
 from pathlib import Path
-sys.path.insert(0, {os.path.dirname(__file__)!r})
-from test_cache import entry
-from merge_runner.llm.cache import ResponseCache
-asyncio.run(ResponseCache(Path({str(folder)!r})).put(entry(1)))
+from merge_runner.llm.cache import Entry, ResponseCache
+asyncio.run(ResponseCache(Path(sys.argv[1])).put(Entry.from_json(sys.argv[2])))
 os._exit(7)
 """
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 7
+
+
+def test_a_reply_outlives_a_process_that_dies_after_put(folder):
+    arguments = [sys.executable, "-c", PUT_AND_DIE, folder, entry(1).to_json()]
+    assert subprocess.run(arguments, check=False).returncode == 7
     reopened = ResponseCache(folder)
     assert reopened.get(entry(1).request.key) == entry(1)
     reopened.close()
@@ -149,11 +154,14 @@ async def test_a_write_that_fails_is_told_to_all_who_wait(cache, folder):
     assert [isinstance(result, MergeRunnerError) for result in results] == [True, True]
 
 
-async def test_letters_that_no_file_can_hold_lose_no_reply(cache):
-    """JSON can spell half a surrogate pair, so a server's message may hold one."""
-    odd = entry(1, error=json.loads(r'"\ud800"'))
-    await put(cache, odd, entry(2))
-    assert cache.get(odd.request.key).attempts[0].reply == "{}"
+async def test_an_entry_that_cannot_be_written_leaves_nobody_waiting(cache):
+    """No file can hold half a surrogate pair."""
+    async with asyncio.timeout(10):
+        odd = cache.put(entry(1, error="\ud800"))
+        (failure,) = await asyncio.gather(odd, return_exceptions=True)
+    assert isinstance(failure, Exception)
+    await put(cache, entry(2))
+    assert cache.get(entry(2).request.key)
 
 
 def test_the_folder_is_for_its_owner_alone(folder):
@@ -220,16 +228,29 @@ def test_each_write_is_synchronous(stock):
     assert stock.sqlite_synchronous == 2
 
 
-def damaged(**changes):
-    return json.dumps({**json.loads(entry().to_json()), **changes})
+def paths(value, path=()):
+    """The paths to all values inside a JSON value."""
+    if isinstance(value, dict | list):
+        for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield (*path, name)
+            yield from paths(inner, (*path, name))
 
 
-def without(name):
-    value = json.loads(entry().to_json())
-    del value[name]
-    return json.dumps(value)
+def damaged(path, *value):
+    """The text of an entry with one value replaced, or left out."""
+    whole = inner = json.loads(entry().to_json())
+    for name in path[:-1]:
+        inner = inner[name]
+    if value:
+        inner[path[-1]] = value[0]
+    else:
+        del inner[path[-1]]
+    return json.dumps(whole)
 
 
+NEEDED = {"request", "attempts", "number", "outcome", "slot", "condition", "side", "decision"}
+NEEDED |= {"repetition", "sample_set", "key", "provider", "endpoint", "model", "path", "body"}
+PATHS = list(paths(json.loads(entry().to_json())))
 DAMAGED = [
     "",
     "no JSON",
@@ -237,15 +258,10 @@ DAMAGED = [
     "[]",
     "1",
     "null",
-    damaged(version=2),
-    damaged(slot={}),
-    damaged(slot="A1"),
-    damaged(attempts=None),
-    damaged(attempts=[]),
-    damaged(attempts=[{"number": 1}]),
-    damaged(attempts=[{"number": 1, "outcome": "ok", "usage": None}]),
-    damaged(attempts=["ok"]),
-    *(without(name) for name in json.loads(entry().to_json())),
+    damaged(["version"], 2),
+    damaged(["attempts"], []),
+    *(damaged(path, [[]]) for path in PATHS),
+    *(damaged(path) for path in PATHS if path[-1] in NEEDED),
 ]
 
 
@@ -288,7 +304,7 @@ def test_a_folder_that_is_a_file_is_an_error_of_ours(folder):
 
 def test_an_overlay_answers_after_the_folder(folder):
     recorded = {number: entry(number, reply="overlay") for number in (1, 2)}
-    cache = ResponseCache(folder, overlay={e.request.key: e for e in recorded.values()})
+    cache = ResponseCache(folder, overlay=lambda: by_key(*recorded.values()))
     cache.put_now([entry(1, reply="folder"), entry(3)])
     replies = {n: cache.get(entry(n).request.key) for n in (1, 2, 3, 4)}
     assert replies[1].attempts[0].reply == "folder"
@@ -300,8 +316,7 @@ def test_an_overlay_answers_after_the_folder(folder):
 
 
 def test_an_overlay_is_never_written(folder):
-    overlaid = entry(1)
-    cache = ResponseCache(folder, overlay={overlaid.request.key: overlaid})
+    cache = ResponseCache(folder, overlay=lambda: by_key(entry(1)))
     cache.put_now([entry(2)])
     cache.close()
     plain = ResponseCache(folder)
@@ -309,9 +324,30 @@ def test_an_overlay_is_never_written(folder):
     plain.close()
 
 
-def test_endpoints_are_listed_per_model(folder):
-    overlaid = entry(9, model="a", endpoint="http://overlay/v1")
-    cache = ResponseCache(folder, overlay={overlaid.request.key: overlaid})
+def test_an_overlay_is_read_once_and_only_when_it_is_needed(folder):
+    readings = []
+
+    def overlay():
+        readings.append("read")
+        return by_key(entry(2))
+
+    cache = ResponseCache(folder, overlay=overlay)
+    cache.put_now([entry(1)])
+    assert cache.get(entry(1).request.key)
+    assert cache.recorded_endpoints("m") == ["openai"]
+    assert readings == []
+    assert cache.get(entry(2).request.key)
+    assert cache.get(entry(3).request.key) is None
+    assert readings == ["read"]
+    cache.close()
+
+
+def test_endpoints_are_listed_per_model_the_overlays_where_the_folder_has_none(folder):
+    recorded = [
+        entry(8, model="a", endpoint="http://overlay/v1"),
+        entry(9, model="c", endpoint="http://overlay/v1"),
+    ]
+    cache = ResponseCache(folder, overlay=lambda: by_key(*recorded))
     cache.put_now(
         [
             entry(1, model="a"),
@@ -320,7 +356,8 @@ def test_endpoints_are_listed_per_model(folder):
             entry(4, model="b", endpoint="emulator"),
         ]
     )
-    assert cache.recorded_endpoints("a") == ["http://b/v1", "http://overlay/v1", "openai"]
+    assert cache.recorded_endpoints("a") == ["http://b/v1", "openai"]
     assert cache.recorded_endpoints("b") == ["emulator"]
-    assert cache.recorded_endpoints("c") == []
+    assert cache.recorded_endpoints("c") == ["http://overlay/v1"]
+    assert cache.recorded_endpoints("d") == []
     cache.close()

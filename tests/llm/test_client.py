@@ -79,6 +79,7 @@ class Server:
         self.sent = []
         self.times = []
         self.timeouts = []
+        self.answered = 0
         self.open = asyncio.Event()
         self.open.set()
 
@@ -88,6 +89,7 @@ class Server:
         self.timeouts.append(timeout_s)
         reply = self.replies.pop(0) if len(self.replies) > 1 else self.replies[0]
         await self.open.wait()
+        self.answered += 1
         if isinstance(reply, Exception):
             raise reply
         return reply
@@ -143,7 +145,7 @@ def cache(opened):
 def make(cache):
     """A client whose server gives these replies."""
 
-    def make(*replies, transport=None, limiter=None, cap=None, **changes):
+    def make(*replies, transport=None, limiter=None, cap=None, cache=cache, **changes):
         fields = {
             "provider": "openai",
             "format": "openai-chat",
@@ -245,6 +247,17 @@ async def test_passing_failures_are_tried_again_and_all_attempts_are_kept(make, 
     assert cache.get(reply.request.key).attempts == reply.attempts
     assert client.meter.outcomes == Counter(outcomes(reply.attempts))
     assert reply.text == "M"
+
+
+@on_a_clock
+async def test_words_that_no_file_can_hold_lose_no_reply(make, cache):
+    """JSON can spell half a surrogate pair; a file cannot."""
+    odd = json.dumps({"error": {"message": "\ud800"}, "model": "\udfff"})
+    client = make(raw(odd, 500), answer("\ud800M", "\ud800", "\ud800"))
+    reply = await client.ask("prompt", slot())
+    assert outcomes(reply.attempts) == ["server_error", "ok"]
+    assert reply.text.endswith("M")
+    assert cache.get(reply.request.key).attempts == reply.attempts
 
 
 @on_a_clock
@@ -440,14 +453,16 @@ async def test_drain_does_not_wait_for_another_attempt_of_a_call_in_flight(make)
 
 
 @on_a_clock
-async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, cache):
-    client = make(answer("paid for"))
+async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, tmp_path):
+    own = ResponseCache(tmp_path)
+    client = make(answer("paid for"), cache=own)
     asked = [asyncio.create_task(client.ask("prompt", slot(n))) for n in (1, 2)]
-    while client.flying or len(client.transport.sent) < 2:
+    while client.transport.answered < 2:
         await asyncio.sleep(0)
     await client.drain()
-    assert len(list(cache.entries())) == 2
+    assert len(list(own.entries())) == 2
     assert [(await each).text for each in asked] == ["paid for", "paid for"]
+    own.close()
 
 
 @pytest.mark.parametrize(

@@ -70,8 +70,13 @@ def as_list(value: object) -> list[Any]:
 
 
 def as_text(value: object) -> str | None:
-    """A JSON string, or None where the server sent something else."""
-    return value if isinstance(value, str) else None
+    """A JSON string, or None where the server sent something else.
+
+    JSON can spell half of a surrogate pair, which no file can hold: a "?" takes its place.
+    """
+    if not isinstance(value, str):
+        return None
+    return value if value.isascii() else value.encode(errors="replace").decode()
 
 
 def as_count(value: object) -> int | None:
