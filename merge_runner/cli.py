@@ -16,6 +16,7 @@ from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.places import DEFAULT_CACHE, DEFAULT_DB
 
 if TYPE_CHECKING:
+    from merge_runner.emulator.faults import FaultPlan
     from merge_runner.estimate import Estimate
     from merge_runner.plan import Choice, Plan
     from merge_runner.sweep import Options
@@ -122,8 +123,7 @@ def sweep(
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
-    from merge_runner.clients import Limits
-    from merge_runner.plan import Choice
+    from merge_runner.plan import Choice, Limits
     from merge_runner.sweep import Options
 
     if recording is not None and not replay:
@@ -136,6 +136,7 @@ def sweep(
         replay=replay,
         recording=recording,
         emulator_options=_emulator_options(fault_rate, faults, seed),
+        faults_identity=_faults(fault_rate, faults, seed).identity,
     )
     choice = Choice(
         sweep=name,
@@ -251,11 +252,16 @@ def emulate(
     until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Run the local stand-in for a language model on 127.0.0.1; prints its base URL."""
-    from merge_runner.emulator.faults import load_faults, transient_faults
     from merge_runner.emulator.server import run
 
-    plan = load_faults(faults) if faults else transient_faults(fault_rate, seed)
-    asyncio.run(run(port, plan, announce=_print, until_stdin_closes=until_stdin_closes))
+    asyncio.run(
+        run(
+            port,
+            _faults(fault_rate, faults, seed),
+            announce=_print,
+            until_stdin_closes=until_stdin_closes,
+        )
+    )
 
 
 @recording_app.command("export")
@@ -273,6 +279,8 @@ def recording_export(
     from merge_runner.store import sweep_row, used_call_keys
 
     found, keys = used_call_keys(db, sweep_id)
+    if not keys:
+        raise UsageError(f"the sweep {found} made no call: there is nothing to record")
     row = sweep_row(db, found)
     provenance = {name: str(value) for name, value in row.items() if value is not None}
     calls = export_recording(file, ResponseCache(cache), keys, provenance)
@@ -294,7 +302,7 @@ def recording_verify(file: RecordingFile) -> None:
     """Check that every reply belongs to its key."""
     from merge_runner.recording import summarise
 
-    _say(f"{file} is whole: {summarise(file).calls} calls, every key belongs to its content")
+    _say(f"{file} is whole: {summarise(file).calls} calls, as they were exported")
 
 
 @recording_app.command("info")
@@ -315,7 +323,7 @@ def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json:
 
     plan = make_plan(choice)
     if dry_run:
-        _print_estimate(estimate(plan, plan.trials, in_flight=options.in_flight), as_json=as_json)
+        _print_estimate(estimate(plan, plan.trials, options.limits), as_json=as_json)
         return
     prepared = Sweep(plan, options, say=_say)
     if not options.replay and prepared.trials_to_play:
@@ -345,7 +353,7 @@ def _confirm(plan: Plan, trials: int, options: Options, *, yes: bool) -> None:
         resolve_endpoint(name, entry)
         if entry.shutdown:
             _say(f"note: {name} ({entry.id}) is announced to shut down on {entry.shutdown}")
-    expected = estimate(plan, trials, in_flight=options.in_flight)
+    expected = estimate(plan, trials, options.limits)
     if expected.free:
         return
     cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
@@ -382,14 +390,20 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
     _print("Nothing was sent.")
 
 
-def _emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list[str]:
-    """The options for the emulator's own process, refused here if they are wrong."""
+def _faults(fault_rate: float, faults: Path | None, seed: int) -> FaultPlan:
+    """What goes wrong on purpose at the emulator; raises UsageError."""
     from merge_runner.emulator.faults import load_faults, transient_faults
 
+    if faults is None:
+        return transient_faults(fault_rate, seed)
+    if fault_rate or seed:
+        raise UsageError("--faults names a file that holds the rates and the seed: give it alone")
+    return load_faults(faults)
+
+
+def _emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list[str]:
     if faults is not None:
-        load_faults(faults)
         return ["--faults", str(faults.resolve())]
-    transient_faults(fault_rate, seed)
     return ["--fault-rate", str(fault_rate), "--seed", str(seed)]
 
 

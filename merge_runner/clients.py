@@ -5,7 +5,6 @@ from __future__ import annotations
 import resource
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, resolve_endpoint, running_emulator_url
 from merge_runner.emulator.process import emulator_process
@@ -16,22 +15,16 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.transport import SealedTransport, Transport
+from merge_runner.plan import Limits
 
 SPARE_FILES = 64
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What bounds the calls; ``rpm`` and ``tpm`` replace those of the registry."""
-
-    rpm: int | None = None
-    tpm: int | None = None
-    max_cost_usd: float | None = None
-    connections: int = 400
-
-
 def sealed_clients(
-    entries: Mapping[str, ModelEntry], endpoints: Mapping[str, str], cache: ResponseCache
+    entries: Mapping[str, ModelEntry],
+    endpoints: Mapping[str, str],
+    cache: ResponseCache,
+    transport: SealedTransport,
 ) -> dict[str, LlmClient]:
     """Clients that answer from recordings alone: no key, no connection."""
     return {
@@ -40,7 +33,7 @@ def sealed_clients(
             entry,
             endpoint=endpoints[name],
             cache=cache,
-            transport=SealedTransport(),
+            transport=transport,
             limiter=Limiter(),
             budget=Budget(),
         )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from merge_runner.config import ModelEntry
 from merge_runner.llm.prices import pricing
-from merge_runner.plan import PROMPTS_PER_DRIVER, Plan
+from merge_runner.plan import PROMPTS_PER_DRIVER, Limits, Plan
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
 from merge_runner.simulator.conditions import CONDITIONS
@@ -25,7 +26,7 @@ class Estimate:
     free: bool
 
 
-def estimate(plan: Plan, trials: int, *, in_flight: int) -> Estimate:
+def estimate(plan: Plan, trials: int, limits: Limits) -> Estimate:
     """The estimate for this many trials of a plan, as if nothing were recorded yet."""
     calls = input_tokens = output_tokens = 0
     cost: float | None = 0.0
@@ -40,14 +41,11 @@ def estimate(plan: Plan, trials: int, *, in_flight: int) -> Estimate:
         input_tokens += made * prompt_tokens
         output_tokens += made * entry.typical_output_tokens
         cost = None if cost is None or price is None else cost + made * price
-        rounds = -(-trials // in_flight)
+        rounds = -(-2 * trials // limits.connections)
         slowest_s = max(
             slowest_s,
             rounds * PROMPTS_PER_DRIVER * entry.typical_latency_s,
-            60 * made / entry.rpm if entry.rpm else 0.0,
-            60 * made * (prompt_tokens + entry.typical_output_tokens) / entry.tpm
-            if entry.tpm
-            else 0.0,
+            _limited_s(entry, limits, made, prompt_tokens),
         )
     return Estimate(
         trials=trials,
@@ -58,6 +56,20 @@ def estimate(plan: Plan, trials: int, *, in_flight: int) -> Estimate:
         minutes=round(slowest_s / 60, 1),
         free=all(entry.price == "free" for entry in plan.entries.values()),
     )
+
+
+def _limited_s(entry: ModelEntry, limits: Limits, calls: int, prompt_tokens: int) -> float:
+    """How long the limits stretch the calls, in s.
+
+    Within a minute's window a call counts with its output cap until its reply is in, and with
+    its actual tokens from then on.
+    """
+    rpm, tpm = limits.rpm or entry.rpm, limits.tpm or entry.tpm
+    waiting = min(entry.typical_latency_s / 60, 1.0)
+    tokens = prompt_tokens + (
+        waiting * entry.max_output_tokens + (1 - waiting) * entry.typical_output_tokens
+    )
+    return max(60 * calls / rpm if rpm else 0.0, 60 * calls * tokens / tpm if tpm else 0.0)
 
 
 def _typical_prompt(plan: Plan) -> str:

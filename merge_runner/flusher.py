@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from merge_runner.errors import StoreLocked
+from merge_runner.errors import StoreError
 from merge_runner.records import TrialRecord
 from merge_runner.store import Store
 
@@ -15,13 +15,19 @@ LAST_PATIENCE_S = 60.0
 
 
 class Flusher:
-    """Collects ended trials and stores them about once a second."""
+    """Collects ended trials and stores them about once a second.
+
+    What cannot be stored waits in memory while the trials go on. ``differing`` lists the trials
+    that are stored already, with another result.
+    """
 
     def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
+        self.differing: list[str] = []
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
         self._pending: list[TrialRecord] = []
+        self._problem = ""
         self._closing = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
@@ -30,17 +36,18 @@ class Flusher:
         self._pending.append(record)
 
     async def close(self) -> None:
-        """Store what is left; raises StoreLocked if the database stays locked for a minute."""
+        """Store what is left; raises StoreError if that does not work for a minute."""
         self._closing.set()
         await self._task
         give_up = asyncio.get_running_loop().time() + LAST_PATIENCE_S
         while self._pending and not await self._flush():
             if asyncio.get_running_loop().time() >= give_up:
-                raise StoreLocked(
-                    f"{len(self._pending)} trials are not stored: {self._store.path} is locked by "
-                    "another program. Close it and run the same command again: it writes them "
-                    "from the recorded replies without a call."
+                raise StoreError(
+                    f"{len(self._pending)} trials are not stored: {self._problem}. When that is "
+                    "mended, run the same command again: it writes them from the recorded replies "
+                    "without a call."
                 )
+            await asyncio.sleep(min(EVERY_S, LAST_PATIENCE_S))
 
     async def _run(self) -> None:
         while not self._closing.is_set():
@@ -51,16 +58,18 @@ class Flusher:
                 await self._flush()
 
     async def _flush(self) -> bool:
-        """Write one batch; False if the database is locked."""
+        """Write one batch; False if that did not work."""
         batch, self._pending = self._pending, []
         if not batch:
             return True
         try:
-            await asyncio.to_thread(
+            self.differing += await asyncio.to_thread(
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
             )
-        except StoreLocked:
+        except StoreError as exc:
             self._pending = batch + self._pending
-            self._say(f"{self._store.path} is locked by another program: waiting for it")
+            if str(exc) != self._problem:
+                self._problem = str(exc)
+                self._say(f"waiting to store {len(self._pending)} trials: {exc}")
             return False
         return True

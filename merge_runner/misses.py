@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from merge_runner.llm.cache import Entry
-from merge_runner.records import ChatRequest, TrialRecord
+from merge_runner.llm.transport import SealedTransport
+from merge_runner.records import ChatRequest, Slot, TrialRecord
 
 SHOWN = 70
 
@@ -20,39 +21,49 @@ class Miss:
     request: ChatRequest
 
 
-def misses_of(record: TrialRecord) -> Iterator[Miss]:
-    """The calls that a trial lacked."""
+def misses_of(record: TrialRecord, sealed: SealedTransport) -> Iterator[Miss]:
+    """The calls of a trial that a sealed transport refused."""
+    refused = {request.key for request in sealed.misses} if record.failed_calls else set()
     for failed in record.failed_calls:
-        yield Miss(record.spec.trial_id, failed.request)
+        if failed.request.key in refused:
+            yield Miss(record.spec.trial_id, failed.request)
 
 
 def explain(misses: list[Miss], recorded: Iterable[Entry]) -> list[str]:
-    """One text per miss: trial, side, decision, and what differs from the nearest request."""
-    nearest: dict[str, tuple[tuple[int, int], ChatRequest]] = {}
+    """One text per miss: trial, side, decision, and what differs from the nearest request.
+
+    Nearest is a request of the same slot, else of the same place in another repetition, else
+    any; among those of one slot the one with the fewest differences.
+    """
+    wanted = {miss.request.slot for miss in misses}
+    same_slot: dict[Slot, list[ChatRequest]] = {}
+    same_place: dict[tuple[str, str, int], ChatRequest] = {}
     for entry in recorded:
-        for miss in misses:
-            distance = _distance(miss.request, entry.request)
-            best = nearest.get(miss.request.key)
-            if best is None or distance < best[0]:
-                nearest[miss.request.key] = (distance, entry.request)
-    lines = []
-    for miss in misses:
-        slot = miss.request.slot
-        where = f"{miss.trial_id}, {slot.side}, decision {slot.decision}"
-        found = nearest.get(miss.request.key)
-        if found is None:
-            lines.append(f"{where}: nothing is recorded at all")
-            continue
-        differences = "; ".join(_differences(found[1], miss.request))
-        lines.append(f"{where}: the nearest recorded request differs in {differences}")
-    return lines
+        request = entry.request
+        if request.slot in wanted:
+            same_slot.setdefault(request.slot, []).append(request)
+        same_place.setdefault(_place(request.slot), request)
+    return [_explained(miss, same_slot, same_place) for miss in misses]
 
 
-def _distance(wanted: ChatRequest, recorded: ChatRequest) -> tuple[int, int]:
-    """How many fields differ outside the body, then how much of the body does."""
-    fields = _fields(wanted)
-    apart = sum(fields[name] != value for name, value in _fields(recorded).items())
-    return apart, abs(len(wanted.body) - len(recorded.body)) + (wanted.body != recorded.body)
+def _explained(
+    miss: Miss,
+    same_slot: dict[Slot, list[ChatRequest]],
+    same_place: dict[tuple[str, str, int], ChatRequest],
+) -> str:
+    request, slot = miss.request, miss.request.slot
+    where = f"{miss.trial_id}, {slot.side}, decision {slot.decision}"
+    others = same_slot.get(slot) or [
+        same_place.get(_place(slot)) or next(iter(same_place.values()), request)
+    ]
+    nearest = min((list(_differences(other, request)) for other in others), key=len)
+    if not nearest:
+        return f"{where}: nothing is recorded at all"
+    return f"{where}: the nearest recorded request differs in {'; '.join(nearest)}"
+
+
+def _place(slot: Slot) -> tuple[str, str, int]:
+    return slot.condition, slot.side, slot.decision
 
 
 def _fields(request: ChatRequest) -> dict[str, object]:

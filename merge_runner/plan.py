@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from merge_runner.config import ModelEntry, Scenario, SweepFile, load_models, load_sweep
+from merge_runner.drivers import projected_order
 from merge_runner.errors import UsageError
+from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import canonical_json
 from merge_runner.prompts.blocks import VARIANTS, block_digests
 from merge_runner.records import Side, TrialSpec
@@ -17,7 +19,11 @@ from merge_runner.simulator.conditions import CONDITIONS
 SPEC_VERSION = 1
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 PROMPTS_PER_DRIVER = 10.5
-PROGRAMS = ("constant", "projected-order")
+# The programs that drive, with the parameters of their rules.
+PROGRAMS: dict[str, dict[str, float]] = {
+    "constant": {},
+    "projected-order": projected_order.PARAMETERS,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +36,16 @@ class Choice:
     conditions: Sequence[str] | None = None
     variants: Sequence[str] | None = None
     sample_set: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What bounds the calls; ``rpm`` and ``tpm`` replace those of the registry."""
+
+    rpm: int | None = None
+    tpm: int | None = None
+    max_cost_usd: float | None = None
+    connections: int = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +75,11 @@ class Plan:
     def source(self) -> Literal["llm", "driver"]:
         """Whether any language model takes part."""
         return "llm" if self.entries else "driver"
+
+    @property
+    def scripted(self) -> bool:
+        """Whether the emulator takes part."""
+        return any(entry.provider == "emulator" for entry in self.entries.values())
 
     def specs(self, endpoints: Mapping[str, str]) -> dict[str, str]:
         """Variant to the canonical JSON that its spec hash covers."""
@@ -99,6 +120,7 @@ class Plan:
                 repetition=repetition,
                 sample_set=self.sample_set,
                 order=order,
+                scripted=self.scripted,
             )
             for order, (repetition, variant, condition) in enumerate(cells)
         ]
@@ -121,19 +143,14 @@ class Plan:
     def _driver(self, name: str, endpoints: Mapping[str, str]) -> dict[str, object]:
         entry = self.entries.get(name)
         if entry is None:
-            return {"program": name}
-        sent = entry.model_dump(
-            include={
-                "provider",
-                "format",
-                "id",
-                "parameters",
-                "max_output_tokens",
-                "cap_field",
-                "path",
-            }
-        )
-        return {**sent, "endpoint": endpoints[name]}
+            return {"program": name, "parameters": PROGRAMS[name]}
+        sent = FORMATS[entry.format].request(entry, "")
+        return {
+            "endpoint": endpoints[name],
+            "path": sent.path,
+            "headers": sent.headers,
+            "body": sent.body,
+        }
 
 
 def spec_hash(text: str) -> str:
@@ -148,9 +165,12 @@ def make_plan(choice: Choice) -> Plan:
     left, _, right = choice.model.partition("+")
     sides: dict[Side, str] = {"left": left, "right": right or left}
     valid = (*models, *PROGRAMS)
-    for side in sides.values():
-        _require(side, valid, "model", "two joined by + drive left and right")
-    conditions = tuple(choice.conditions or file.conditions or CONDITIONS)
+    for driver in sides.values():
+        _require(driver, valid, "model", "two joined by + drive left and right")
+    wanted = choice.conditions if choice.conditions is not None else file.conditions
+    conditions = tuple(dict.fromkeys(CONDITIONS if wanted is None else wanted))
+    if not conditions:
+        raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
     for condition in conditions:
         _require(condition, tuple(CONDITIONS), "condition")
     if choice.sample_set < 0:
@@ -159,7 +179,7 @@ def make_plan(choice: Choice) -> Plan:
         name=name,
         model=left if left == sides["right"] else f"{left}+{right}",
         sides=sides,
-        entries={side: models[side] for side in sides.values() if side in models},
+        entries={driver: models[driver] for driver in sides.values() if driver in models},
         scenario=file.scenario,
         repetitions=_repetitions(name, file, choice),
         conditions=conditions,
@@ -173,7 +193,7 @@ def _repetitions(name: str, file: SweepFile, choice: Choice) -> dict[str, int]:
     if choice.repetitions is not None and choice.repetitions < 1:
         raise UsageError("--reps is a whole number from 1")
     wanted: dict[str, int] = {}
-    for variant in choice.variants or file.repetitions:
+    for variant in file.repetitions if choice.variants is None else choice.variants:
         repetitions = choice.repetitions or file.repetitions.get(variant)
         if repetitions is None:
             raise UsageError(
@@ -182,7 +202,7 @@ def _repetitions(name: str, file: SweepFile, choice: Choice) -> dict[str, int]:
             )
         wanted[variant] = repetitions
     if not wanted:
-        raise UsageError(f"the sweep {name} has no variant: add one under [repetitions]")
+        raise UsageError(f"the sweep {name} has no variant; valid: {', '.join(VARIANTS)}")
     return wanted
 
 

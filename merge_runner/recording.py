@@ -6,10 +6,12 @@ file's key-value metadata hold where it comes from. Any Parquet tool can query i
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,25 +68,32 @@ def export_recording(
             f"{len(missing)} of {len(keys)} replies are not in the cache {cache.folder}, the first "
             f"is {missing[0]}: run the sweep again with this cache"
         )
-    file.parent.mkdir(parents=True, exist_ok=True)
+    if file.is_dir():
+        raise UsageError(f"{file} is a folder: name a file")
     partial = file.with_name(file.name + ".partial")
-    metadata = {**provenance, "format": FORMAT, "key_version": str(KEY_VERSION)}
-    with duckdb.connect() as connection:
+    rows = sorted((_row(entry) for entry in map(cache.get, keys) if entry), key=_order)
+    content = hashlib.sha256()
+    for row in rows:
+        content.update(_fingerprint(row[0], row[-1]))
+    metadata = {
+        **provenance,
+        "format": FORMAT,
+        "key_version": str(KEY_VERSION),
+        "calls": str(len(rows)),
+        "content_sha256": content.hexdigest(),
+    }
+    with _written(file), duckdb.connect() as connection:
         columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
         connection.execute(f"CREATE TABLE calls ({columns})")
         appender = connection.appender("calls")
-        for key in keys:
-            entry = cache.get(key)
-            assert entry is not None
-            appender.append_row(*_row(entry))
+        appender.append_rows(rows)
         appender.flush()
         pairs = ", ".join(f"{_quoted(name)}: {_quoted(text)}" for name, text in metadata.items())
         connection.execute(
-            "COPY (FROM calls ORDER BY condition, repetition, side, decision, call_key) "
-            f"TO {_quoted(str(partial))} "
+            f"COPY calls TO {_quoted(str(partial))} "
             f"(FORMAT parquet, COMPRESSION zstd, KV_METADATA {{{pairs}}})"
         )
-    os.replace(partial, file)
+        os.replace(partial, file)
     return len(keys)
 
 
@@ -93,6 +102,7 @@ def read_recording(file: Path) -> Iterator[Entry]:
     with _opened(file) as connection:
         rows = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM recording")  # noqa: S608 # constants
         seen: set[str] = set()
+        content = hashlib.sha256()
         number = 0
         while batch := _fetch(rows, file):
             for values in batch:
@@ -101,7 +111,14 @@ def read_recording(file: Path) -> Iterator[Entry]:
                 if entry.request.key in seen:
                     raise RecordingError(f"{file}: row {number} repeats {entry.request.key}")
                 seen.add(entry.request.key)
+                content.update(_fingerprint(values[0], values[-1]))
                 yield entry
+    told = _metadata(file)
+    if (str(number), content.hexdigest()) != (told.get("calls"), told.get("content_sha256")):
+        raise RecordingError(
+            f"{file} is not as it was exported: it holds {number} calls of {told.get('calls')}, "
+            "and its content has another hash"
+        )
 
 
 def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
@@ -146,6 +163,25 @@ def summarise(file: Path) -> Summary:
         outcomes=dict(outcomes),
         provenance=_metadata(file),
     )
+
+
+@contextmanager
+def _written(file: Path) -> Iterator[None]:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except (OSError, duckdb.Error) as exc:
+        raise RecordingError(f"{file} cannot be written: {exc}") from exc
+
+
+def _order(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Rows in the order of condition, repetition, side, decision, sample set and key."""
+    return (*row[6:11], row[0])
+
+
+def _fingerprint(key: str, attempts: str) -> bytes:
+    """What the hash of a recording covers of a row: the key covers the rest."""
+    return f"{key} {attempts}\n".encode()
 
 
 def _row(entry: Entry) -> tuple[Any, ...]:

@@ -48,8 +48,7 @@ class Observation:
     ``relative_distance_m`` is the other's travelled distance minus the own one, so that it is
     positive while the other is ahead. ``distance_to_merge_m`` is None on the straight road.
     The histories are oldest first, one value per simulation step: the accelerations that the own
-    vehicle executed, and the speeds at which the other was seen before now. ``remaining_plan``
-    is the unexecuted rest of the last valid plan (normalised), None before the first.
+    vehicle executed, and the speeds at which the other was seen before now.
     """
 
     road: Road
@@ -150,7 +149,11 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class TrialSpec:
-    """One trial to play. ``order`` is its place in the sweep: lower goes first."""
+    """One trial to play.
+
+    ``order`` is its place in the sweep: lower goes first. ``scripted`` says that the emulator
+    takes part, a stand-in and no language model.
+    """
 
     trial_id: str
     spec_hash: str
@@ -162,6 +165,7 @@ class TrialSpec:
     repetition: int
     sample_set: int
     order: int
+    scripted: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,7 @@ def trial_row(record: TrialRecord) -> Row:
         record.merged_first,
         record.end_time_s,
         record.error,
+        spec.scripted,
     )
 
 
@@ -114,7 +115,7 @@ def _call_row(
         attempt.usage.cached_input_tokens,
         attempt.usage.output_tokens,
         attempt.usage.reasoning_tokens,
-        0.0 if cached else attempt.cost_usd,
+        attempt.cost_usd,
         attempt.finish_reason,
         request.body,
         _as_json(attempt.reply),

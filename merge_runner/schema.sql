@@ -42,6 +42,7 @@ CREATE TABLE IF NOT EXISTS trials (
     merged_first VARCHAR,             -- left, right, NULL: collided, failed, or nobody merged
     end_time_s DOUBLE NOT NULL,
     error VARCHAR,
+    scripted BOOLEAN NOT NULL,        -- the emulator drives on a side: a stand-in, no model
     PRIMARY KEY (trial_id, spec_hash)
 );
 
@@ -92,7 +93,7 @@ CREATE TABLE IF NOT EXISTS calls (
     cached_input_tokens BIGINT,
     output_tokens BIGINT,             -- includes the reasoning ones
     reasoning_tokens BIGINT,
-    cost_usd DOUBLE,                  -- 0 for a recorded reply; NULL: unknown
+    cost_usd DOUBLE,                  -- what it cost when it was made; NULL: unknown
     finish_reason VARCHAR,
     request JSON,
     reply JSON,

@@ -45,20 +45,20 @@ class SweepRow:
 def open_database(
     path: Path, *, read_only: bool, patience_s: float
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open the database, waiting for others to close it; raises StoreLocked or UsageError."""
+    """Open the database, waiting for others to close it; raises StoreError."""
     give_up = time.monotonic() + patience_s
     while True:
         try:
             connection = duckdb.connect(str(path), read_only=read_only)
             break
         except duckdb.IOException as exc:
-            if "lock" not in str(exc).lower():
-                raise UsageError(f"{path} cannot be opened as a database: {exc}") from exc
+            if "Could not set lock" not in str(exc):
+                raise StoreError(f"{path} cannot be opened as a database: {exc}") from exc
             if time.monotonic() >= give_up:
                 raise StoreLocked(f"{path} is locked by another program") from exc
             time.sleep(LOCK_RETRY_S)
         except duckdb.Error as exc:
-            raise UsageError(f"{path} cannot be opened as a database: {exc}") from exc
+            raise StoreError(f"{path} cannot be opened as a database: {exc}") from exc
     try:
         yield connection
     finally:
@@ -70,9 +70,23 @@ def read_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open an existing database of our schema for reading; raises UsageError."""
     if not path.is_file():
         raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
-    with open_database(path, read_only=True, patience_s=PATIENCE_S) as connection:
+    with (
+        _refused_as_usage(),
+        open_database(path, read_only=True, patience_s=PATIENCE_S) as connection,
+    ):
         _check_version(connection, path)
         yield connection
+
+
+@contextmanager
+def _refused_as_usage() -> Iterator[None]:
+    """A file that is no database at all is the user's to name another, before anything runs."""
+    try:
+        yield
+    except StoreLocked:
+        raise
+    except StoreError as exc:
+        raise UsageError(f"{exc}; name another with --db") from exc
 
 
 class Store:
@@ -86,7 +100,7 @@ class Store:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as exc:
             raise UsageError(f"{path.parent} cannot be made: {exc}") from exc
-        with self._writing() as connection:
+        with _refused_as_usage(), self._writing() as connection:
             tables = {name for (name,) in connection.execute("SHOW TABLES").fetchall()}
             if tables:
                 _check_version(connection, path)
@@ -131,8 +145,13 @@ class Store:
                 if status != "failed"
             }
 
-    def write(self, sweep_id: str, records: Sequence[TrialRecord], *, patience_s: float) -> None:
-        """Store whole trials of a sweep; one that has ended already is only linked."""
+    def write(
+        self, sweep_id: str, records: Sequence[TrialRecord], *, patience_s: float
+    ) -> list[str]:
+        """Store whole trials of a sweep; one that has ended already is compared and linked.
+
+        Returns the ids of those that were played to another end than the stored one.
+        """
         with self._writing(patience_s) as connection:
             keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
             stored = _statuses(connection, keys)
@@ -142,11 +161,19 @@ class Store:
                 for record, key in zip(records, keys, strict=True)
                 if stored.get(key, "failed") == "failed"
             ]
+            differing = [
+                record.spec.trial_id
+                for record, key in zip(records, keys, strict=True)
+                if stored.get(key, "failed") != "failed"
+                and record.status != "failed"
+                and not _same(connection, record)
+            ]
             _append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
             _append(connection, "trials", map(trial_row, new))
             _append(connection, "states", chain.from_iterable(map(state_rows, new)))
             _append(connection, "decisions", chain.from_iterable(map(decision_rows, new)))
             _append(connection, "calls", chain.from_iterable(map(call_rows, new)))
+            return differing
 
     @contextmanager
     def _writing(self, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
@@ -272,7 +299,9 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
             return connection.execute(f"{select} {of_sweep} {rest}", [sweep_id]).fetchall()
 
         decisions = rows(
-            "SELECT count(*), count_if(NOT valid), count_if(fallback) FROM decisions", ""
+            "SELECT count(*), count(*) FILTER (NOT valid), count(*) FILTER (fallback) "
+            "FROM decisions",
+            "",
         )[0]
         return SweepFacts(
             outcomes=rows(
@@ -312,6 +341,24 @@ def _statuses(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> di
         [[key[0] for key in keys], [key[1] for key in keys]],
     ).fetchall()
     return {(trial_id, spec_hash): status for trial_id, spec_hash, status in rows}
+
+
+def _same(connection: duckdb.DuckDBPyConnection, record: TrialRecord) -> bool:
+    """Whether the stored trial has the same states and the same plans."""
+    key = (record.spec.trial_id, record.spec.spec_hash)
+
+    def stored(columns: str, table: str, order: str) -> list[tuple[Any, ...]]:
+        return connection.execute(
+            f"SELECT {columns} FROM {table} WHERE trial_id = ? AND spec_hash = ? ORDER BY {order}",  # noqa: S608 # constants
+            key,
+        ).fetchall()
+
+    states = sorted((s.step, s.side, s.position_m, s.velocity_mps) for s in record.states)
+    plans = sorted((d.number, d.side, list(d.decision.applied)) for d in record.decisions)
+    return (
+        stored("step, side, position_m, velocity_mps", "states", "step, side") == states
+        and stored("decision, side, applied", "decisions", "decision, side") == plans
+    )
 
 
 def _delete(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from merge_runner.errors import ReplayMiss
 from merge_runner.plan import Plan
 from merge_runner.store import SweepFacts
 from merge_runner.sweep import Outcome
@@ -31,7 +32,7 @@ class Summary:
             "sweep_id": outcome.sweep_id,
             "name": self.plan.name,
             "model": self.plan.model,
-            "scripted": self._scripted(),
+            "scripted": self.plan.scripted,
             "exit_code": outcome.exit_code,
             "messages": outcome.messages,
             "db": str(self.db),
@@ -73,14 +74,14 @@ class Summary:
         )
         for pair, answers in self.mismatches().items():
             yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
-        if self._scripted():
+        if self.plan.scripted:
             yield "The model `emulator` is a scripted stand-in, no language model."
         if facts is not None:
             for trial_id, error in facts.failed[:FAILURES_SHOWN]:
                 yield f"failed: {trial_id}: {error}"
             if len(facts.failed) > FAILURES_SHOWN:
                 yield f"... and {len(facts.failed) - FAILURES_SHOWN} more, in the table trials"
-            if facts.failed:
+            if facts.failed and outcome.exit_code != ReplayMiss.exit_code:
                 yield "Run the same command again to play the failed trials anew."
         yield f"database: {self.db}"
 
@@ -94,9 +95,6 @@ class Summary:
             )
             if served is not None and served not in accepted.get(requested, {requested})
         }
-
-    def _scripted(self) -> bool:
-        return any(entry.provider == "emulator" for entry in self.plan.entries.values())
 
     def _table(self, facts: SweepFacts) -> Iterator[str]:
         """Counts per condition, and per variant where there are several."""

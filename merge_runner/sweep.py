@@ -10,20 +10,27 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from merge_runner.clients import Limits, live_clients, sealed_clients
+from merge_runner.clients import live_clients, sealed_clients
 from merge_runner.config import ModelEntry, endpoint_identity
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.llm_driver import LlmDriver
 from merge_runner.drivers.projected_order import ProjectedOrderDriver
-from merge_runner.errors import ReplayMiss, StoreError, SweepStopped, UsageError
+from merge_runner.errors import (
+    RecordingError,
+    ReplayMiss,
+    StoreError,
+    SweepStopped,
+    UsageError,
+)
 from merge_runner.flusher import Flusher
 from merge_runner.interrupt import on_interrupt
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.keys import canonical_json
+from merge_runner.llm.transport import SealedTransport
 from merge_runner.misses import Miss, explain, misses_of
-from merge_runner.plan import PROMPTS_PER_DRIVER, Plan, spec_hash
+from merge_runner.plan import PROMPTS_PER_DRIVER, Limits, Plan, spec_hash
 from merge_runner.progress import Progress, shown
 from merge_runner.provenance import git_state, versions
 from merge_runner.recording import read_recording
@@ -33,11 +40,16 @@ from merge_runner.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.trial import play_trial
 
 INTERRUPTED = 130
+SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How a sweep runs; nothing here changes a result."""
+    """How a sweep runs; nothing here changes a result.
+
+    ``faults_identity`` tells the answers of an emulator that is asked for bad answers from those
+    of the usual one.
+    """
 
     db: Path
     cache: Path
@@ -46,6 +58,7 @@ class Options:
     replay: bool = False
     recording: Path | None = None
     emulator_options: Sequence[str] = ()
+    faults_identity: str = ""
 
 
 @dataclass(slots=True)
@@ -93,9 +106,10 @@ class Sweep:
         self._stored = [key for key in specs if key in ended]
         self._todo = [spec for key, spec in specs.items() if key not in ended]
         self._clients: dict[str, LlmClient] = {}
+        self._sealed = SealedTransport()
         self._misses: list[Miss] = []
         self._progress = Progress(
-            title=f"{plan.name}: {plan.model}",
+            title=f"{plan.name}: {plan.model}" + (" (scripted stand-in)" if plan.scripted else ""),
             total=len(self._todo),
             expected_calls=round(len(self._todo) * plan.llm_sides * PROMPTS_PER_DRIVER),
             cap_usd=options.limits.max_cost_usd,
@@ -121,8 +135,7 @@ class Sweep:
                     await self._play(flusher, outcome)
             finally:
                 await self._finish(flusher, outcome)
-            for line in explain(self._misses, self._cache.entries()) if self._misses else ():
-                outcome.fail(ReplayMiss.exit_code, line)
+            self._explain_misses(outcome)
         for meter in meters:
             outcome.calls_live += meter.calls_live
             outcome.calls_cached += meter.calls_cached
@@ -133,6 +146,17 @@ class Sweep:
         if self._progress.done["failed"] and not self._misses:
             outcome.fail(1, f"{self._progress.done['failed']} trials failed")
         return outcome
+
+    def _explain_misses(self, outcome: Outcome) -> None:
+        if not self._misses:
+            return
+        try:
+            lines = explain(self._misses, self._cache.entries())
+        except RecordingError as exc:
+            names = ", ".join(sorted({miss.trial_id for miss in self._misses}))
+            lines = [f"no recorded reply in {names}; nothing to compare with: {exc}"]
+        for line in lines:
+            outcome.fail(ReplayMiss.exit_code, line)
 
     def _begin(self) -> str:
         """Add the sweep to the database, with the trials that are stored already."""
@@ -157,7 +181,7 @@ class Sweep:
     async def _connect(self, stack: AsyncExitStack) -> dict[str, LlmClient]:
         entries, endpoints = self._plan.entries, self._endpoints
         if self._options.replay or not self._todo or not entries:
-            return sealed_clients(entries, endpoints, self._cache)
+            return sealed_clients(entries, endpoints, self._cache, self._sealed)
         return await live_clients(
             entries,
             endpoints,
@@ -172,8 +196,7 @@ class Sweep:
 
         def ended(record: TrialRecord) -> None:
             self._progress.done[record.status] += 1
-            if self._options.replay:
-                self._misses += misses_of(record)
+            self._misses += misses_of(record, self._sealed)
             flusher.add(record)
 
         work = asyncio.create_task(
@@ -194,6 +217,7 @@ class Sweep:
 
         with on_interrupt(interrupted, drain.cancel):
             await asyncio.wait([drain])
+            await asyncio.wait([work])
         if work.cancelled():
             outcome.fail(INTERRUPTED, "Interrupted. Run the same command again to go on.")
         elif isinstance(error := work.exception(), SweepStopped):
@@ -211,6 +235,13 @@ class Sweep:
         """Store what has ended, and read back what the database holds of the sweep."""
         try:
             await flusher.close()
+            if flusher.differing:
+                outcome.fail(
+                    StoreError.exit_code,
+                    f"{len(flusher.differing)} trials ended otherwise than those stored in "
+                    f"{self._options.db}, which are left as they are: "
+                    f"{', '.join(flusher.differing[:SHOWN])}. Replay into another --db.",
+                )
             self._store.end_sweep(outcome.sweep_id, datetime.now(UTC).replace(tzinfo=None))
             outcome.facts = sweep_facts(self._options.db, outcome.sweep_id)
         except StoreError as exc:
@@ -241,6 +272,8 @@ class Sweep:
     def _endpoint(self, name: str, entry: ModelEntry) -> str:
         """The endpoint's identity: in a replay, the one under which the model is recorded."""
         configured = endpoint_identity(name, entry)
+        if entry.provider == "emulator":
+            configured += self._options.faults_identity
         if not self._options.replay:
             return configured
         recorded = self._cache.recorded_endpoints(entry.id)

@@ -18,6 +18,9 @@ from harness import PROJECT, environment, watched
 from merge_runner.cli import app
 
 PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
+PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
+# The environment is the project's own: a make in another folder must not install into it.
+INSTALLED = " ".join(f"--old-file=.venv/{stamp}" for stamp in ("python", "runtime", "dev"))
 LINKED = (".venv", "Makefile", "pyproject.toml", "requirements.lock", "requirements-dev.lock")
 
 
@@ -48,7 +51,7 @@ async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
     process = await asyncio.create_subprocess_shell(
         command,
         cwd=folder,
-        env=environment(PATH=f"{PROJECT}/.venv/bin:{os.environ['PATH']}", **changes),
+        env=environment(PATH=PATH, MAKEFLAGS=INSTALLED, **changes),
         stdin=terminal,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,

@@ -10,7 +10,8 @@ from merge_runner.records import Decision, Observation, Side
 
 # The mean human gap at the merge point (arXiv 2604.09609, Table V).
 TARGET_GAP_M = 3.85
-GENTLEST_MPS2 = -1.5
+HARDEST_BRAKING_MPS2 = -1.5
+PARAMETERS = {"target_gap_m": TARGET_GAP_M, "hardest_braking_mps2": HARDEST_BRAKING_MPS2}
 TIE_S = 1e-6
 
 
@@ -19,7 +20,7 @@ class ProjectedOrderDriver:
     """Yields to whoever would arrive first at present speeds; on a tie the right one yields.
 
     The yielding vehicle brakes evenly so that the net gap is 3.85 m when the other reaches the
-    merge point, with at most 1.5 m/s^2 while that suffices, and then follows at that gap.
+    merge point, but never harder than 1.5 m/s^2, and then follows at that gap.
     """
 
     scenario: Scenario
@@ -41,7 +42,7 @@ class ProjectedOrderDriver:
         seconds = other_distance / max(seen.other_speed_mps, 0.1)
         spare = distance - seen.own_speed_mps * seconds
         wanted = TARGET_GAP_M + self.scenario.vehicle_length_m
-        return min(0.0, max(GENTLEST_MPS2, 2 * (spare - wanted) / seconds**2))
+        return min(0.0, max(HARDEST_BRAKING_MPS2, 2 * (spare - wanted) / seconds**2))
 
     def _goes_first(self, seen: Observation, distance: float, other_distance: float) -> bool:
         own_s = distance / max(seen.own_speed_mps, 0.1)

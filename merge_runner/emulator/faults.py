@@ -26,8 +26,9 @@ Fault = Literal[
     "malformed",
 ]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
-# Faults that pass, so that a sweep with them ends like one without.
-TRANSIENT: tuple[Fault, ...] = FAULTS[: FAULTS.index("truncated_json")]
+# These are outcomes; all others pass, so that a sweep with them ends like one without.
+OUTCOMES: frozenset[Fault] = frozenset({"empty", "refused", "malformed"})
+TRANSIENT: tuple[Fault, ...] = tuple(fault for fault in FAULTS if fault not in OUTCOMES)
 
 
 class FaultPlan(BaseModel):
@@ -50,6 +51,12 @@ class FaultPlan(BaseModel):
         if sum(self.rates.values()) > 1 + 1e-9:
             raise ValueError("the rates add up to more than 1")
         return self
+
+    @property
+    def identity(self) -> str:
+        """What tells the emulator's answers apart from those without faults: mostly nothing."""
+        outcomes = {fault: self.rates[fault] for fault in sorted(OUTCOMES & self.rates.keys())}
+        return f"#faults-{self.seed}-{outcomes}" if any(outcomes.values()) else ""
 
     def fault(self, where: str, attempt: int) -> Fault | None:
         """The fault of an attempt, None for none; ``where`` names the request."""

@@ -2,8 +2,8 @@
 
 Who goes first is drawn from the human logistic odds, logit P(left first) = -0.30 + 1.11 h - 3.30 dv
 (arXiv 2604.09609, Table III), once for a trial and shared by both sides. Both hold piecewise
-constant accelerations that open a gap. In every third repetition one driver misjudges in one
-condition: it takes the right of way that the other also takes, and they collide.
+constant accelerations that open a gap. In every third repetition, in one condition, the driver
+that should yield misjudges: it keeps level with the other, and they collide.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ class Seen:
     asks_tactical: bool
     plan_actions: int
     vehicle_length: float
+    other_acceleration: float
+    """From the last two seen speeds of the other; 0 where the prompt has no history."""
     previous: float | None
     """The next action of the previous plan, normalised."""
 
@@ -47,14 +49,13 @@ class Seen:
 class Temper:
     """What is drawn for a trial: who goes first, the gap aimed at, and who does how much.
 
-    ``contested`` says that both go first, because one of them misjudges.
+    ``misjudges`` says that this driver goes first although the other does.
     """
 
     goes_first: bool
-    contested: bool
+    misjudges: bool
     target_gap_m: float
     leader_share: float
-    push_mps2: float
 
 
 def answer(prompt: str, slot: Slot | None) -> str:
@@ -91,6 +92,7 @@ def read_prompt(prompt: str) -> Seen | None:
         asks_tactical="merge first (M) or yield" in prompt,
         plan_actions=int(actions),
         vehicle_length=_number(r"Length of each car: (\S+) m", prompt) or VEHICLE_LENGTH_M,
+        other_acceleration=_other_acceleration(prompt, other),
         previous=_number(r"not been executed yet\): \[([^,\]]+)", prompt),
     )
 
@@ -98,16 +100,16 @@ def read_prompt(prompt: str) -> Seen | None:
 def temper_for(seen: Seen, slot: Slot | None, prompt: str) -> Temper:
     """The trial's draws; without a slot the projected order decides who goes first."""
     if slot is None:
-        return Temper(_projected_lead_m(seen) > 0, False, 3.85, 0.5, 0.3)
+        return Temper(_projected_lead_m(seen) > 0, False, 3.85, 0.5)
     trial = (slot.condition, slot.repetition, slot.sample_set)
     left_first = draw("who first", *trial) < _chance_left_first(slot.condition)
-    contested = _contested(slot)
+    goes_first = (slot.side == "left") == left_first
+    misjudges = not goes_first and _somebody_misjudges(slot)
     return Temper(
-        goes_first=contested or (slot.side == "left") == left_first,
-        contested=contested,
+        goes_first=goes_first or misjudges,
+        misjudges=misjudges,
         target_gap_m=draw_between(1.8, 6.5, "gap", *trial),
         leader_share=draw_between(0.1, 0.7, "share", *trial),
-        push_mps2=round(draw_between(0.1, 0.5, "push", *trial), 1),
     )
 
 
@@ -117,8 +119,8 @@ def _chance_left_first(condition: str) -> float:
     return 1 / (1 + math.exp(-odds))
 
 
-def _contested(slot: Slot) -> bool:
-    """Whether somebody misjudges in this trial: one condition in every third repetition."""
+def _somebody_misjudges(slot: Slot) -> bool:
+    """Whether it happens in this trial: in one condition of every third repetition."""
     turn = draw_index(3, "misjudge turn", slot.sample_set)
     chosen = draw_index(len(CONDITIONS), "misjudged condition", slot.repetition, slot.sample_set)
     return slot.repetition % 3 == turn and list(CONDITIONS)[chosen] == slot.condition
@@ -127,13 +129,15 @@ def _contested(slot: Slot) -> bool:
 def _go_first(seen: Seen, temper: Temper, slot: Slot | None) -> tuple[float, str]:
     if seen.other_distance_to_merge <= 0:
         return 0.0, "The other car is through already, so I keep my speed and stay behind it."
-    if temper.contested:
-        return temper.push_mps2, _phrase(
-            slot,
-            "I take the gap: with a little more speed I reach the merge point before the other "
-            "car, which should let me in. I keep an eye on it.",
-        )
     leading = _projected_lead_m(seen)
+    if temper.misjudges:
+        catch_up = _even_acceleration(-leading, seen.distance_to_merge, seen.own_speed)
+        action = min(MAX_ACCELERATION_MPS2, max(0.0, seen.other_acceleration + catch_up))
+        return action, _phrase(
+            slot,
+            "I take the gap: with enough speed I reach the merge point before the other car, "
+            "which should let me in. I keep an eye on it.",
+        )
     lacking = _lacking_m(leading, seen, temper)
     push = _even_acceleration(temper.leader_share * lacking, seen.distance_to_merge, seen.own_speed)
     action = min(HARDEST_PUSH_MPS2, max(0.0, push))
@@ -210,6 +214,12 @@ def _phrase(slot: Slot | None, reason: str) -> str:
         "I compare when each of us arrives at the merge point.",
     )
     return f"{openings[draw_index(len(openings), 'words', *slot.as_dict().values())]} {reason}"
+
+
+def _other_acceleration(prompt: str, speed_now: float) -> float:
+    before = _number(r"Observed speeds of the other car .*[\[ ]([^, \]]+)\]$", prompt)
+    step = _number(r"one value every (\S+) s", prompt)
+    return (speed_now - before) / step if before is not None and step else 0.0
 
 
 def _number(pattern: str, prompt: str) -> float | None:

@@ -34,28 +34,39 @@ class Entry:
 
     request: ChatRequest
     attempts: tuple[Attempt, ...]
-    version: int = ENTRY_VERSION
 
     def to_json(self) -> str:
         """The entry as one JSON text."""
-        return _ENTRY.dump_json(self).decode()
+        return _STORED.dump_json(_Stored(ENTRY_VERSION, self)).decode()
 
     @classmethod
     def from_json(cls, text: str) -> Entry:
         """Read an entry; raises RecordingError."""
         try:
-            entry = _ENTRY.validate_json(text, strict=True)
+            stored = _STORED.validate_json(text, strict=True)
         except ValidationError as exc:
-            raise RecordingError(f"damaged cache entry: {exc}") from exc
-        if entry.version != ENTRY_VERSION or not entry.attempts:
             raise RecordingError(
-                f"the cache entry has version {entry.version} and {len(entry.attempts)} attempts; "
-                f"this program reads version {ENTRY_VERSION}"
+                f"the recorded reply is damaged: {exc.errors()[0]['msg']}"
+            ) from exc
+        if stored.version != ENTRY_VERSION:
+            raise RecordingError(
+                f"the recorded reply has version {stored.version}, this program reads version "
+                f"{ENTRY_VERSION}"
             )
-        return entry
+        if not stored.entry.attempts:
+            raise RecordingError("the recorded reply is damaged: it holds no attempt")
+        return stored.entry
 
 
-_ENTRY = TypeAdapter(Entry)
+@dataclass(frozen=True, slots=True)
+class _Stored:
+    """An entry as it lies in the cache."""
+
+    version: int
+    entry: Entry
+
+
+_STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 
 
 class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
@@ -88,7 +99,10 @@ class ResponseCache:
     def __init__(
         self, folder: Path, *, overlay: Callable[[], Mapping[str, Entry]] | None = None
     ) -> None:
-        """Open or make the folder; ``overlay`` reads a recording, entries by key, when needed."""
+        """Open or make the folder; ``overlay`` reads a recording, entries by key.
+
+        What the recording holds comes before what the folder holds.
+        """
         self.folder = folder
         self._read_overlay = overlay
         try:
@@ -105,7 +119,7 @@ class ResponseCache:
             )
         except (OSError, sqlite3.Error) as exc:
             raise UsageError(f"the cache {folder} cannot be used: {exc}") from exc
-        self._pending: list[tuple[Entry, asyncio.Future[None]]] = []
+        self._pending: list[tuple[Entry, asyncio.Future[Entry]]] = []
         self._writer: asyncio.Task[None] | None = None
 
     @cached_property
@@ -114,23 +128,33 @@ class ResponseCache:
 
     def get(self, key: str) -> Entry | None:
         """The entry of a call key."""
-        text = self._disk.get(key)
-        return self._overlay.get(key) if text is None else Entry.from_json(text)
+        if key in self._overlay:
+            return self._overlay[key]
+        text: str | None = self._disk.get(key)
+        return None if text is None else Entry.from_json(text)
 
-    async def put(self, entry: Entry) -> None:
-        """Keep an entry; returns when it is durable."""
-        done = asyncio.get_running_loop().create_future()
+    async def put(self, entry: Entry) -> Entry:
+        """Keep an entry; returns the one that is kept when it is durable.
+
+        That is another one where another process was first: a kept reply is never replaced.
+        """
+        done: asyncio.Future[Entry] = asyncio.get_running_loop().create_future()
         self._pending.append((entry, done))
         if self._writer is None:
             self._writer = asyncio.create_task(self._write_pending())
-        await done
+        return await done
 
-    def put_now(self, entries: Iterable[Entry]) -> None:
-        """Keep entries in one transaction, in this thread."""
+    def put_now(self, entries: Iterable[Entry]) -> list[Entry]:
+        """Keep entries in one transaction, in this thread; returns those that are kept."""
+        kept = []
         with self._disk.transact(retry=True):
             for entry in entries:
-                self._disk.set(entry.request.key, entry.to_json())
-                self._note_endpoint(entry.request)
+                if self._disk.add(entry.request.key, entry.to_json()):
+                    self._note_endpoint(entry.request)
+                    kept.append(entry)
+                else:
+                    kept.append(Entry.from_json(self._disk[entry.request.key]))
+        return kept
 
     def entries(self) -> Iterator[Entry]:
         """All entries, of the folder and of the overlay."""
@@ -140,11 +164,10 @@ class ResponseCache:
         yield from self._overlay.values()
 
     def recorded_endpoints(self, model: str) -> list[str]:
-        """The endpoint identities of a model's replies: the folder's, else the recording's."""
-        if on_disk := self._endpoints(model):
-            return on_disk
+        """The endpoint identities of a model's replies: the recording's, else the folder's."""
         requests = (entry.request for entry in self._overlay.values())
-        return sorted({r.endpoint for r in requests if r.model == model})
+        overlaid = sorted({r.endpoint for r in requests if r.model == model})
+        return overlaid or self._endpoints(model)
 
     def close(self) -> None:
         """Close the folder."""
@@ -154,14 +177,16 @@ class ResponseCache:
         while self._pending:
             batch, self._pending = self._pending, []
             try:
-                await asyncio.to_thread(self.put_now, [entry for entry, _ in batch])
+                kept = await asyncio.to_thread(self.put_now, [entry for entry, _ in batch])
             except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
                 failure = UsageError(f"the cache {self.folder} cannot be written: {exc}")
-                for done in _waited_for(batch):
-                    done.set_exception(failure)
+                for _, done in batch:
+                    if not done.done():  # else whoever waited has given up
+                        done.set_exception(failure)
             else:
-                for done in _waited_for(batch):
-                    done.set_result(None)
+                for entry, (_, done) in zip(kept, batch, strict=True):
+                    if not done.done():
+                        done.set_result(entry)
         self._writer = None
 
     def _note_endpoint(self, request: ChatRequest) -> None:
@@ -176,10 +201,3 @@ class ResponseCache:
             return [] if text is None else _NAMES.validate_json(text)
         except ValidationError as exc:
             raise RecordingError(f"the cache's list of endpoints is damaged: {exc}") from exc
-
-
-def _waited_for(
-    batch: list[tuple[Entry, asyncio.Future[None]]],
-) -> Iterator[asyncio.Future[None]]:
-    """The futures of a batch that nobody has cancelled."""
-    return (done for _, done in batch if not done.done())

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from merge_runner.config import ModelEntry
-from merge_runner.errors import CallFailed, EndpointRefused, QuotaExhausted
+from merge_runner.errors import CallFailed, EndpointRefused, QuotaExhausted, RecordingError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.formats import FORMATS
@@ -20,7 +20,13 @@ from merge_runner.llm.keys import make_request
 from merge_runner.llm.limiter import Limiter, Permit
 from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import Pricing
-from merge_runner.llm.retry import OutOfTime, RequestFailed, TryAgain, call_with_retries
+from merge_runner.llm.retry import (
+    OutOfTime,
+    RequestFailed,
+    TryAgain,
+    backoff_s,
+    call_with_retries,
+)
 from merge_runner.llm.transport import Transport, TransportFailure
 from merge_runner.llm.verdicts import RawReply, Verdict, judge
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
@@ -62,7 +68,10 @@ class LlmClient:
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """The model's reply for a slot; lower ``order`` is served first. Raises CallFailed."""
         request = self._request(prompt, slot)
-        entry = self.cache.get(request.key)
+        try:
+            entry = self.cache.get(request.key)
+        except RecordingError as exc:
+            raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
         cached = entry is not None
         if entry is None:
             call = self._calls.get(request.key)
@@ -115,9 +124,14 @@ class LlmClient:
 
         async def take_turn() -> Turn:
             with self._giving_way(request):
-                permit = await self.limiter.acquire(_estimated_tokens(worst), order=order)
                 worst_usd = self.pricing.cost_usd(worst) or 0.0
+                # Money first: a permit must be used when it is given, or the limits do not hold.
                 await self.budget.reserve(worst_usd)
+                try:
+                    permit = await self.limiter.acquire(_estimated_tokens(worst), order=order)
+                except asyncio.CancelledError:
+                    self.budget.settle(worst_usd, 0.0)
+                    raise
                 return Turn(permit, worst_usd)
 
         async def attempt(turn: Turn, number: int, seconds_left: float) -> None:
@@ -138,9 +152,7 @@ class LlmClient:
                 request,
                 tuple(attempts),
             ) from exc
-        entry = Entry(request, tuple(attempts))
-        await self.cache.put(entry)
-        return entry
+        return await self.cache.put(Entry(request, tuple(attempts)))
 
     @contextmanager
     def _giving_way(self, request: ChatRequest) -> Iterator[None]:
@@ -193,12 +205,13 @@ class LlmClient:
                 f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
                 "is saved; run the same command again later to go on."
             )
-        if verdict.pause and verdict.delay_s:
-            self.limiter.pause(verdict.delay_s)
-        if verdict.pause and (verdict.delay_s or 0) >= SHOWN_PAUSE_S:
-            self.meter.notes.append(
-                f"{self.name}: rate limit, all its calls wait {verdict.delay_s:.1f} s"
-            )
+        if verdict.pause:
+            pause_s = verdict.delay_s or backoff_s(len(attempts))
+            self.limiter.pause(pause_s)
+            if pause_s >= SHOWN_PAUSE_S:
+                self.meter.notes.append(
+                    f"{self.name}: rate limit, all its calls wait {pause_s:.1f} s"
+                )
         if verdict.action == "retry":
             raise TryAgain(message, verdict.delay_s)
         if verdict.action == "fail":

@@ -47,7 +47,7 @@ class HttpTransport:
             **request.headers,
             **self._endpoint.auth_headers,
         }
-        if self._endpoint.identity == "emulator":
+        if self._endpoint.provider == "emulator":
             headers[SLOT_HEADER] = canonical_json(request.slot.as_dict())
             headers[ATTEMPT_HEADER] = str(attempt)
         url = self._endpoint.base_url + request.path
@@ -61,10 +61,9 @@ class HttpTransport:
             # errors of the other's: whatever it is, there is no reply.
             raise TransportFailure("connection_lost", str(exc) or type(exc).__name__) from exc
         body = reply.text
-        if reply.status_code != httpx.codes.OK:
-            # A provider may echo the key in its error; it must not get into a log or a database.
-            for secret in self._secrets:
-                body = body.replace(secret, "[key]")
+        # A provider may echo the key in an error; it must not get into a log or a database.
+        for secret in self._secrets:
+            body = body.replace(secret, "[key]")
         return RawReply(reply.status_code, {k.lower(): v for k, v in reply.headers.items()}, body)
 
     async def close(self) -> None:

@@ -13,7 +13,10 @@ from merge_runner.errors import MergeRunnerError
 
 AnswerT = TypeVar("AnswerT")
 TurnT = TypeVar("TurnT")
-_BACKOFF = wait_exponential_jitter(initial=0.5, max=60, jitter=0.5)
+FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
+_BACKOFF = wait_exponential_jitter(
+    initial=FIRST_BACKOFF_S, max=LONGEST_BACKOFF_S, jitter=FIRST_BACKOFF_S
+)
 
 
 class TryAgain(MergeRunnerError):
@@ -30,6 +33,11 @@ class RequestFailed(MergeRunnerError):
 
 class OutOfTime(MergeRunnerError):
     """A call's deadline would pass before the next attempt."""
+
+
+def backoff_s(attempts: int) -> float:
+    """The wait after so many failed attempts, without jitter."""
+    return float(min(FIRST_BACKOFF_S * 2 ** (attempts - 1), LONGEST_BACKOFF_S))
 
 
 async def call_with_retries(

@@ -25,6 +25,8 @@ QUOTA_CODES = frozenset(
         "contract_spend_limit_reached",
     }
 )
+# Anthropic reports these as invalid requests.
+SPENT = ("credit balance is too low", "spend limit")
 TRANSIENT = {
     408: "request_timeout",
     409: "conflict",
@@ -142,7 +144,8 @@ def _judge_error(status: int, raw: RawReply, payload: object) -> Verdict:
     should_retry = raw.headers.get("x-should-retry")
     message = f"HTTP {status}: {error.message}"
     reading = Reading("error")
-    if status == 400 and "content_filter" in error.names:
+    moderated = status == 403 and "flagged_input" in raw.body  # as OpenRouter says it
+    if moderated or (status == 400 and "content_filter" in error.names):
         return Verdict("accept", "refusal", Reading("refusal"), message)
     if _quota_exhausted(status, raw, error):
         return Verdict("quota", "quota_exhausted", reading, message)
@@ -167,7 +170,7 @@ def _quota_exhausted(status: int, raw: RawReply, error: ErrorInfo) -> bool:
     if error.names & QUOTA_CODES:
         return True
     if status == 400:
-        return "credit balance is too low" in error.message
+        return any(words in error.message for words in SPENT)
     per_day = any(
         "PerDay" in str(as_dict(violation).get("quotaId"))
         for detail in error.details

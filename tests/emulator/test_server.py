@@ -9,6 +9,7 @@ import pytest
 
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.emulator.server import run, serve
+from merge_runner.errors import UsageError
 from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS
 from merge_runner.prompts.parse import parse_reply
@@ -479,6 +480,12 @@ async def test_the_emulator_is_bound_to_loopback_alone():
         assert url == f"http://127.0.0.1:{runner.addresses[0][1]}"
     finally:
         await runner.cleanup()
+
+
+async def test_a_port_in_use_is_a_usage_error(emulator):
+    port = urlsplit(await emulator()).port
+    with pytest.raises(UsageError, match=str(port)):
+        await serve(port)
 
 
 async def test_the_models_are_listed(emulator):

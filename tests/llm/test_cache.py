@@ -133,6 +133,17 @@ async def test_many_concurrent_puts_are_all_kept(cache, folder):
     other.close()
 
 
+async def test_a_kept_reply_is_never_replaced(cache, folder):
+    """Where another process was first, its reply is the one that all go on with."""
+    other = ResponseCache(folder)
+    first, second = entry(1, reply="first"), entry(1, reply="second")
+    assert await other.put(first) == first
+    assert await cache.put(second) == first
+    assert cache.put_now([second, entry(2)]) == [first, entry(2)]
+    assert cache.get(second.request.key) == first
+    other.close()
+
+
 async def test_a_put_that_is_cancelled_disturbs_no_other(cache):
     given_up = asyncio.create_task(cache.put(entry(1)))
     kept = asyncio.create_task(put(cache, entry(2)))
@@ -154,14 +165,27 @@ async def test_a_write_that_fails_is_told_to_all_who_wait(cache, folder):
     assert [isinstance(result, MergeRunnerError) for result in results] == [True, True]
 
 
-async def test_an_entry_that_cannot_be_written_leaves_nobody_waiting(cache):
-    """No file can hold half a surrogate pair."""
+async def fails(cache, entry):
     async with asyncio.timeout(10):
-        odd = cache.put(entry(1, error="\ud800"))
-        (failure,) = await asyncio.gather(odd, return_exceptions=True)
-    assert isinstance(failure, Exception)
+        (result,) = await asyncio.gather(cache.put(entry), return_exceptions=True)
+    assert isinstance(result, Exception)
+
+
+async def test_an_entry_that_no_file_can_hold_leaves_nobody_waiting(cache):
+    """Half a surrogate pair, for example."""
+    await fails(cache, entry(1, error="\ud800"))
     await put(cache, entry(2))
     assert cache.get(entry(2).request.key)
+
+
+async def test_a_damaged_folder_leaves_nobody_waiting(cache, stock):
+    cache.put_now([entry(1)])
+    for name in list(stock):
+        stock[name] = "no JSON"
+    await fails(cache, entry(1))
+    await fails(cache, entry(2))
+    await put(cache, entry(3, model="another"))
+    assert cache.get(entry(3, model="another").request.key)
 
 
 def test_the_folder_is_for_its_owner_alone(folder):
@@ -248,8 +272,9 @@ def damaged(path, *value):
     return json.dumps(whole)
 
 
-NEEDED = {"request", "attempts", "number", "outcome", "slot", "condition", "side", "decision"}
-NEEDED |= {"repetition", "sample_set", "key", "provider", "endpoint", "model", "path", "body"}
+NEEDED = {"version", "entry", "request", "attempts", "number", "outcome", "slot", "condition"}
+NEEDED |= {"side", "decision", "repetition", "sample_set"}
+NEEDED |= {"key", "provider", "endpoint", "model", "path", "body"}
 PATHS = list(paths(json.loads(entry().to_json())))
 DAMAGED = [
     "",
@@ -259,7 +284,8 @@ DAMAGED = [
     "1",
     "null",
     damaged(["version"], 2),
-    damaged(["attempts"], []),
+    damaged(["entry", "attempts"], []),
+    damaged(["entry", "attempts", 0, "number"], "1"),
     *(damaged(path, [[]]) for path in PATHS),
     *(damaged(path) for path in PATHS if path[-1] in NEEDED),
 ]
@@ -302,12 +328,12 @@ def test_a_folder_that_is_a_file_is_an_error_of_ours(folder):
         ResponseCache(folder)
 
 
-def test_an_overlay_answers_after_the_folder(folder):
-    recorded = {number: entry(number, reply="overlay") for number in (1, 2)}
-    cache = ResponseCache(folder, overlay=lambda: by_key(*recorded.values()))
+def test_an_overlay_answers_before_the_folder(folder):
+    recorded = by_key(*(entry(number, reply="overlay") for number in (1, 2)))
+    cache = ResponseCache(folder, overlay=lambda: recorded)
     cache.put_now([entry(1, reply="folder"), entry(3)])
     replies = {n: cache.get(entry(n).request.key) for n in (1, 2, 3, 4)}
-    assert replies[1].attempts[0].reply == "folder"
+    assert replies[1].attempts[0].reply == "overlay"
     assert replies[2].attempts[0].reply == "overlay"
     assert replies[3] == entry(3)
     assert replies[4] is None
@@ -324,7 +350,7 @@ def test_an_overlay_is_never_written(folder):
     plain.close()
 
 
-def test_an_overlay_is_read_once_and_only_when_it_is_needed(folder):
+def test_an_overlay_is_read_once_and_not_before_it_is_needed(folder):
     readings = []
 
     def overlay():
@@ -333,31 +359,31 @@ def test_an_overlay_is_read_once_and_only_when_it_is_needed(folder):
 
     cache = ResponseCache(folder, overlay=overlay)
     cache.put_now([entry(1)])
-    assert cache.get(entry(1).request.key)
-    assert cache.recorded_endpoints("m") == ["openai"]
     assert readings == []
     assert cache.get(entry(2).request.key)
-    assert cache.get(entry(3).request.key) is None
+    assert cache.get(entry(1).request.key)
+    assert cache.recorded_endpoints("m") == ["openai"]
+    assert len(list(cache.entries())) == 2
     assert readings == ["read"]
     cache.close()
 
 
-def test_endpoints_are_listed_per_model_the_overlays_where_the_folder_has_none(folder):
-    recorded = [
+def test_endpoints_are_listed_per_model_the_folders_where_the_overlay_has_none(folder):
+    recorded = by_key(
         entry(8, model="a", endpoint="http://overlay/v1"),
         entry(9, model="c", endpoint="http://overlay/v1"),
-    ]
-    cache = ResponseCache(folder, overlay=lambda: by_key(*recorded))
+    )
+    cache = ResponseCache(folder, overlay=lambda: recorded)
     cache.put_now(
         [
             entry(1, model="a"),
-            entry(2, model="a"),
-            entry(3, model="a", endpoint="http://b/v1"),
-            entry(4, model="b", endpoint="emulator"),
+            entry(2, model="b"),
+            entry(3, model="b"),
+            entry(4, model="b", endpoint="http://b/v1"),
         ]
     )
-    assert cache.recorded_endpoints("a") == ["http://b/v1", "openai"]
-    assert cache.recorded_endpoints("b") == ["emulator"]
+    assert cache.recorded_endpoints("a") == ["http://overlay/v1"]
+    assert cache.recorded_endpoints("b") == ["http://b/v1", "openai"]
     assert cache.recorded_endpoints("c") == ["http://overlay/v1"]
     assert cache.recorded_endpoints("d") == []
     cache.close()

@@ -4,6 +4,7 @@ import json
 import sqlite3
 from collections import Counter
 
+import diskcache
 import pytest
 
 from merge_runner.config import ModelEntry, Price
@@ -13,6 +14,7 @@ from merge_runner.errors import (
     EndpointRefused,
     QuotaExhausted,
     ReplayMiss,
+    UsageError,
 )
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
@@ -258,6 +260,31 @@ async def test_words_that_no_file_can_hold_lose_no_reply(make, cache):
     assert outcomes(reply.attempts) == ["server_error", "ok"]
     assert reply.text.endswith("M")
     assert cache.get(reply.request.key).attempts == reply.attempts
+
+
+@on_a_clock
+async def test_a_damaged_reply_fails_its_call_and_is_not_asked_again(make, cache):
+    recorded = await make(answer()).ask("prompt", slot())
+    with diskcache.Cache(str(cache.folder)) as stock:
+        stock[recorded.request.key] = "no JSON"
+    client = make(answer())
+    with pytest.raises(CallFailed, match=recorded.request.key) as caught:
+        await client.ask("prompt", slot())
+    assert caught.value.request == recorded.request
+    assert client.transport.sent == []
+    assert (await client.ask("prompt", slot(2))).outcome == "ok"
+
+
+@on_a_clock
+async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, tmp_path):
+    caches = [ResponseCache(tmp_path) for _ in range(2)]
+    clients = [make(answer(f"from {n}"), cache=caches[n]) for n in range(2)]
+    replies = await asyncio.gather(*(client.ask("prompt", slot()) for client in clients))
+    assert [len(client.transport.sent) for client in clients] == [1, 1]
+    assert replies[0].text == replies[1].text
+    assert replies[0].attempts == replies[1].attempts
+    for own in caches:
+        own.close()
 
 
 @on_a_clock
@@ -529,6 +556,26 @@ async def test_calls_in_flight_are_waited_for_and_their_actual_cost_counts(make)
 
 
 @on_a_clock
+async def test_a_call_that_gets_no_turn_gives_its_money_back(make):
+    limiter = Limiter()
+    client = make(answer(), price=PRICE, cap=0.0015, limiter=limiter)
+    limiter.pause(300)
+    asked = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    await client.drain()
+    await asyncio.gather(asked, return_exceptions=True)
+    await client.budget.reserve(0.0015)
+
+
+@on_a_clock
+async def test_a_call_above_the_token_limit_gives_its_money_back(make):
+    client = make(answer(), price=PRICE, cap=0.0015, limiter=Limiter(tpm=50))
+    for repetition in (1, 2):
+        with pytest.raises(UsageError, match="--tpm"):
+            await client.ask("prompt", slot(repetition))
+
+
+@on_a_clock
 async def test_an_attempt_without_a_reply_may_have_been_charged(make):
     failure = TransportFailure("timeout", "no reply")
     client = make(failure, answer(), price=PRICE, cap=0.0015)
@@ -551,6 +598,18 @@ async def test_a_rate_limit_makes_all_calls_of_the_key_wait(make):
     assert client.transport.times == [0, 30, 30]
     assert other.transport.times == [30]
     assert any("30.0 s" in note for note in client.meter.notes)
+
+
+@on_a_clock
+async def test_a_rate_limit_without_a_delay_makes_all_calls_wait_as_long_as_its_own(make):
+    client = make(error(429), error(429), error(429), answer())
+    asked = [asyncio.create_task(client.ask("prompt", slot()))]
+    await ticks()
+    asked.append(asyncio.create_task(client.ask("prompt", slot(2))))
+    await ticks()
+    assert client.transport.times == [0]
+    await asyncio.gather(*asked)
+    assert client.transport.times[1] >= 0.5
 
 
 @on_a_clock

@@ -309,6 +309,8 @@ ANSWERS = [
     ("openai-responses", response(REFUSED), "refusal", REFUSAL),
     ("openai-responses", response(TEXT, TEXT), "ok", "TEXTTEXT"),
     ("openai-responses", response(), "empty", ""),
+    # Only messages are the answer.
+    ("openai-responses", {"output": [{"type": "reasoning", "content": [TEXT]}]}, "empty", ""),
     (
         "openai-responses",
         response(status="incomplete", reason="max_output_tokens"),
@@ -338,7 +340,10 @@ ANSWERS = [
     ("gemini", {"usageMetadata": {"promptTokenCount": 100}}, "empty"),
     *(
         ("gemini", gemini({"finishReason": reason}), "refusal")
-        for reason in ("RECITATION", "LANGUAGE", "OTHER", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII")
+        for reason in (
+            *("RECITATION", "LANGUAGE", "OTHER", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII"),
+            "MODEL_ARMOR",
+        )
     ),
     # A blocked prompt has no candidates at all.
     *(
@@ -369,6 +374,7 @@ ANSWERS = [
     ),
     ("gemini", gemini({"content": {"parts": [THOUGHT]}, "finishReason": "STOP"}), "empty"),
     ("gemini", gemini({"content": {"parts": [{"text": "TEXT"}]}}), "ok", "TEXT"),
+    ("gemini", {"error": {"code": 503, "status": "UNAVAILABLE"}}, "error", ""),
     ("gemini", gemini({"content": {"parts": [{"text": "T"}]}, "finishReason": "NEW"}), "ok", "T"),
     (
         "anthropic",

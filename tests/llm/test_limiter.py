@@ -144,6 +144,16 @@ async def test_no_window_holds_more_requests_than_the_limit(rpm):
     assert fullest_window(queue.times, [1] * len(queue.times)) <= rpm
 
 
+@pytest.mark.parametrize("rpm", [60, 500])
+@on_a_clock
+async def test_requests_flow_evenly_and_not_a_window_at_once(rpm):
+    queue = Queue(Limiter(rpm=rpm))
+    for number in range(rpm // 3):
+        queue.ask(number)
+    await queue.all_served()
+    assert fullest_window(queue.times, [1] * len(queue.times), length=1.0) <= 2 * rpm / 60
+
+
 @on_a_clock
 async def test_an_idle_limiter_saves_up_no_requests():
     queue = Queue(Limiter(rpm=10))

@@ -3,7 +3,13 @@ import asyncio
 import pytest
 
 from merge_runner.errors import CallFailed, QuotaExhausted, UsageError
-from merge_runner.llm.retry import OutOfTime, RequestFailed, TryAgain, call_with_retries
+from merge_runner.llm.retry import (
+    OutOfTime,
+    RequestFailed,
+    TryAgain,
+    backoff_s,
+    call_with_retries,
+)
 
 
 class Call:
@@ -72,6 +78,7 @@ async def test_waits_double_from_half_a_second_to_a_minute(make_call):
     await call.run()
     for number, slept in enumerate(call.sleeps):
         assert min(0.5 * 2**number, 60) <= slept <= min(0.5 * 2**number + 0.5, 60)
+        assert backoff_s(number + 1) == min(0.5 * 2**number, 60)
 
 
 async def test_waits_differ_so_that_those_who_failed_together_do_not_return_together(make_call):

@@ -173,6 +173,14 @@ ERRORS = [
         "quota",
         "quota_exhausted",
     ),
+    (
+        "anthropic",
+        400,
+        anthropic("invalid_request_error", "You have reached your spend limit."),
+        {},
+        "quota",
+        "quota_exhausted",
+    ),
     ("anthropic", 401, anthropic("authentication_error"), {}, "refused", "not_allowed"),
     ("anthropic", 402, anthropic("billing_error"), {}, "quota", "quota_exhausted"),
     ("anthropic", 403, anthropic("permission_error"), {}, "refused", "not_allowed"),
@@ -410,6 +418,7 @@ SUCCESSES = [
     ("gemini", candidate("STOP"), "accept", "empty"),
     ("gemini", candidate("SAFETY"), "accept", "refusal"),
     ("gemini", candidate("MAX_TOKENS"), "accept", "truncated"),
+    ("gemini", gemini(503, "UNAVAILABLE"), "retry", "overloaded"),
     # Bodies that are cut, or come from somebody else than the server.
     ("openai-chat", json.dumps(choice())[:-3], "retry", "bad_body"),
     ("openai-chat", "", "retry", "bad_body"),
@@ -446,21 +455,31 @@ def test_what_a_body_of_status_200_means(wire, body, action, outcome):
     assert (verdict.action, verdict.outcome, verdict.pause) == (action, outcome, False)
 
 
-def test_azures_content_filter_is_a_refusal_and_no_failure():
-    body = {
-        "error": {
-            "message": "The response was filtered",
-            "type": None,
-            "param": "prompt",
-            "code": "content_filter",
-            "status": 400,
-            "innererror": {"code": "ResponsibleAIPolicyViolation"},
-        }
-    }
-    verdict = judged("openai-chat", 400, body)
+AZURE_FILTER = {
+    "message": "The response was filtered",
+    "type": None,
+    "param": "prompt",
+    "code": "content_filter",
+    "status": 400,
+    "innererror": {"code": "ResponsibleAIPolicyViolation"},
+}
+OPENROUTER_FILTER = openrouter(403, "Your input was flagged", flagged_input="PROMPT", reasons=["x"])
+
+
+@pytest.mark.parametrize(
+    ("status", "body"), [(400, {"error": AZURE_FILTER}), (403, OPENROUTER_FILTER)]
+)
+def test_a_filter_is_a_refusal_and_no_failure(status, body):
+    verdict = judged("openai-chat", status, body)
     assert (verdict.action, verdict.outcome) == ("accept", "refusal")
     assert verdict.reading.outcome == "refusal"
     assert verdict.reading.text == ""
+
+
+@pytest.mark.parametrize(("status", "outcome"), [(200, "bad_body"), (500, "server_error")])
+def test_a_body_that_is_nested_too_deep_is_no_json(status, outcome):
+    verdict = judged("openai-chat", status, "[" * 100_000)
+    assert (verdict.action, verdict.outcome) == ("retry", outcome)
 
 
 @pytest.mark.parametrize(

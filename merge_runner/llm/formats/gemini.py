@@ -69,7 +69,9 @@ class GeminiGenerateContent:
         usage = as_dict(payload.get("usageMetadata"))
         thoughts = as_count(usage.get("thoughtsTokenCount"))
         return Reading(
-            outcome=outcome_of(
+            outcome="error"
+            if payload.get("error")
+            else outcome_of(
                 text,
                 truncated=finish == "MAX_TOKENS",
                 refused=bool(blocked) or finish in REFUSALS,
