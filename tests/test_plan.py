@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.plan import Choice, make_plan
+from merge_runner.estimate import estimate
+from merge_runner.plan import PROGRAMS, Choice, Limits, make_plan
 
 EMULATOR = {"emulator": "emulator"}
 
@@ -69,7 +70,7 @@ def test_the_spec_hash_covers_what_determines_a_result_and_nothing_else(tmp_path
 def test_the_spec_hash_of_the_baseline_is_pinned():
     # It changes only where the prompt, a parameter or a rule changes: then this is the reminder
     # that results of before and after are told apart, and that the recording is made anew.
-    assert hashes(make_plan(Choice("baseline", "emulator"))) == {"baseline": "6383e8cbdb279248"}
+    assert hashes(make_plan(Choice("baseline", "emulator"))) == {"baseline": "07166b20dca0921b"}
 
 
 @pytest.mark.parametrize(
@@ -79,6 +80,7 @@ def test_the_spec_hash_of_the_baseline_is_pinned():
         ("[repetitions]\nbaseline = 0", "repetitions.baseline"),
         ("[repetitions]\nbaseline = 1.5", "repetitions.baseline"),
         ("[repetitions]", "has no variant"),
+        ("conditions = []\n[repetitions]\nbaseline = 1", "no condition is left"),
         ("repetition = 3", "unknown key 'repetition'; valid: description, repetitions"),
         ("[repetitions]\nbaseline = 1\n[scenario]\nstep = 1", "valid: horizon_s"),
         ("[repetitions]\nbaseline = 1\n[scenario]\nstep_s = 0.3", "no whole number"),
@@ -93,3 +95,35 @@ def test_a_bad_sweep_file_gets_one_line_with_the_valid_choices(tmp_path, text, s
         make_plan(Choice(str(file), "emulator"))
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_program_is_known_by_the_parameters_of_its_rule(monkeypatch):
+    plan = make_plan(Choice("baseline", "projected-order"))
+    before = hashes(plan, {})
+    monkeypatch.setitem(PROGRAMS["projected-order"], "target_gap_m", 5.0)
+    assert hashes(plan, {}) != before
+
+
+def test_what_is_named_twice_is_played_once():
+    plan = make_plan(Choice("baseline", "constant", conditions=["N_0_0", "N_0_0"]))
+    assert plan.trials == len(plan.trial_specs({})) == 10
+
+
+@pytest.mark.parametrize(
+    ("limits", "minutes"),
+    [
+        # 110 trials of 21 calls at 100 a minute, the slowest of all bounds.
+        (Limits(rpm=100, tpm=10**9), 2310 / 100),
+        # About 25 of 60 s a call counts with its cap of 16000 tokens, then with 1500.
+        (Limits(tpm=100_000), 2310 * (0.026 + 16 * 25 / 60 + 1.5 * 35 / 60) / 100),
+        # One trial after the other, each prompt 25 s.
+        (Limits(rpm=10**6, tpm=10**9, connections=2), 110 * 10.5 * 25 / 60),
+    ],
+)
+def test_the_estimate_takes_the_limits_into_account(limits, minutes):
+    plan = make_plan(Choice("baseline", "o3"))
+    expected = estimate(plan, plan.trials, limits)
+    assert expected.minutes == pytest.approx(minutes, rel=0.08)
+    assert expected.calls == 2310
+    each = 2310 * (500 * 2 + 1500 * 8) / 1e6
+    assert expected.cost_usd == pytest.approx(each, rel=0.05)

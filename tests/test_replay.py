@@ -5,13 +5,17 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
 
 import duckdb
 import pytest
-from harness import PROJECT, RECORDING, environment
+from harness import PROJECT, RECORDING, environment, watched
+
+from merge_runner.emulator.faults import FaultPlan
+from merge_runner.recording import read_recording
 
 # The digest of the committed recording: results, and so this text, never change by themselves.
 GOLDEN = (PROJECT / "tests/golden/emulator-baseline.digest").read_text()
@@ -114,13 +118,20 @@ async def test_an_exported_sweep_goes_round_through_a_file(merge_runner, tmp_pat
 
 
 def changed(file, change: str) -> None:
-    """Rewrite a recording with one thing changed."""
+    """Rewrite the recording with one thing changed and its metadata kept."""
     with duckdb.connect() as connection:
-        connection.execute(f"CREATE TABLE calls AS FROM '{RECORDING}' LIMIT 20")
+        told = connection.execute(f"FROM parquet_kv_metadata('{RECORDING}')").fetchall()
+        kept = {k.decode(): v.decode() for _, k, v in told if k != b"config"}
+        pairs = ", ".join(f"{k}: '{v}'" for k, v in kept.items() if "'" not in v)
+        connection.execute(f"CREATE TABLE calls AS FROM '{RECORDING}'")
         connection.execute(change)
-        connection.execute(
-            f"COPY calls TO '{file}' (FORMAT parquet, KV_METADATA {{key_version: '1'}})"
-        )
+        connection.execute(f"COPY calls TO '{file}' (FORMAT parquet, KV_METADATA {{{pairs}}})")
+
+
+def test_a_rewritten_recording_that_is_not_changed_is_whole(tmp_path):
+    """The other tests would show nothing if the rewriting alone made it damaged."""
+    changed(tmp_path / "same.parquet", "SELECT 1")
+    assert sum(1 for _ in read_recording(tmp_path / "same.parquet")) == 2054
 
 
 @pytest.mark.parametrize(
@@ -132,6 +143,8 @@ def changed(file, change: str) -> None:
         ("UPDATE calls SET attempts = '[]'", "holds no reply"),
         ("UPDATE calls SET attempts = 'import os'", "is damaged"),
         ("INSERT INTO calls FROM calls LIMIT 1", "repeats"),
+        ("DELETE FROM calls WHERE repetition >= 4", "is not as it was exported"),
+        ("UPDATE calls SET attempts = replace(attempts, 'right', 'left')", "not as it was"),
         ("ALTER TABLE calls ADD COLUMN extra INTEGER", "is no recording of ours"),
     ],
 )
@@ -149,8 +162,6 @@ async def test_a_recording_that_was_tampered_with_is_refused_whole(
 
 
 async def test_a_recording_holds_no_secret(merge_runner, tmp_path):
-    from harness import watched
-
     async with watched() as server:
         env = {"OPENAI_API_KEY": "sk-very-secret-1", "OPENAI_BASE_URL": f"{server.url}/v1"}
         part = ("--reps", 1, "--conditions", "N_0_0", "--model", "o3", "--yes")
@@ -162,3 +173,50 @@ async def test_a_recording_holds_no_secret(merge_runner, tmp_path):
     with duckdb.connect() as connection:
         rows = connection.execute(f"FROM '{tmp_path / 'o3.parquet'}'").fetchall()
     assert "sk-very-secret" not in str(rows)
+
+
+async def test_a_named_recording_comes_before_what_the_cache_holds(merge_runner):
+    part = ("baseline", "--reps", 1, "--conditions", "L_4_0", "--model", "o3", "--json")
+    digests = []
+    # The second server's replies are all bad, and lie in the cache that the replay uses.
+    for name, faults in (("good", None), ("bad", FaultPlan(rates={"malformed": 1.0}))):
+        async with watched(faults=faults) as server:
+            env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
+            places = ("--db", f"{name}.duckdb", "--cache", name)
+            assert (await merge_runner("sweep", *part, "--yes", *places, **env)).code == 0
+            assert (await merge_runner("recording", "export", f"{name}.parquet", *places)).code == 0
+        digests.append((await merge_runner("digest", "--db", f"{name}.duckdb")).out)
+    replay = ("replay", *part, "--cache", "bad", "--recording", "good.parquet", "--db", "r.duckdb")
+    assert (await merge_runner(*replay)).code == 0
+    assert digests[0] != digests[1]
+    assert (await merge_runner("digest", "--db", "r.duckdb")).out == digests[0]
+
+
+async def test_a_replay_that_ends_otherwise_than_the_stored_trials_says_so(merge_runner, tmp_path):
+    part = ("--reps", 1, "--conditions", "N_0_0,L_4_0")
+    assert (await merge_runner(*REPLAY, *part)).code == 0
+    assert (await merge_runner(*REPLAY, *part)).code == 0
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb")) as connection:
+        connection.execute(
+            "UPDATE states SET velocity_mps = velocity_mps + 0.001 "
+            "WHERE trial_id LIKE '%N_0_0%' AND step = 7"
+        )
+    again = await merge_runner(*REPLAY, *part)
+    assert again.code == 1
+    assert "1 trials ended otherwise than those stored" in again.err
+    assert "emulator/baseline/N_0_0/rep01" in again.err
+
+
+async def test_a_damaged_reply_fails_its_trial_alone(merge_runner, tmp_path):
+    part = ("--reps", 1, "--conditions", "N_0_0,L_4_0", "--json")
+    assert (await merge_runner("sweep", "baseline", *part)).code == 0
+    with sqlite3.connect(tmp_path / "cache/responses/cache.db") as database:
+        database.execute(
+            "UPDATE Cache SET value = substr(value, 1, 100) "
+            'WHERE value LIKE \'%"condition":"N_0_0"%"decision":4%\''
+        )
+    run = await merge_runner("replay", "baseline", *part, "--db", "replay.duckdb")
+    assert run.code == 1
+    assert run.summary["trials"]["failed"] == 1
+    assert "the recorded reply is damaged" in run.summary["failed"]["emulator/baseline/N_0_0/rep01"]
+    assert "Traceback" not in run.err

@@ -6,6 +6,7 @@ import asyncio
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import datetime
 
 import duckdb
@@ -15,7 +16,7 @@ from merge_runner import flusher
 from merge_runner.config import Scenario
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.projected_order import ProjectedOrderDriver
-from merge_runner.errors import StoreLocked, UsageError
+from merge_runner.errors import StoreError, UsageError
 from merge_runner.flusher import Flusher
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.simulator.conditions import CONDITIONS
@@ -82,8 +83,21 @@ def test_a_failed_trial_is_replaced_and_an_ended_one_never(store, path):
     assert store.ended_trials([("m/baseline/L_4_0/rep01", "h")]) == set()
     assert sweep_facts(path, "s1").failed == [("m/baseline/L_4_0/rep01", "it broke")]
     store.write("s1", [record], patience_s=1)
-    store.write("s1", [failed(record)], patience_s=1)
+    assert store.write("s1", [failed(record)], patience_s=1) == []
     assert rows(path, "select status, error from trials") == [("finished", None)]
+    assert rows(path, "select count(*) from states") == [(len(record.states),)]
+
+
+def test_a_trial_that_ends_otherwise_than_the_stored_one_is_named_and_not_stored(store, path):
+    record = played()
+    assert store.write("s1", [record], patience_s=1) == []
+    assert store.write("s1", [record], patience_s=1) == []
+    other = replace(played("L_4_8"), spec=record.spec)
+    assert store.write("s1", [other], patience_s=1) == ["m/baseline/L_4_0/rep01"]
+    plan = record.decisions[3].decision
+    swerve = replace(record.decisions[3], decision=replace(plan, applied=(0.5,) * 5))
+    decided = replace(record, decisions=(*record.decisions[:3], swerve, *record.decisions[4:]))
+    assert store.write("s1", [decided], patience_s=1) == ["m/baseline/L_4_0/rep01"]
     assert rows(path, "select count(*) from states") == [(len(record.states),)]
 
 
@@ -227,6 +241,6 @@ async def test_a_database_that_stays_locked_is_given_up_with_what_to_do(
     process = holder()
     waiting = Flusher(store, "s1", lambda line: None)
     waiting.add(record)
-    with pytest.raises(StoreLocked, match=r"1 trials are not stored.*run the same command again"):
+    with pytest.raises(StoreError, match=r"1 trials are not stored.*run the same command again"):
         await waiting.close()
     process.communicate("")

@@ -225,6 +225,27 @@ async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(merge
     assert interrupted == await digest(merge_runner, "whole.duckdb")
 
 
+async def test_two_signals_at_once_end_it_as_one_does(merge_runner):
+    async with watched(faults=FaultPlan(latency_s=0.2)) as server:
+        process = await merge_runner.start(*SMALL, EMULATOR_BASE_URL=f"{server.url}/v1")
+        while server.requests < 40:
+            await asyncio.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
+        _, err = await process.communicate()
+    assert process.returncode == 130
+    assert b"Traceback" not in err
+
+
+async def test_bad_answers_on_purpose_are_not_kept_as_the_emulators_own(merge_runner, tmp_path):
+    (tmp_path / "bad.toml").write_text("[rates]\nmalformed = 0.4\n")
+    bad = await merge_runner(*SMALL, *TWO, "--faults", "bad.toml")
+    assert bad.summary["invalid_decisions"] > 5
+    assert bad.summary["fallbacks"] == bad.summary["invalid_decisions"]
+    plain = await merge_runner(*SMALL, *TWO, "--db", "plain.duckdb")
+    assert plain.summary["invalid_decisions"] == 0
+
+
 async def test_another_process_queries_while_a_sweep_runs(merge_runner):
     async with watched(faults=FaultPlan(latency_s=0.1)) as server:
         sweep = ("sweep", "baseline", "--reps", 3, "--in-flight", 8)
@@ -283,6 +304,10 @@ async def test_the_cost_cap_is_never_exceeded_and_a_higher_one_goes_on(merge_run
         assert (await merge_runner(*sweep, "--max-cost", 5, **env)).code == 0
         assert set(server.asked.values()) == {1}
         assert server.requests > spent
+    told = await merge_runner("sql", "select sum(cost_usd) usd, count(*) n from calls")
+    usd, calls = told.out.split()[-2:]
+    assert int(calls) == server.requests
+    assert float(usd) > run.summary["cost_usd"], "what the first run paid is part of the sum"
 
 
 async def test_programs_drive_without_a_call_alone_and_against_a_model(merge_runner):

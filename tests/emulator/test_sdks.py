@@ -16,11 +16,14 @@ pytestmark = pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWar
 
 
 @pytest.fixture(autouse=True)
-def _no_settings_of_the_user(monkeypatch):
+def _no_settings_of_the_user(monkeypatch, tmp_path):
     # Proxies would lead away from loopback, and the libraries read much more than keys.
     for name in list(os.environ):
         if name.upper().endswith("_PROXY") or name.startswith(("OPENAI_", "ANTHROPIC_", "GOOGLE_")):
             monkeypatch.delenv(name)
+    # Nothing here speaks TLS, and to load the certificates takes longer than most of the tests.
+    monkeypatch.delenv("SSL_CERT_FILE", raising=False)
+    monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path))
 
 
 def openai_client(url):
