@@ -38,6 +38,8 @@ class Run:
 def environment(**changes: str) -> dict[str, str]:
     """The environment without keys, base URLs and proxies."""
     kept = {k: v for k, v in os.environ.items() if not k.endswith(CONFIGURING)}
+    # Compiled modules are kept, or each of the many starts would compile them anew.
+    kept.pop("PYTHONDONTWRITEBYTECODE", None)
     return {**kept, **changes}
 
 

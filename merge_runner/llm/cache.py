@@ -119,8 +119,9 @@ class ResponseCache:
             )
         except (OSError, sqlite3.Error) as exc:
             raise UsageError(f"the cache {folder} cannot be used: {exc}") from exc
-        self._pending: list[tuple[Entry, asyncio.Future[Entry]]] = []
-        self._writer: asyncio.Task[None] | None = None
+        self._pending: list[Entry] = []
+        self._next_batch: asyncio.Task[list[Entry]] | None = None
+        self._one_batch_at_a_time = asyncio.Lock()
 
     @cached_property
     def _overlay(self) -> Mapping[str, Entry]:
@@ -138,11 +139,12 @@ class ResponseCache:
 
         That is another one where another process was first: a kept reply is never replaced.
         """
-        done: asyncio.Future[Entry] = asyncio.get_running_loop().create_future()
-        self._pending.append((entry, done))
-        if self._writer is None:
-            self._writer = asyncio.create_task(self._write_pending())
-        return await done
+        if self._next_batch is None:
+            self._next_batch = asyncio.create_task(self._write_batch())
+        batch, place = self._next_batch, len(self._pending)
+        self._pending.append(entry)
+        # Shielded: whoever gives up waiting takes nobody else's entry with it.
+        return (await asyncio.shield(batch))[place]
 
     def put_now(self, entries: Iterable[Entry]) -> list[Entry]:
         """Keep entries in one transaction, in this thread; returns those that are kept."""
@@ -173,21 +175,14 @@ class ResponseCache:
         """Close the folder."""
         self._disk.close()
 
-    async def _write_pending(self) -> None:
-        while self._pending:
-            batch, self._pending = self._pending, []
+    async def _write_batch(self) -> list[Entry]:
+        """Write all that has gathered while the batch before this one was written."""
+        async with self._one_batch_at_a_time:
+            entries, self._pending, self._next_batch = self._pending, [], None
             try:
-                kept = await asyncio.to_thread(self.put_now, [entry for entry, _ in batch])
+                return await asyncio.to_thread(self.put_now, entries)
             except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
-                failure = UsageError(f"the cache {self.folder} cannot be written: {exc}")
-                for _, done in batch:
-                    if not done.done():  # else whoever waited has given up
-                        done.set_exception(failure)
-            else:
-                for entry, (_, done) in zip(kept, batch, strict=True):
-                    if not done.done():
-                        done.set_result(entry)
-        self._writer = None
+                raise UsageError(f"the cache {self.folder} cannot be written: {exc}") from exc
 
     def _note_endpoint(self, request: ChatRequest) -> None:
         known = self._endpoints(request.model)

@@ -127,12 +127,14 @@ class LlmClient:
                 worst_usd = self.pricing.cost_usd(worst) or 0.0
                 # Money first: a permit must be used when it is given, or the limits do not hold.
                 await self.budget.reserve(worst_usd)
+                turn: Turn | None = None
                 try:
                     permit = await self.limiter.acquire(_estimated_tokens(worst), order=order)
-                except asyncio.CancelledError:
-                    self.budget.settle(worst_usd, 0.0)
-                    raise
-                return Turn(permit, worst_usd)
+                    turn = Turn(permit, worst_usd)
+                finally:
+                    if turn is None:
+                        self.budget.settle(worst_usd, 0.0)
+                return turn
 
         async def attempt(turn: Turn, number: int, seconds_left: float) -> None:
             await self._attempt(request, turn, number, seconds_left, attempts)
