@@ -108,7 +108,8 @@ async def test_another_sample_set_and_another_prompt_are_other_samples(merge_run
 async def test_a_real_model_runs_against_any_server_of_its_format_and_replays_without_a_key(
     merge_runner, model, variables, path
 ):
-    sweep = (*SMALL, "--conditions", "L_4_0", "--model", model)
+    fast = ("--rpm", 100_000, "--tpm", 100_000_000)
+    sweep = (*SMALL, "--conditions", "L_4_0", "--model", model, *fast)
     without = await merge_runner(*sweep)
     assert without.code == 2
     assert variables[0] in without.err
