@@ -20,7 +20,7 @@ from merge_runner.cli import app
 PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
 # The environment is the project's own: a make in another folder must not install into it.
-INSTALLED = " ".join(f"--old-file=.venv/{stamp}" for stamp in ("python", "runtime", "dev"))
+INSTALLED = 'make() { command make -o .venv/python -o .venv/runtime -o .venv/dev "$@"; }\n'
 LINKED = (".venv", "Makefile", "pyproject.toml", "requirements.lock", "requirements-dev.lock")
 
 
@@ -49,9 +49,9 @@ async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
     """Run a command at a terminal, and answer its question with yes."""
     screen, terminal = pty.openpty()
     process = await asyncio.create_subprocess_shell(
-        command,
+        INSTALLED + command,
         cwd=folder,
-        env=environment(PATH=PATH, MAKEFLAGS=INSTALLED, **changes),
+        env=environment(PATH=PATH, **changes),
         stdin=terminal,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
