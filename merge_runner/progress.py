@@ -54,7 +54,10 @@ class Progress:
         window = min(60.0, max(elapsed, 1.0)) / 60
         cap = "" if self.cap_usd is None else f" of {self.cap_usd:.2f}"
         before = f" (+{self.stored_before} stored before)" if self.stored_before else ""
+        others = sum((meter.mismatches for meter in self.meters), Counter[str]())
+        warnings = [("WARNING", f"another model answers: {pair}") for pair in sorted(others)]
         return [
+            *warnings,
             ("trials", f"{self.ended}/{self.total} ended{before}, {self.running} running"),
             ("failed", str(self.done["failed"])),
             ("calls", f"{live} live, {cached} from recordings"),

@@ -8,6 +8,11 @@ from pathlib import Path
 
 import pytest
 from harness import Run, environment
+from hypothesis import settings
+
+# The gate depends on neither luck nor load.
+settings.register_profile("gate", derandomize=True, deadline=None)
+settings.load_profile("gate")
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ def test_every_figure_is_that_of_the_meters():
     meters = [Meter(calls_live=30, calls_cached=12), Meter(calls_live=4)]
     meters[0].count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
     meters[1].count_attempt(Attempt(1, "timeout"))
+    meters[1].mismatches["o3 -> gpt-4o"] = 2
     progress = Progress(
         title="t",
         total=10,
@@ -28,6 +29,7 @@ def test_every_figure_is_that_of_the_meters():
     fields = dict(progress.fields())
     assert fields["trials"] == "3/10 ended (+7 stored before), 5 running"
     assert fields["failed"] == "1"
+    assert fields["WARNING"] == "another model answers: o3 -> gpt-4o"
     assert fields["calls"] == "34 live, 12 from recordings"
     assert fields["rate"] == "2 requests/min, 150 tokens/min"
     assert fields["cost"] == "1.50 of 20.00 USD"

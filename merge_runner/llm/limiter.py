@@ -77,11 +77,6 @@ class Limiter:
         self._changed = asyncio.Event()
         self._dispatcher: asyncio.Task[None] | None = None
 
-    @property
-    def waiting(self) -> int:
-        """How many requests wait for their turn."""
-        return len(self._waiters)
-
     async def acquire(self, tokens: int, *, order: int = 0) -> Permit:
         """Wait for a turn; ``tokens`` is the estimate of what the request will use."""
         if self._tpm is not None and tokens > self._tpm:

@@ -350,14 +350,3 @@ async def test_a_request_above_the_token_limit_is_refused_with_advice():
     with pytest.raises(UsageError, match=r"101 tokens.*100 tokens.*--tpm"):
         await limiter.acquire(101)
     assert (await limiter.acquire(100)).tokens == 100
-
-
-@on_a_clock
-async def test_waiting_counts_those_in_the_queue():
-    queue = Queue(Limiter(rpm=1))
-    for _ in range(3):
-        queue.ask()
-    await queue.settled()
-    assert queue.limiter.waiting == 2
-    await queue.all_served()
-    assert queue.limiter.waiting == 0
