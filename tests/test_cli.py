@@ -11,7 +11,7 @@ import pytest
 import typer.main
 
 import merge_runner as package
-from merge_runner.cli import app
+from analysis.commands import app
 
 COMMANDS = {"sweep", "replay", "sql", "digest", "models", "emulate", "recording"}
 # The promised options; more may be there.
@@ -28,7 +28,7 @@ def test_the_menu_is_what_was_promised():
     assert options >= SWEEP_OPTIONS
     assert set(command.commands["recording"].commands) == {"export", "import", "verify", "info"}
     assert package.__all__ == ["__version__"]
-    assert [e.value for e in entry_points(name="merge-runner")] == ["merge_runner.cli:main"]
+    assert [e.value for e in entry_points(name="merge-runner")] == ["analysis.commands:main"]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 import typer.main
 from harness import PROJECT, environment, watched
 
-from merge_runner.cli import app
+from analysis.commands import app
 
 PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
