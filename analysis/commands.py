@@ -5,6 +5,110 @@ Libraries are imported where they are used, so that the runner's commands start 
 
 from __future__ import annotations
 
-from merge_runner.cli import app, main
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from analysis.forms import TableFormat
+from analysis.human.commands import human_app
+from merge_runner.cli import DbOption, app, listed, main, print_out, say
+from merge_runner.places import DEFAULT_DB
+
+if TYPE_CHECKING:
+    from analysis.study import Study
 
 __all__ = ["app", "main"]
+
+app.add_typer(human_app, name="human")
+
+
+ModelsOption = Annotated[
+    str | None,
+    typer.Option("--models", help="These drivers alone, separated by commas; human is one."),
+]
+
+
+@app.command()
+def tables(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME ...]", help="Tables; all if none is named.")
+    ] = None,
+    db: DbOption = DEFAULT_DB,
+    models: ModelsOption = None,
+    output: Annotated[
+        TableFormat, typer.Option("--format", help="Form of the tables.")
+    ] = TableFormat.TEXT,
+    against: Annotated[
+        str | None, typer.Option("--against", help="paper: published values and differences.")
+    ] = None,
+) -> None:
+    """Print the paper's tables III to VII, and those that say what these cannot."""
+    from analysis.tables import make_tables
+    from analysis.tables.against import against as beside
+    from analysis.tables.formats import render
+
+    made = make_tables(_study(db, models), names or ())
+    if against is not None:
+        made = [beside(table, against) for table in made]
+    print_out(render(made, output))
+
+
+@app.command()
+def explain(
+    table: Annotated[str, typer.Argument(metavar="TABLE", help="A table's name.")],
+    cell: Annotated[str, typer.Argument(metavar="CELL", help="ROW, or ROW:COLUMN.")],
+    db: DbOption = DEFAULT_DB,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Say where a cell of a table comes from: its meaning, the query, and the trials."""
+    from analysis.explain import explain as explain_cell
+    from analysis.tables import make_tables
+
+    study = _study(db, None)
+    found = explain_cell(study, make_tables(study, [table])[0], cell)
+    if as_json:
+        print_out(json.dumps(asdict(found), indent=2, ensure_ascii=False))
+    else:
+        print_out("\n".join(found.lines()))
+
+
+@app.command()
+def figures(
+    out: Annotated[Path, typer.Option("--out", help="The folder to write to.")] = Path(
+        "results/figures"
+    ),
+    db: DbOption = DEFAULT_DB,
+    models: ModelsOption = None,
+) -> None:
+    """Draw Figure 2, the ablation matrix and the distributions, as PDF and PNG."""
+    from analysis.figures import write_figures
+
+    for path in write_figures(_study(db, models), out):
+        say(f"wrote {path}")
+
+
+@app.command()
+def report(
+    out: Annotated[Path, typer.Option("--out", help="The HTML file to write.")] = Path(
+        "results/report.html"
+    ),
+    files: Annotated[
+        Path | None, typer.Option("--files", help="Also write all tables and figures here.")
+    ] = None,
+    db: DbOption = DEFAULT_DB,
+    models: ModelsOption = None,
+) -> None:
+    """Write tables, figures, provenance and conclusions as one HTML file, and all as files."""
+    from analysis.report import write_report
+
+    for path in write_report(_study(db, models), out, files):
+        say(f"wrote {path}")
+
+
+def _study(db: Path, models: str | None) -> Study:
+    from analysis.study import Study
+
+    return Study(db, listed(models))

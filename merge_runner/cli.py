@@ -82,7 +82,7 @@ def main() -> None:
     except MergeRunnerError as exc:
         if debug:
             raise
-        _say(f"error: {exc}")
+        say(f"error: {exc}")
         sys.exit(exc.exit_code)
 
 
@@ -142,8 +142,8 @@ def sweep(
         sweep=name,
         model=model,
         repetitions=reps,
-        conditions=_listed(conditions),
-        variants=_listed(variants),
+        conditions=listed(conditions),
+        variants=listed(variants),
         sample_set=sample_set,
     )
     _run(choice, options, dry_run=dry_run, yes=yes, as_json=as_json)
@@ -192,7 +192,7 @@ def sql(
     names, rows = run_query(db, query)
     if output is Format.JSON:
         records = [dict(zip(names, row, strict=True)) for row in rows]
-        _print(json.dumps(records, indent=2, default=str, ensure_ascii=False))
+        print_out(json.dumps(records, indent=2, default=str, ensure_ascii=False))
     elif output is Format.CSV:
         writer = csv.writer(sys.stdout)
         writer.writerow(names)
@@ -207,7 +207,7 @@ def digest(db: DbOption = DEFAULT_DB) -> None:
     from merge_runner.store import results_digest
 
     value, trials = results_digest(db)
-    _print(f"{value}  {trials} trials")
+    print_out(f"{value}  {trials} trials")
 
 
 @app.command()
@@ -258,7 +258,7 @@ def emulate(
         run(
             port,
             _faults(fault_rate, faults, seed),
-            announce=_print,
+            announce=print_out,
             until_stdin_closes=until_stdin_closes,
         )
     )
@@ -284,7 +284,7 @@ def recording_export(
     row = sweep_row(db, found)
     provenance = {name: str(value) for name, value in row.items() if value is not None}
     calls = export_recording(file, ResponseCache(cache), keys, provenance)
-    _say(f"{calls} calls of {found} are in {file}")
+    say(f"{calls} calls of {found} are in {file}")
 
 
 @recording_app.command("import")
@@ -294,7 +294,7 @@ def recording_import(file: RecordingFile, cache: CacheOption = DEFAULT_CACHE) ->
     from merge_runner.recording import import_recording
 
     added, there = import_recording(file, ResponseCache(cache))
-    _say(f"{added} calls added to {cache}, {there} were there already")
+    say(f"{added} calls added to {cache}, {there} were there already")
 
 
 @recording_app.command("verify")
@@ -302,7 +302,7 @@ def recording_verify(file: RecordingFile) -> None:
     """Check that every reply belongs to its key."""
     from merge_runner.recording import summarise
 
-    _say(f"{file} is whole: {summarise(file).calls} calls, as they were exported")
+    say(f"{file} is whole: {summarise(file).calls} calls, as they were exported")
 
 
 @recording_app.command("info")
@@ -312,7 +312,7 @@ def recording_info(file: RecordingFile) -> None:
 
     from merge_runner.recording import summarise
 
-    _print(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
+    print_out(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
 
 
 def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json: bool) -> None:
@@ -325,22 +325,22 @@ def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json:
     if dry_run:
         _print_estimate(estimate(plan, plan.trials, options.limits), as_json=as_json)
         return
-    prepared = Sweep(plan, options, say=_say)
+    prepared = Sweep(plan, options, say=say)
     if not options.replay and prepared.trials_to_play:
         _confirm(plan, prepared.trials_to_play, options, yes=yes)
     try:
         outcome = asyncio.run(prepared.run())
     except KeyboardInterrupt:  # before the trials began or after they ended
-        _say("interrupted: run the same command again to go on")
+        say("interrupted: run the same command again to go on")
         sys.exit(INTERRUPTED)
     summary = Summary(plan, outcome, options.db)
     if as_json:
-        _print(json.dumps(summary.as_dict(), ensure_ascii=False))
+        print_out(json.dumps(summary.as_dict(), ensure_ascii=False))
     else:
         for line in summary.lines():
-            _print(line)
+            print_out(line)
     for message in outcome.messages:
-        _say(f"error: {message}")
+        say(f"error: {message}")
     sys.exit(outcome.exit_code)
 
 
@@ -352,12 +352,12 @@ def _confirm(plan: Plan, trials: int, options: Options, *, yes: bool) -> None:
     for name, entry in plan.entries.items():
         resolve_endpoint(name, entry)
         if entry.shutdown:
-            _say(f"note: {name} ({entry.id}) is announced to shut down on {entry.shutdown}")
+            say(f"note: {name} ({entry.id}) is announced to shut down on {entry.shutdown}")
     expected = estimate(plan, trials, options.limits)
     if expected.free:
         return
     cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
-    _say(
+    say(
         f"{trials} trials, about {expected.calls} calls, {cost}, "
         f"{expected.minutes} minutes or more, if nothing is recorded yet"
     )
@@ -376,7 +376,7 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
     from dataclasses import asdict
 
     if as_json:
-        _print(json.dumps(asdict(expected)))
+        print_out(json.dumps(asdict(expected)))
         return
     cost = "unknown" if expected.cost_usd is None else f"{expected.cost_usd:.2f} USD"
     for name, text in (
@@ -386,8 +386,8 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         ("cost", f"about {cost}, less what is recorded already"),
         ("time", f"about {expected.minutes} minutes"),
     ):
-        _print(f"{name:<8}{text}")
-    _print("Nothing was sent.")
+        print_out(f"{name:<8}{text}")
+    print_out("Nothing was sent.")
 
 
 def _faults(fault_rate: float, faults: Path | None, seed: int) -> FaultPlan:
@@ -407,7 +407,7 @@ def _emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list
     return ["--fault-rate", str(fault_rate), "--seed", str(seed)]
 
 
-def _listed(text: str | None) -> list[str] | None:
+def listed(text: str | None) -> list[str] | None:
     return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
 
 
@@ -415,14 +415,14 @@ def _print_table(names: list[str], rows: list[tuple[Any, ...]]) -> None:
     cells = [names, *(["" if value is None else str(value) for value in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(names))]
     for row in cells:
-        _print(
+        print_out(
             "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
         )
 
 
-def _print(text: str) -> None:
+def print_out(text: str) -> None:
     print(text, flush=True)  # noqa: T201 # the command line's output
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)  # noqa: T201 # the command line's messages

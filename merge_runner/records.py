@@ -149,23 +149,24 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class TrialSpec:
-    """One trial to play.
+    """One trial to play, or one that humans drove.
 
     ``order`` is its place in the sweep: lower goes first. ``scripted`` says that the emulator
-    takes part, a stand-in and no language model.
+    takes part, a stand-in and no language model. Humans have a ``pair`` and no ``variant``.
     """
 
     trial_id: str
     spec_hash: str
-    source: Literal["llm", "driver"]
+    source: Literal["llm", "driver", "human"]
     model_left: str
     model_right: str
-    variant: str
+    variant: str | None
     condition: str
     repetition: int
     sample_set: int
     order: int
     scripted: bool = False
+    pair: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ def trial_row(record: TrialRecord) -> Row:
     return (
         spec.trial_id,
         spec.spec_hash,
-        None,
+        spec.pair,
         spec.source,
         spec.model_left,
         spec.model_right,

@@ -100,76 +100,132 @@ CREATE TABLE IF NOT EXISTS calls (
     error VARCHAR
 );
 
--- One row a trial. The merge instants are interpolated within the step; what a trial has no value
--- for is NULL: gaps, RMSE and joint are those of finished trials (arXiv 2604.09609, sec. II-G).
-CREATE VIEW IF NOT EXISTS trial_metrics AS
+-- When a vehicle passes a level: linear within the step in which it does, else NULL.
+CREATE MACRO IF NOT EXISTS passing_s(level_m, before_m, now_m, before_s, now_s) AS
+    CASE WHEN before_m < level_m AND now_m >= level_m
+    THEN before_s + (now_s - before_s) * (level_m - before_m) / (now_m - before_m) END;
+
+-- One row a sample, both vehicles side by side and the sample before.
+CREATE VIEW IF NOT EXISTS vehicle_pairs AS
 WITH pairs AS (
     SELECT trial_id, spec_hash, step, time_s,
         max(position_m) FILTER (side = 'left') AS left_m,
         max(position_m) FILTER (side = 'right') AS right_m,
         max(velocity_mps) FILTER (side = 'left') AS left_mps,
-        max(velocity_mps) FILTER (side = 'right') AS right_mps
+        max(velocity_mps) FILTER (side = 'right') AS right_mps,
+        max(abs(acceleration_mps2)) AS hardest_mps2
     FROM states GROUP BY ALL
-), steps AS (
-    SELECT *,
-        lag(time_s) OVER trial AS time_before_s,
-        lag(left_m) OVER trial AS left_before_m,
-        lag(right_m) OVER trial AS right_before_m
-    FROM pairs WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step)
-), merges AS (
-    SELECT trial_id, spec_hash,
-        min(time_before_s + (time_s - time_before_s) * (100 - left_before_m)
-            / (left_m - left_before_m)) FILTER (left_before_m < 100 AND left_m >= 100) AS left_s,
-        min(time_before_s + (time_s - time_before_s) * (100 - right_before_m)
-            / (right_m - right_before_m)) FILTER (right_before_m < 100 AND right_m >= 100) AS right_s
-    FROM steps GROUP BY ALL
-), firsts AS (
-    SELECT *, least(left_s, right_s) AS first_s FROM merges
-), gaps AS (
+)
+SELECT *,
+    lag(time_s) OVER trial AS time_before_s,
+    lag(left_m) OVER trial AS left_before_m,
+    lag(right_m) OVER trial AS right_before_m
+FROM pairs WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step);
+
+-- When each vehicle's centre reaches the merge point (100 m), when its front does, and when its
+-- rear has left it (vehicles are 4.5 m long); NULL: never.
+CREATE VIEW IF NOT EXISTS merge_times AS
+SELECT *,
+    least(left_s, right_s) AS first_s,
+    if(left_s IS NULL OR right_s IS NULL, NULL, greatest(left_s, right_s)) AS both_s
+FROM (SELECT trial_id, spec_hash,
+    min(passing_s(100, left_before_m, left_m, time_before_s, time_s)) AS left_s,
+    min(passing_s(100, right_before_m, right_m, time_before_s, time_s)) AS right_s,
+    min(passing_s(97.75, left_before_m, left_m, time_before_s, time_s)) AS left_front_s,
+    min(passing_s(97.75, right_before_m, right_m, time_before_s, time_s)) AS right_front_s,
+    min(passing_s(102.25, left_before_m, left_m, time_before_s, time_s)) AS left_rear_s,
+    min(passing_s(102.25, right_before_m, right_m, time_before_s, time_s)) AS right_rear_s
+FROM vehicle_pairs GROUP BY ALL);
+
+-- RMSE of each vehicle's speed from its initial speed, over four readings of "the interaction
+-- window": from the start of control to the first vehicle's merge, to the second's, to the end,
+-- and the whole trial with the tunnel where it was recorded. A window ends with the first sample
+-- at which it is over.
+CREATE VIEW IF NOT EXISTS speed_deviations AS
+SELECT *,
+    (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
+    least(rmse_left_mps, rmse_right_mps) >= 0.5 AS joint
+FROM (SELECT trial_id, spec_hash, time_window,
+    sqrt(avg((left_mps - (10 + relative_velocity_mps / 2)) ** 2)) AS rmse_left_mps,
+    sqrt(avg((right_mps - (10 - relative_velocity_mps / 2)) ** 2)) AS rmse_right_mps
+FROM vehicle_pairs
+JOIN trials USING (trial_id, spec_hash)
+JOIN merge_times USING (trial_id, spec_hash)
+CROSS JOIN (VALUES ('first_merge'), ('both_merges'), ('end'), ('whole')) AS windows (time_window)
+WHERE status = 'finished' AND CASE time_window
+    WHEN 'first_merge' THEN time_s >= 0 AND coalesce(time_before_s < first_s, true)
+    WHEN 'both_merges' THEN time_s >= 0 AND both_s IS NOT NULL
+        AND coalesce(time_before_s < both_s, true)
+    WHEN 'end' THEN time_s >= 0
+    ELSE true END
+GROUP BY ALL);
+
+-- One row a trial. What a trial has no value for is NULL: gaps, speed deviations and joint are
+-- those of finished trials (arXiv 2604.09609, sec. II-G).
+CREATE VIEW IF NOT EXISTS trial_metrics AS
+WITH gaps AS (
     SELECT trial_id, spec_hash,
         abs(left_before_m - right_before_m
             + (first_s - time_before_s) / (time_s - time_before_s)
-            * (left_m - left_before_m - right_m + right_before_m)) AS headway_m
-    FROM steps JOIN firsts USING (trial_id, spec_hash)
+            * (left_m - left_before_m - right_m + right_before_m)) - 4.5 AS gap_m
+    FROM vehicle_pairs JOIN merge_times USING (trial_id, spec_hash)
     WHERE time_before_s < first_s AND first_s <= time_s
-), means AS (
-    SELECT trial_id, spec_hash, arg_min(abs(left_m - right_m), step) AS headway_m
-    FROM pairs WHERE left_m + right_m >= 200 GROUP BY ALL
-), deviations AS (
+), sampled_gaps AS (
     SELECT trial_id, spec_hash,
-        sqrt(avg((left_mps - (10 + relative_velocity_mps / 2)) ** 2)) AS left_mps,
-        sqrt(avg((right_mps - (10 - relative_velocity_mps / 2)) ** 2)) AS right_mps
-    FROM steps
-    JOIN trials USING (trial_id, spec_hash)
-    JOIN firsts USING (trial_id, spec_hash)
-    -- from the start of control to the first sample at which a vehicle has reached the merge point
-    WHERE time_s >= 0 AND coalesce(time_before_s < first_s, true)
-    GROUP BY ALL
+        arg_min(abs(left_m - right_m), step) FILTER (greatest(left_m, right_m) >= 100) - 4.5
+            AS gap_first_sample_m,
+        arg_min(abs(left_m - right_m), step) FILTER (left_m + right_m >= 200) - 4.5
+            AS gap_mean100_m,
+        max(hardest_mps2) FILTER (time_s > 0) AS max_acceleration_mps2
+    FROM vehicle_pairs GROUP BY ALL
 ), collision_times AS (
-    SELECT trial_id, spec_hash,
-        min((abs(left_m - right_m) - 4.5) / closing_mps) AS seconds
+    SELECT trial_id, spec_hash, min((abs(left_m - right_m) - 4.5) / closing_mps) AS min_ttc_s
     FROM (
         SELECT *, if(left_m > right_m, right_mps - left_mps, left_mps - right_mps) AS closing_mps
-        FROM pairs WHERE greatest(left_m, right_m) >= 100
+        FROM vehicle_pairs WHERE greatest(left_m, right_m) >= 100
     )
     WHERE closing_mps > 0 AND abs(left_m - right_m) > 4.5
     GROUP BY ALL
+), resolutions AS (
+    -- On a collision course for a point: when one vehicle will be there at its present speed, the
+    -- other will be within the bounds in which their boxes overlap. Points: first possible contact,
+    -- merge point, end of the track (Siebinga et al., conflict_signal.py).
+    SELECT trial_id, spec_hash, min(time_s) AS conflict_resolution_s
+    FROM (
+        SELECT trial_id, spec_hash, step, time_s, bool_or(coalesce(
+            left_m < at_m AND left_mps > 0 AND right_m + right_mps * (at_m - left_m) / left_mps
+                BETWEEN low_m AND high_m
+            OR right_m < at_m AND right_mps > 0 AND left_m + left_mps * (at_m - right_m) / right_mps
+                BETWEEN low_m AND high_m, false)) AS on_course
+        FROM vehicle_pairs CROSS JOIN (VALUES
+            (90.6065, 90.6065, 95.1065), (100, 95.3471, 104.5949), (150, 145.5, 154.5)
+        ) AS points (at_m, low_m, high_m)
+        WHERE time_s >= 0 GROUP BY ALL
+    )
+    WHERE NOT on_course GROUP BY ALL
 )
 SELECT
     trials.trial_id,
     trials.spec_hash,
-    if(status = 'finished', gaps.headway_m - 4.5, NULL) AS gap_m,
-    if(status = 'finished', means.headway_m - 4.5, NULL) AS gap_mean100_m,
-    if(status = 'finished', deviations.left_mps, NULL) AS rmse_left_mps,
-    if(status = 'finished', deviations.right_mps, NULL) AS rmse_right_mps,
-    (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
-    least(rmse_left_mps, rmse_right_mps) >= 0.5 AS joint,
-    if(status = 'finished', abs(left_s - right_s), NULL) AS post_encroachment_s,
-    collision_times.seconds AS min_ttc_s,
-    first_s AS time_to_merge_s
-FROM trials
-LEFT JOIN firsts USING (trial_id, spec_hash)
+    if(finished, gap_m, NULL) AS gap_m,
+    if(finished, gap_first_sample_m, NULL) AS gap_first_sample_m,
+    if(finished, gap_mean100_m, NULL) AS gap_mean100_m,
+    rmse_left_mps,
+    rmse_right_mps,
+    rmse_mps,
+    joint,
+    first_s AS time_to_merge_s,
+    if(finished, abs(left_s - right_s), NULL) AS merge_interval_s,
+    -- from when the first vehicle's rear has left the merge point to when the second's front is there
+    if(finished, if(left_s < right_s, right_front_s - left_rear_s, left_front_s - right_rear_s), NULL)
+        AS post_encroachment_s,
+    min_ttc_s,
+    max_acceleration_mps2,
+    if(status = 'collided', NULL, conflict_resolution_s) AS conflict_resolution_s
+FROM (SELECT *, status = 'finished' AS finished FROM trials) AS trials
+LEFT JOIN merge_times USING (trial_id, spec_hash)
 LEFT JOIN gaps USING (trial_id, spec_hash)
-LEFT JOIN means USING (trial_id, spec_hash)
-LEFT JOIN deviations USING (trial_id, spec_hash)
-LEFT JOIN collision_times USING (trial_id, spec_hash);
+LEFT JOIN sampled_gaps USING (trial_id, spec_hash)
+LEFT JOIN (FROM speed_deviations WHERE time_window = 'first_merge') USING (trial_id, spec_hash)
+LEFT JOIN collision_times USING (trial_id, spec_hash)
+LEFT JOIN resolutions USING (trial_id, spec_hash);

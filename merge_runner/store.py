@@ -18,7 +18,7 @@ import duckdb
 
 from merge_runner.errors import StoreError, StoreLocked, UsageError
 from merge_runner.records import TrialRecord
-from merge_runner.rows import call_rows, decision_rows, state_rows, trial_row
+from merge_runner.rows import Row, call_rows, decision_rows, state_rows, trial_row
 
 SCHEMA_VERSION = 1
 SCHEMA = Path(__file__).with_name("schema.sql")
@@ -125,8 +125,7 @@ class Store:
                     sweep.versions,
                 ],
             )
-            for item in specs.items():
-                connection.execute("INSERT OR IGNORE INTO specs VALUES (?, ?)", list(item))
+            _add_specs(connection, specs)
             _append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
 
     def end_sweep(self, sweep_id: str, ended_at: datetime) -> None:
@@ -174,6 +173,29 @@ class Store:
             _append(connection, "decisions", chain.from_iterable(map(decision_rows, new)))
             _append(connection, "calls", chain.from_iterable(map(call_rows, new)))
             return differing
+
+    def add_recorded(
+        self, records: Sequence[TrialRecord], specs: dict[str, str]
+    ) -> tuple[int, int, list[str]]:
+        """Store recorded trials without decisions; one that is stored already stays as it is.
+
+        Returns how many were added, how many were stored already, and the ids of those that are
+        stored with other values.
+        """
+        with self._writing() as connection:
+            _add_specs(connection, specs)
+            keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
+            known = _stored(connection, keys)
+            stored = len(known)
+            differing = []
+            for key, record in zip(keys, records, strict=True):
+                rows = (trial_row(record), list(state_rows(record)))
+                if known.setdefault(key, rows) != rows:
+                    differing.append(record.spec.trial_id)
+            new = list(known.values())[stored:]
+            _append(connection, "trials", (trial for trial, _ in new))
+            _append(connection, "states", chain.from_iterable(states for _, states in new))
+            return len(new), len(records) - len(new) - len(differing), differing
 
     @contextmanager
     def _writing(self, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
@@ -334,13 +356,35 @@ def _check_version(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
         )
 
 
-def _statuses(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> dict[TrialKey, str]:
-    rows = connection.execute(
-        "SELECT trial_id, spec_hash, status FROM trials SEMI JOIN "
-        "(SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)",
+def _add_specs(connection: duckdb.DuckDBPyConnection, specs: dict[str, str]) -> None:
+    for item in specs.items():
+        connection.execute("INSERT OR IGNORE INTO specs VALUES (?, ?)", list(item))
+
+
+def _rows_of(
+    connection: duckdb.DuckDBPyConnection, keys: list[TrialKey], select: str, order: str = "ALL"
+) -> list[Row]:
+    return connection.execute(
+        f"{select} SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) "
+        f"USING (trial_id, spec_hash) ORDER BY {order}",
         [[key[0] for key in keys], [key[1] for key in keys]],
     ).fetchall()
+
+
+def _statuses(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> dict[TrialKey, str]:
+    rows = _rows_of(connection, keys, "SELECT trial_id, spec_hash, status FROM trials")
     return {(trial_id, spec_hash): status for trial_id, spec_hash, status in rows}
+
+
+def _stored(
+    connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]
+) -> dict[TrialKey, tuple[Row, list[Row]]]:
+    """The rows of those of these trials that are stored: the trial's, and its states in order."""
+    trials = _rows_of(connection, keys, "FROM trials")
+    found: dict[TrialKey, tuple[Row, list[Row]]] = {(row[0], row[1]): (row, []) for row in trials}
+    for row in _rows_of(connection, keys, "FROM states", "trial_id, spec_hash, step, side"):
+        found[row[0], row[1]][1].append(row)
+    return found
 
 
 def _same(connection: duckdb.DuckDBPyConnection, record: TrialRecord) -> bool:

@@ -267,6 +267,7 @@ class Sweep:
             slot = Slot(spec.condition, spec.repetition, side, number, spec.sample_set)
             return await client.ask(prompt, slot, order=spec.order)
 
+        assert spec.variant is not None, "only human trials have no prompt variant"
         return LlmDriver(ask, spec.variant, scenario)
 
     def _endpoint(self, name: str, entry: ModelEntry) -> str:

@@ -1,0 +1,265 @@
+"""What a perfect human clone would score: the indicators on resampled human data of a given size.
+
+Each data set draws, per condition, as many human trials as the model has. Before human traces are
+imported, outcomes come from the published counts and gaps from the published regression with normal
+residuals; afterwards whole trials are resampled. All data sets are fitted at once, by the same
+definitions as in ``regressions`` and ``indicators``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.special import expit
+
+from analysis.indicators import ALPHA, SLOPE_MARGIN_S, TESTED
+from analysis.intervals import proportion
+from analysis.piecewise import THRESHOLDS
+from analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
+from analysis.regressions import gap_design
+from merge_runner.simulator.conditions import CONDITIONS
+
+Array = NDArray[np.float64]
+
+SEED = 260409609
+DATA_SETS = 1000
+WALD_STEPS = 35  # statsmodels' limit
+FIRTH_STEPS = 60
+HALVINGS = 8
+
+HEADWAYS = np.array([c.projected_headway_m for c in CONDITIONS.values()])
+VELOCITIES = np.array([c.relative_velocity_mps for c in CONDITIONS.values()])
+LOGIT_DESIGN = np.column_stack([np.ones(len(CONDITIONS)), HEADWAYS, VELOCITIES])
+GAP_DESIGN = gap_design(HEADWAYS, VELOCITIES)
+
+Passes = dict[str, NDArray[np.bool_]]
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """Human trials by condition, in the order of CONDITIONS, one array each.
+
+    ``left``: 1 or 0 for who merged first, NaN after a collision. ``gap_m``: NaN after a collision.
+    ``piecewise``: whether the trial's profiles pass I5; empty before an import.
+    """
+
+    left: tuple[Array, ...]
+    gap_m: tuple[Array, ...] = ()
+    piecewise: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Ceiling:
+    """Shares of human data sets that pass each indicator, and I1 to I4 together (``I1-I4``)."""
+
+    paper: dict[str, float]
+    robust: dict[str, float]
+
+
+def published_humans() -> Population:
+    """The humans as far as they are published: counts, and the regression of their gaps."""
+    return Population(left=_by_condition(human_outcomes(), _left(human_outcomes())))
+
+
+def imported_humans(trials: pd.DataFrame, piecewise: pd.Series) -> Population:
+    """The humans as imported: rows of ``load_trials`` and whether each trial passes I5."""
+    return Population(
+        left=_by_condition(trials, _left(trials)),
+        gap_m=_by_condition(trials, trials["gap_m"]),
+        piecewise=_by_condition(trials, piecewise.astype(float)),
+    )
+
+
+@cache
+def ceiling(humans: Population, sizes: tuple[int, ...]) -> Ceiling:
+    """The human ceiling for ``sizes`` trials per condition, in the order of CONDITIONS."""
+    draws = _Draws(humans, sizes)
+    paper, robust = _wald(draws), _firth_tests(draws)
+    paper_gap, robust_gap = _gap_tests(draws)
+    both: list[dict[str, float]] = []
+    for passes in (paper | paper_gap, robust | robust_gap):
+        shares = {name: float(passes[name].mean()) for name in TESTED}
+        shares["I1-I4"] = float(np.logical_and.reduce([passes[name] for name in TESTED]).mean())
+        if draws.piecewise is not None:
+            shares["I5"] = float(draws.piecewise.mean())
+        both.append(shares)
+    return Ceiling(*both)
+
+
+class _Draws:
+    """DATA_SETS human data sets: counts and sums per condition, arrays of shape (sets, 11)."""
+
+    def __init__(self, humans: Population, sizes: Sequence[int]) -> None:
+        rng = np.random.default_rng(SEED)
+        shape = (DATA_SETS, len(CONDITIONS))
+        self.n, self.left = np.zeros(shape), np.zeros(shape)
+        self.gap, self.squared_gap = np.zeros(shape), np.zeros(shape)
+        passes = np.zeros(shape)
+        expected = GAP_DESIGN @ _published_gap()
+        for i, size in enumerate(sizes):
+            if size == 0 or len(humans.left[i]) == 0:
+                continue
+            drawn = rng.integers(0, len(humans.left[i]), (DATA_SETS, size))
+            left = humans.left[i][drawn]
+            gap = (
+                humans.gap_m[i][drawn]
+                if humans.gap_m
+                else expected[i] + HUMAN_GAP_SD_M * rng.standard_normal((DATA_SETS, size))
+            )
+            kept = np.isfinite(left)
+            self.n[:, i] = kept.sum(axis=1)
+            self.left[:, i] = np.where(kept, left, 0).sum(axis=1)
+            self.gap[:, i] = np.where(kept, gap, 0).sum(axis=1)
+            self.squared_gap[:, i] = np.where(kept, gap**2, 0).sum(axis=1)
+            if humans.piecewise:
+                passes[:, i] = humans.piecewise[i][drawn].sum(axis=1)
+        total = sum(sizes)
+        self.piecewise = (
+            np.array([_enough(int(passing), total) for passing in passes.sum(axis=1)])
+            if humans.piecewise
+            else None
+        )
+
+
+def _enough(passing: int, total: int) -> bool:
+    low = proportion(passing, total).low
+    return low is not None and low >= THRESHOLDS.min_share
+
+
+def _wald(draws: _Draws) -> Passes:
+    """I1 and I2 by Wald tests of the maximum likelihood fit; a fit without an end fails."""
+    b = np.zeros((DATA_SETS, 3))
+    alive = _rank(LOGIT_DESIGN, draws.n)
+    last = np.full(DATA_SETS, np.inf)
+    for _ in range(WALD_STEPS):
+        p = expit(b @ LOGIT_DESIGN.T)
+        covariance, sound = _inverse(LOGIT_DESIGN, draws.n * p * (1 - p), alive)
+        step = np.einsum("bjk,bk->bj", covariance, (draws.left - draws.n * p) @ LOGIT_DESIGN)
+        b = np.where(sound[:, None], b + np.clip(step, -10, 10), b)
+        last = np.abs(step).max(axis=1)
+    se = np.sqrt(np.abs(np.einsum("bjj->bj", covariance)))
+    sound &= last < 1e-6
+    with np.errstate(divide="ignore", invalid="ignore"):
+        significant = 2 * stats.norm.sf(np.abs(b / se)) < ALPHA
+    return {
+        "I1": sound & significant[:, 1] & (b[:, 1] > 0),
+        "I2": sound & significant[:, 2] & (b[:, 2] < 0),
+    }
+
+
+def _firth_tests(draws: _Draws) -> Passes:
+    """I1 and I2 by penalised likelihood-ratio tests of Firth's fit."""
+    alive = _rank(LOGIT_DESIGN, draws.n)
+    full, b = _firth(draws, alive, (0, 1, 2))
+    critical = stats.chi2.isf(ALPHA, 1)
+    passes = {}
+    for name, column, sign in (("I1", 1, 1), ("I2", 2, -1)):
+        constrained, _ = _firth(draws, alive, tuple({0, 1, 2} - {column}))
+        significant = 2 * (full - constrained) > critical
+        passes[name] = alive & significant & (b[:, column] * sign > 0)
+    return passes
+
+
+def _firth(draws: _Draws, alive: NDArray[np.bool_], free: tuple[int, ...]) -> tuple[Array, Array]:
+    """Maximal penalised log-likelihoods (sets,) with the ``free`` coefficients, and these (sets, 3).
+
+    Newton steps on Firth's score with the whole design's information, halved where they do not
+    increase the penalised likelihood (Heinze and Schemper 2002).
+    """
+    design, n, left = LOGIT_DESIGN, draws.n, draws.left
+
+    def likelihood(b: Array) -> Array:
+        linear = b @ design.T
+        p = expit(linear)
+        information = np.einsum("bi,ij,ik->bjk", n * p * (1 - p), design, design)
+        determinant = np.where(alive, np.linalg.det(information), 1.0)
+        fit = (left * linear - n * np.logaddexp(0, linear)).sum(axis=1)
+        return np.asarray(fit + np.log(np.maximum(determinant, 1e-300)) / 2)
+
+    b = np.zeros((DATA_SETS, 3))
+    best = likelihood(b)
+    for _ in range(FIRTH_STEPS):
+        p = expit(b @ design.T)
+        weights = n * p * (1 - p)
+        covariance, _ = _inverse(design, weights, alive)
+        leverage = weights * np.einsum("ij,bjk,ik->bi", design, covariance, design)
+        score = (left - n * p + leverage * (0.5 - p)) @ design
+        step = np.zeros_like(b)
+        step[:, free] = np.einsum(
+            "bjk,bk->bj", _inverse(design[:, free], weights, alive)[0], score[:, free]
+        )
+        step = np.clip(step, -5, 5)
+        for _ in range(HALVINGS):
+            tried = likelihood(b + step)
+            worse = tried < best
+            if not worse.any():
+                break
+            step[worse] /= 2
+        step[tried < best] = 0
+        b, best = b + step, np.maximum(tried, best)
+        if np.abs(step).max() < 1e-8:
+            break
+    return best, b
+
+
+def _gap_tests(draws: _Draws) -> tuple[Passes, Passes]:
+    """I3 and I4 by the paper's t tests, and by HC3 errors and equivalence."""
+    x, n = GAP_DESIGN, draws.n
+    alive = _rank(x, n) & (n.sum(axis=1) > x.shape[1])
+    inverse, _ = _inverse(x, n, alive)
+    b = np.einsum("bjk,bk->bj", inverse, draws.gap @ x)
+    fitted = b @ x.T
+    residual = draws.squared_gap - 2 * fitted * draws.gap + n * fitted**2  # per condition
+    freedom = np.maximum(n.sum(axis=1) - x.shape[1], 1)
+    classic = np.einsum("bjj->bj", inverse) * (residual.sum(axis=1) / freedom)[:, None]
+    leverage = np.einsum("ij,bjk,ik->bi", x, inverse, x)
+    meat = np.einsum("bi,ij,ik->bjk", residual / np.maximum(1 - leverage, 1e-9) ** 2, x, x)
+    hc3 = np.einsum("bjk,bkl,blm->bjm", inverse, meat, inverse)
+    se, robust_se = np.sqrt(classic), np.sqrt(np.einsum("bjj->bj", hc3))
+    critical = stats.t.isf(ALPHA / 2, freedom)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        paper = {
+            "I3": alive & (b[:, 1] / se[:, 1] > critical),
+            "I4": alive & (np.abs(b[:, 2] / se[:, 2]) <= critical),
+        }
+        nearest = (SLOPE_MARGIN_S - np.abs(b[:, 2])) / robust_se[:, 2]
+        robust = {
+            "I3": alive & (b[:, 1] / robust_se[:, 1] > critical),
+            "I4": alive & (stats.t.sf(nearest, freedom) < ALPHA),
+        }
+    return paper, robust
+
+
+def _inverse(
+    design: Array, weights: Array, alive: NDArray[np.bool_]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(X' W X)^-1 for each row of ``weights``, and where it exists; elsewhere the identity."""
+    information = np.einsum("bi,ij,ik->bjk", weights, design, design)
+    size = design.shape[1]
+    sound = alive & (np.linalg.det(information) > 1e-12)
+    return np.linalg.inv(np.where(sound[:, None, None], information, np.eye(size))), sound
+
+
+def _rank(design: Array, n: Array) -> NDArray[np.bool_]:
+    information = np.einsum("bi,ij,ik->bjk", (n > 0).astype(float), design, design)
+    return np.asarray(np.linalg.matrix_rank(information) == design.shape[1])
+
+
+def _published_gap() -> Array:
+    human = published("paper_gap").query("driver == 'human'")
+    return human["b"].to_numpy(float)
+
+
+def _left(trials: pd.DataFrame) -> pd.Series:
+    left = (trials["merged_first"] == "left").astype(float)
+    return left.where((trials["status"] == "finished") & trials["merged_first"].notna())
+
+
+def _by_condition(trials: pd.DataFrame, values: pd.Series) -> tuple[Array, ...]:
+    return tuple(values[trials["condition"] == name].to_numpy(float) for name in CONDITIONS)

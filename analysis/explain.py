@@ -1,0 +1,118 @@
+"""Where a cell of a table comes from: what it means, the query, and the trials behind it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from analysis.load import load
+from analysis.published import citation
+from analysis.study import Group, Study
+from analysis.tables.formats import shown_value
+from analysis.tables.model import Column, Row, Table, Value
+from merge_runner.errors import UsageError
+
+SHOWN = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """The trials of one group that a cell rests on, and how to list them."""
+
+    group: str
+    text: str
+    query: str
+    trials: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """A cell with its value as printed, its meaning and its sources."""
+
+    cell: str
+    value: str
+    meaning: str
+    note: str
+    sources: tuple[Source, ...]
+
+    def lines(self) -> list[str]:
+        """The explanation for a reader."""
+        lines = [f"{self.cell} = {self.value}", self.meaning]
+        if self.note:
+            lines.append(f"note: {self.note}")
+        for source in self.sources:
+            lines += ["", f"{source.group}: {source.text}"]
+            if source.query:
+                lines.append(f'merge-runner sql "{source.query}"')
+            lines += [f"  {trial}" for trial in source.trials]
+        return lines
+
+
+def explain(study: Study, table: Table, cell: str) -> Explanation:
+    """Explain ``ROW:COLUMN`` of a table, or a whole ROW; raises UsageError."""
+    row_id, _, column_name = cell.rpartition(":") if ":" in cell else (cell, "", "")
+    row = _find(table, row_id)
+    column = _column(table, row, column_name) if column_name else None
+    value: Value = row.values.get(column.name) if column else None
+    return Explanation(
+        cell=f"{table.name} {cell}",
+        value=shown_value(column, value) if column else _whole_row(table, row),
+        meaning=f"{table.heading}" + (f": {column.meaning or column.heading}" if column else ""),
+        note=row.note,
+        sources=tuple(
+            _source(study, group, row.counts or _predicate(table, column))
+            for group in study.groups
+            if group.id in row.groups
+        ),
+    )
+
+
+def query_of(group: Group, predicate: str) -> str:
+    """The query that lists the trials of a group which a value rests on."""
+    driver = f"trials.spec_hash = '{group.spec_hash}'"
+    # Equal drivers and prompts share a spec, whatever the condition and the repetition.
+    variant = f" AND variant = '{group.setting}'" if group.setting else ""
+    return (
+        "SELECT trial_id, condition, status, merged_first, gap_m, rmse_mps, joint FROM trials "
+        f"JOIN trial_metrics USING (trial_id, spec_hash) WHERE {driver}{variant} AND {predicate} "
+        "ORDER BY trial_id"
+    )
+
+
+def _source(study: Study, group: Group, predicate: str) -> Source:
+    if group.spec_hash is None:
+        text = f"published, not from traces: {citation('human_outcomes')}; see the table's notes"
+        return Source(group.id, text, "", ())
+    query = query_of(group, predicate)
+    trials = tuple(load(query, study.db)["trial_id"])
+    text = f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}"
+    return Source(group.id, text, query, trials)
+
+
+def _find(table: Table, row_id: str) -> Row:
+    for row in table.rows:
+        if row.id == row_id:
+            return row
+    ids = ", ".join(row.id for row in table.rows[:SHOWN])
+    more = f" and {len(table.rows) - SHOWN} more" if len(table.rows) > SHOWN else ""
+    raise UsageError(f"the table {table.name} has no row {row_id!r}; valid: {ids}{more}")
+
+
+def _column(table: Table, row: Row, name: str) -> Column:
+    for column in table.columns:
+        if column.name == name:
+            return column
+    valid = ", ".join(c.name for c in table.columns if row.values.get(c.name) is not None)
+    raise UsageError(f"the table {table.name} has no column {name!r}; valid: {valid}")
+
+
+def _predicate(table: Table, column: Column | None) -> str:
+    chosen = column or next((c for c in table.columns if c.name == "n"), table.columns[-1])
+    return chosen.counts if chosen.counts else "true"
+
+
+def _whole_row(table: Table, row: Row) -> str:
+    return ", ".join(
+        f"{column.name} {shown_value(column, row.values[column.name])}"
+        for column in table.columns
+        if row.values.get(column.name) is not None
+    )

@@ -1,0 +1,1 @@
+"""The human recordings of the simplified merge (4TU doi 10.4121/19550377)."""

@@ -1,0 +1,140 @@
+"""The files of a download: a folder, or a zip that is read in memory and never unpacked."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PureWindowsPath
+
+from merge_runner.errors import MergeRunnerError, UsageError
+
+MAX_FILE_BYTES = 64 * 2**20
+MAX_TOTAL_BYTES = 4 * 2**30
+# Recorded numbers shrink to a third; a text of one line repeated, to a hundredth.
+MAX_RATIO = 200
+ENCRYPTED = 0x1
+DAMAGED = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    ValueError,
+)
+
+
+class Unreadable(MergeRunnerError):
+    """One file holds no trial that can be imported; the message is the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class File:
+    """One file: its path within the download, its size and its share of a zip, in bytes.
+
+    ``read`` returns the whole content; raises Unreadable.
+    """
+
+    name: str
+    size: int
+    packed_size: int
+    read: Callable[[], bytes]
+
+
+@contextmanager
+def open_files(path: Path) -> Iterator[list[File]]:
+    """All files of a folder and those below it, or of a zip; raises UsageError."""
+    if path.is_dir():
+        yield list(_files_below(path))
+        return
+    if not path.exists():
+        raise UsageError(f"there is no {path}: name the downloaded zip, or the folder of its files")
+    try:
+        archive = zipfile.ZipFile(path)
+    except DAMAGED as exc:
+        raise UsageError(
+            f"{path} is neither a folder nor a whole zip ({exc}): download it again"
+        ) from exc
+    with archive:
+        members = [member for member in archive.infolist() if not member.is_dir()]
+        _refuse_paths_outside(path, members)
+        yield [
+            File(
+                member.filename.replace("\\", "/"),
+                member.file_size,
+                member.compress_size,
+                _reader(archive, member),
+            )
+            for member in members
+        ]
+
+
+def refuse_bombs(files: Iterable[File]) -> None:
+    """Raise UsageError where the sizes that a zip declares are none that recordings can have."""
+    total = 0
+    for file in files:
+        total += file.size
+        if file.size > MAX_FILE_BYTES:
+            what = f"{file.name} has {file.size} bytes unpacked"
+        elif file.size > MAX_RATIO * file.packed_size:
+            what = f"{file.name} unpacks from {file.packed_size} to {file.size} bytes"
+        elif total > MAX_TOTAL_BYTES:
+            what = f"the trials have more than {MAX_TOTAL_BYTES} bytes unpacked"
+        else:
+            continue
+        raise UsageError(f"{what}, which recordings never have: download the zip again")
+
+
+def _files_below(folder: Path) -> Iterator[File]:
+    def refuse(error: OSError) -> None:
+        raise UsageError(f"{error.filename} cannot be read: {error.strerror}") from error
+
+    for parent, _, names in os.walk(folder, onerror=refuse):
+        for name in names:
+            path = Path(parent, name)
+            size = path.stat().st_size if path.is_file() else 0
+            yield File(str(path.relative_to(folder)), size, size, partial(_read_file, path))
+
+
+def _read_file(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as exc:
+        raise Unreadable(f"it cannot be read: {exc.strerror}") from exc
+
+
+def _refuse_paths_outside(path: Path, members: list[zipfile.ZipInfo]) -> None:
+    """Nothing is unpacked, but a zip with such names was made to harm."""
+    for member in members:
+        name = PureWindowsPath(member.orig_filename)
+        if name.anchor or ".." in name.parts:
+            raise UsageError(
+                f"{path} is unsafe: its member {member.orig_filename!r} leads out of the folder; "
+                "download it again from the source"
+            )
+
+
+def _reader(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Callable[[], bytes]:
+    def read() -> bytes:
+        if member.flag_bits & ENCRYPTED:
+            raise Unreadable("it is encrypted: unpack the zip and import the folder")
+        # Only these two unpack no more bytes than asked for.
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise Unreadable("its compression is not deflate: unpack the zip, import the folder")
+        try:
+            with archive.open(member) as stream:
+                content = stream.read(member.file_size)
+        except DAMAGED as exc:
+            raise Unreadable(f"it is damaged in the zip: {exc}") from exc
+        if len(content) != member.file_size:
+            raise Unreadable("it is damaged in the zip: it is shorter than declared")
+        return content
+
+    return read

@@ -1,0 +1,126 @@
+"""The commands ``merge-runner human``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from merge_runner.cli import DbOption, print_out, say
+from merge_runner.errors import UsageError
+from merge_runner.places import DEFAULT_DB
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from analysis.human.load import Download, Report
+
+INTERRUPTED = 130
+MOST_ALIKE = 20
+
+human_app = typer.Typer(
+    help="The human recordings, 4TU doi 10.4121/19550377.", no_args_is_help=True
+)
+
+
+@human_app.command("import")
+def human_import(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="The downloaded zip, or the folder of its files.")
+    ],
+    db: DbOption = DEFAULT_DB,
+) -> None:
+    """Add the recorded human trials to the database; those that are there stay as they are."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from analysis.human.archive import open_files
+    from analysis.human.counts import findings, human_counts
+    from analysis.human.load import import_trials, sort_files
+    from merge_runner.store import Store
+
+    try:
+        with open_files(path) as files:
+            download = sort_files(files)
+            if not download.trials:
+                raise UsageError(f"no trial is in {path}; trials are experiment_N_iter_M.csv")
+            shown = track(
+                download.trials,
+                "importing",
+                console=Console(stderr=True),
+                transient=True,
+                disable=not sys.stderr.isatty(),
+            )
+            report = import_trials(shown, Store(db))
+    except KeyboardInterrupt:
+        say("interrupted: what is stored stays; run the same command again to go on")
+        sys.exit(INTERRUPTED)
+    for line in _messages(download, report):
+        say(line)
+    for line in findings(human_counts(db)):
+        say(f"note: {line}")
+    print_out(
+        f"{report.added} trials added, {report.there} there already, {len(report.unreadable)} "
+        f"files could not be read, {download.training} training runs skipped"
+    )
+    sys.exit(1 if report.unreadable or report.differing else 0)
+
+
+@human_app.command("status")
+def human_status(db: DbOption = DEFAULT_DB) -> None:
+    """Count the human trials per pair and condition, beside the published counts."""
+    from analysis.human.counts import (
+        COUNTS,
+        OUTCOMES,
+        by_condition,
+        by_pair,
+        findings,
+        human_counts,
+    )
+    from analysis.published import HUMAN_DOI
+
+    counts = human_counts(db) if db.exists() else None
+    if counts is None or counts.empty:
+        print_out(
+            "no human recordings are imported: merge-runner human import PATH, where PATH is the "
+            f"download of https://doi.org/{HUMAN_DOI}"
+        )
+        return
+    conditions = by_condition(counts)
+    known = conditions[[f"{outcome}_published" for outcome in OUTCOMES]].astype(str)
+    print_out(_text(by_pair(counts)))
+    print_out("")
+    print_out(_text(conditions[COUNTS].assign(published=known.agg(" ".join, axis=1))))
+    print_out("")
+    for line in findings(counts):
+        print_out(line)
+
+
+def _messages(download: Download, report: Report) -> Iterator[str]:
+    if download.simulated:
+        yield f"note: {download.simulated} simulated trials are not human: they are skipped"
+    for line in _grouped(report.replaced):
+        yield f"note: {line}; another file of the trial was read"
+    for line in _grouped(report.unreadable):
+        yield f"error: {line}"
+    for trial_id in report.differing:
+        yield f"error: {trial_id} is stored with other values, which stay"
+
+
+def _grouped(files: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """One line a file, and one line a reason that many share."""
+    names: dict[str, list[str]] = {}
+    for name, reason in files:
+        names.setdefault(reason, []).append(name)
+    for reason, alike in names.items():
+        if len(alike) > MOST_ALIKE:
+            yield f"{len(alike)} files, the first is {alike[0]}: {reason}"
+        else:
+            yield from (f"{name}: {reason}" for name in alike)
+
+
+def _text(counts: pd.DataFrame) -> str:
+    return str(counts.rename_axis(None).rename(columns=lambda name: name.replace("_", " ")))

@@ -1,0 +1,119 @@
+"""From the files of a download to trials in the database."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import PurePath
+
+from analysis.human.archive import File, Unreadable, refuse_bombs
+from analysis.human.record import SPEC, SPEC_HASH, trial_record
+from analysis.human.trace import Trace, parse_csv, parse_mat
+from merge_runner.records import TrialRecord
+from merge_runner.store import Store
+
+BATCH = 100
+NAME = re.compile(
+    r"(?P<what>experiment|simulation)_(?P<experiment>[0-9]{1,6})"
+    r"_(?P<phase>iter|training)_(?P<number>[0-9]{1,6})\.(?P<suffix>csv|mat|pkl)",
+    re.IGNORECASE,
+)
+PARSERS: dict[str, Callable[[bytes], Trace]] = {"csv": parse_csv, "mat": parse_mat}
+ONLY_PICKLED = (
+    "it exists only as PKL, which runs code when it is read and needs the experiment's own "
+    "program: export it there as CSV"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedTrial:
+    """One trial of a download; ``files`` holds its files by suffix: csv, mat, pkl."""
+
+    experiment: int
+    iteration: int
+    files: dict[str, list[File]]
+
+
+@dataclass(frozen=True, slots=True)
+class Download:
+    """What a download holds: its trials in order, and numbers of training and simulated runs."""
+
+    trials: list[RecordedTrial]
+    training: int
+    simulated: int
+
+
+@dataclass(slots=True)
+class Report:
+    """What became of the trials.
+
+    ``added`` and ``there`` are numbers of trials, ``differing`` ids of those that are stored with
+    other values. ``unreadable`` holds file and reason where a trial could not be imported,
+    ``replaced`` where another of its files was read instead.
+    """
+
+    added: int = 0
+    there: int = 0
+    differing: list[str] = field(default_factory=list)
+    unreadable: list[tuple[str, str]] = field(default_factory=list)
+    replaced: list[tuple[str, str]] = field(default_factory=list)
+
+
+def sort_files(files: Iterable[File]) -> Download:
+    """Tell trials, training and simulated runs by their names; raises UsageError for a bomb."""
+    trials: dict[tuple[int, int], dict[str, list[File]]] = {}
+    training: set[tuple[int, int]] = set()
+    simulated: set[tuple[int, int]] = set()
+    for file in files:
+        found = NAME.fullmatch(PurePath(file.name).name)
+        if found is None:
+            continue
+        what, phase, suffix = (found[group].lower() for group in ("what", "phase", "suffix"))
+        run = (int(found["experiment"]), int(found["number"]))
+        if what == "simulation":
+            simulated.add(run)
+        elif phase == "training":
+            training.add(run)
+        else:
+            trials.setdefault(run, {}).setdefault(suffix, []).append(file)
+    refuse_bombs(
+        file for forms in trials.values() for suffix in PARSERS for file in forms.get(suffix, ())
+    )
+    return Download(
+        trials=[RecordedTrial(*run, forms) for run, forms in sorted(trials.items())],
+        training=len(training),
+        simulated=len(simulated),
+    )
+
+
+def import_trials(trials: Iterable[RecordedTrial], store: Store) -> Report:
+    """Store the trials batch by batch; a batch that is stored stays. Raises StoreError."""
+    report = Report()
+    remaining = iter(trials)
+    while batch := list(islice(remaining, BATCH)):
+        records = [record for trial in batch for record in _read(trial, report)]
+        added, there, differing = store.add_recorded(records, {SPEC_HASH: SPEC})
+        report.added += added
+        report.there += there
+        report.differing += differing
+    return report
+
+
+def _read(trial: RecordedTrial, report: Report) -> list[TrialRecord]:
+    """The trial from its CSV, copies too, or else from its MAT; what cannot be read is reported."""
+    records: list[TrialRecord] = []
+    failed: list[tuple[str, str]] = []
+    for suffix, parse in PARSERS.items():
+        for file in trial.files.get(suffix, ()) if not records else ():
+            try:
+                trace = parse(file.read())
+                records.append(trial_record(trace, trial.experiment, trial.iteration))
+            except Unreadable as exc:
+                failed.append((file.name, str(exc)))
+    if records:
+        report.replaced += failed
+    else:
+        report.unreadable += failed or [(trial.files["pkl"][0].name, ONLY_PICKLED)]
+    return records

@@ -1,0 +1,153 @@
+"""A recorded trial as a trial of the database: its condition, its outcome, its states."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from analysis.human.archive import Unreadable
+from analysis.human.trace import Trace
+from analysis.published import HUMAN_DOI
+from merge_runner.llm.keys import canonical_json
+from merge_runner.plan import spec_hash
+from merge_runner.records import SIDES, Side, StateRow, Status, TrialRecord, TrialSpec
+from merge_runner.simulator.conditions import CONDITIONS, Condition
+from merge_runner.simulator.track import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
+
+# The experiments whose pairs the publications number 1 to 9.
+PAIRS = {
+    experiment: f"pair{number}"
+    for number, experiment in enumerate((4, 5, 6, 8, 9, 10, 11, 12, 13), start=1)
+}
+STATUSES: dict[str, Status] = {
+    "Finished": "finished",
+    "Collided": "collided",
+    "Time ran out": "timeout",
+    "Beyond track bounds": "failed",
+}
+# A recording may begin one step late: up to 0.52 m and 0.05 m/s from the start of its condition.
+START_TOLERANCE_M = 0.6
+START_TOLERANCE_MPS = 0.1
+# The experiment ends at a place, which differs from the travelled distance by some millimetres.
+END_TOLERANCE_M = 1.0
+SPEC = canonical_json(
+    {
+        "spec_version": 1,
+        "source": "human",
+        "doi": HUMAN_DOI,
+        "condition": "the one whose start is at most "
+        f"{START_TOLERANCE_M} m and {START_TOLERANCE_MPS} m/s from the first sample",
+        "time_s": f"from the first sample with both vehicles beyond {TUNNEL_EXIT_M:g} m",
+        "position_m": "travelled_distance",
+        "velocity_mps": "velocities",
+        "acceleration_mps2": "difference of velocities over the step before",
+        "merged_first": f"at {MERGE_POINT_M:g} m, interpolated within the step",
+    }
+)
+SPEC_HASH = spec_hash(SPEC)
+
+
+def trial_record(trace: Trace, experiment: int, iteration: int) -> TrialRecord:
+    """The record of trial ``iteration`` of an experiment; raises Unreadable."""
+    status = _status(trace)
+    condition = _condition(trace)
+    states = _states(trace, _control_start(trace))
+    pair = PAIRS.get(experiment, f"experiment_{experiment}")
+    decided = status not in ("collided", "failed")
+    return TrialRecord(
+        spec=TrialSpec(
+            trial_id=f"human/{pair}/{condition}/iter{iteration:03d}",
+            spec_hash=SPEC_HASH,
+            source="human",
+            pair=pair,
+            model_left="human",
+            model_right="human",
+            variant=None,
+            condition=condition,
+            repetition=iteration,
+            sample_set=0,
+            order=0,
+        ),
+        status=status,
+        merged_first=_merged_first(trace) if decided else None,
+        end_time_s=states[-1].time_s,
+        error=trace.end_state if status == "failed" else None,
+        states=states,
+        decisions=(),
+    )
+
+
+def _status(trace: Trace) -> Status:
+    status = STATUSES.get(trace.end_state)
+    if status is None:
+        raise Unreadable(f"end_state is {trace.end_state!r}; known: {', '.join(STATUSES)}")
+    farthest = max(trace.positions_m[side][-1] for side in SIDES)
+    if status == "finished" and farthest < TRACK_END_M - END_TOLERANCE_M:
+        raise Unreadable(f"it is Finished, but ends with no vehicle beyond {farthest:.1f} m")
+    return status
+
+
+def _condition(trace: Trace) -> str:
+    for name, condition in CONDITIONS.items():
+        if _starts_like(condition, trace):
+            return name
+    starts = (
+        f"{side} at {trace.positions_m[side][0]:.2f} m with {trace.velocities_mps[side][0]:.2f} m/s"
+        for side in SIDES
+    )
+    raise Unreadable(f"it starts like none of the conditions: {', '.join(starts)}")
+
+
+def _starts_like(condition: Condition, trace: Trace) -> bool:
+    return all(
+        abs(trace.positions_m[side][0] - start_m) <= START_TOLERANCE_M
+        and abs(trace.velocities_mps[side][0] - speed_mps) <= START_TOLERANCE_MPS
+        for side, start_m, speed_mps in zip(
+            SIDES, condition.starts_m, condition.speeds_mps, strict=True
+        )
+    )
+
+
+def _control_start(trace: Trace) -> int:
+    """The first sample with both vehicles out of their tunnels: time 0."""
+    for sample, positions in enumerate(zip(*trace.positions_m.values(), strict=True)):
+        if min(positions) > TUNNEL_EXIT_M:
+            return sample
+    raise Unreadable(f"its vehicles are never both beyond the tunnels ({TUNNEL_EXIT_M:g} m)")
+
+
+def _merged_first(trace: Trace) -> Side | None:
+    arrivals = {side: _arrival(trace.positions_m[side]) for side in SIDES}
+    merged = {side: arrival for side, arrival in arrivals.items() if arrival is not None}
+    if not merged:
+        return None
+    return min(merged, key=merged.__getitem__)
+
+
+def _arrival(positions_m: list[float]) -> float | None:
+    """When a vehicle reaches the merge point, in steps from the first sample; None: never."""
+    for step, (before, now) in enumerate(pairwise(positions_m)):
+        if before < MERGE_POINT_M <= now:
+            return step + (MERGE_POINT_M - before) / (now - before)
+    return None
+
+
+def _states(trace: Trace, start: int) -> tuple[StateRow, ...]:
+    return tuple(
+        StateRow(
+            step=sample - start,
+            # Rounded: without the binary dust of a product like 3 * 0.05.
+            time_s=round((sample - start) * trace.step_s, 9),
+            side=side,
+            position_m=trace.positions_m[side][sample],
+            velocity_mps=trace.velocities_mps[side][sample],
+            acceleration_mps2=_acceleration(trace.velocities_mps[side], sample, trace.step_s),
+        )
+        for sample in range(len(trace.positions_m["left"]))
+        for side in SIDES
+    )
+
+
+def _acceleration(velocities_mps: list[float], sample: int, step_s: float) -> float:
+    if sample == 0:
+        return 0.0
+    return (velocities_mps[sample] - velocities_mps[sample - 1]) / step_s

@@ -1,0 +1,95 @@
+"""One recorded trial as it stands in its file, CSV or MAT.
+
+The experiment's recorder wrote series under dotted names, and scalars into the first row alone;
+MAT has the same names with underscores. Rows count from 0.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+
+from analysis.human.archive import Unreadable
+from analysis.human.mat import read_mat
+from merge_runner.records import SIDES, Side
+
+POSITIONS: dict[Side, str] = {side: f"travelled_distance.{side}" for side in SIDES}
+VELOCITIES: dict[Side, str] = {side: f"velocities.{side}" for side in SIDES}
+SERIES = (*POSITIONS.values(), *VELOCITIES.values())
+NEEDED = ("dt", "end_state", *SERIES)
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """Both vehicles, one value a sample, in SI units; at least 2 samples, all of them finite.
+
+    ``step_s`` is the time between samples, ``end_state`` the recorder's word for how it ended,
+    ``positions_m`` the distances travelled along the own branch.
+    """
+
+    step_s: float
+    end_state: str
+    positions_m: dict[Side, list[float]]
+    velocities_mps: dict[Side, list[float]]
+
+
+def parse_csv(content: bytes) -> Trace:
+    """Read a trial's CSV file; raises Unreadable."""
+    try:
+        lines = io.StringIO(content.decode("utf-8-sig"), newline="")
+        header, *rows = [row for row in csv.reader(lines, strict=True) if row] or [[]]
+    except (UnicodeDecodeError, csv.Error) as exc:
+        raise Unreadable(f"it is no CSV table: {exc}") from exc
+    _require(NEEDED, header)
+    for number, row in enumerate(rows):
+        if len(row) != len(header):
+            raise Unreadable(f"row {number} has {len(row)} of {len(header)} columns: it is cut off")
+    return _trace({name: [row[header.index(name)] for row in rows] for name in NEEDED})
+
+
+def parse_mat(content: bytes) -> Trace:
+    """Read a trial's MAT file of version 5; raises Unreadable."""
+    variables = read_mat(content)
+    names = {name: name.replace(".", "_") for name in NEEDED}
+    _require(names.values(), variables)
+    return _trace({name: variables[names[name]] for name in NEEDED})
+
+
+def _require(names: Iterable[str], found: Iterable[str]) -> None:
+    if missing := sorted(set(names) - set(found)):
+        raise Unreadable(f"it lacks {', '.join(missing)}")
+
+
+def _trace(columns: Mapping[str, Sequence[object]]) -> Trace:
+    """Check the columns; of ``dt`` (ms) and ``end_state`` only the first value counts."""
+    lengths = {len(columns[name]) for name in SERIES}
+    if len(lengths) > 1:
+        raise Unreadable(f"its series differ in length: {sorted(lengths)} samples")
+    if max(lengths) < 2:
+        raise Unreadable("it has fewer than 2 rows")
+    step_ms = _number("dt", 0, next(iter(columns["dt"]), None))
+    if step_ms <= 0:
+        raise Unreadable(f"dt is {step_ms:g} ms")
+    return Trace(
+        step_s=step_ms / 1000,
+        end_state=str(next(iter(columns["end_state"]), "")).strip(),
+        positions_m={side: _numbers(name, columns[name]) for side, name in POSITIONS.items()},
+        velocities_mps={side: _numbers(name, columns[name]) for side, name in VELOCITIES.items()},
+    )
+
+
+def _numbers(name: str, values: Sequence[object]) -> list[float]:
+    return [_number(name, row, value) for row, value in enumerate(values)]
+
+
+def _number(name: str, row: int, value: object) -> float:
+    try:
+        number = float(value)  # type: ignore[arg-type] # what is none raises TypeError
+    except (TypeError, ValueError):
+        number = float("nan")
+    if not isfinite(number):
+        raise Unreadable(f"{name} is {value!r} in row {row}, not a finite number")
+    return number

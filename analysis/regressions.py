@@ -1,0 +1,204 @@
+"""The regressions of arXiv 2604.09609 (eqs. 1 and 2), and tests that hold where theirs do not.
+
+A fit that the data do not allow has no terms but a ``problem`` in words. Data frames have the
+columns of ``load_trials``; only finished trials count.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.special import expit
+
+Array = NDArray[np.float64]
+
+WHO_FIRST_TERMS = ("intercept", "projected_headway", "relative_velocity")
+GAP_TERMS = (
+    "intercept",
+    "abs_projected_headway",
+    "abs_relative_velocity",
+    "headway_x_velocity",
+)
+# firthmodels' default of 25 is too few under separation.
+MAX_ITERATIONS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One coefficient: estimate, standard error, z or t (None for likelihood ratios), p."""
+
+    b: float
+    se: float
+    statistic: float | None
+    p: float
+
+
+@dataclass(frozen=True, slots=True)
+class Regression:
+    """A fit to ``n`` trials; ``problem`` says why there are no terms, and is else empty.
+
+    ``freedom`` is the residual degrees of freedom of a linear fit.
+    """
+
+    n: int
+    terms: dict[str, Term]
+    problem: str = ""
+    freedom: int | None = None
+
+
+def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:
+    """Design (n, 3) of intercept, h in m, dv in m/s; and left-first as 0 or 1, shape (n,)."""
+    chosen = trials[(trials["status"] == "finished") & trials["merged_first"].notna()]
+    design = np.column_stack(
+        [
+            np.ones(len(chosen)),
+            chosen["projected_headway_m"].to_numpy(float),
+            chosen["relative_velocity_mps"].to_numpy(float),
+        ]
+    )
+    return design, (chosen["merged_first"] == "left").to_numpy(float)
+
+
+def gap_data(trials: pd.DataFrame) -> tuple[Array, Array, pd.DataFrame]:
+    """Design (n, 4) of intercept, |h|, |dv|, h*dv; gaps in m, shape (n,); and their trials."""
+    chosen = trials[(trials["status"] == "finished") & trials["gap_m"].notna()]
+    return (
+        gap_design(
+            chosen["projected_headway_m"].to_numpy(float),
+            chosen["relative_velocity_mps"].to_numpy(float),
+        ),
+        chosen["gap_m"].to_numpy(float),
+        chosen,
+    )
+
+
+def gap_design(headway_m: Array, velocity_mps: Array) -> Array:
+    """The regressors of the gap: intercept, |h|, |dv| and the signed product h*dv."""
+    return np.column_stack(
+        [
+            np.ones(len(headway_m)),
+            np.abs(headway_m),
+            np.abs(velocity_mps),
+            headway_m * velocity_mps,
+        ]
+    )
+
+
+def who_first_logit(trials: pd.DataFrame) -> Regression:
+    """Logit of left-first on h and dv by maximum likelihood, with Wald tests (eq. 1)."""
+    from statsmodels.discrete.discrete_model import Logit
+    from statsmodels.tools.sm_exceptions import ConvergenceWarning
+
+    design, left = who_first_data(trials)
+    problem = _unidentified(design, left) or _separated(design, left)
+    if problem:
+        return Regression(len(left), {}, problem)
+    with warnings.catch_warnings():
+        # Convergence is checked right below.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fit = Logit(left, design).fit(disp=0)
+    if not fit.mle_retvals["converged"] or not np.isfinite(fit.bse).all():
+        return Regression(len(left), {}, "the maximum likelihood fit does not converge")
+    return Regression(len(left), _terms(WHO_FIRST_TERMS, fit))
+
+
+def who_first_firth(trials: pd.DataFrame) -> Regression:
+    """The same by Firth's penalised likelihood, with penalised likelihood-ratio tests.
+
+    It is finite under separation (Firth 1993; Heinze and Schemper 2002).
+    """
+    from firthmodels import FirthLogisticRegression
+
+    design, left = who_first_data(trials)
+    problem = _unidentified(design, left)
+    if problem:
+        return Regression(len(left), {}, problem)
+    fit = FirthLogisticRegression(max_iter=MAX_ITERATIONS).fit(design[:, 1:], left)
+    if not fit.converged_:
+        return Regression(len(left), {}, "Firth's penalised fit does not converge")
+    fit.lrt()
+    estimates = np.array([fit.intercept_, *fit.coef_])
+    p = expit(design @ estimates)
+    information = design.T @ (design * (p * (1 - p))[:, None])
+    errors = np.sqrt(np.diag(np.linalg.inv(information)))
+    if not np.isfinite(fit.lrt_pvalues_).all():
+        return Regression(len(left), {}, "a likelihood-ratio test of Firth's fit does not converge")
+    return Regression(
+        len(left),
+        {
+            name: Term(float(b), float(se), None, float(p))
+            for name, b, se, p in zip(
+                # firthmodels puts the intercept's test last.
+                *(WHO_FIRST_TERMS, estimates, errors, np.roll(fit.lrt_pvalues_, 1)),
+                strict=True,
+            )
+        },
+    )
+
+
+def gap_ols(trials: pd.DataFrame, *, robust: bool = False) -> Regression:
+    """OLS of the gap on |h|, |dv| and h*dv (eq. 2); ``robust`` takes HC3 standard errors.
+
+    HC3 holds under unequal variances (MacKinnon and White 1985).
+    """
+    from statsmodels.regression.linear_model import OLS
+
+    design, gap, _ = gap_data(trials)
+    freedom = len(gap) - design.shape[1]
+    if freedom < 1 or np.linalg.matrix_rank(design) < design.shape[1]:
+        return Regression(len(gap), {}, _too_few(len(gap), "with a gap"))
+    fit = OLS(gap, design).fit()
+    if robust:
+        if fit.get_influence().hat_matrix_diag.max() > 1 - 1e-9:
+            return Regression(len(gap), {}, "a single trial decides a coefficient: no HC3 errors")
+        fit = fit.get_robustcov_results("HC3", use_t=True)
+    if not (np.asarray(fit.bse) > 1e-12).all():
+        return Regression(len(gap), {}, "the gaps do not vary: there is nothing to test")
+    return Regression(len(gap), _terms(GAP_TERMS, fit), freedom=freedom)
+
+
+def _terms(names: tuple[str, ...], fit: Any) -> dict[str, Term]:
+    return {
+        name: Term(float(b), float(se), float(statistic), float(p))
+        for name, b, se, statistic, p in zip(
+            names, fit.params, fit.bse, fit.tvalues, fit.pvalues, strict=True
+        )
+    }
+
+
+def _unidentified(design: Array, left: Array) -> str:
+    if len(left) <= design.shape[1] or np.linalg.matrix_rank(design) < design.shape[1]:
+        return _too_few(len(left), "with a first merger")
+    if left.min() == left.max():
+        side = "left" if left[0] else "right"
+        return f"the {side} vehicle merged first in all {len(left)} trials: nothing to explain"
+    return ""
+
+
+def _separated(design: Array, left: Array) -> str:
+    from firthmodels import detect_separation
+
+    found = detect_separation(design[:, 1:], left)
+    if not found.separation:
+        return ""
+    infinite = [
+        name
+        for name, finite in zip(
+            (*WHO_FIRST_TERMS[1:], WHO_FIRST_TERMS[0]), found.is_finite, strict=True
+        )
+        if not finite
+    ]
+    return f"separation: no finite estimate of {', '.join(infinite)}; see Firth's fit"
+
+
+def _too_few(n: int, what: str) -> str:
+    return (
+        f"{n} finished trials {what}, in too few conditions to tell the terms apart"
+        if n
+        else f"no finished trial {what}"
+    )

@@ -1,0 +1,33 @@
+"""The paper's tables, and those that say what these cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from analysis.study import Study
+from analysis.tables.ablations import ablation_qualitative, ablation_quantitative, contrasts
+from analysis.tables.indicators import indicators
+from analysis.tables.model import Table
+from analysis.tables.profiles import velocity_profiles
+from analysis.tables.regressions import gap, who_first
+from analysis.tables.robustness import robustness
+from merge_runner.errors import UsageError
+
+TABLES: dict[str, Callable[[Study], Table]] = {
+    "who-first": who_first,
+    "gap": gap,
+    "indicators": indicators,
+    "ablation-qualitative": ablation_qualitative,
+    "ablation-quantitative": ablation_quantitative,
+    "contrasts": contrasts,
+    "velocity-profiles": velocity_profiles,
+    "robustness": robustness,
+}
+
+
+def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
+    """The named tables, or all; raises UsageError."""
+    for name in names:
+        if name not in TABLES:
+            raise UsageError(f"there is no table {name!r}; valid: {', '.join(TABLES)}")
+    return [TABLES[name](study) for name in names or TABLES]

@@ -1,0 +1,227 @@
+"""Tables as text, CSV, JSON, Markdown and LaTeX. Full precision in CSV and JSON, else rounded."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Sequence
+
+from analysis.forms import TableFormat
+from analysis.tables.model import Column, Row, Table, Value
+
+MISSING = "–"
+
+
+def render(tables: Sequence[Table], form: TableFormat) -> str:
+    """All tables as one text that ends without a line break."""
+    if form is TableFormat.JSON:
+        return json.dumps({"tables": [as_json(t) for t in tables]}, indent=2, ensure_ascii=False)
+    write: Callable[[Table], str] = {
+        TableFormat.TEXT: as_text,
+        TableFormat.CSV: as_csv,
+        TableFormat.MD: as_markdown,
+        TableFormat.LATEX: as_latex,
+    }[form]
+    return "\n\n".join(
+        # Several CSV tables in one stream need their names.
+        f"# {table.name}\n{write(table)}"
+        if form is TableFormat.CSV and len(tables) > 1
+        else write(table)
+        for table in tables
+    )
+
+
+def as_text(table: Table) -> str:
+    """A table for the terminal, never cut: lines are as long as they need to be."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table as RichTable
+
+    shown = _shown(table)
+    grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for column in shown:
+        grid.add_column(column.heading, justify="left" if column.kind == "text" else "right")
+    for row in table.rows:
+        grid.add_row(*(_text(column, row.values.get(column.name)) for column in shown))
+    out = io.StringIO()
+    console = Console(file=out, width=1000, color_system=None, highlight=False, markup=False)
+    console.print(table.heading)
+    console.print(grid)
+    lines = [line.rstrip() for line in out.getvalue().rstrip().splitlines()]
+    return "\n".join([*lines, *(f"  {note}" for note in _notes(table))])
+
+
+def as_csv(table: Table) -> str:
+    """A table's values at full precision; an interval makes two columns."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    names = [name for column in table.columns for name in _names(column)]
+    writer.writerow(["row", *names, "note"])
+    for row in table.rows:
+        cells = [cell for column in table.columns for cell in _plain(column, row)]
+        writer.writerow([row.id, *("" if cell is None else _exact(cell) for cell in cells), row.note])
+    return out.getvalue().rstrip("\n")
+
+
+def as_json(table: Table) -> dict[str, object]:
+    """A table as JSON values."""
+    return {
+        "name": table.name,
+        "number": table.number,
+        "title": table.title,
+        "columns": [
+            {"name": c.name, "heading": c.heading, "kind": c.kind, "meaning": c.meaning}
+            for c in table.columns
+        ],
+        "rows": [
+            {
+                "row": row.id,
+                **{
+                    name: cell
+                    for column in table.columns
+                    for name, cell in zip(_names(column), _plain(column, row), strict=True)
+                },
+                "note": row.note,
+            }
+            for row in table.rows
+        ],
+        "notes": list(table.notes),
+    }
+
+
+def as_markdown(table: Table) -> str:
+    """A table for a README or an issue."""
+    shown = _shown(table)
+    lines = [
+        f"**{table.heading}**",
+        "",
+        "| " + " | ".join(_bar(column.heading) for column in shown) + " |",
+        "|" + "|".join(":--" if column.kind == "text" else "--:" for column in shown) + "|",
+    ]
+    lines += [
+        "| "
+        + " | ".join(_bar(_text(column, row.values.get(column.name))) for column in shown)
+        + " |"
+        for row in table.rows
+    ]
+    return "\n".join([*lines, "", *(f"- {note}" for note in _notes(table))])
+
+
+def as_latex(table: Table) -> str:
+    r"""A table for the paper: needs the packages booktabs and amssymb, and ``\begin{table*}`` fits."""
+    shown = _shown(table)
+    form = "".join("l" if column.kind == "text" else "r" for column in shown)
+    body = [
+        " & ".join(_latex(column, row.values.get(column.name)) for column in shown) + r" \\"
+        for row in table.rows
+    ]
+    notes = r"\\ ".join(_escaped(note) for note in _notes(table))
+    return "\n".join(
+        [
+            r"\begin{table*}",
+            r"\centering",
+            rf"\caption{{{_escaped(table.title)}}}",
+            rf"\label{{tab:{table.name}}}",
+            rf"\begin{{tabular}}{{{form}}}",
+            r"\toprule",
+            " & ".join(_escaped(column.heading) for column in shown) + r" \\",
+            r"\midrule",
+            *body,
+            r"\bottomrule",
+            r"\end{tabular}",
+            rf"\\[2pt]\parbox{{\linewidth}}{{\footnotesize {notes}}}",
+            r"\end{table*}",
+        ]
+    )
+
+
+def shown_value(column: Column, value: Value) -> str:
+    """One value as a reader sees it."""
+    return _text(column, value)
+
+
+def _shown(table: Table) -> list[Column]:
+    """The columns that hold anything."""
+    return [c for c in table.columns if any(r.values.get(c.name) is not None for r in table.rows)]
+
+
+def _notes(table: Table) -> list[str]:
+    """The table's notes, after those of its rows; equal notes are said once, with their groups."""
+    groups: dict[str, dict[str, None]] = {}
+    for row in table.rows:
+        if row.note:
+            groups.setdefault(row.note, {}).update(dict.fromkeys(row.groups))
+    return [*(f"{', '.join(ids)}: {note}" for note, ids in groups.items()), *table.notes]
+
+
+def _text(column: Column, value: Value) -> str:
+    if value is None:
+        return MISSING
+    if isinstance(value, tuple):
+        return f"[{_rounded(value[0], column.digits)}, {_rounded(value[1], column.digits)}]"
+    if isinstance(value, bool):
+        return "✓" if value else "✗"
+    if column.kind == "p" and isinstance(value, float):
+        return "<0.001" if value < 0.001 else f"{value:.3f}"
+    if isinstance(value, float):
+        return _rounded(value, column.digits)
+    return str(value)
+
+
+def _rounded(value: float, digits: int) -> str:
+    text = f"{value:.{digits}f}"
+    # A rounded zero has no sign.
+    return text.lstrip("-") if float(text) == 0 else text
+
+
+def _exact(cell: object) -> str:
+    return repr(cell) if isinstance(cell, float) else str(cell)
+
+
+def _names(column: Column) -> tuple[str, ...]:
+    if column.kind == "interval":
+        return f"{column.name}_low", f"{column.name}_high"
+    return (column.name,)
+
+
+def _plain(column: Column, row: Row) -> tuple[Value, ...]:
+    value = row.values.get(column.name)
+    if column.kind != "interval":
+        return (value,)
+    return value if isinstance(value, tuple) else (None, None)
+
+
+def _bar(text: str) -> str:
+    return text.replace("|", r"\|")
+
+
+def _latex(column: Column, value: Value) -> str:
+    text = _text(column, value)
+    if isinstance(value, bool):
+        return r"\checkmark" if value else r"\textbf{X}"
+    if column.kind in {"p", "number", "percent", "interval"} and value is not None:
+        return f"${text}$"
+    return _escaped(text)
+
+
+def _escaped(text: str) -> str:
+    special = {
+        "\\": r"\textbackslash{}",
+        "–": "--",
+        "≠": r"$\neq$",
+        "≥": r"$\geq$",
+        "≤": r"$\leq$",
+        "±": r"$\pm$",
+        "Δ": r"$\Delta$",
+        "²": r"$^2$",
+        "✓": r"\checkmark{}",
+        "✗": r"\textbf{X}",
+        "<": "$<$",
+        ">": "$>$",
+        "|": "$|$",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+        **{character: f"\\{character}" for character in "&%$#_{}"},
+    }
+    return "".join(special.get(character, character) for character in text)

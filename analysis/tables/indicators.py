@@ -1,0 +1,146 @@
+"""Table V: qualitative and quantitative indicators beside the human ceiling."""
+
+from __future__ import annotations
+
+from analysis.indicators import INDICATORS
+from analysis.measures import MEASURES, Measure, estimate, known, published_human
+from analysis.published import citation
+from analysis.study import Group, Study
+from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.notes import ceiling_notes, piecewise_notes, sample_notes
+from analysis.verdicts import Score, score
+
+SOURCE = "paper_ablation_quantitative"
+RULES = (
+    "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
+    "Firth's fit (I1, I2), HC3 errors (I3), equivalence (I4)"
+)
+
+
+def indicators(study: Study) -> Table:
+    """Table V: I1 to I5 and the four quantitative measures, one row a driver."""
+    rows = []
+    for name in INDICATORS:
+        rows += [_verdict_row(study, group, name) for group in study.baselines]
+    rows += [_total_row(study, group) for group in study.baselines]
+    for measure in MEASURES:
+        rows += [_measure_row(group, measure) for group in study.baselines]
+    return Table(
+        "indicators",
+        "Qualitative and quantitative indicators of behaviour during merging conflicts",
+        (
+            Column("indicator", "indicator"),
+            Column("driver", "driver"),
+            Column("paper", "paper's rule", "verdict", meaning="by the paper's rule", optional=True),
+            Column("robust", "robust", "verdict", meaning="by robust tests", optional=True),
+            Column("differ", "", meaning="where the two rules disagree", optional=True),
+            Column("value", "value", "number", 2, "score or measure", optional=True),
+            Column("interval", "95 % CI", "interval", 2, "Wilson for rates, t for means", optional=True),
+            Column(
+                "ceiling_paper",
+                "humans pass (%)",
+                "percent",
+                0,
+                "share of resampled human data sets of this size that pass the paper's rule",
+                optional=True,
+            ),
+            Column(
+                "ceiling_robust",
+                "robust (%)",
+                "percent",
+                0,
+                "share of resampled human data sets of this size that pass the robust rule",
+                optional=True,
+            ),
+            Column("n", "n", "count", 0, "trials", optional=True),
+        ),
+        rows,
+        (
+            RULES,
+            *(f"{name}: {text}" for name, text in INDICATORS.items()),
+            *ceiling_notes(study),
+            *piecewise_notes(study),
+            *sample_notes(study, study.baselines),
+        ),
+        "Table V",
+    )
+
+
+def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value]:
+    """An indicator by both rules, and whether they disagree."""
+    paper, robust = found.paper[name].passed, found.robust[name].passed
+    disagree = None not in {paper, robust} and paper != robust
+    return {
+        f"{prefix}paper": paper,
+        f"{prefix}robust": robust,
+        f"{prefix}differ": "≠" if disagree else None,
+    }
+
+
+def verdict_note(found: Score, *names: str) -> str:
+    """Why a verdict is missing or rests on something else than a test."""
+    reasons = [
+        f"{name} {verdict.why}"
+        for name in names
+        for verdict in (found.paper[name], found.robust[name])
+        if verdict.why
+    ]
+    return "; ".join(dict.fromkeys(reasons))
+
+
+def _verdict_row(study: Study, group: Group, name: str) -> Row:
+    found = score(study, group)
+    return Row(
+        f"{group.id}/{name}",
+        (group.id,),
+        {
+            "indicator": name,
+            "driver": group.driver,
+            **verdict_values(found, name),
+            "ceiling_paper": percent(found.ceiling.paper.get(name)),
+            "ceiling_robust": percent(found.ceiling.robust.get(name)),
+            "n": len(group.finished),
+        },
+        verdict_note(found, name),
+    )
+
+
+def _total_row(study: Study, group: Group) -> Row:
+    found = score(study, group)
+    paper, robust = Score.total(found.paper), Score.total(found.robust)
+    missing = [name for name in INDICATORS if found.paper[name].passed is None]
+    return Row(
+        f"{group.id}/score",
+        (group.id,),
+        {
+            "indicator": f"Score, of {len(INDICATORS)}",
+            "driver": group.driver,
+            "paper": paper,
+            "robust": robust,
+            "ceiling_paper": percent(found.ceiling.paper["I1-I4"]),
+            "ceiling_robust": percent(found.ceiling.robust["I1-I4"]),
+            "n": len(group.finished),
+        },
+        f"no score: {', '.join(missing)} cannot be judged" if missing else "",
+    )
+
+
+def _measure_row(group: Group, measure: Measure) -> Row:
+    key: dict[str, Value] = {"indicator": measure.heading, "driver": group.driver}
+    row = f"{group.id}/{measure.name}"
+    if not known(group, measure):
+        source = f"published value, no human traces are imported ({citation(SOURCE)})"
+        return Row(row, (group.id,), {**key, "value": published_human(measure)}, source)
+    found = estimate(group, measure)
+    interval = None if found.low is None or found.high is None else (found.low, found.high)
+    return Row(
+        row,
+        (group.id,),
+        {**key, "value": found.value, "interval": interval, "n": found.n},
+        "" if found.value is not None else f"{measure.heading}: no trial with this measure",
+        measure.counts,
+    )
+
+
+def percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share

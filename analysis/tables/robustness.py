@@ -1,0 +1,78 @@
+"""Outcomes under the three readings of the paper's collision rule."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from analysis.intervals import proportion
+from analysis.robustness import RULES, UNDECIDED, outcomes
+from analysis.study import Group, Study, of_group
+from analysis.tables.model import Column, Row, Table
+from analysis.tables.notes import sample_notes
+
+
+def robustness(study: Study) -> Table:
+    """One row a group and rule: collisions, who was first, and what cannot be known."""
+    measured = [group for group in study.groups if group.measured]
+    found = (
+        outcomes(study.db, pd.concat([group.trials for group in measured])) if measured else None
+    )
+    rows = [] if found is None else [r for group in measured for r in _rows(group, found)]
+    everything = "status <> 'failed'"
+    return Table(
+        "robustness",
+        "Outcomes under three collision rules, from the stored plans",
+        (
+            Column("driver", "driver"),
+            Column("setting", "setting"),
+            Column("rule", "rule"),
+            Column("n", "n", "count", 0, "trials that ended", everything),
+            Column("collided", "collided", "count", 0, "trials that collide", everything),
+            Column("collided_percent", "(%)", "percent", 2, "of n", everything),
+            Column("collided_percent_ci", "95 % CI", "interval", 2, "Wilson", everything),
+            Column("finished", "finished", "count", 0, "trials that finish", everything),
+            Column("timeout", "timeout", "count", 0, "trials nobody finishes", everything),
+            Column(UNDECIDED, UNDECIDED, "count", 0, "trials whose plans end first", everything),
+            Column("left_first", "left first", "count", 0, "finished, left first", everything),
+        ),
+        rows,
+        (
+            "euclid2d: centres closer than 4.5 m in the plane; rectangle: the 4.5 x 1.8 m boxes "
+            "overlap, the rule of the human experiment; shared_lane: closer than 4.5 m along the "
+            "track once either vehicle has passed the merge point",
+            "undecided: the trial ended in a collision that this rule does not see, and the last "
+            "plans, or the human trace, end before it is decided",
+            *([] if rows else [f"{study.db} holds no trial"]),
+            *sample_notes(study, measured),
+        ),
+    )
+
+
+def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
+    own = of_group(found, group, group.ended)
+    rows = []
+    for rule in RULES:
+        chosen = own[own["rule"] == rule]
+        counts = chosen["status"].value_counts()
+        collided, n = int(counts.get("collided", 0)), len(chosen)
+        share = proportion(collided, n)
+        values = {
+            "driver": group.driver,
+            "setting": group.setting,
+            "rule": rule,
+            "n": n,
+            "collided": collided,
+            **{name: int(counts.get(name, 0)) for name in ("finished", "timeout", UNDECIDED)},
+            "left_first": int(
+                ((chosen["status"] == "finished") & (chosen["merged_first"] == "left")).sum()
+            ),
+        }
+        note = "no trial ended"
+        if share.value is not None and share.low is not None and share.high is not None:
+            values |= {
+                "collided_percent": 100 * share.value,
+                "collided_percent_ci": (100 * share.low, 100 * share.high),
+            }
+            note = ""
+        rows.append(Row(f"{group.id}/{rule}", (group.id,), values, note))
+    return rows
