@@ -167,7 +167,7 @@ def _firth_tests(draws: _Draws) -> Passes:
 
 
 def _firth(draws: _Draws, alive: NDArray[np.bool_], free: tuple[int, ...]) -> tuple[Array, Array]:
-    """Maximal penalised log-likelihoods (sets,) with the ``free`` coefficients, and these (sets, 3).
+    """Maximal penalised log-likelihoods (sets,) over ``free`` coefficients, and these (sets, 3).
 
     Newton steps on Firth's score with the whole design's information, halved where they do not
     increase the penalised likelihood (Heinze and Schemper 2002).
@@ -253,7 +253,7 @@ def _rank(design: Array, n: Array) -> NDArray[np.bool_]:
 
 def _published_gap() -> Array:
     human = published("paper_gap").query("driver == 'human'")
-    return human["b"].to_numpy(float)
+    return np.asarray(human["b"], dtype=float)
 
 
 def _left(trials: pd.DataFrame) -> pd.Series:

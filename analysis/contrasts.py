@@ -1,4 +1,4 @@
-"""Differences between two groups of trials: exact and permutation tests, corrected within families."""
+"""Differences between two groups of trials: exact and permutation tests, and corrections."""
 
 from __future__ import annotations
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
-from analysis.load import load
+import duckdb
+import pandas as pd
+
 from analysis.published import citation
 from analysis.study import Group, Study
 from analysis.tables.formats import shown_value
@@ -58,11 +61,15 @@ def explain(study: Study, table: Table, cell: str) -> Explanation:
         value=shown_value(column, value) if column else _whole_row(table, row),
         meaning=f"{table.heading}" + (f": {column.meaning or column.heading}" if column else ""),
         note=row.note,
-        sources=tuple(
-            _source(study, group, row.counts or _predicate(table, column))
-            for group in study.groups
-            if group.id in row.groups
-        ),
+        sources=sources_of(study, table, row, column),
+    )
+
+
+def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> tuple[Source, ...]:
+    """The trials of each group behind a cell, or behind a row where no column is named."""
+    predicate = row.counts or _predicate(table, column)
+    return tuple(
+        _source(study, group, predicate) for group in study.groups if group.id in row.groups
     )
 
 
@@ -72,20 +79,30 @@ def query_of(group: Group, predicate: str) -> str:
     # Equal drivers and prompts share a spec, whatever the condition and the repetition.
     variant = f" AND variant = '{group.setting}'" if group.setting else ""
     return (
-        "SELECT trial_id, condition, status, merged_first, gap_m, rmse_mps, joint FROM trials "
+        "SELECT trial_id, condition, status, merged_first, gap_m, rmse_mps, joint "  # noqa: S608 # ours
+        "FROM trials "
         f"JOIN trial_metrics USING (trial_id, spec_hash) WHERE {driver}{variant} AND {predicate} "
         "ORDER BY trial_id"
     )
 
 
+@cache
 def _source(study: Study, group: Group, predicate: str) -> Source:
     if group.spec_hash is None:
         text = f"published, not from traces: {citation('human_outcomes')}; see the table's notes"
         return Source(group.id, text, "", ())
     query = query_of(group, predicate)
-    trials = tuple(load(query, study.db)["trial_id"])
+    trials = _chosen(group.trials, predicate)
     text = f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}"
     return Source(group.id, text, query, trials)
+
+
+def _chosen(trials: pd.DataFrame, predicate: str) -> tuple[str, ...]:
+    """The ids for which an SQL predicate over the columns of ``load_trials`` holds."""
+    with duckdb.connect() as connection:
+        connection.register("trials", trials)
+        rows = connection.table("trials").filter(predicate).order("trial_id").fetchall()
+    return tuple(trial_id for trial_id, *_ in rows)
 
 
 def _find(table: Table, row_id: str) -> Row:

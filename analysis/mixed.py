@@ -73,9 +73,7 @@ def who_first_mixed(trials: pd.DataFrame) -> Regression:
         len(left),
         {
             name: Term(float(b), float(se), float(b / se), float(2 * stats.norm.sf(abs(b / se))))
-            for name, b, se in zip(
-                WHO_FIRST_TERMS, found.x[:3], np.sqrt(variances), strict=True
-            )
+            for name, b, se in zip(WHO_FIRST_TERMS, found.x[:3], np.sqrt(variances), strict=True)
         },
     )
 
@@ -83,7 +81,7 @@ def who_first_mixed(trials: pd.DataFrame) -> Regression:
 def _cells(design: Array, left: Array) -> tuple[Array, Array, Array]:
     """Trials of equal regressors as one binomial: design (k, 3), trials (k,), left-first (k,)."""
     cells, place, trials = np.unique(design, axis=0, return_inverse=True, return_counts=True)
-    return cells, trials.astype(float), np.bincount(place, weights=left)
+    return cells, trials.astype(float), np.bincount(place, weights=left).astype(float)
 
 
 def _marginal(parameters: Array, design: Array, trials: Array, left: Array) -> float:
@@ -106,7 +104,9 @@ def _marginal(parameters: Array, design: Array, trials: Array, left: Array) -> f
             break
     nodes, weights = np.polynomial.hermite.hermgauss(NODES)
     scale = np.sqrt(2 / curvature)
-    return float(logsumexp(joint(mode + scale * nodes) + nodes**2 + np.log(weights)) + np.log(scale))
+    return float(
+        logsumexp(joint(mode + scale * nodes) + nodes**2 + np.log(weights)) + np.log(scale)
+    )
 
 
 def _hessian(function: object, at: Array) -> Array:

@@ -59,7 +59,7 @@ class Profile:
         )
 
 
-class ContinuousPolyline(BaseCost):
+class ContinuousPolyline(BaseCost):  # type: ignore[misc] # ruptures ships no types
     """Residual sums of squares of straight lines from sample to sample, all computed at once.
 
     Segments share their end samples, as with ruptures' own ``clinear``, which computes one segment
@@ -143,4 +143,4 @@ def fit_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
 def at_5_hz(time_s: Array, velocity_mps: Array) -> Array:
     """The speeds at multiples of 0.2 s, linear between samples where they lie closer."""
     samples = int(np.floor(time_s[-1] / SAMPLE_S + 1e-9)) + 1 if len(time_s) else 0
-    return np.interp(np.arange(samples) * SAMPLE_S, time_s, velocity_mps)
+    return np.asarray(np.interp(np.arange(samples) * SAMPLE_S, time_s, velocity_mps))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 import pandas as pd
@@ -26,6 +26,15 @@ GAP_TERMS = (
 )
 # firthmodels' default of 25 is too few under separation.
 MAX_ITERATIONS = 1000
+
+
+class _Fit(Protocol):
+    """What we read of statsmodels' results."""
+
+    params: Array
+    bse: Array
+    tvalues: Array
+    pvalues: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +171,7 @@ def gap_ols(trials: pd.DataFrame, *, robust: bool = False) -> Regression:
     return Regression(len(gap), _terms(GAP_TERMS, fit), freedom=freedom)
 
 
-def _terms(names: tuple[str, ...], fit: Any) -> dict[str, Term]:
+def _terms(names: tuple[str, ...], fit: _Fit) -> dict[str, Term]:
     return {
         name: Term(float(b), float(se), float(statistic), float(p))
         for name, b, se, statistic, p in zip(

@@ -1,7 +1,7 @@
 """What the trials would have come to under the other readings of "collision".
 
 The stored plans are driven again. Where a trial ended in a collision that another rule does not
-see, the drivers' last plans go on as far as they reach; what is not decided then stays ``undecided``.
+see, the drivers' last plans go on as far as they reach; what is open then stays ``undecided``.
 Human traces are judged as they are.
 """
 
@@ -63,8 +63,8 @@ def redrive(
     steps = max(map(len, actions))
     queues: list[list[float | None]] = []
     for side, last, own in zip(applied, last_plans, actions, strict=True):
-        rest = list(last[len(side[-1]) :]) if side else []
-        queues.append([None] * (steps - len(own)) + list(own) + rest)
+        rest = last[len(side[-1]) :] if side else []
+        queues.append([*[None] * (steps - len(own)), *own, *rest])
     for left, right in zip(*queues, strict=False):
         if world.status is not None:
             break
@@ -122,5 +122,5 @@ def _judged(trials: pd.DataFrame, traces: pd.DataFrame) -> pd.DataFrame:
     return _frame(rows)
 
 
-def _frame(rows: list[tuple[str, str, str, str, str | None]]) -> pd.DataFrame:
+def _frame(rows: Sequence[tuple[str, str, str, str, str | None]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["trial_id", "spec_hash", "rule", "status", "merged_first"])

@@ -101,7 +101,17 @@ class Study:
         """One row a vehicle: the piecewise-linear fit of its speeds."""
         from analysis.piecewise import fit_profiles
 
-        return fit_profiles(load_speeds(self.db))
+        return fit_profiles(self.speeds)
+
+    @cached_property
+    def speeds(self) -> pd.DataFrame:
+        """One row a vehicle: its speeds from the start of control on."""
+        return load_speeds(self.db)
+
+    @cached_property
+    def deviations(self) -> pd.DataFrame:
+        """One row a trial and window: RMSE of the speeds from the initial ones, and joint."""
+        return load("SELECT * FROM speed_deviations ORDER BY ALL", self.db)
 
     @cached_property
     def plans(self) -> pd.DataFrame:
@@ -145,4 +155,6 @@ def _model_groups(trials: pd.DataFrame) -> list[Group]:
         )
         for (driver, variant, spec_hash), rows in keyed.groupby(["driver", "variant", "spec_hash"])
     ]
-    return sorted(groups, key=lambda group: (group.driver, group.setting != BASELINE, group.setting))
+    return sorted(
+        groups, key=lambda group: (group.driver, group.setting != BASELINE, group.setting)
+    )

@@ -408,6 +408,7 @@ def _emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list
 
 
 def listed(text: str | None) -> list[str] | None:
+    """The parts of an option that takes several names, None where it is not given."""
     return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
 
 
@@ -421,8 +422,10 @@ def _print_table(names: list[str], rows: list[tuple[Any, ...]]) -> None:
 
 
 def print_out(text: str) -> None:
+    """Print a result."""
     print(text, flush=True)  # noqa: T201 # the command line's output
 
 
 def say(text: str) -> None:
+    """Print a message beside the result."""
     print(text, file=sys.stderr, flush=True)  # noqa: T201 # the command line's messages

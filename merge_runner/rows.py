@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
+from datetime import datetime
 from typing import Any
 
 from merge_runner.records import Attempt, ChatRequest, DecisionRow, FailedCall, TrialRecord
@@ -110,6 +111,7 @@ def _call_row(
         attempt.http_status,
         attempt.outcome,
         cached,
+        attempt.started_at and datetime.fromisoformat(attempt.started_at).replace(tzinfo=None),
         attempt.latency_s,
         attempt.usage.input_tokens,
         attempt.usage.cached_input_tokens,

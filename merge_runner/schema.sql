@@ -88,6 +88,7 @@ CREATE TABLE IF NOT EXISTS calls (
     http_status INTEGER,
     outcome VARCHAR NOT NULL,
     cached BOOLEAN NOT NULL,          -- the sweep found the reply recorded
+    started_at TIMESTAMP,             -- when it was made, maybe long before this run
     latency_s DOUBLE,
     input_tokens BIGINT,              -- includes the cached ones
     cached_input_tokens BIGINT,

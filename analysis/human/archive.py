@@ -63,8 +63,7 @@ def open_files(path: Path) -> Iterator[list[File]]:
             f"{path} is neither a folder nor a whole zip ({exc}): download it again"
         ) from exc
     with archive:
-        members = [member for member in archive.infolist() if not member.is_dir()]
-        _refuse_paths_outside(path, members)
+        _refuse_paths_outside(path, archive.infolist())
         yield [
             File(
                 member.filename.replace("\\", "/"),
@@ -72,7 +71,8 @@ def open_files(path: Path) -> Iterator[list[File]]:
                 member.compress_size,
                 _reader(archive, member),
             )
-            for member in members
+            for member in archive.infolist()
+            if not member.filename.endswith("/")
         ]
 
 

@@ -123,4 +123,5 @@ def _grouped(files: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 
 def _text(counts: pd.DataFrame) -> str:
-    return str(counts.rename_axis(None).rename(columns=lambda name: name.replace("_", " ")))
+    shown = counts.rename_axis(None).rename(columns=lambda name: name.replace("_", " "))
+    return str(shown.to_string())

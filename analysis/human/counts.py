@@ -45,7 +45,7 @@ def by_condition(counts: pd.DataFrame) -> pd.DataFrame:
         .set_index("condition")[OUTCOMES]
         .assign(trials=lambda frame: frame.sum(axis=1))
     )
-    return found.join(known, rsuffix="_published")
+    return found.join(known, suffixes=("", "_published"))
 
 
 def findings(counts: pd.DataFrame) -> Iterator[str]:

@@ -21,7 +21,7 @@ TEXTS = {4: "utf-16-le", 16: "utf-8", 17: "utf-16-le"}
 DAMAGED = (struct.error, zlib.error, ValueError, IndexError)
 
 
-def read_mat(content: bytes) -> dict[str, list[float] | list[str]]:
+def read_mat(content: bytes) -> dict[str, list[float | str]]:
     """Variable to its values; a text is one value, cells and structures are left out.
 
     Raises Unreadable.
@@ -66,7 +66,7 @@ def _unpacked(data: memoryview) -> memoryview:
     return memoryview(content)
 
 
-def _variable(data: memoryview) -> tuple[str, list[float] | list[str]]:
+def _variable(data: memoryview) -> tuple[str, list[float | str]]:
     """Name and values of a matrix: its flags, its dimensions, its name, its values."""
     (_, flags), _, (_, name), *rest = _elements(data)
     kind, values = rest[0] if rest else (0, memoryview(b""))

@@ -132,22 +132,22 @@ def _arrival(positions_m: list[float]) -> float | None:
 
 
 def _states(trace: Trace, start: int) -> tuple[StateRow, ...]:
-    return tuple(
-        StateRow(
-            step=sample - start,
-            # Rounded: without the binary dust of a product like 3 * 0.05.
-            time_s=round((sample - start) * trace.step_s, 9),
-            side=side,
-            position_m=trace.positions_m[side][sample],
-            velocity_mps=trace.velocities_mps[side][sample],
-            acceleration_mps2=_acceleration(trace.velocities_mps[side], sample, trace.step_s),
+    vehicles = [
+        zip(
+            trace.positions_m[side],
+            trace.velocities_mps[side],
+            _accelerations(trace.velocities_mps[side], trace.step_s),
+            strict=True,
         )
-        for sample in range(len(trace.positions_m["left"]))
         for side in SIDES
+    ]
+    return tuple(
+        # Rounded: a time without the binary dust of a product like 3 * 0.05.
+        StateRow(step, round(step * trace.step_s, 9), side, *values)
+        for step, sample in enumerate(zip(*vehicles, strict=True), start=-start)
+        for side, values in zip(SIDES, sample, strict=True)
     )
 
 
-def _acceleration(velocities_mps: list[float], sample: int, step_s: float) -> float:
-    if sample == 0:
-        return 0.0
-    return (velocities_mps[sample] - velocities_mps[sample - 1]) / step_s
+def _accelerations(velocities_mps: list[float], step_s: float) -> list[float]:
+    return [0.0, *((now - before) / step_s for before, now in pairwise(velocities_mps))]

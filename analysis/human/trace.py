@@ -47,7 +47,8 @@ def parse_csv(content: bytes) -> Trace:
     for number, row in enumerate(rows):
         if len(row) != len(header):
             raise Unreadable(f"row {number} has {len(row)} of {len(header)} columns: it is cut off")
-    return _trace({name: [row[header.index(name)] for row in rows] for name in NEEDED})
+    places = {name: header.index(name) for name in NEEDED}
+    return _trace({name: [row[place] for row in rows] for name, place in places.items()})
 
 
 def parse_mat(content: bytes) -> Trace:
@@ -63,33 +64,37 @@ def _require(names: Iterable[str], found: Iterable[str]) -> None:
         raise Unreadable(f"it lacks {', '.join(missing)}")
 
 
-def _trace(columns: Mapping[str, Sequence[object]]) -> Trace:
+def _trace(columns: Mapping[str, Sequence[float | str]]) -> Trace:
     """Check the columns; of ``dt`` (ms) and ``end_state`` only the first value counts."""
     lengths = {len(columns[name]) for name in SERIES}
     if len(lengths) > 1:
         raise Unreadable(f"its series differ in length: {sorted(lengths)} samples")
     if max(lengths) < 2:
         raise Unreadable("it has fewer than 2 rows")
-    step_ms = _number("dt", 0, next(iter(columns["dt"]), None))
-    if step_ms <= 0:
-        raise Unreadable(f"dt is {step_ms:g} ms")
+    steps_ms = _numbers("dt", columns["dt"][:1])
+    if not steps_ms or steps_ms[0] <= 0:
+        raise Unreadable(f"dt is {steps_ms}, not a time in ms")
     return Trace(
-        step_s=step_ms / 1000,
+        step_s=steps_ms[0] / 1000,
         end_state=str(next(iter(columns["end_state"]), "")).strip(),
         positions_m={side: _numbers(name, columns[name]) for side, name in POSITIONS.items()},
         velocities_mps={side: _numbers(name, columns[name]) for side, name in VELOCITIES.items()},
     )
 
 
-def _numbers(name: str, values: Sequence[object]) -> list[float]:
-    return [_number(name, row, value) for row, value in enumerate(values)]
-
-
-def _number(name: str, row: int, value: object) -> float:
+def _numbers(name: str, values: Sequence[float | str]) -> list[float]:
     try:
-        number = float(value)  # type: ignore[arg-type] # what is none raises TypeError
-    except (TypeError, ValueError):
-        number = float("nan")
-    if not isfinite(number):
-        raise Unreadable(f"{name} is {value!r} in row {row}, not a finite number")
-    return number
+        numbers = list(map(float, values))
+    except ValueError:
+        numbers = []
+    if len(numbers) < len(values) or not all(map(isfinite, numbers)):
+        row = next(row for row, value in enumerate(values) if not _is_number(value))
+        raise Unreadable(f"{name} is {values[row]!r} in row {row}, not a finite number")
+    return numbers
+
+
+def _is_number(value: float | str) -> bool:
+    try:
+        return isfinite(float(value))
+    except ValueError:
+        return False

@@ -11,6 +11,7 @@ from analysis.tables.model import Table
 from analysis.tables.profiles import velocity_profiles
 from analysis.tables.regressions import gap, who_first
 from analysis.tables.robustness import robustness
+from analysis.tables.windows import speed_windows
 from merge_runner.errors import UsageError
 
 TABLES: dict[str, Callable[[Study], Table]] = {
@@ -21,6 +22,7 @@ TABLES: dict[str, Callable[[Study], Table]] = {
     "ablation-quantitative": ablation_quantitative,
     "contrasts": contrasts,
     "velocity-profiles": velocity_profiles,
+    "speed-windows": speed_windows,
     "robustness": robustness,
 }
 

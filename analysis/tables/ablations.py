@@ -297,9 +297,7 @@ def _shared_notes(study: Study) -> list[str]:
         if row.shared and driver in drivers:
             notes.append(
                 f"{driver}/{row.variant}: {row.shared} of {row.calls} calls share their reply with "
-                "the baseline, where prompt and slot are equal: the groups are not independent, and "
-                "the tests, which take them as such, are conservative there"
+                "the baseline, where prompt and slot are equal: the groups are not independent, "
+                "and the tests, which take them as such, are conservative there"
             )
     return notes
-
-

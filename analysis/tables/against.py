@@ -54,6 +54,11 @@ def against(table: Table, reference: str) -> Table:
     return replace(table, columns=columns, rows=rows, notes=(*table.notes, *cited, *absent))
 
 
+def in_paper(table: Table) -> bool:
+    """Whether the paper prints this table."""
+    return table.name in {*FILES, "indicators"}
+
+
 def _beside(table: Table) -> tuple[list[Column], list[Row]]:
     name, pairs = FILES[table.name]
     columns: list[Column] = []

@@ -38,7 +38,7 @@ def as_text(table: Table) -> str:
     from rich.console import Console
     from rich.table import Table as RichTable
 
-    shown = _shown(table)
+    shown = shown_columns(table)
     grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for column in shown:
         grid.add_column(column.heading, justify="left" if column.kind == "text" else "right")
@@ -49,7 +49,7 @@ def as_text(table: Table) -> str:
     console.print(table.heading)
     console.print(grid)
     lines = [line.rstrip() for line in out.getvalue().rstrip().splitlines()]
-    return "\n".join([*lines, *(f"  {note}" for note in _notes(table))])
+    return "\n".join([*lines, *(f"  {note}" for note in notes_of(table))])
 
 
 def as_csv(table: Table) -> str:
@@ -60,7 +60,9 @@ def as_csv(table: Table) -> str:
     writer.writerow(["row", *names, "note"])
     for row in table.rows:
         cells = [cell for column in table.columns for cell in _plain(column, row)]
-        writer.writerow([row.id, *("" if cell is None else _exact(cell) for cell in cells), row.note])
+        writer.writerow(
+            [row.id, *("" if cell is None else _exact(cell) for cell in cells), row.note]
+        )
     return out.getvalue().rstrip("\n")
 
 
@@ -92,7 +94,7 @@ def as_json(table: Table) -> dict[str, object]:
 
 def as_markdown(table: Table) -> str:
     """A table for a README or an issue."""
-    shown = _shown(table)
+    shown = shown_columns(table)
     lines = [
         f"**{table.heading}**",
         "",
@@ -105,31 +107,32 @@ def as_markdown(table: Table) -> str:
         + " |"
         for row in table.rows
     ]
-    return "\n".join([*lines, "", *(f"- {note}" for note in _notes(table))])
+    return "\n".join([*lines, "", *(f"- {note}" for note in notes_of(table))])
 
 
 def as_latex(table: Table) -> str:
-    r"""A table for the paper: needs the packages booktabs and amssymb, and ``\begin{table*}`` fits."""
-    shown = _shown(table)
+    r"""A table for the paper: needs the packages booktabs, amssymb and graphicx."""
+    shown = shown_columns(table)
     form = "".join("l" if column.kind == "text" else "r" for column in shown)
     body = [
         " & ".join(_latex(column, row.values.get(column.name)) for column in shown) + r" \\"
         for row in table.rows
     ]
-    notes = r"\\ ".join(_escaped(note) for note in _notes(table))
+    notes = r"\\ ".join(_escaped(note) for note in notes_of(table))
     return "\n".join(
         [
             r"\begin{table*}",
             r"\centering",
             rf"\caption{{{_escaped(table.title)}}}",
             rf"\label{{tab:{table.name}}}",
+            r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
             rf"\begin{{tabular}}{{{form}}}",
             r"\toprule",
             " & ".join(_escaped(column.heading) for column in shown) + r" \\",
             r"\midrule",
             *body,
             r"\bottomrule",
-            r"\end{tabular}",
+            r"\end{tabular}}",
             rf"\\[2pt]\parbox{{\linewidth}}{{\footnotesize {notes}}}",
             r"\end{table*}",
         ]
@@ -141,12 +144,12 @@ def shown_value(column: Column, value: Value) -> str:
     return _text(column, value)
 
 
-def _shown(table: Table) -> list[Column]:
+def shown_columns(table: Table) -> list[Column]:
     """The columns that hold anything."""
     return [c for c in table.columns if any(r.values.get(c.name) is not None for r in table.rows)]
 
 
-def _notes(table: Table) -> list[str]:
+def notes_of(table: Table) -> list[str]:
     """The table's notes, after those of its rows; equal notes are said once, with their groups."""
     groups: dict[str, dict[str, None]] = {}
     for row in table.rows:

@@ -31,11 +31,15 @@ def indicators(study: Study) -> Table:
         (
             Column("indicator", "indicator"),
             Column("driver", "driver"),
-            Column("paper", "paper's rule", "verdict", meaning="by the paper's rule", optional=True),
+            Column(
+                "paper", "paper's rule", "verdict", meaning="by the paper's rule", optional=True
+            ),
             Column("robust", "robust", "verdict", meaning="by robust tests", optional=True),
             Column("differ", "", meaning="where the two rules disagree", optional=True),
             Column("value", "value", "number", 2, "score or measure", optional=True),
-            Column("interval", "95 % CI", "interval", 2, "Wilson for rates, t for means", optional=True),
+            Column(
+                "interval", "95 % CI", "interval", 2, "Wilson for rates, t for means", optional=True
+            ),
             Column(
                 "ceiling_paper",
                 "humans pass (%)",
@@ -143,4 +147,5 @@ def _measure_row(group: Group, measure: Measure) -> Row:
 
 
 def percent(share: float | None) -> float | None:
+    """A share in percent."""
     return None if share is None else 100 * share

@@ -27,7 +27,9 @@ def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
         )
     notes += [
         f"{group.driver} is a scripted stand-in, no language model"
-        for group in dict.fromkeys(g for g in groups if g.scripted and g.setting in {"", "baseline"})
+        for group in dict.fromkeys(
+            g for g in groups if g.scripted and g.setting in {"", "baseline"}
+        )
     ]
     return notes
 
@@ -37,8 +39,8 @@ def ceiling_notes(study: Study) -> list[str]:
     source = (
         "whole trials are resampled from the imported recordings"
         if study.human.measured
-        else "outcomes from the published counts, gaps from the published regression with residuals "
-        f"of SD {HUMAN_GAP_SD_M} m"
+        else "outcomes from the published counts, gaps from the published regression with "
+        f"residuals of SD {HUMAN_GAP_SD_M} m"
     )
     return [
         f"humans pass: share of {DATA_SETS} human data sets with as many trials per condition as "
@@ -56,8 +58,8 @@ def piecewise_notes(study: Study) -> list[str]:
         else "uncalibrated, no human traces are imported"
     )
     return [
-        f"I5: a trial passes where both speeds are fitted within {limits.max_rmse_mps:.2f} m/s with "
-        f"at most {limits.max_knot_rate_hz:.1f} knots and {limits.max_reversal_rate_hz:.2f} "
+        f"I5: a trial passes where both speeds are fitted within {limits.max_rmse_mps:.2f} m/s "
+        f"with at most {limits.max_knot_rate_hz:.1f} knots and {limits.max_reversal_rate_hz:.2f} "
         f"reversals per s ({state}); a group passes where at least "
         f"{100 * THRESHOLDS.min_share:.0f} % of its trials do, by the Wilson lower bound"
     ]

@@ -53,7 +53,9 @@ def who_first(study: Study) -> Table:
         (
             *_key_columns(WITH_MERGER),
             *_wald_columns("z", WITH_MERGER),
-            Column("firth_b", "Firth b", "number", 2, "Firth's penalised estimate", WITH_MERGER, True),
+            Column(
+                "firth_b", "Firth b", "number", 2, "Firth's penalised estimate", WITH_MERGER, True
+            ),
             Column("firth_se", "SE", "number", 3, "its standard error", WITH_MERGER, True),
             Column("firth_p", "LR p", "p", 3, "its likelihood-ratio test", WITH_MERGER, True),
         ),

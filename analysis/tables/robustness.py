@@ -7,7 +7,7 @@ import pandas as pd
 from analysis.intervals import proportion
 from analysis.robustness import RULES, UNDECIDED, outcomes
 from analysis.study import Group, Study, of_group
-from analysis.tables.model import Column, Row, Table
+from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
 
 
@@ -56,7 +56,7 @@ def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
         counts = chosen["status"].value_counts()
         collided, n = int(counts.get("collided", 0)), len(chosen)
         share = proportion(collided, n)
-        values = {
+        values: dict[str, Value] = {
             "driver": group.driver,
             "setting": group.setting,
             "rule": rule,

@@ -1,0 +1,140 @@
+"""In plain words: what the results of a study show, and what they cannot show."""
+
+from __future__ import annotations
+
+from analysis.contrasts import contrast_rates
+from analysis.indicators import ALPHA, INDICATORS, TESTED, Verdict
+from analysis.measures import MEASURES, counts, estimate
+from analysis.provenance import Provenance
+from analysis.study import Group, Study
+from analysis.verdicts import Score, score
+
+COLLISIONS, GAP = MEASURES[0], MEASURES[1]
+NAMES = {
+    "I1": "going first becomes likelier with a projected headway advantage",
+    "I2": "going first becomes less likely with a relative velocity advantage",
+    "I3": "the gap grows with the projected headway",
+    "I4": "the gap does not depend on the relative velocity",
+    "I5": "speeds are piecewise linear",
+}
+LOW_POWER = 0.8
+
+
+def shown(study: Study) -> list[str]:
+    """What the baseline of each driver shows, one sentence or two a driver."""
+    return [text for group in study.baselines if group.setting for text in _shown(study, group)]
+
+
+def not_shown(study: Study, origin: Provenance) -> list[str]:
+    """What cannot be concluded, and why."""
+    models = [group for group in study.baselines if group.setting]
+    texts = [text for group in models for text in _limits(study, group)]
+    texts += [
+        f"Another model answered: {text}. These trials are not what they claim to be."
+        for text in origin.mismatches
+    ]
+    if not models:
+        texts.append(f"{study.db} holds no baseline trial of a driver: nothing can be concluded.")
+    if not study.human.measured:
+        texts.append(
+            "The human recordings are not imported: human gaps, speed deviations and profiles are "
+            "those that were published, I5 is not calibrated, and the human ceiling rests on a "
+            "normal approximation of the gaps."
+        )
+    texts.append(
+        "The prompt is a reconstruction, the original wording is not public; results hold for this "
+        "wording, this scenario and the default sampling temperature."
+    )
+    texts.append(
+        "Trials of humans come from nine pairs who differ: tests that pool them, as the paper's, "
+        "understate the human uncertainty."
+    )
+    return texts
+
+
+def _shown(study: Study, group: Group) -> list[str]:
+    if not len(group.finished):
+        return [f"{group.driver}: no trial finished ({group.left_out})."]
+    found = score(study, group)
+    agreed = [NAMES[n] for n in INDICATORS if found.paper[n].passed and found.robust[n].passed]
+    failed = [NAMES[n] for n in TESTED if found.paper[n].passed is False is found.robust[n].passed]
+    mixed = [
+        f"{NAMES[name]} (paper's rule: {_word(found.paper[name])}, "
+        f"robust: {_word(found.robust[name])})"
+        for name in TESTED
+        if None not in {found.paper[name].passed, found.robust[name].passed}
+        and found.paper[name].passed != found.robust[name].passed
+    ]
+    texts = [f"{group.driver}, like humans: {_listed(agreed)}."] if agreed else []
+    if failed:
+        texts.append(f"{group.driver}, not shown: {_listed(failed)}.")
+    if mixed:
+        texts.append(f"{group.driver}, depends on the test: {_listed(mixed)}.")
+    return [*texts, _collisions(study, group), _gap(study, group)]
+
+
+def _collisions(study: Study, group: Group) -> str:
+    found, human = estimate(group, COLLISIONS), estimate(study.human, COLLISIONS)
+    contrast = contrast_rates(counts(group, COLLISIONS), counts(study.human, COLLISIONS))
+    verdict = (
+        "a difference that chance does not explain"
+        if contrast.p < ALPHA
+        else "no difference can be shown, and none is excluded beyond these intervals"
+    )
+    return (
+        f"{group.driver} collided in {found.value:.1f} % of {found.n} trials "
+        f"(95 % CI {found.low:.1f} to {found.high:.1f}), humans in {human.value:.1f} % "
+        f"({human.low:.1f} to {human.high:.1f}); Fisher's exact p = {contrast.p:.3f}: {verdict}."
+    )
+
+
+def _gap(study: Study, group: Group) -> str:
+    found = estimate(group, GAP)
+    human = estimate(study.human, GAP) if study.human.measured else None
+    if found.value is None:
+        return f"{group.driver} has no gap at the merge point."
+    interval = "" if found.low is None else f" (95 % CI {found.low:.2f} to {found.high:.2f})"
+    reference = (
+        f"{human.value:.2f} m in the recordings"
+        if human is not None and human.value is not None
+        else "3.85 m as published"
+    )
+    return f"{group.driver} leaves {found.value:.2f} m on average{interval}; humans {reference}."
+
+
+def _limits(study: Study, group: Group) -> list[str]:
+    found, texts = score(study, group), []
+    if group.scripted:
+        texts.append(
+            f"{group.driver} is a scripted stand-in: its rows say nothing about a language model."
+        )
+    chance = found.ceiling.paper["I1-I4"]
+    if chance < LOW_POWER:
+        texts.append(
+            f"{group.driver}: with {len(group.ended)} trials a perfect copy of the humans would "
+            f"pass I1 to I4 together in {100 * chance:.0f} % of studies by the paper's tests, in "
+            f"{100 * found.ceiling.robust['I1-I4']:.0f} % by the robust ones. A missing mark is "
+            "weak evidence against the driver."
+        )
+    if found.paper["I4"].passed and not found.robust["I4"].passed:
+        texts.append(
+            f"{group.driver}: that the gap does not depend on relative velocity is not shown; the "
+            "effect is not significant, but one of 1 m is not excluded either."
+        )
+    texts += [
+        f"{group.driver}: {name} rests on {verdict.why}."
+        for name in TESTED
+        for verdict in [found.paper[name]]
+        if verdict.why
+    ]
+    if Score.total(found.paper) is None:
+        texts.append(f"{group.driver}: no score, as not all indicators can be judged.")
+    return texts
+
+
+def _word(verdict: Verdict) -> str:
+    return "yes" if verdict.passed else "no"
+
+
+def _listed(items: list[str]) -> str:
+    return items[0] if len(items) == 1 else f"{'; '.join(items[:-1])}; and {items[-1]}"

@@ -1,0 +1,93 @@
+"""``merge-runner human`` on the real command line: outputs and exit codes."""
+
+from __future__ import annotations
+
+import pytest
+from recordings import drive, write_folder, write_zip
+
+from merge_runner.store import query
+
+GOOD = {
+    "data/experiment_4/experiment_4_iter_1.csv": drive("L_4_0").csv(),
+    "data/experiment_6/experiment_6_iter_2.mat": drive("N_0_0", yields="nobody").mat(),
+    "data/experiment_4/experiment_4_training_1.csv": b"",
+    "data/experiment_4/participant_info.txt": b"left",
+    "data/experiment_4/auto_save.pkl": b"",
+}
+BAD = {
+    "data/experiment_5/experiment_5_iter_1.csv": b"dt,end_state\r\n50,Finished\r\n",
+    "data/experiment_5/experiment_5_iter_2.pkl": b"",
+    "simulated/experiment_4/simulation_4_iter_0.pkl": b"",
+    **{f"cut/experiment_8_iter_{m}.csv": b"" for m in range(21)},
+}
+
+
+def test_a_zip_is_imported_and_the_status_counts_it(human, tmp_path):
+    path = write_zip(tmp_path / "download.zip", GOOD)
+    run = human("import", path)
+    assert run.code == 0
+    assert run.out == (
+        "2 trials added, 0 there already, 0 files could not be read, 1 training runs skipped\n"
+    )
+    assert run.err == "note: 2 of 990 trials: the human rows of the tables come from these\n"
+    again = human("import", write_folder(tmp_path / "unpacked", GOOD))
+    assert (again.code, again.out[:33]) == (0, "0 trials added, 2 there already, ")
+    status = human("status")
+    assert status.code == 0
+    lines = [line.split() for line in status.out.splitlines()]
+    assert ["pair1", "1", "1", "0", "0"] in lines
+    assert ["pair3", "1", "0", "0", "1"] in lines
+    assert ["L_4_0", "1", "1", "0", "0", "88", "0", "2"] in lines
+    assert ["N_0_0", "1", "0", "0", "1", "37", "48", "5"] in lines
+    assert lines[-1][:4] == ["2", "of", "990", "trials:"]
+
+
+def test_what_cannot_be_read_is_listed_and_the_rest_is_imported(human, tmp_path):
+    run = human("import", write_folder(tmp_path / "d", {**GOOD, **BAD}), "--db", "other.duckdb")
+    assert run.code == 1
+    assert "2 trials added, 0 there already, 23 files could not be read" in run.out
+    lines = run.err.splitlines()
+    assert lines[0] == "note: 1 simulated trials are not human: they are skipped"
+    assert (
+        "error: data/experiment_5/experiment_5_iter_1.csv: it lacks travelled_distance.left, "
+        "travelled_distance.right, velocities.left, velocities.right" in lines
+    )
+    assert any("experiment_5_iter_2.pkl: it exists only as PKL" in line for line in lines)
+    assert any("21 files, the first is cut/experiment_8_iter_0.csv: it lacks" in x for x in lines)
+    assert len(lines) == 5
+    assert query(tmp_path / "other.duckdb", "select count(*) from trials")[1] == [(2,)]
+
+
+def test_a_trial_with_other_values_ends_with_1(human, tmp_path):
+    name = "experiment_4_iter_1.csv"
+    human("import", write_folder(tmp_path / "a", {name: GOOD[f"data/experiment_4/{name}"]}))
+    late = write_folder(tmp_path / "b", {name: drive("L_4_0", late=True).csv()})
+    run = human("import", late)
+    assert run.code == 1
+    assert "error: human/pair1/L_4_0/iter001 is stored with other values, which stay" in run.err
+
+
+@pytest.mark.parametrize(
+    ("files", "says"),
+    [
+        (None, "error: there is no download.zip"),
+        ({}, "error: no trial is in download.zip"),
+        ({"../experiment_4_iter_1.csv": b""}, "error: download.zip is unsafe"),
+        ({"experiment_4_iter_1.csv": bytes(10**6)}, "recordings never have"),
+    ],
+)
+def test_wrong_usage_ends_with_2_one_line_and_no_database(human, tmp_path, files, says):
+    if files is not None:
+        write_zip(tmp_path / "download.zip", files)
+    run = human("import", "download.zip")
+    assert run.code == 2
+    assert says in run.err
+    assert len(run.err.splitlines()) == 1
+    assert not (tmp_path / "results").exists()
+
+
+def test_the_status_of_nothing_says_what_to_type(human):
+    run = human("status")
+    assert run.code == 0
+    assert run.out.startswith("no human recordings are imported: merge-runner human import PATH")
+    assert "10.4121/19550377" in run.out

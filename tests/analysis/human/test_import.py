@@ -1,0 +1,191 @@
+"""Importing: which files are read, what is stored, and what happens the second time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from recordings import Recording, drive, file
+
+from analysis.human import load
+from analysis.human.load import import_trials, sort_files
+from analysis.human.record import SPEC, SPEC_HASH, trial_record
+from analysis.human.trace import parse_csv
+from merge_runner.errors import UsageError
+from merge_runner.rows import state_rows, trial_row
+from merge_runner.store import Store, query, results_digest
+
+LEFT, RIGHT = drive("L_4_0"), drive("R_-4_0", yields="left")
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "results/merge.duckdb"
+
+
+def imported(path, files: dict[str, bytes]):
+    download = sort_files(file(name, content) for name, content in files.items())
+    return import_trials(download.trials, Store(path))
+
+
+def rows(path, sql):
+    return query(path, sql)[1]
+
+
+def changed(recording: Recording, name: str, row: int, value: object) -> Recording:
+    columns = {key: list(values) for key, values in recording.columns.items()}
+    columns[name][row] = value
+    return Recording(columns)
+
+
+def test_a_trial_is_stored_as_its_record_says_and_its_spec_too(path):
+    report = imported(path, {"d/experiment_6_iter_1.csv": LEFT.csv()})
+    assert (report.added, report.there, report.differing) == (1, 0, [])
+    record = trial_record(parse_csv(LEFT.csv()), 6, 1)
+    assert rows(path, "from trials") == [trial_row(record)]
+    assert rows(path, "from states order by step, side") == list(state_rows(record))
+    assert rows(path, "from specs") == [(SPEC_HASH, SPEC)]
+    assert rows(path, "select pair, source, variant, time_to_merge_s > 0 from trials "
+                "join trial_metrics using (trial_id, spec_hash)") == [
+        ("pair3", "human", None, True)
+    ]  # fmt: skip
+
+
+def test_importing_twice_leaves_the_database_as_it_was(path):
+    files = {f"experiment_{n}_iter_{m}.csv": LEFT.csv() for n in (4, 5) for m in (0, 1)}
+    assert imported(path, files).added == 4
+    before = results_digest(path)
+    again = imported(path, files)
+    assert (again.added, again.there, again.differing) == (0, 4, [])
+    assert results_digest(path) == before
+    assert rows(path, "select count(*) from specs") == [(1,)]
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "value"),
+    [
+        ("velocities.left", 120, 9.0),
+        ("travelled_distance.right", 120, 60.0),
+        ("end_state", 0, "Collided"),
+        ("dt", 0, 51),
+    ],
+)
+def test_a_trial_that_is_stored_with_other_values_is_named_and_kept(path, name, row, value):
+    imported(path, {"experiment_4_iter_1.csv": LEFT.csv()})
+    of_first = "from states where trial_id like '%iter001' order by step, side"
+    before = rows(path, "from trials"), rows(path, of_first)
+    other = changed(LEFT, name, row, value).csv()
+    report = imported(path, {"experiment_4_iter_1.csv": other, "experiment_4_iter_2.csv": other})
+    assert (report.added, report.there) == (1, 0)
+    assert report.differing == ["human/pair1/L_4_0/iter001"]
+    assert rows(path, "select count(*) from trials") == [(2,)]
+    assert (rows(path, "from trials where rep = 1"), rows(path, of_first)) == before
+
+
+def test_trials_of_a_sweep_are_left_alone(path):
+    record = trial_record(parse_csv(LEFT.csv()), 4, 1)
+    llm = replace(record, spec=replace(record.spec, spec_hash="another", source="llm"))
+    Store(path).add_recorded([llm], {})
+    assert imported(path, {"experiment_4_iter_1.csv": LEFT.csv()}).added == 1
+    assert rows(path, "select count(*), count(distinct trial_id) from trials") == [(2, 1)]
+
+
+def test_copies_of_a_trial_are_stored_once_and_other_values_are_named(path):
+    copies = {"a/experiment_4_iter_1.csv": LEFT.csv(), "b/experiment_4_iter_1.csv": LEFT.csv()}
+    other = changed(LEFT, "velocities.left", 120, 9.0).csv()
+    report = imported(path, {**copies, "c/experiment_4_iter_1.csv": other})
+    assert (report.added, report.there) == (1, 1)
+    assert report.differing == ["human/pair1/L_4_0/iter001"]
+
+
+def test_a_mat_file_is_read_where_there_is_no_csv_and_is_the_same_trial(path):
+    assert imported(path, {"experiment_4_iter_1.mat": LEFT.mat()}).added == 1
+    report = imported(path, {"experiment_4_iter_1.csv": LEFT.csv()})
+    assert (report.there, report.replaced) == (1, [])
+
+
+def test_a_mat_file_is_not_read_beside_a_csv(path):
+    files = {"experiment_4_iter_1.mat": b"damaged", "experiment_4_iter_1.csv": LEFT.csv()}
+    report = imported(path, files)
+    assert (report.added, report.replaced, report.unreadable) == (1, [], [])
+
+
+def test_a_mat_file_is_read_where_the_csv_cannot_be_and_that_is_said(path):
+    files = {"experiment_4_iter_1.csv": LEFT.csv()[:9000], "experiment_4_iter_1.mat": LEFT.mat()}
+    report = imported(path, files)
+    assert (report.added, report.unreadable) == (1, [])
+    [(name, reason)] = report.replaced
+    assert name == "experiment_4_iter_1.csv"
+    assert "it is cut off" in reason
+
+
+def test_where_neither_can_be_read_both_say_why_and_the_rest_is_imported(path):
+    report = imported(
+        path,
+        {
+            "experiment_4_iter_1.csv": b"",
+            "experiment_4_iter_1.mat": b"",
+            "experiment_4_iter_2.csv": RIGHT.csv(),
+            "experiment_4_iter_3.csv": changed(LEFT, "travelled_distance.left", 0, 2.0).csv(),
+        },
+    )
+    assert report.added == 1
+    assert [name for name, _ in report.unreadable] == [
+        "experiment_4_iter_1.csv", "experiment_4_iter_1.mat", "experiment_4_iter_3.csv",
+    ]  # fmt: skip
+    assert "left at 2.00 m with 10.00 m/s, right at 0.00 m" in report.unreadable[2][1]
+
+
+def test_a_pickle_is_never_read(path):
+    def read():
+        raise AssertionError
+
+    pickled = replace(file("experiment_4_iter_1.pkl", b""), read=read)
+    beside = [file("experiment_4_iter_2.csv", LEFT.csv())]
+    beside.append(replace(pickled, name="pkl/experiment_4_iter_2.pkl"))
+    report = import_trials(sort_files([pickled, *beside]).trials, Store(path))
+    assert report.added == 1
+    [(name, reason)] = report.unreadable
+    assert name == "experiment_4_iter_1.pkl"
+    assert "only as PKL" in reason
+
+
+def test_only_trials_are_trials():
+    names = [
+        *(
+            f"experiment_4_training_{k}.{suffix}"
+            for k in (1, 2)
+            for suffix in ("csv", "mat", "pkl")
+        ),
+        *("simulation_4_iter_0.pkl", "simulation_4_iter_1.pkl", "auto_save.pkl"),
+        *("participant_info.txt", "._experiment_4_iter_1.csv", "experiment_4_iter_1.csv.bak"),
+        *("experiment_4_iter_.csv", "experiment_10_iter_1.CSV", "experiment_9_iter_2.csv"),
+    ]
+    download = sort_files(file(name, b"x") for name in names)
+    assert (download.training, download.simulated) == (2, 2)
+    assert [(trial.experiment, trial.iteration) for trial in download.trials] == [(9, 2), (10, 1)]
+
+
+def test_only_what_would_be_read_can_be_a_bomb():
+    sort_files([replace(file("auto_save.pkl", b""), size=10**9)])
+    sort_files([replace(file("experiment_4_iter_1.pkl", b""), size=10**9)])
+    for suffix in ("csv", "mat"):
+        with pytest.raises(UsageError, match="recordings never have"):
+            sort_files([replace(file(f"experiment_4_iter_1.{suffix}", b""), size=10**9)])
+
+
+def test_what_is_stored_before_an_interruption_stays(path, monkeypatch):
+    monkeypatch.setattr(load, "BATCH", 2)
+    content = LEFT.csv()
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    files = [file(f"experiment_4_iter_{m}.csv", content) for m in range(5)]
+    files[3] = replace(files[3], read=interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        import_trials(sort_files(files).trials, Store(path))
+    assert rows(path, "select rep from trials order by rep") == [(0,), (1,)]
+    files[3] = replace(files[3], read=lambda: content)
+    report = import_trials(sort_files(files).trials, Store(path))
+    assert (report.added, report.there) == (3, 2)
