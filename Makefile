@@ -9,7 +9,7 @@ PYTHON ?= python3
 RUN := .venv/bin/merge-runner
 export Q
 
-.PHONY: help sweep replay sql test lint check lock
+.PHONY: help sweep replay report sql test lint check lock
 
 help:
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -19,6 +19,9 @@ sweep: .venv/runtime ## the main job: MODEL=, SWEEP=, ARGS=
 
 replay: .venv/runtime ## the same from recorded replies alone: MODEL=, SWEEP=, RECORDING=, ARGS=
 	@$(RUN) replay $(SWEEP) --model $(MODEL) $(if $(RECORDING),--recording $(RECORDING)) $(ARGS)
+
+report: .venv/runtime ## tables, figures and the HTML report of what the database holds: ARGS=
+	@$(RUN) report --out results/report.html --files results/report $(ARGS)
 
 sql: .venv/runtime ## a query over the results: Q="select ...", ARGS=
 	@$(RUN) sql "$$Q" $(ARGS)

@@ -221,7 +221,9 @@ def _gap_tests(draws: _Draws) -> tuple[Passes, Passes]:
     leverage = np.einsum("ij,bjk,ik->bi", x, inverse, x)
     meat = np.einsum("bi,ij,ik->bjk", residual / np.maximum(1 - leverage, 1e-9) ** 2, x, x)
     hc3 = np.einsum("bjk,bkl,blm->bjm", inverse, meat, inverse)
-    se, robust_se = np.sqrt(classic), np.sqrt(np.einsum("bjj->bj", hc3))
+    # Where nothing varies, rounding leaves variances just below 0.
+    se = np.sqrt(np.maximum(classic, 0))
+    robust_se = np.sqrt(np.maximum(np.einsum("bjj->bj", hc3), 0))
     critical = stats.t.isf(ALPHA / 2, freedom)
     with np.errstate(divide="ignore", invalid="ignore"):
         paper = {

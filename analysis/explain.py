@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cache
 
 import duckdb
-import pandas as pd
 
 from analysis.published import citation
 from analysis.study import Group, Study
@@ -92,17 +91,17 @@ def _source(study: Study, group: Group, predicate: str) -> Source:
         text = f"published, not from traces: {citation('human_outcomes')}; see the table's notes"
         return Source(group.id, text, "", ())
     query = query_of(group, predicate)
-    trials = _chosen(group.trials, predicate)
+    trials = tuple(row[0] for row in _table(group).filter(predicate).order("trial_id").fetchall())
     text = f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}"
     return Source(group.id, text, query, trials)
 
 
-def _chosen(trials: pd.DataFrame, predicate: str) -> tuple[str, ...]:
-    """The ids for which an SQL predicate over the columns of ``load_trials`` holds."""
-    with duckdb.connect() as connection:
-        connection.register("trials", trials)
-        rows = connection.table("trials").filter(predicate).order("trial_id").fetchall()
-    return tuple(trial_id for trial_id, *_ in rows)
+@cache
+def _table(group: Group) -> duckdb.DuckDBPyRelation:
+    """The columns of ``load_trials``, for predicates in SQL."""
+    connection = duckdb.connect()
+    connection.register("frame", group.trials)
+    return connection.sql("CREATE TABLE trials AS FROM frame; FROM trials")
 
 
 def _find(table: Table, row_id: str) -> Row:

@@ -26,7 +26,7 @@ def proportion(successes: int, n: int) -> Estimate:
     """A proportion with its Wilson score interval (Wilson 1927)."""
     if n == 0:
         return Estimate(None, None, None, 0)
-    z = stats.norm.ppf((1 + LEVEL) / 2)
+    z = float(stats.norm.ppf((1 + LEVEL) / 2))
     p = successes / n
     middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z / (1 + z**2 / n) * sqrt(p * (1 - p) / n + z**2 / (4 * n**2))

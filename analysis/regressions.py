@@ -206,8 +206,7 @@ def _separated(design: Array, left: Array) -> str:
 
 
 def _too_few(n: int, what: str) -> str:
-    return (
-        f"{n} finished trials {what}, in too few conditions to tell the terms apart"
-        if n
-        else f"no finished trial {what}"
-    )
+    if n == 0:
+        return f"no finished trial {what}"
+    trials = "trial" if n == 1 else "trials"
+    return f"{n} finished {trials} {what}, in too few conditions to tell the terms apart"

@@ -19,6 +19,7 @@ from analysis.regressions import Regression, gap_ols, who_first_firth, who_first
 from analysis.study import Group, Study, of_group
 
 REVERSAL_QUANTILE = 0.95
+PUBLISHED = "as published, no human traces are imported"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,7 @@ def fits(group: Group) -> Fits:
     """Fit a group's trials; without gaps the linear fits say so."""
     logit, firth = who_first_logit(group.trials), who_first_firth(group.trials)
     if not group.measured:
-        missing = Regression(0, {}, "no human traces are imported: published values")
+        missing = Regression(0, {}, PUBLISHED)
         return Fits(logit, firth, missing, missing)
     return Fits(logit, firth, gap_ols(group.trials), gap_ols(group.trials, robust=True))
 
@@ -65,8 +66,8 @@ def score(study: Study, group: Group) -> Score:
     if not group.measured:
         row = published("paper_ablation_qualitative").query("driver == 'human'").iloc[0]
         for name in ("I3", "I4"):
-            paper[name] = Verdict(bool(row[name.lower()]), None, "published")
-        piecewise = Verdict(bool(row["i5"]), None, "published, judged by eye")
+            paper[name] = Verdict(bool(row[name.lower()]), None, PUBLISHED)
+        piecewise = Verdict(bool(row["i5"]), None, f"{PUBLISHED}, judged by eye")
     return Score(
         paper | {"I5": piecewise},
         robust | {"I5": piecewise},
@@ -110,6 +111,9 @@ def piecewise_verdict(study: Study, group: Group) -> Verdict:
     share = piecewise_share(study, group)
     if share.low is None:
         return Verdict(None, None, "no finished trial")
+    best = proportion(share.n, share.n).low
+    if best is not None and best < THRESHOLDS.min_share:
+        return Verdict(None, None, f"{share.n} finished trials are too few, even if all pass")
     return Verdict(bool(share.low >= THRESHOLDS.min_share))
 
 

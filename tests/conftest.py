@@ -10,6 +10,7 @@ import pytest
 from harness import Run, environment
 from hypothesis import settings
 
+PROGRAM = Path(sys.executable).with_name("merge-runner")
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)
 settings.load_profile("gate")
@@ -26,9 +27,7 @@ def merge_runner(tmp_path):
 
     async def start(*arguments: object, cwd: Path = tmp_path, **changes: str):
         return await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "merge_runner",
+            PROGRAM,
             *map(str, arguments),
             cwd=cwd,
             env=environment(**changes),

@@ -16,6 +16,7 @@ from merge_runner.places import DEFAULT_DB
 if TYPE_CHECKING:
     import pandas as pd
 
+    from analysis.human.archive import File
     from analysis.human.load import Download, Report
 
 INTERRUPTED = 130
@@ -46,7 +47,7 @@ def human_import(
         with open_files(path) as files:
             download = sort_files(files)
             if not download.trials:
-                raise UsageError(f"no trial is in {path}; trials are experiment_N_iter_M.csv")
+                raise UsageError(_nothing_in(path, files))
             shown = track(
                 download.trials,
                 "importing",
@@ -97,6 +98,12 @@ def human_status(db: DbOption = DEFAULT_DB) -> None:
     print_out("")
     for line in findings(counts):
         print_out(line)
+
+
+def _nothing_in(path: Path, files: list[File]) -> str:
+    inner = [file.name for file in files if file.name.lower().endswith(".zip")]
+    hint = f"; unpack it, and import {', '.join(inner)} of it" if inner else ""
+    return f"no trial is in {path}: trials are experiment_N_iter_M.csv or .mat{hint}"
 
 
 def _messages(download: Download, report: Report) -> Iterator[str]:

@@ -141,10 +141,12 @@ def _states(trace: Trace, start: int) -> tuple[StateRow, ...]:
         )
         for side in SIDES
     ]
+    steps = range(-start, len(trace.positions_m["left"]) - start)
+    # Rounded: without the binary dust of a product like 3 * 0.05.
+    times_s = [round(step * trace.step_s, 9) for step in steps]
     return tuple(
-        # Rounded: a time without the binary dust of a product like 3 * 0.05.
-        StateRow(step, round(step * trace.step_s, 9), side, *values)
-        for step, sample in enumerate(zip(*vehicles, strict=True), start=-start)
+        StateRow(step, time_s, side, *values)
+        for step, time_s, *sample in zip(steps, times_s, *vehicles, strict=True)
         for side, values in zip(SIDES, sample, strict=True)
     )
 

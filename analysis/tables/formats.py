@@ -160,7 +160,7 @@ def notes_of(table: Table) -> list[str]:
 
 def _text(column: Column, value: Value) -> str:
     if value is None:
-        return MISSING
+        return "" if column.kind == "text" else MISSING
     if isinstance(value, tuple):
         return f"[{_rounded(value[0], column.digits)}, {_rounded(value[1], column.digits)}]"
     if isinstance(value, bool):
@@ -179,7 +179,7 @@ def _rounded(value: float, digits: int) -> str:
 
 
 def _exact(cell: object) -> str:
-    return repr(cell) if isinstance(cell, float) else str(cell)
+    return repr(float(cell)) if isinstance(cell, float) else str(cell)
 
 
 def _names(column: Column) -> tuple[str, ...]:

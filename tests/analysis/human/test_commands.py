@@ -71,7 +71,8 @@ def test_a_trial_with_other_values_ends_with_1(human, tmp_path):
     ("files", "says"),
     [
         (None, "error: there is no download.zip"),
-        ({}, "error: no trial is in download.zip"),
+        ({}, "error: no trial is in download.zip: trials are experiment_N_iter_M.csv or .mat\n"),
+        ({"a/data.zip": b""}, "or .mat; unpack it, and import a/data.zip of it"),
         ({"../experiment_4_iter_1.csv": b""}, "error: download.zip is unsafe"),
         ({"experiment_4_iter_1.csv": bytes(10**6)}, "recordings never have"),
     ],
