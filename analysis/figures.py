@@ -130,7 +130,7 @@ def distributions(study: Study) -> Figure:
             spread = row + 0.36 * (np.arange(len(values)) % 7 / 6 - 0.5)
             axis.plot(values, spread, ".", color=colour, ms=1.5, alpha=0.4, rasterized=True)
             axis.boxplot(
-                values, positions=[row], vert=False, widths=0.6, showfliers=False,
+                values, positions=[row], orientation="horizontal", widths=0.6, showfliers=False,
                 medianprops={"color": colour, "lw": 1.4}, manage_ticks=False,
             )  # fmt: skip
         axis.set_xlabel(measure.heading)

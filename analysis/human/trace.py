@@ -76,7 +76,7 @@ def _trace(columns: Mapping[str, Sequence[float | str]]) -> Trace:
         raise Unreadable(f"dt is {steps_ms}, not a time in ms")
     return Trace(
         step_s=steps_ms[0] / 1000,
-        end_state=str(next(iter(columns["end_state"]), "")).strip(),
+        end_state=str(next(iter(columns["end_state"]), "")),
         positions_m={side: _numbers(name, columns[name]) for side, name in POSITIONS.items()},
         velocities_mps={side: _numbers(name, columns[name]) for side, name in VELOCITIES.items()},
     )

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import pandas as pd
+
 from analysis.study import Study
 from analysis.tables.ablations import ablation_qualitative, ablation_quantitative, contrasts
+from analysis.tables.formats import value_rows
 from analysis.tables.indicators import indicators
 from analysis.tables.model import Table
 from analysis.tables.profiles import velocity_profiles
@@ -33,3 +36,9 @@ def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
         if name not in TABLES:
             raise UsageError(f"there is no table {name!r}; valid: {', '.join(TABLES)}")
     return [TABLES[name](study) for name in names or TABLES]
+
+
+def table(study: Study, name: str) -> pd.DataFrame:
+    """A table as a data frame, at full precision, one row as in its CSV; raises UsageError."""
+    (made,) = make_tables(study, [name])
+    return pd.DataFrame(value_rows(made)).set_index("row")

@@ -58,11 +58,8 @@ def as_csv(table: Table) -> str:
     writer = csv.writer(out, lineterminator="\n")
     names = [name for column in table.columns for name in _names(column)]
     writer.writerow(["row", *names, "note"])
-    for row in table.rows:
-        cells = [cell for column in table.columns for cell in _plain(column, row)]
-        writer.writerow(
-            [row.id, *("" if cell is None else _exact(cell) for cell in cells), row.note]
-        )
+    for row in value_rows(table):
+        writer.writerow("" if value is None else _exact(value) for value in row.values())
     return out.getvalue().rstrip("\n")
 
 
@@ -76,20 +73,25 @@ def as_json(table: Table) -> dict[str, object]:
             {"name": c.name, "heading": c.heading, "kind": c.kind, "meaning": c.meaning}
             for c in table.columns
         ],
-        "rows": [
-            {
-                "row": row.id,
-                **{
-                    name: cell
-                    for column in table.columns
-                    for name, cell in zip(_names(column), _plain(column, row), strict=True)
-                },
-                "note": row.note,
-            }
-            for row in table.rows
-        ],
+        "rows": value_rows(table),
         "notes": list(table.notes),
     }
+
+
+def value_rows(table: Table) -> list[dict[str, Value]]:
+    """Each row's id, values and note; an interval makes two values."""
+    return [
+        {
+            "row": row.id,
+            **{
+                name: cell
+                for column in table.columns
+                for name, cell in zip(_names(column), _plain(column, row), strict=True)
+            },
+            "note": row.note,
+        }
+        for row in table.rows
+    ]
 
 
 def as_markdown(table: Table) -> str:

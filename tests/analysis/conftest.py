@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from studies import yielding, write_study
+from studies import write_study, yielding
 
 from analysis.study import Study
 

@@ -86,7 +86,15 @@ def write_study(path: Path, drives: Iterable[Drive], scenario: Scenario = SCENAR
     specs = {
         record.spec.spec_hash: json.dumps({"scenario": scenario.model_dump()}) for record in records
     }
-    sweep = SweepRow("sweep-1", "test", datetime(2026, 11, 21, tzinfo=UTC).replace(tzinfo=None), "{}", None, None, "{}")
+    sweep = SweepRow(
+        "sweep-1",
+        "test",
+        datetime(2026, 11, 21, tzinfo=UTC).replace(tzinfo=None),
+        "{}",
+        None,
+        None,
+        "{}",
+    )
     store.begin_sweep(sweep, specs, [])
     store.write("sweep-1", records, patience_s=5)
     return path
