@@ -96,7 +96,7 @@ def ablation_matrix(study: Study) -> Figure:
             )
             text = _mark(passed)
             if name in TESTED and robust is not None and robust != passed:
-                text += f" (robust: {_mark(robust)})"
+                text += f" / {_mark(robust)}"
             axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=6)
     axes.set(xlim=(0, len(INDICATORS)), ylim=(len(groups), 0))
     axes.set_xticks(np.arange(len(INDICATORS)) + 0.5, list(INDICATORS))
@@ -156,7 +156,7 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
     "ablation-matrix": (
         ablation_matrix,
         "Indicators of human behaviour by the paper's rule; where the robust tests disagree, their "
-        "verdict stands in brackets.",
+        "verdict stands after a stroke.",
     ),
     "distributions": (
         distributions,

@@ -13,7 +13,10 @@ import typer.main
 import merge_runner as package
 from analysis.commands import app
 
-COMMANDS = {"sweep", "replay", "sql", "digest", "models", "emulate", "recording"}
+COMMANDS = {
+    *("sweep", "replay", "sql", "digest", "models", "emulate", "recording"),
+    *("tables", "figures", "report", "explain", "human"),
+}
 # The promised options; more may be there.
 SWEEP_OPTIONS = {
     *("--model", "--reps", "--conditions", "--variants", "--sample-set", "--db", "--cache"),
@@ -55,6 +58,11 @@ def test_the_menu_is_what_was_promised():
         (["digest", "--db", "no.duckdb"], "there is no database no.duckdb"),
         (["sql", "select 1", "--format", "xml"], "csv"),
         (["recording", "export", "x.parquet"], "there is no database"),
+        (["tables"], "there is no database"),
+        (["tables", "--format", "xml"], "latex"),
+        (["report"], "there is no database"),
+        (["figures", "--db", "no.duckdb"], "there is no database no.duckdb"),
+        (["explain", "gap"], "Missing argument 'CELL'"),
     ],
 )
 async def test_bad_input_exits_2_with_a_clear_line_and_no_traceback(merge_runner, arguments, says):

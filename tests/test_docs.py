@@ -16,6 +16,7 @@ import typer.main
 from harness import PROJECT, environment, watched
 
 from analysis.commands import app
+from analysis.published import published
 
 PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
@@ -105,6 +106,13 @@ def test_every_command_and_every_make_target_is_in_the_docs():
     targets = re.findall(r"^([a-z]+):.*## ", (PROJECT / "Makefile").read_text(), re.MULTILINE)
     for target in targets:
         assert f"make {target}" in text, target
+
+
+def test_the_readings_of_the_docs_are_those_of_the_report():
+    text = (PROJECT / "docs/reproduction.md").read_text(encoding="utf-8")
+    shown = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    readings = published("readings").itertuples(index=False)
+    assert shown == ["| " + " | ".join(c.replace("|", r"\|") for c in r) + " |" for r in readings]
 
 
 def test_links_of_the_docs_lead_somewhere():
