@@ -46,7 +46,8 @@ class Population:
     """Human trials by condition, in the order of CONDITIONS, one array each.
 
     ``left``: 1 or 0 for who merged first, NaN after a collision. ``gap_m``: NaN after a collision.
-    ``piecewise``: whether the trial's profiles pass I5; empty before an import.
+    ``piecewise``: 1 or 0 for whether the trial's profiles pass I5, NaN where it did not finish.
+    Without traces the last two are empty.
     """
 
     left: tuple[Array, ...]
@@ -68,11 +69,11 @@ def published_humans() -> Population:
 
 
 def imported_humans(trials: pd.DataFrame, piecewise: pd.Series) -> Population:
-    """The humans as imported: rows of ``load_trials`` and whether each trial passes I5."""
+    """The humans as imported: rows of ``load_trials``, and I5 of each trial as in Population."""
     return Population(
         left=_by_condition(trials, _left(trials)),
         gap_m=_by_condition(trials, trials["gap_m"]),
-        piecewise=_by_condition(trials, piecewise.astype(float)),
+        piecewise=_by_condition(trials, piecewise),
     )
 
 
@@ -100,7 +101,7 @@ class _Draws:
         shape = (DATA_SETS, len(CONDITIONS))
         self.n, self.left = np.zeros(shape), np.zeros(shape)
         self.gap, self.squared_gap = np.zeros(shape), np.zeros(shape)
-        passes = np.zeros(shape)
+        judged, passing = np.zeros(DATA_SETS, int), np.zeros(DATA_SETS, int)
         expected = GAP_DESIGN @ _published_gap()
         for i, size in enumerate(sizes):
             if size == 0 or len(humans.left[i]) == 0:
@@ -118,17 +119,18 @@ class _Draws:
             self.gap[:, i] = np.where(kept, gap, 0).sum(axis=1)
             self.squared_gap[:, i] = np.where(kept, gap**2, 0).sum(axis=1)
             if humans.piecewise:
-                passes[:, i] = humans.piecewise[i][drawn].sum(axis=1)
-        total = sum(sizes)
+                passes = humans.piecewise[i][drawn]
+                judged += np.isfinite(passes).sum(axis=1)
+                passing += np.nansum(passes, axis=1).astype(int)
         self.piecewise = (
-            np.array([_enough(int(passing), total) for passing in passes.sum(axis=1)])
+            np.array([_enough(*counts) for counts in zip(passing, judged, strict=True)])
             if humans.piecewise
             else None
         )
 
 
-def _enough(passing: int, total: int) -> bool:
-    low = proportion(passing, total).low
+def _enough(passing: int, judged: int) -> bool:
+    low = proportion(int(passing), int(judged)).low
     return low is not None and low >= THRESHOLDS.min_share
 
 

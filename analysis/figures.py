@@ -202,8 +202,9 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
             axis: Axes = axes[row, column]
             found = left_traces(study, group, first)
             colour, _ = _style(study, group)
+            alpha = min(0.4, max(0.06, 25 / max(len(found), 1)))  # many lines must not be one blot
             for time_s, velocity_mps in found:
-                axis.plot(time_s, velocity_mps, color=colour, lw=0.4, alpha=0.35, rasterized=True)
+                axis.plot(time_s, velocity_mps, color=colour, lw=0.4, alpha=alpha, rasterized=True)
             if not group.measured:
                 _say(axis, MISSING)
             elif not found:

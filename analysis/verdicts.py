@@ -124,4 +124,4 @@ def population(study: Study) -> Population:
     if not human.measured:
         return published_humans()
     passes = piecewise_trials(study, human)
-    return imported_humans(human.ended, human.ended["trial_id"].map(passes).fillna(False))
+    return imported_humans(human.ended, human.ended["trial_id"].map(passes).astype(float))

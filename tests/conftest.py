@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 from pathlib import Path
 
 import pytest
-from harness import Run, environment
+from harness import PROGRAM, Run, environment
 from hypothesis import settings
 
-PROGRAM = Path(sys.executable).with_name("merge-runner")
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)
 settings.load_profile("gate")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -16,6 +17,7 @@ from merge_runner.emulator.server import HOST, Emulator
 from merge_runner.records import SLOT_HEADER
 
 PROJECT = Path(__file__).parent.parent
+PROGRAM = Path(sys.executable).with_name("merge-runner")
 RECORDING = PROJECT / "cache/recordings/emulator-baseline.parquet"
 # Variables that would change what a run does.
 CONFIGURING = ("_API_KEY", "_BASE_URL", "_PROXY", "_proxy")

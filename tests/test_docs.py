@@ -14,9 +14,11 @@ from pathlib import Path
 import pytest
 import typer.main
 from harness import PROJECT, environment, watched
+from recordings import drive, write_folder
 
 from analysis.commands import app
 from analysis.published import published
+from merge_runner.simulator.conditions import CONDITIONS
 
 PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
@@ -43,6 +45,13 @@ def folder(tmp_path):
         change = (r"^[rt]pm = .*$", "") if sweep.stem == "models" else (r" = \d+$", " = 1")
         sweep.write_text(re.sub(*change, sweep.read_text(), flags=re.MULTILINE))
     shutil.copytree(PROJECT / "cache/recordings", tmp_path / "cache/recordings")
+    write_folder(
+        tmp_path / "recordings",
+        {
+            f"data/experiments/experiment_4/experiment_4_iter_{i}.csv": drive(name).csv()
+            for i, name in enumerate(CONDITIONS, 1)
+        },
+    )
     return tmp_path
 
 

@@ -22,7 +22,7 @@ DAMAGED = (struct.error, zlib.error, ValueError, IndexError)
 
 
 def read_mat(content: bytes) -> dict[str, list[float | str]]:
-    """Variable to its values; a text is one value, cells and structures are left out.
+    """Variable to its values; a text is one value, cells and structures have none.
 
     Raises Unreadable.
     """

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import pandas as pd
 
 from analysis.study import Study
-from analysis.tables.ablations import ablation_qualitative, ablation_quantitative, contrasts
+from analysis.tables.ablations import ablation_qualitative, ablation_quantitative
+from analysis.tables.contrasts import contrasts
 from analysis.tables.formats import value_rows
 from analysis.tables.indicators import indicators
 from analysis.tables.model import Table

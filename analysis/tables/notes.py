@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from analysis.ceiling import DATA_SETS, SEED
+from analysis.human.counts import findings, human_counts
 from analysis.piecewise import THRESHOLDS
 from analysis.published import HUMAN_DOI, HUMAN_GAP_SD_M
 from analysis.study import Group, Study
@@ -20,6 +21,8 @@ def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
         notes.append(text + group.left_out)
     if not study.models:
         notes.append(f"{study.db} holds no trial of a model; `make sweep` plays some")
+    if study.human.measured and study.human in study.groups:
+        notes += [f"human: {finding}" for finding in findings(human_counts(study.db))]
     if not study.human.measured and study.human in study.groups:
         notes.append(
             "human: the published outcomes of 990 trials; for the rest `merge-runner human import "

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import subprocess
-import sys
-from pathlib import Path
 
 import pytest
-from harness import Run, environment
-
-PROGRAM = Path(sys.executable).with_name("merge-runner")
+from harness import PROGRAM, Run, environment
 
 
 @pytest.fixture

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pandas as pd
 import pytest
 
@@ -74,7 +76,7 @@ def test_experiments_beside_the_published_pairs_are_named_and_not_compared():
 
 @pytest.fixture
 def db(tmp_path):
-    """The 990 published outcomes as trials of nine pairs."""
+    """The 990 published outcomes as trials of nine pairs, and a trial of a model."""
     pairs = list(PAIRS.values())
     records = []
     for number, row in enumerate(human_outcomes().itertuples()):
@@ -86,7 +88,8 @@ def db(tmp_path):
         state = StateRow(0, 0.0, "left", 50.0, 10.0, 0.0)
         records.append(TrialRecord(spec, row.status, first, 5.0, None, (state,), ()))
     path = tmp_path / "merge.duckdb"
-    Store(path).add_recorded(records, {})
+    spec = replace(spec, trial_id="o3/1", source="llm", variant="baseline", pair=None)
+    Store(path).add_recorded([*records, replace(records[-1], spec=spec)], {})
     return path
 
 

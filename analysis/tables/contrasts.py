@@ -1,0 +1,148 @@
+"""Differences between prompts, and between drivers and humans, corrected for their number."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from analysis.contrasts import Contrast, contrast_means, contrast_rates, corrected
+from analysis.measures import MEASURES, Measure, counts, estimate, known, published_human
+from analysis.study import BASELINE, Group, Study
+from analysis.tables.ablations import VARIANTS
+from analysis.tables.model import Column, Row, Table
+
+
+def contrasts(study: Study) -> Table:
+    """Every variant against its driver's baseline, and every baseline against the humans."""
+    rows: list[Row] = []
+    for driver in dict.fromkeys(group.driver for group in study.models):
+        for measure in MEASURES:
+            rows += _family(study, driver, measure)
+    rows += _against_humans(study)
+    return Table(
+        "contrasts",
+        "Differences from the baseline prompt, and of the baseline from humans",
+        (
+            Column("driver", "driver"),
+            Column("setting", "setting"),
+            Column("reference", "against"),
+            Column("measure", "measure"),
+            Column("difference", "difference", "number", 2, "first minus second"),
+            Column("ci", "95 % CI", "interval", 2, "Newcombe or Welch", optional=True),
+            Column("p", "p", "p", 3, "Fisher's exact or permutation test"),
+            Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
+            Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
+            Column("n", "n", "count", 0, "trials of the setting"),
+            Column("n_reference", "n ref.", "count", 0, "trials of the reference"),
+        ),
+        rows,
+        (
+            "rates: Fisher's exact test; means: permutation within conditions, seeded; a family is "
+            "one measure of one driver over its variants, or over all drivers against humans",
+            *(
+                []
+                if study.human.measured
+                else ["gap and RMSE against humans need the recordings: merge-runner human import"]
+            ),
+            *_shared_notes(study),
+            *([] if rows else [f"{study.db} holds no pair of groups to compare"]),
+        ),
+    )
+
+
+def _family(study: Study, driver: str, measure: Measure) -> list[Row]:
+    """One measure of a driver's variants against its baseline."""
+    groups = [group for group in study.models if group.driver == driver]
+    baseline = next((group for group in groups if group.setting == BASELINE), None)
+    if baseline is None:
+        return []
+    pairs = [(group, baseline) for group in groups if group.setting != BASELINE]
+    return _corrected(pairs, measure, "baseline")
+
+
+def _against_humans(study: Study) -> Iterator[Row]:
+    """Every driver's baseline against the humans, as far as these are known."""
+    if study.human not in study.groups:
+        return
+    pairs = [(group, study.human) for group in study.models if group.setting == BASELINE]
+    for measure in MEASURES:
+        if known(study.human, measure) or measure.name == "joint_percent":
+            yield from _corrected(pairs, measure, "human")
+
+
+def _corrected(pairs: list[tuple[Group, Group]], measure: Measure, reference: str) -> list[Row]:
+    """A family of contrasts; groups without the measure are left out of it."""
+    found = [
+        (group, other, contrast)
+        for group, other in pairs
+        if (contrast := _contrast(group, other, measure)) is not None
+    ]
+    if not found:
+        return []
+    holm, bh = corrected([contrast.p for _, _, contrast in found])
+    return [
+        Row(
+            f"{group.id}/{reference}/{measure.name}",
+            (group.id, other.id),
+            {
+                "driver": group.driver,
+                "setting": VARIANTS.get(group.setting, group.setting),
+                "reference": reference,
+                "measure": measure.heading,
+                "difference": contrast.difference * (100 if measure.rate else 1),
+                "ci": _scaled(contrast, measure),
+                "p": contrast.p,
+                "p_holm": float(holm[i]),
+                "p_bh": float(bh[i]),
+                "n": _n(group, measure),
+                "n_reference": _n(other, measure),
+            },
+            counts=measure.counts,
+        )
+        for i, (group, other, contrast) in enumerate(found)
+    ]
+
+
+def _contrast(group: Group, other: Group, measure: Measure) -> Contrast | None:
+    if measure.rate:
+        first, second = counts(group, measure), _rate(other, measure)
+        return contrast_rates(first, second) if first[1] and second[1] else None
+    assert measure.column is not None
+    if not _n(group, measure) or not _n(other, measure):
+        return None
+    return contrast_means(group.finished, other.finished, measure.column)
+
+
+def _rate(group: Group, measure: Measure) -> tuple[int, int]:
+    """Successes and n; the humans' joint rate before an import is the published 53.0 % of 962."""
+    if known(group, measure):
+        return counts(group, measure)
+    finished = len(group.finished)
+    return round(finished * published_human(measure) / 100), finished
+
+
+def _n(group: Group, measure: Measure) -> int:
+    if measure.rate:
+        return _rate(group, measure)[1]
+    return estimate(group, measure).n
+
+
+def _scaled(contrast: Contrast, measure: Measure) -> tuple[float, float] | None:
+    if contrast.low is None or contrast.high is None:
+        return None
+    factor = 100 if measure.rate else 1
+    return factor * contrast.low, factor * contrast.high
+
+
+def _shared_notes(study: Study) -> list[str]:
+    """Variants share a reply with the baseline where their prompts are equal."""
+    drivers = {group.driver for group in study.models}
+    notes = []
+    for row in study.shared.itertuples():
+        driver = row.model_left if row.model_left == row.model_right else None
+        if row.shared and driver in drivers:
+            notes.append(
+                f"{driver}/{row.variant}: {row.shared} of {row.calls} calls share their reply with "
+                "the baseline, where prompt and slot are equal: the groups are not independent, "
+                "and the tests, which take them as such, are conservative there"
+            )
+    return notes

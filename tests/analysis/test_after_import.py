@@ -1,0 +1,88 @@
+"""What changes in tables, figures and report once the human recordings are imported."""
+
+from __future__ import annotations
+
+import pytest
+from recordings import drive, write_folder
+from studies import write_study, yielding
+
+from analysis.conclusions import not_shown
+from analysis.figures import figure_2
+from analysis.human.archive import open_files
+from analysis.human.load import import_trials, sort_files
+from analysis.piecewise import THRESHOLDS
+from analysis.provenance import provenance
+from analysis.study import Study, of_group
+from analysis.tables import make_tables
+from analysis.verdicts import population, score, thresholds
+from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.store import Store
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory):
+    """Four pairs of humans, three trials each in every condition, beside a driver."""
+    folder = tmp_path_factory.mktemp("imported")
+    files = {}
+    for experiment in (4, 5, 6, 8):
+        number = 0
+        for condition in CONDITIONS.values():
+            for rep in range(3):
+                number += 1
+                ahead = condition.projected_headway_m + 0.1 * experiment - 0.5 + 0.3 * (rep - 1)
+                yields = "both" if rep == 2 and experiment == 8 else None
+                yields = yields or ("right" if ahead > 0 else "left")
+                name = f"experiment_{experiment}/experiment_{experiment}_iter_{number}.csv"
+                files[name] = drive(condition.name, yields=yields).csv()
+    db = write_study(folder / "t.duckdb", yielding("o3", reps=5))
+    with open_files(write_folder(folder / "recordings", files)) as found:
+        import_trials(sort_files(found).trials, Store(db))
+    return Study(db)
+
+
+def test_human_rows_come_from_the_traces(imported):
+    tables = {table.name: table for table in make_tables(imported)}
+    human = imported.human
+    assert human.measured
+    row = next(r for r in tables["ablation-quantitative"].rows if r.id == "human")
+    assert row.values["n"] == 4 * 33
+    assert row.values["gap_m"] == pytest.approx(human.finished["gap_m"].mean())
+    assert "published" not in row.note
+    assert {row.groups for row in tables["contrasts"].rows} == {("o3/baseline", "human")}
+    assert {row.values["measure"] for row in tables["contrasts"].rows} == {
+        *("coll. (%)", "gap (m)", "RMSE (m/s)", "joint (%)")
+    }
+    assert any("132 of 990 trials" in note for note in tables["who-first"].notes)
+    windows = [row.values["window"] for row in tables["speed-windows"].rows if "human" in row.id]
+    assert len(windows) == 4
+    rules = {r.values["rule"]: r.values for r in tables["robustness"].rows if "human" in r.id}
+    assert rules["rectangle"]["n"] == 132
+
+
+def test_humans_have_further_rows_with_a_random_intercept_per_pair(imported):
+    for table in make_tables(imported, ["who-first", "gap"]):
+        rows = [row for row in table.rows if "/mixed/" in row.id]
+        terms = {row.id.rpartition("/")[2] for row in table.rows}
+        assert {row.id.rpartition("/")[2] for row in rows} == terms
+        assert all(row.values.get("b") is not None or row.note for row in rows)
+
+
+def test_the_limit_of_reversals_becomes_the_human_95th_percentile(imported):
+    human = of_group(imported.profiles, imported.human, imported.human.finished)
+    expected = human["reversal_rate_hz"].quantile(0.95)
+    assert thresholds(imported).max_reversal_rate_hz == expected != THRESHOLDS.max_reversal_rate_hz
+    (table,) = make_tables(imported, ["velocity-profiles"])
+    assert any("human 95th percentile" in note for note in table.notes)
+
+
+def test_ceilings_are_drawn_from_the_imported_trials(imported):
+    humans = population(imported)
+    assert sum(len(gaps) for gaps in humans.gap_m) == 132
+    assert "I5" in score(imported, imported.models[0]).ceiling.paper
+
+
+def test_nothing_says_any_more_that_recordings_are_missing(imported):
+    texts = " ".join(not_shown(imported, provenance(imported.db)))
+    assert "not imported" not in texts
+    shown = [t.get_text() for sub in figure_2(imported).subfigs for a in sub.axes for t in a.texts]
+    assert not any("recordings" in text for text in shown)

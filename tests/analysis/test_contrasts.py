@@ -1,0 +1,162 @@
+"""Differences between groups, against enumerations and figures worked out by hand."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import comb, sqrt
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from analysis.contrasts import PERMUTATIONS, contrast_means, contrast_rates, corrected
+
+
+def fisher(first, second) -> float:
+    """Fisher's two-sided p: all tables with these margins that are no likelier."""
+    (a, n), (b, m) = first, second
+    total = a + b
+    ways = {k: comb(n, k) * comb(m, total - k) for k in range(max(0, total - m), min(n, total) + 1)}
+    return sum(w for w in ways.values() if w <= ways[a]) / sum(ways.values())
+
+
+def wilson(successes, n):
+    """Wilson's bounds of a proportion."""
+    z = 1.959964
+    centre, width = successes + z**2 / 2, z * sqrt(successes * (n - successes) / n + z**2 / 4)
+    return (centre - width) / (n + z**2), (centre + width) / (n + z**2)
+
+
+def newcombe(first, second):
+    """Newcombe's (1998) hybrid score interval, his method 10."""
+    p, q = first[0] / first[1], second[0] / second[1]
+    (p_low, p_high), (q_low, q_high) = wilson(*first), wilson(*second)
+    low = p - q - sqrt((p - p_low) ** 2 + (q_high - q) ** 2)
+    high = p - q + sqrt((p_high - p) ** 2 + (q - q_low) ** 2)
+    return low, high
+
+
+RATES = [
+    ((0, 110), (28, 990)),
+    ((28, 110), (28, 990)),
+    ((16, 110), (28, 110)),
+    ((3, 110), (0, 110)),
+    ((5, 5), (0, 4)),
+]
+
+
+@pytest.mark.parametrize(("first", "second"), RATES)
+def test_rates_are_compared_by_fishers_test_and_newcombes_interval(first, second):
+    found = contrast_rates(first, second)
+    assert found.difference == pytest.approx(first[0] / first[1] - second[0] / second[1])
+    assert (found.low, found.high) == pytest.approx(newcombe(first, second), abs=1e-6)
+    assert found.p == pytest.approx(fisher(first, second), rel=1e-6)
+    assert found.low <= found.difference <= found.high
+
+
+def test_o3s_collisions_do_not_differ_from_the_humans_and_geminis_do():
+    assert contrast_rates((0, 110), (28, 990)).p == pytest.approx(0.10, abs=0.005)
+    assert contrast_rates((28, 110), (28, 990)).p == pytest.approx(3e-15, rel=0.2)
+    assert contrast_rates((3, 110), (0, 110)).p == pytest.approx(0.25, abs=0.005)
+
+
+def group(**values) -> pd.DataFrame:
+    """Trials by condition: one row a value."""
+    rows = [(name, value) for name, column in values.items() for value in column]
+    return pd.DataFrame(rows, columns=["condition", "gap_m"])
+
+
+FIRST = group(N_0_0=[1.0, 4.5, 5.0], L_4_8=[9.0, 12.0])
+SECOND = group(N_0_0=[2.0, 3.0], L_4_8=[6.0, 7.5, 9.5])
+
+
+def enumerated(first, second) -> float:
+    """The exact share of all shuffles within conditions with as large a difference of means."""
+    both = pd.concat([first, second])["gap_m"].sum()
+    ways = []
+    for name in ("N_0_0", "L_4_8"):
+        mine = first.loc[first["condition"] == name, "gap_m"]
+        other = second.loc[second["condition"] == name, "gap_m"]
+        ways.append([sum(chosen) for chosen in combinations([*mine, *other], len(mine))])
+    observed = abs(first["gap_m"].mean() - second["gap_m"].mean())
+    differences = [
+        abs((a + b) / len(first) - (both - a - b) / len(second)) for a in ways[0] for b in ways[1]
+    ]
+    assert len(differences) == 100
+    return sum(difference >= observed - 1e-9 for difference in differences) / len(differences)
+
+
+def test_the_permutation_p_is_that_of_all_shuffles_within_conditions():
+    exact = enumerated(FIRST, SECOND)
+    assert 0.1 < exact < 0.9
+    error = sqrt(exact * (1 - exact) / PERMUTATIONS)
+    assert contrast_means(FIRST, SECOND, "gap_m").p == pytest.approx(exact, abs=4 * error)
+
+
+def test_the_permutation_p_is_two_sided():
+    assert enumerated(SECOND, FIRST) == enumerated(FIRST, SECOND)
+    found = [contrast_means(*pair, "gap_m").p for pair in ((FIRST, SECOND), (SECOND, FIRST))]
+    assert found[0] == pytest.approx(found[1], abs=0.02)
+
+
+def test_means_have_welchs_interval():
+    found = contrast_means(FIRST, SECOND, "gap_m")
+    x, y = FIRST["gap_m"], SECOND["gap_m"]
+    u, v = x.var() / len(x), y.var() / len(y)
+    freedom = (u + v) ** 2 / (u**2 / (len(x) - 1) + v**2 / (len(y) - 1))
+    half = stats.t.ppf(0.975, freedom) * sqrt(u + v)
+    assert found.difference == pytest.approx(6.3 - 5.6)
+    assert (found.low, found.high) == pytest.approx((0.7 - half, 0.7 + half))
+
+
+def test_another_mix_of_conditions_alone_is_no_difference():
+    """Both drive alike in either condition, but each has lost many trials of another one."""
+    rng = np.random.default_rng(2)
+    first = group(N_0_0=rng.normal(2, 1, 40), L_4_8=rng.normal(8, 1, 10))
+    second = group(N_0_0=rng.normal(2, 1, 10), L_4_8=rng.normal(8, 1, 40))
+    found = contrast_means(first, second, "gap_m")
+    assert found.high < -2  # Welch's interval knows nothing of conditions
+    assert found.p > 0.2
+
+
+def test_a_difference_within_conditions_is_found():
+    rng = np.random.default_rng(2)
+    first = group(N_0_0=rng.normal(2, 1, 20), L_4_8=rng.normal(8, 1, 20))
+    second = first.assign(gap_m=first["gap_m"] + 1.5)
+    assert contrast_means(first, second, "gap_m").p == 1 / (PERMUTATIONS + 1)
+
+
+def test_trials_without_the_measure_do_not_count():
+    missing = group(N_0_0=[np.nan, np.nan], L_4_8=[np.nan])
+    found = contrast_means(pd.concat([FIRST, missing]), pd.concat([missing, SECOND]), "gap_m")
+    assert found == contrast_means(FIRST, SECOND, "gap_m")
+
+
+def test_a_contrast_of_means_is_the_same_every_time():
+    found = contrast_means(FIRST, SECOND, "gap_m")
+    assert found == contrast_means(FIRST.copy(), SECOND.copy(), "gap_m")
+    assert found.p == 0.7325
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [(group(N_0_0=[3.0]), group(N_0_0=[3.0, 4.0])), (group(N_0_0=[3.0] * 4),) * 2],
+    ids=["one trial", "equal values"],
+)
+def test_where_nothing_varies_there_is_no_interval_and_no_difference(first, second):
+    found = contrast_means(first, second, "gap_m")
+    assert (found.low, found.high) == (None, None)
+    assert found.p == 1
+
+
+def test_a_family_is_corrected_by_holm_and_by_benjamini_and_hochberg():
+    holm, false_discovery = corrected([0.01, 0.04, 0.03, 0.005])
+    assert list(holm) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert list(false_discovery) == pytest.approx([0.02, 0.04, 0.04, 0.02])
+
+
+def test_corrected_p_values_stay_at_most_1():
+    holm, false_discovery = corrected([0.6, 0.9, 0.2])
+    assert list(holm) == pytest.approx([1.0, 1.0, 0.6])
+    assert list(false_discovery) == pytest.approx([0.9, 0.9, 0.6])

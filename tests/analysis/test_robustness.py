@@ -1,0 +1,227 @@
+"""Trials judged again under the other collision rules."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+from harness import RECORDING
+
+from analysis.load import load, load_trials
+from analysis.robustness import RULES, UNDECIDED, outcomes, redrive
+from merge_runner.config import Scenario
+from merge_runner.records import StateRow, TrialRecord, TrialSpec
+from merge_runner.store import Store
+
+KEY = ["trial_id", "spec_hash"]
+OWN_EXIT = "[repetitions]\nbaseline = 1\n[scenario]\ncontrol_start = 'own_exit'\n"
+CRUISE = [0.0] * 5  # a decision's actions
+
+
+def by_rule(found) -> dict[str, pd.DataFrame]:
+    """The outcomes of each rule, in the order of the trials."""
+    assert list(found["rule"].unique()) == list(RULES)
+    return {rule: rows.reset_index(drop=True) for rule, rows in found.groupby("rule")}
+
+
+def same(found, trials) -> bool:
+    """Whether trials have these statuses and first mergers."""
+    columns = [*KEY, "status", "merged_first"]
+    left, right = (frame[columns].fillna("nobody").to_numpy().tolist() for frame in (found, trials))
+    return left == right
+
+
+def driven(condition, left, right, rest=0):
+    """Outcomes by rule of plans of single actions; both last plans go on for ``rest`` actions."""
+    decided = [[side[k : k + 5] for k in range(0, len(side), 5)] for side in (left, right)]
+    last = [[*decisions[-1], *[0.0] * rest] for decisions in decided]
+    return {
+        rule: redrive(Scenario(collision_rule=rule), condition, decided, last) for rule in RULES
+    }
+
+
+def test_the_rules_are_those_of_the_scenario():
+    assert RULES == ("euclid2d", "rectangle", "shared_lane")
+
+
+async def test_a_sweeps_trials_have_their_stored_outcomes_under_their_own_rule(
+    merge_runner, tmp_path
+):
+    run = await merge_runner("replay", "baseline", "--recording", RECORDING, "--reps", 2)
+    assert run.code == 0, run.err
+    db = tmp_path / "results/merge.duckdb"
+    trials = load_trials(db)
+    assert len(trials) == 22
+    found = by_rule(outcomes(db, trials))
+    assert same(found["euclid2d"], trials)
+    # Where nothing collided the recorded positions tell what a shared lane makes of it.
+    pairs = load("SELECT *, greatest(left_m, right_m) AS first_m FROM vehicle_pairs", db)
+    close = pairs[(pairs["first_m"] >= 100) & ((pairs["left_m"] - pairs["right_m"]).abs() < 4.5)]
+    finished = trials["status"] == "finished"
+    assert finished.sum() > 10
+    shared = trials["status"].mask(trials["trial_id"].isin(close["trial_id"]), "collided")
+    expected = trials.assign(status=shared)
+    assert same(found["shared_lane"][finished], expected[finished])
+
+
+async def test_constant_drivers_collide_under_every_rule_and_failed_trials_are_left_out(
+    merge_runner, tmp_path
+):
+    run = await merge_runner("sweep", "baseline", "--model", "constant", "--reps", 1)
+    assert run.code == 0, run.err
+    db = tmp_path / "results/merge.duckdb"
+    trials = load_trials(db)
+    assert set(trials["status"]) == {"collided"}
+    for rows in by_rule(outcomes(db, trials)).values():
+        assert same(rows, trials)
+    failed = trials.assign(status=["failed", *trials["status"][1:]])
+    assert set(outcomes(db, failed)["trial_id"]) == set(trials["trial_id"][1:])
+
+
+async def test_a_vehicle_that_came_out_later_cruised_before(merge_runner, tmp_path):
+    """Under own_exit the drivers' first decisions lie apart."""
+    (tmp_path / "own.toml").write_text(OWN_EXIT)
+    run = await merge_runner("sweep", "own.toml", "--model", "projected-order")
+    assert run.code == 0, run.err
+    db = tmp_path / "results/merge.duckdb"
+    starts = load("SELECT min(time_s) AS first_s FROM decisions GROUP BY trial_id, side", db)
+    assert starts["first_s"].max() > 0
+    trials = load_trials(db)
+    assert same(by_rule(outcomes(db, trials))["euclid2d"], trials)
+
+
+def test_boxes_may_overlap_where_the_centres_stay_a_vehicle_length_apart():
+    """The left gains 0.58 m on its lead of 4 m, and keeps 4.58 m from then on."""
+    gain = 0.58 / (2.5 * 0.6**2)
+    left = [gain] * 3 + [-gain] * 3 + [0.0] * 44
+    assert driven("L_4_0", left, [0.0] * 50) == {
+        "euclid2d": ("finished", "left"),
+        "rectangle": ("collided", None),
+        "shared_lane": ("finished", "left"),
+    }
+    assert driven("R_-4_0", [0.0] * 50, left)["euclid2d"] == ("finished", "right")
+    assert driven("R_-4_0", [0.0] * 50, left)["rectangle"] == ("collided", None)
+
+
+def test_centres_may_come_close_on_two_branches_where_nothing_touches():
+    """Side by side to 76 m, then one brakes and one accelerates as hard as they can."""
+    steps = [0.0] * 13
+    left, right = [*steps, *[1.0] * 12, *[0.0] * 30], [*steps, *[-1.0] * 12, *[0.0] * 30]
+    assert driven("N_0_0", left, right) == {
+        "euclid2d": ("collided", None),
+        "rectangle": ("finished", "left"),
+        "shared_lane": ("finished", "left"),
+    }
+
+
+def test_a_shared_lane_collides_later():
+    """Side by side the centres are 4.5 m apart at 82 m, and share a lane from 100 m on."""
+    to_89_m, to_97_m, to_101_m = ([0.0] * n for n in (20, 24, 26))
+    assert [outcome[0] for outcome in driven("N_0_0", to_89_m, to_89_m).values()] == [
+        "collided", UNDECIDED, UNDECIDED
+    ]  # fmt: skip
+    assert [outcome[0] for outcome in driven("N_0_0", to_97_m, to_97_m).values()] == [
+        "collided", "collided", UNDECIDED
+    ]  # fmt: skip
+    assert [outcome[0] for outcome in driven("N_0_0", to_101_m, to_101_m).values()] == [
+        "collided"
+    ] * 3
+
+
+def test_last_plans_go_on_where_they_were_left():
+    """Driven to 90 m; the whole plans reach beyond the merge point."""
+    driven_out = [0.0] * 20
+    assert driven("N_0_0", driven_out, driven_out, rest=3)["shared_lane"] == (UNDECIDED, None)
+    assert driven("N_0_0", driven_out, driven_out, rest=5)["shared_lane"] == ("collided", None)
+
+
+def test_a_last_plan_goes_on_after_the_actions_that_were_driven():
+    """Two actions up were driven, two down are left: 0.4 m are won, and 4.4 m are too few.
+
+    From any other action on the left would stay faster, and merge.
+    """
+    applied = [[CRUISE, [1.0, 1.0]], [CRUISE, [0.0, 0.0]]]
+    last = [1.0, 1.0, -1.0, -1.0, *[0.0] * 64]
+    scenario = Scenario(collision_rule="shared_lane")
+    assert redrive(scenario, "L_4_0", applied, [last, [0.0] * 68]) == ("collided", None)
+    longer = [*[1.0] * 3, *[-1.0] * 3, *[0.0] * 60]  # 0.9 m are enough
+    assert redrive(scenario, "L_4_0", applied, [longer, [0.0] * 66]) == ("finished", "left")
+
+
+def test_it_stays_open_where_one_drivers_plan_is_not_known():
+    """A fallback has no plan of its own."""
+    applied = [[CRUISE] * 4, [CRUISE] * 4]
+    scenario = Scenario(collision_rule="shared_lane")
+    known = [0.0] * 20
+    assert redrive(scenario, "N_0_0", applied, [known, known]) == ("collided", None)
+    assert redrive(scenario, "N_0_0", applied, [known, []]) == (UNDECIDED, None)
+    assert redrive(scenario, "N_0_0", applied, [[], known]) == (UNDECIDED, None)
+
+
+def test_an_open_trial_has_no_first_merger():
+    """The left has passed the merge point, the plans end before the track does."""
+    lead = [1.0] * 10 + [0.0] * 20
+    found = driven("L_4_0", lead, [-1.0] * 10 + [0.0] * 20)
+    assert set(found.values()) == {(UNDECIDED, None)}
+
+
+def test_a_driver_that_decided_later_cruised_in_the_steps_before():
+    """Full throttle from the right's first decision on, five steps late, comes too late to pass."""
+    scenario = Scenario(control_start="own_exit")
+    early = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 12], [[], []])
+    late = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 8], [[], []])
+    assert early == ("finished", "right")
+    assert late == ("collided", None)
+    drawn_out = redrive(
+        scenario, "N_0_0", [[[0.0] * 5] * 12, [CRUISE] * 4 + [[1.0] * 5] * 8], [[], []]
+    )
+    assert late == drawn_out
+
+
+@pytest.fixture
+def humans(tmp_path):
+    """Stores human trials of N_0_0: (status, merged first, positions) each."""
+
+    def store(*trials):
+        records = []
+        for number, (status, first, pairs) in enumerate(trials):
+            spec = TrialSpec(
+                f"human/{number}", "h", "human", "human", "human", None, "N_0_0", number, 0, 0,
+                pair="pair1",
+            )  # fmt: skip
+            states = tuple(
+                StateRow(step, 0.05 * step, side, position, 10.0, 0.0)
+                for step, pair in enumerate(pairs)
+                for side, position in zip(("left", "right"), pair, strict=True)
+            )
+            end_s = 0.05 * (len(pairs) - 1)
+            records.append(TrialRecord(spec, status, first, end_s, None, states, ()))
+        path = tmp_path / "humans.duckdb"
+        Store(path).add_recorded(records, {})
+        return path
+
+    return store
+
+
+def test_human_traces_are_judged_as_they_are(humans):
+    apart = [(90.0, 80.0), (110.0, 100.0), (150.0, 140.0)]
+    side_by_side = [(84.0, 84.0), (90.0, 80.0), (150.0, 140.0)]
+    boxes = [(97.0, 101.55), (101.0, 110.0), (140.0, 150.0)]
+    db = humans(
+        ("finished", "left", apart),
+        ("finished", "left", side_by_side),
+        ("collided", None, boxes[:1]),
+        ("collided", None, apart[:1]),
+        ("timeout", None, apart[:1]),
+    )
+    found = outcomes(db, load_trials(db))
+    assert len(found) == 15
+    finished, collided, opened = ("finished", "left"), ("collided", None), (UNDECIDED, None)
+    timeout = ("timeout", None)
+    expected = {
+        "euclid2d": [finished, collided, opened, opened, timeout],
+        "rectangle": [finished, finished, collided, opened, timeout],
+        "shared_lane": [finished, finished, opened, opened, timeout],
+    }
+    for rule, rows in by_rule(found).items():
+        merged = rows["merged_first"].astype(object).where(rows["merged_first"].notna(), None)
+        assert list(zip(rows["status"], merged, strict=True)) == expected[rule]
