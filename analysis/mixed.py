@@ -34,7 +34,7 @@ def gap_mixed(trials: pd.DataFrame) -> Regression:
     if problem:
         return Regression(len(gap), {}, problem)
     with warnings.catch_warnings():
-        # Where pairs do not differ their variance is 0, the boundary, and the fit is the pooled one.
+        # Where pairs do not differ their variance is 0, on the boundary: the fit is the pooled one.
         warnings.simplefilter("ignore", ConvergenceWarning)
         warnings.simplefilter("ignore", SingularMatrixWarning)
         fit = MixedLM(gap, design, groups=chosen["pair"].to_numpy()).fit(reml=True)

@@ -27,11 +27,13 @@ PLANS = (
     "arg_max(coalesce(plan, []), decision) AS last_plan FROM decisions "
     "GROUP BY ALL ORDER BY ALL"
 )
-HUMAN_TRACES = (
-    "SELECT trial_id, spec_hash, list(left_m ORDER BY step) AS left_m, "
-    "list(right_m ORDER BY step) AS right_m FROM vehicle_pairs JOIN trials "
-    "USING (trial_id, spec_hash) WHERE source = 'human' GROUP BY ALL ORDER BY ALL"
-)
+# No rule sees a collision where the vehicles are 5 m apart along the track.
+HUMAN_TRACES = """
+SELECT trial_id, spec_hash,
+    coalesce(list((left_m, right_m) ORDER BY step) FILTER (abs(left_m - right_m) < 5), []) AS close
+FROM vehicle_pairs JOIN trials USING (trial_id, spec_hash) WHERE source = 'human'
+GROUP BY ALL ORDER BY ALL
+"""
 
 
 def outcomes(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
@@ -110,9 +112,8 @@ def _judged(trials: pd.DataFrame, traces: pd.DataFrame) -> pd.DataFrame:
         if (trace.trial_id, trace.spec_hash) not in stored.index:
             continue
         trial = stored.loc[(trace.trial_id, trace.spec_hash)]
-        pairs = list(zip(trace.left_m, trace.right_m, strict=True))
         for rule, scenario in scenarios.items():
-            if any(collided(scenario, left, right) for left, right in pairs):
+            if any(collided(scenario, left, right) for left, right in trace.close):
                 outcome = "collided", None
             elif trial["status"] == "collided":
                 outcome = UNDECIDED, None

@@ -8,6 +8,7 @@ import pandas as pd
 
 from analysis.study import Study
 from analysis.tables.ablations import ablation_qualitative, ablation_quantitative
+from analysis.tables.conflicts import conflict_resolution, criticality
 from analysis.tables.contrasts import contrasts
 from analysis.tables.formats import value_rows
 from analysis.tables.indicators import indicators
@@ -26,6 +27,8 @@ TABLES: dict[str, Callable[[Study], Table]] = {
     "ablation-quantitative": ablation_quantitative,
     "contrasts": contrasts,
     "velocity-profiles": velocity_profiles,
+    "conflict-resolution": conflict_resolution,
+    "criticality": criticality,
     "speed-windows": speed_windows,
     "robustness": robustness,
 }
