@@ -21,20 +21,20 @@ from merge_runner.store import Store
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory):
-    """Four pairs of humans, three trials each in every condition, beside a driver."""
+    """Three pairs of humans, two trials each in every condition, beside a driver."""
     folder = tmp_path_factory.mktemp("imported")
     files = {}
-    for experiment in (4, 5, 6, 8):
+    for experiment in (4, 6, 8):
         number = 0
         for condition in CONDITIONS.values():
-            for rep in range(3):
+            for rep in range(2):
                 number += 1
                 ahead = condition.projected_headway_m + 0.1 * experiment - 0.5 + 0.3 * (rep - 1)
-                yields = "both" if rep == 2 and experiment == 8 else None
+                yields = "both" if rep == 1 and experiment == 8 else None
                 yields = yields or ("right" if ahead > 0 else "left")
                 name = f"experiment_{experiment}/experiment_{experiment}_iter_{number}.csv"
                 files[name] = drive(condition.name, yields=yields).csv()
-    db = write_study(folder / "t.duckdb", yielding("o3", reps=5))
+    db = write_study(folder / "t.duckdb", yielding("o3", reps=2))
     with open_files(write_folder(folder / "recordings", files)) as found:
         import_trials(sort_files(found).trials, Store(db))
     return Study(db)
@@ -45,18 +45,18 @@ def test_human_rows_come_from_the_traces(imported):
     human = imported.human
     assert human.measured
     row = next(r for r in tables["ablation-quantitative"].rows if r.id == "human")
-    assert row.values["n"] == 4 * 33
+    assert row.values["n"] == 66
     assert row.values["gap_m"] == pytest.approx(human.finished["gap_m"].mean())
     assert "published" not in row.note
     assert {row.groups for row in tables["contrasts"].rows} == {("o3/baseline", "human")}
     assert {row.values["measure"] for row in tables["contrasts"].rows} == {
         *("coll. (%)", "gap (m)", "RMSE (m/s)", "joint (%)")
     }
-    assert any("132 of 990 trials" in note for note in tables["who-first"].notes)
+    assert any("66 of 990 trials" in note for note in tables["who-first"].notes)
     windows = [row.values["window"] for row in tables["speed-windows"].rows if "human" in row.id]
     assert len(windows) == 4
     rules = {r.values["rule"]: r.values for r in tables["robustness"].rows if "human" in r.id}
-    assert rules["rectangle"]["n"] == 132
+    assert rules["rectangle"]["n"] == 66
 
 
 def test_humans_have_further_rows_with_a_random_intercept_per_pair(imported):
@@ -77,7 +77,7 @@ def test_the_limit_of_reversals_becomes_the_human_95th_percentile(imported):
 
 def test_ceilings_are_drawn_from_the_imported_trials(imported):
     humans = population(imported)
-    assert sum(len(gaps) for gaps in humans.gap_m) == 132
+    assert sum(len(gaps) for gaps in humans.gap_m) == 66
     assert "I5" in score(imported, imported.models[0]).ceiling.paper
 
 

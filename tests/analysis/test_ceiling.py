@@ -225,6 +225,41 @@ def test_too_few_conditions_pass_nothing(sizes):
     assert (found.paper, found.robust) == (nothing, nothing)
 
 
+def test_four_trials_are_too_few_for_the_four_coefficients_of_the_gap():
+    four = {"N_0_0", "L_0_-8", "L_4_0", "L_4_8"}
+    draws = _Draws(gapped(), [int(name in four) for name in CONDITIONS])
+    for passes in _gap_tests(draws):
+        assert not (passes["I3"] | passes["I4"]).any()
+
+
+@pytest.mark.usefixtures("few")
+def test_opposite_effects_pass_no_signed_indicator():
+    """The humans with their sides exchanged, and with gaps that shrink as far as they grew."""
+    humans = gapped()
+    shrinking = [
+        8 - 0.5 * abs(h) + (gap - 4) / 3 for gap, (h, _) in zip(humans.gap_m, CELLS, strict=True)
+    ]
+    opposite = Population(tuple(1 - who for who in humans.left), tuple(shrinking))
+    draws = _Draws(opposite, even(20))
+    for passes in (_wald(draws), _firth_tests(draws)):
+        assert not (passes["I1"] | passes["I2"]).any()
+    for passes in _gap_tests(draws):
+        assert not passes["I3"].any()
+    draws = _Draws(gapped(), even(20))
+    assert _wald(draws)["I1"].mean() > 0.9
+    assert _gap_tests(draws)[0]["I3"].mean() > 0.3
+
+
+def test_a_condition_without_human_trials_is_left_out():
+    left, gaps = list(HUMANS.left), list(gapped().gap_m)
+    left[0], gaps[0] = left[0][:0], gaps[0][:0]
+    draws = _Draws(Population(tuple(left), tuple(gaps)), even(10))
+    assert (draws.n[:, 0] == 0).all()
+    assert (draws.n[:, 1:] > 0).all()
+    assert _firth_tests(draws)["I1"].mean() > 0.9
+
+
+@pytest.mark.usefixtures("few")
 def test_one_trial_per_condition_has_a_ceiling():
     found = ceiling(gapped(), even(1))
     assert found.paper["I1-I4"] == 0
@@ -272,6 +307,17 @@ def test_after_an_import_the_ceiling_has_i5_by_both_rules():
     assert _Draws(imported_humans(trials, ~always), even(10)).piecewise.mean() == 0
 
 
+def test_trials_that_did_not_finish_do_not_count_for_i5():
+    """Half of the human trials collided; all others pass, mostly enough of them."""
+    left = [np.array([1.0, np.nan])] * 11
+    passing = [np.array([1.0, np.nan])] * 11
+    gaps = [np.array([4.0, np.nan])] * 11
+    draws = _Draws(Population(tuple(left), tuple(gaps), tuple(passing)), even(10))
+    enough = proportion_confint(draws.n.sum(axis=1), draws.n.sum(axis=1), method="wilson")[0] >= 0.8
+    assert (draws.piecewise == enough).all()
+    assert enough.mean() > 0.9
+
+
 def test_imported_humans_are_their_trials_by_condition():
     rows = [
         ("N_0_0", "finished", "left", 3.0),
@@ -281,11 +327,11 @@ def test_imported_humans_are_their_trials_by_condition():
         ("L_4_8", "finished", "left", 5.0),
     ]
     trials = pd.DataFrame(rows, columns=["condition", "status", "merged_first", "gap_m"])
-    found = imported_humans(trials, pd.Series([True, False, False, False, True]))
+    found = imported_humans(trials, pd.Series([1.0, 0.0, np.nan, np.nan, 1.0]))
     at = list(CONDITIONS).index("N_0_0")
     assert found.left[at] == pytest.approx([1, 0, np.nan, np.nan], nan_ok=True)
     assert found.gap_m[at] == pytest.approx([3, 4, np.nan, np.nan], nan_ok=True)
-    assert list(found.piecewise[at]) == [1, 0, 0, 0]
+    assert found.piecewise[at] == pytest.approx([1, 0, np.nan, np.nan], nan_ok=True)
     last = list(CONDITIONS).index("L_4_8")
     assert [list(part[last]) for part in (found.left, found.gap_m, found.piecewise)] == [
         [1], [5], [1]

@@ -58,6 +58,21 @@ def restricted(trials):
     return b, np.sqrt(np.diag(np.linalg.inv(information)))
 
 
+def hessian(function, at, step=5e-3):
+    """Second derivatives by central differences."""
+    moves = np.eye(len(at)) * step
+    return np.array(
+        [
+            [
+                function(at + i + j) - function(at + i - j) - function(at - i + j)
+                + function(at - i - j)
+                for j in moves
+            ]
+            for i in moves
+        ]
+    ) / (4 * step**2)  # fmt: skip
+
+
 class Marginal:
     """The likelihood of who goes first with a normal intercept per pair, integrated out."""
 
@@ -106,31 +121,22 @@ def test_pairs_widen_the_intercepts_error_and_narrow_the_slopes():
 
 
 def test_the_mixed_logit_is_the_maximum_of_the_integrated_likelihood():
-    trials = of_pairs(4)
+    """11 trials of each pair, and pairs that differ much: a normal approximation would be off."""
+    trials = of_pairs(3, reps=1)
     likelihood = Marginal(trials)
-    start = [0.0, 0.5, -0.5, 0.0]
-    best = optimize.minimize(lambda b: -likelihood.on_a_grid(b), start, method="BFGS").x
-    assert likelihood.on_a_grid(best) == pytest.approx(likelihood.by_quadrature(best), abs=1e-7)
-    # The maximum by quadrature too: it falls off to all sides.
+    best = optimize.minimize(
+        lambda b: -likelihood.on_a_grid(b), [0.0, 0.5, -0.5, 0.0], options={"gtol": 1e-7}
+    ).x
+    assert np.exp(best[3]) > 2
     highest = likelihood.by_quadrature(best)
+    assert likelihood.on_a_grid(best) == pytest.approx(highest, abs=1e-7)
+    # By quadrature too it falls off to all sides.
     for move in np.vstack([np.eye(4), -np.eye(4)]) * 0.02:
         assert likelihood.by_quadrature(best + move) < highest
-    moves = np.eye(4) * 1e-2
-    curvature = np.array(
-        [
-            [
-                likelihood.on_a_grid(best + i + j) - likelihood.on_a_grid(best + i - j)
-                - likelihood.on_a_grid(best - i + j) + likelihood.on_a_grid(best - i - j)
-                for j in moves
-            ]
-            for i in moves
-        ]
-    ) / (4 * 1e-2**2)  # fmt: skip
-    errors = np.sqrt(np.diag(np.linalg.inv(-curvature)))
-    assert np.exp(best[3]) > 0.5  # the pairs differ
+    errors = np.sqrt(np.diag(np.linalg.inv(-hessian(likelihood.on_a_grid, best))))
     found, found_errors = estimates(who_first_mixed(trials))
-    assert found == pytest.approx(best[:3], rel=2e-3)
-    assert found_errors == pytest.approx(errors[:3], rel=5e-3)
+    assert found == pytest.approx(best[:3], rel=1e-4)
+    assert found_errors == pytest.approx(errors[:3], rel=1e-3)
 
 
 def test_pairs_that_do_not_differ_give_the_plain_logit():
@@ -141,6 +147,16 @@ def test_pairs_that_do_not_differ_give_the_plain_logit():
     plain, plain_errors = estimates(who_first_logit(trials))
     assert found == pytest.approx(plain, rel=1e-3, abs=1e-3)
     assert errors == pytest.approx(plain_errors, rel=2e-2)
+
+
+def test_gaps_of_pairs_that_do_not_differ_give_the_pooled_slopes():
+    """Three equal pairs: the variance between them is 0, at the edge of what it can be."""
+    one = of_pairs(4, pairs=1, reps=3)
+    trials = pd.concat([one.assign(pair=pair) for pair in ("a", "b", "c")])
+    found, errors = estimates(gap_mixed(trials))
+    plain, plain_errors = estimates(gap_ols(trials))
+    assert found == pytest.approx(plain, rel=1e-3, abs=1e-3)
+    assert errors == pytest.approx(plain_errors, rel=1e-2)
 
 
 @FITS

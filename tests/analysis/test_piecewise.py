@@ -157,10 +157,13 @@ def test_reversals_are_changes_of_the_accelerations_sign(accelerations, reversal
 
 @pytest.mark.parametrize("name", ["max_rmse_mps", "max_knot_rate_hz", "max_reversal_rate_hz"])
 def test_a_profile_passes_up_to_each_limit(name):
-    limits = THRESHOLDS
-    at = Profile(limits.max_knot_rate_hz, limits.max_rmse_mps, limits.max_reversal_rate_hz)
-    assert at.passes(limits)
-    assert not at.passes(replace(limits, **{name: getattr(limits, name) - 1e-9}))
+    """0.7 knots and 0.5 reversals a second, and 0.1 m/s beside the polyline."""
+    at = Profile(knot_rate_hz=0.7, rmse_mps=0.10, reversal_rate_hz=0.5)
+    assert at.passes(THRESHOLDS)
+    lower = replace(THRESHOLDS, **{name: getattr(THRESHOLDS, name) - 1e-9})
+    assert not at.passes(lower)
+    measure = name.removeprefix("max_")
+    assert not replace(at, **{measure: getattr(at, measure) + 1e-9}).passes(THRESHOLDS)
 
 
 @given(SPEEDS, st.integers(-9, 9))

@@ -400,6 +400,14 @@ def test_one_trial_is_too_few(fit):
     no_fit(fit(frame([(4.0, 0.8, "finished", "left", 3.0)])), "1 finished trial with a ")
 
 
+@pytest.mark.parametrize("fit", [who_first_logit, who_first_firth])
+def test_as_many_trials_as_coefficients_are_too_few(fit):
+    cells = [(4.0, 0.8), (0.0, 0.0), (0.0, -0.8)]
+    sides = ("left", "right", "left")
+    rows = [(*cell, "finished", side, 3.0) for cell, side in zip(cells, sides, strict=True)]
+    no_fit(fit(frame(rows)), "3 finished trials with a first merger")
+
+
 @every_fit
 def test_one_condition_cannot_tell_the_terms_apart(fit):
     rng = np.random.default_rng(1)

@@ -9,6 +9,7 @@ import pytest
 from studies import write_study, yielding
 
 from analysis.conclusions import not_shown, shown
+from analysis.figures import FIGURES
 from analysis.provenance import provenance
 from analysis.published import published
 from analysis.report import report_html, write_report
@@ -68,7 +69,9 @@ def test_numbers_lead_to_the_trials_behind_them(page):
     assert "merge-runner sql" in page.text
 
 
-def test_equal_results_give_equal_reports(tmp_path):
+def test_equal_results_give_equal_reports(tmp_path, monkeypatch):
+    name = "ablation-matrix"
+    monkeypatch.setattr("analysis.report.FIGURES", {name: FIGURES[name]})
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1))
     texts = {report_html(study, make_tables(study, ["gap"])) for study in (Study(db), Study(db))}
     assert len(texts) == 1
@@ -123,11 +126,12 @@ def test_an_alias_is_no_other_model_and_a_shared_call_is_paid_once(tmp_path):
     assert (row.calls, row.retries, row.cost_usd) == (1, 1, 1.0)
 
 
-def test_the_report_can_write_all_its_parts_as_files(study, tmp_path):
+def test_the_report_can_write_all_its_parts_as_files(tmp_path):
+    study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
     paths = list(write_report(study, tmp_path / "r/report.html", tmp_path / "r/files"))
     assert (tmp_path / "r/report.html") in paths
     for name in TABLES:
         for suffix in ("txt", "csv", "json", "md", "tex"):
             assert (tmp_path / "r/files" / f"{name}.{suffix}").stat().st_size > 50
     with pytest.raises(UsageError, match="cannot be written"):
-        list(write_report(study, tmp_path / "r", None))
+        list(write_report(study, tmp_path, None))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import duckdb
 import pandas as pd
 import pytest
 from harness import RECORDING
+from studies import Drive, write_study
 
 from analysis.load import load, load_trials
 from analysis.robustness import RULES, UNDECIDED, outcomes, redrive
@@ -175,6 +177,35 @@ def test_a_driver_that_decided_later_cruised_in_the_steps_before():
         scenario, "N_0_0", [[[0.0] * 5] * 12, [CRUISE] * 4 + [[1.0] * 5] * 8], [[], []]
     )
     assert late == drawn_out
+
+
+def test_stored_plans_are_driven_again_under_each_rule(tmp_path):
+    """Three trials: boxes that overlap alone, last plans that lead apart, and one not known."""
+    gain = 0.58 / 2.5  # held for a second each way
+    apart = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0)
+    drives = [
+        Drive("o3", "baseline", "L_4_0", 1, (gain, -gain), ()),
+        Drive("o3", "baseline", "N_0_0", 2, apart, tuple(-action for action in apart)),
+        Drive("o3", "baseline", "N_0_0", 3, (), ()),
+        Drive("o3", "baseline", "N_0_0", 4, (), ()),
+    ]
+    db = write_study(tmp_path / "study.duckdb", drives)
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(
+            "UPDATE decisions SET plan = NULL, fallback = true, valid = false "
+            "WHERE trial_id LIKE '%rep04' AND side = 'left' AND decision = 3"
+        )
+    trials = load_trials(db)
+    found = outcomes(db, trials).sort_values("trial_id", key=lambda ids: ids.str[-5:])
+    statuses = {rule: list(rows["status"]) for rule, rows in found.groupby("rule")}
+    assert statuses == {
+        "euclid2d": ["finished", "collided", "collided", "collided"],
+        "rectangle": ["collided", UNDECIDED, "collided", UNDECIDED],
+        "shared_lane": ["finished", UNDECIDED, "collided", UNDECIDED],
+    }
+    firsts = found.dropna(subset=["merged_first"])
+    assert set(firsts["rule"]) == {"euclid2d", "shared_lane"}
+    assert set(firsts["merged_first"]) == {"left"}
 
 
 @pytest.fixture
