@@ -34,7 +34,7 @@ def not_shown(study: Study, origin: Provenance) -> list[str]:
         for text in origin.mismatches
     ]
     if not models:
-        texts.append(f"{study.db} holds no baseline trial of a driver: nothing can be concluded.")
+        texts.append("There is no baseline trial of a driver to show: nothing can be concluded.")
     if not study.human.measured:
         texts.append(
             "The human recordings are not imported: human gaps, speed deviations and profiles are "
@@ -54,7 +54,10 @@ def not_shown(study: Study, origin: Provenance) -> list[str]:
 
 def _shown(study: Study, group: Group) -> list[str]:
     if not len(group.finished):
-        return [f"{group.driver}: no trial finished ({group.left_out})."]
+        return [
+            f"{group.driver}: no trial finished ({group.left_out}).",
+            _collisions(study, group),
+        ]
     found = score(study, group)
     agreed = [NAMES[n] for n in INDICATORS if found.paper[n].passed and found.robust[n].passed]
     failed = [NAMES[n] for n in TESTED if found.paper[n].passed is False is found.robust[n].passed]
@@ -65,11 +68,11 @@ def _shown(study: Study, group: Group) -> list[str]:
         if None not in {found.paper[name].passed, found.robust[name].passed}
         and found.paper[name].passed != found.robust[name].passed
     ]
-    texts = [f"{group.driver}, like humans: {_listed(agreed)}."] if agreed else []
+    texts = [f"{group.driver} shows, by both rules: {_listed(agreed)}."] if agreed else []
     if failed:
-        texts.append(f"{group.driver}, not shown: {_listed(failed)}.")
+        texts.append(f"{group.driver} does not show: {_listed(failed)}.")
     if mixed:
-        texts.append(f"{group.driver}, depends on the test: {_listed(mixed)}.")
+        texts.append(f"{group.driver}, by one rule alone: {_listed(mixed)}.")
     return [*texts, _collisions(study, group), _gap(study, group)]
 
 
@@ -79,12 +82,12 @@ def _collisions(study: Study, group: Group) -> str:
     verdict = (
         "a difference that chance does not explain"
         if contrast.p < ALPHA
-        else "no difference can be shown, and none is excluded beyond these intervals"
+        else "no difference can be shown; a small one is not excluded"
     )
     return (
         f"{group.driver} collided in {found.value:.1f} % of {found.n} trials "
         f"(95 % CI {found.low:.1f} to {found.high:.1f}), humans in {human.value:.1f} % "
-        f"({human.low:.1f} to {human.high:.1f}); Fisher's exact p = {contrast.p:.3f}: {verdict}."
+        f"({human.low:.1f} to {human.high:.1f}); Fisher's exact p {_p(contrast.p)}: {verdict}."
     )
 
 
@@ -109,7 +112,7 @@ def _limits(study: Study, group: Group) -> list[str]:
             f"{group.driver} is a scripted stand-in: its rows say nothing about a language model."
         )
     chance = found.ceiling.paper["I1-I4"]
-    if chance < LOW_POWER:
+    if chance < LOW_POWER and len(group.finished):
         texts.append(
             f"{group.driver}: with {len(group.ended)} trials a perfect copy of the humans would "
             f"pass I1 to I4 together in {100 * chance:.0f} % of studies by the paper's tests, in "
@@ -122,7 +125,7 @@ def _limits(study: Study, group: Group) -> list[str]:
             "effect is not significant, but one of 1 m is not excluded either."
         )
     texts += [
-        f"{group.driver}: {name} rests on {verdict.why}."
+        f"{group.driver}: {name} cannot be judged by the paper's rule: {verdict.why}."
         for name in TESTED
         for verdict in [found.paper[name]]
         if verdict.why
@@ -130,6 +133,10 @@ def _limits(study: Study, group: Group) -> list[str]:
     if Score.total(found.paper) is None:
         texts.append(f"{group.driver}: no score, as not all indicators can be judged.")
     return texts
+
+
+def _p(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
 def _word(verdict: Verdict) -> str:

@@ -9,9 +9,10 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import stats
 
+from analysis.intervals import LEVEL
+
 SEED = 260409609
 PERMUTATIONS = 9999
-LEVEL = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,36 +35,51 @@ def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Contrast:
     return Contrast(a / n - b / m, float(low), float(high), float(p))
 
 
-def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Contrast:
-    """Two means: a permutation test within conditions, and Welch's interval.
+def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Contrast | None:
+    """Two means, compared within conditions: permutation test, least-squares interval.
 
-    The groups are shuffled within each condition alone, so that another mix of conditions, as when
-    one group collides more in some, cannot make a difference. Seeded.
+    The difference is that of a linear model with a level for each condition, so that another mix of
+    conditions, as when one group collides more in some, makes none. The test shuffles the groups
+    within each condition, seeded. None where the groups share no condition.
     """
-    a, b = first.dropna(subset=[measure]), second.dropna(subset=[measure])
-    x, y = a[measure].to_numpy(float), b[measure].to_numpy(float)
-    difference = float(x.mean() - y.mean())
-    interval: tuple[float | None, float | None] = (None, None)
-    if min(len(x), len(y)) > 1 and x.std() + y.std() > 0:
-        welch = stats.ttest_ind(x, y, equal_var=False).confidence_interval(LEVEL)
-        interval = float(welch.low), float(welch.high)
-    return Contrast(difference, *interval, _permutation_p(a, b, measure))
+    both = pd.concat([first.assign(_first=1.0), second.assign(_first=0.0)]).dropna(subset=[measure])
+    both = both.sort_values("condition", kind="stable")
+    by_condition = both.groupby("condition")
+    value = (both[measure].astype(float) - by_condition[measure].transform("mean")).to_numpy(float)
+    group = (both["_first"] - by_condition["_first"].transform("mean")).to_numpy(float)
+    weight = float((group**2).sum())
+    if weight < 1e-12:
+        return None
+    difference = float((group * value).sum()) / weight
+    freedom = len(both) - by_condition.ngroups - 1
+    low = high = None
+    if freedom > 0:
+        variance = float(((value - difference * group) ** 2).sum()) / freedom
+        half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * float(np.sqrt(variance / weight))
+        low, high = difference - half, difference + half
+    chosen = both["_first"].to_numpy(float) == 1
+    sizes = by_condition.size().to_numpy()
+    return Contrast(difference, low, high, _permutation_p(value, chosen, sizes, weight, difference))
 
 
-def _permutation_p(a: pd.DataFrame, b: pd.DataFrame, measure: str) -> float:
-    """Share of shuffles, the observed one included, with as large a difference of means."""
+def _permutation_p(
+    value: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
+    sizes: NDArray[np.int_],
+    weight: float,
+    observed: float,
+) -> float:
+    """Share of shuffles within conditions, the observed one included, with as large a difference.
+
+    ``value`` is centred within each condition; conditions lie one after another, in ``sizes``.
+    """
     rng = np.random.default_rng(SEED)
     sums = np.zeros(PERMUTATIONS)
-    both = pd.concat([a, b])
-    total = float(both[measure].sum())
-    for condition in sorted(both["condition"].unique()):
-        values = both.loc[both["condition"] == condition, measure].to_numpy(float)
-        chosen = int((a["condition"] == condition).sum())
-        order = np.argsort(rng.random((PERMUTATIONS, len(values))), axis=1)[:, :chosen]
-        sums += values[order].sum(axis=1)
-    differences = sums / len(a) - (total - sums) / len(b)
-    observed = abs(float(a[measure].mean() - b[measure].mean()))
-    extreme = int((np.abs(differences) >= observed - 1e-12).sum())
+    ends = np.cumsum(sizes)
+    for start, end in zip(ends - sizes, ends, strict=True):
+        order = np.argsort(rng.random((PERMUTATIONS, end - start)), axis=1)
+        sums += value[start:end][order[:, : int(chosen[start:end].sum())]].sum(axis=1)
+    extreme = int((np.abs(sums / weight) >= abs(observed) - 1e-12).sum())
     return (extreme + 1) / (PERMUTATIONS + 1)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache
 
 import duckdb
@@ -12,6 +13,7 @@ from analysis.study import Group, Study
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.errors import UsageError
+from merge_runner.places import DEFAULT_DB
 
 SHOWN = 10
 
@@ -35,6 +37,7 @@ class Explanation:
     meaning: str
     note: str
     sources: tuple[Source, ...]
+    command: str
 
     def lines(self) -> list[str]:
         """The explanation for a reader."""
@@ -44,14 +47,16 @@ class Explanation:
         for source in self.sources:
             lines += ["", f"{source.group}: {source.text}"]
             if source.query:
-                lines.append(f'merge-runner sql "{source.query}"')
+                lines.append(f'{self.command} "{source.query}"')
             lines += [f"  {trial}" for trial in source.trials]
         return lines
 
 
 def explain(study: Study, table: Table, cell: str) -> Explanation:
     """Explain ``ROW:COLUMN`` of a table, or a whole ROW; raises UsageError."""
-    row_id, _, column_name = cell.rpartition(":") if ":" in cell else (cell, "", "")
+    row_id, _, column_name = cell.rpartition(":")
+    if not row_id or any(row.id == cell for row in table.rows):
+        row_id, column_name = cell, ""
     row = _find(table, row_id)
     column = _column(table, row, column_name) if column_name else None
     value: Value = row.values.get(column.name) if column else None
@@ -61,28 +66,43 @@ def explain(study: Study, table: Table, cell: str) -> Explanation:
         meaning=f"{table.heading}" + (f": {column.meaning or column.heading}" if column else ""),
         note=row.note,
         sources=sources_of(study, table, row, column),
+        command=sql_command(study),
     )
+
+
+def sql_command(study: Study) -> str:
+    """How a query is run on a study's database."""
+    return "merge-runner sql" + ("" if study.db == DEFAULT_DB else f" --db {study.db}")
 
 
 def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> tuple[Source, ...]:
     """The trials of each group behind a cell, or behind a row where no column is named."""
+    if column is not None and column.name.startswith("ceiling"):
+        return (_resampled(study),)
     predicate = row.counts or _predicate(table, column)
     return tuple(
-        _source(study, group, predicate) for group in study.groups if group.id in row.groups
+        _source(study, group, predicate)
+        if group.measured or not row.note
+        else Source(group.id, f"published: {row.note}", "", ())
+        for group in study.groups
+        if group.id in row.groups
     )
 
 
 def query_of(group: Group, predicate: str) -> str:
-    """The query that lists the trials of a group which a value rests on."""
-    driver = f"trials.spec_hash = '{group.spec_hash}'"
-    # Equal drivers and prompts share a spec, whatever the condition and the repetition.
+    """The query that lists the trials of a group which a value rests on, with their measures."""
     variant = f" AND variant = '{group.setting}'" if group.setting else ""
     return (
-        "SELECT trial_id, condition, status, merged_first, gap_m, rmse_mps, joint "  # noqa: S608 # ours
-        "FROM trials "
-        f"JOIN trial_metrics USING (trial_id, spec_hash) WHERE {driver}{variant} AND {predicate} "
-        "ORDER BY trial_id"
+        "SELECT trials.trial_id, condition, status, merged_first, "  # noqa: S608 # ours
+        "trial_metrics.* EXCLUDE (trial_id, spec_hash) FROM trials "
+        "JOIN trial_metrics USING (trial_id, spec_hash) "
+        f"WHERE trials.spec_hash = '{group.spec_hash}'{variant} AND {predicate} ORDER BY ALL"
     )
+
+
+def _resampled(study: Study) -> Source:
+    source = "imported trials" if study.calibrated else "published counts and regression"
+    return Source("human", f"data sets resampled from the {source}, not trials", "", ())
 
 
 @cache
@@ -108,9 +128,13 @@ def _find(table: Table, row_id: str) -> Row:
     for row in table.rows:
         if row.id == row_id:
             return row
-    ids = ", ".join(row.id for row in table.rows[:SHOWN])
-    more = f" and {len(table.rows) - SHOWN} more" if len(table.rows) > SHOWN else ""
-    raise UsageError(f"the table {table.name} has no row {row_id!r}; valid: {ids}{more}")
+    ids = [row.id for row in table.rows]
+    near = get_close_matches(row_id, ids, n=3)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"valid: {', '.join(ids[:SHOWN])}"
+    raise UsageError(
+        f"the table {table.name} has no row {row_id!r}; {hint} "
+        f"`merge-runner tables {table.name} --format csv` shows all rows and columns"
+    )
 
 
 def _column(table: Table, row: Row, name: str) -> Column:

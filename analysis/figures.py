@@ -210,7 +210,10 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
             elif not found:
                 _say(axis, f"{first} never merged first")
             if row == 0:
-                axis.set_title(f"{group.driver} (n = {len(group.finished)})")
+                name = group.driver.replace("+", "+\n").replace(" [", "\n[")
+                axis.set_title(name if len(name) < 20 else name.replace("-", "-\n"))
+            if found:
+                axis.text(0.98, 0.04, f"n = {len(found)}", transform=axis.transAxes, ha="right")
             if column == 0:
                 place = "first" if first == "left" else "second"
                 axis.set_ylabel(f"left merges {place}\nv left (m/s)")

@@ -39,15 +39,15 @@ SELECT trial_id, spec_hash, count(*) AS plans, count(*) FILTER (coarse) AS coars
     count(*) FILTER (revision > 0.1) AS large_revisions
 FROM compared GROUP BY ALL ORDER BY ALL
 """
-# How many decisions of a variant share their reply with one of the same drivers' baseline.
+# How many calls of a variant's spec share their reply with a baseline's spec.
 SHARED = """
 WITH used AS (
-    SELECT DISTINCT model_left, model_right, variant, call_key
+    SELECT DISTINCT spec_hash, variant, call_key
     FROM decisions JOIN trials USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
-)
-SELECT model_left, model_right, variant, count(*) AS calls,
-    count(*) FILTER (call_key IN (SELECT call_key FROM used WHERE variant = 'baseline')) AS shared
-FROM used WHERE variant <> 'baseline' GROUP BY ALL ORDER BY ALL
+), totals AS (SELECT spec_hash, count(*) AS calls FROM used GROUP BY ALL)
+SELECT one.spec_hash, base.spec_hash AS baseline, calls, count(*) AS shared
+FROM used AS one JOIN used AS base USING (call_key) JOIN totals ON totals.spec_hash = one.spec_hash
+WHERE one.variant <> 'baseline' AND base.variant = 'baseline' GROUP BY ALL ORDER BY ALL
 """
 
 

@@ -16,28 +16,36 @@ from analysis.regressions import (
     Regression,
     Term,
     gap_data,
+    unfit_for_logit,
     who_first_data,
 )
 
 Array = NDArray[np.float64]
 NODES = 25
 MIN_PAIRS = 3
+ALIKE = "the pairs do not differ: their variance is 0, and the pooled rows say it all"
 
 
-def gap_mixed(trials: pd.DataFrame) -> Regression:
-    """Linear mixed model of the gap (restricted maximum likelihood), Wald z tests."""
+def gap_mixed(trials: pd.DataFrame, measure: str = "gap_m") -> Regression:
+    """Linear mixed model of a gap (restricted maximum likelihood), Wald z tests."""
     from statsmodels.regression.mixed_linear_model import MixedLM
     from statsmodels.tools.sm_exceptions import ConvergenceWarning, SingularMatrixWarning
 
-    design, gap, chosen = gap_data(trials)
+    design, gap, chosen = gap_data(trials, measure)
     problem = _too_few_pairs(chosen["pair"]) or _rank(design)
     if problem:
         return Regression(len(gap), {}, problem)
+    model = MixedLM(gap, design, groups=chosen["pair"].to_numpy())
     with warnings.catch_warnings():
-        # Where pairs do not differ their variance is 0, on the boundary: the fit is the pooled one.
+        # What they warn of is checked below.
         warnings.simplefilter("ignore", ConvergenceWarning)
         warnings.simplefilter("ignore", SingularMatrixWarning)
-        fit = MixedLM(gap, design, groups=chosen["pair"].to_numpy()).fit(reml=True)
+        try:
+            fit = model.fit(reml=True, method=["lbfgs", "powell"])
+        except np.linalg.LinAlgError:
+            return Regression(len(gap), {}, ALIKE)
+    if float(fit.cov_re[0, 0]) < 1e-6 * float(fit.scale):
+        return Regression(len(gap), {}, ALIKE)
     if not fit.converged or not np.isfinite(fit.bse_fe).all():
         return Regression(len(gap), {}, "the mixed model does not converge")
     return Regression(
@@ -57,7 +65,7 @@ def who_first_mixed(trials: pd.DataFrame) -> Regression:
     """
     chosen = trials[(trials["status"] == "finished") & trials["merged_first"].notna()]
     design, left = who_first_data(trials)
-    problem = _too_few_pairs(chosen["pair"]) or _rank(design)
+    problem = _too_few_pairs(chosen["pair"]) or unfit_for_logit(design, left)
     if problem:
         return Regression(len(left), {}, problem)
     pairs = chosen["pair"].to_numpy()

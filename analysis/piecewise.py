@@ -50,14 +50,6 @@ class Profile:
     rmse_mps: float
     reversal_rate_hz: float
 
-    def passes(self, thresholds: Thresholds) -> bool:
-        """Whether the profile is piecewise linear with few knots."""
-        return (
-            self.rmse_mps <= thresholds.max_rmse_mps
-            and self.knot_rate_hz <= thresholds.max_knot_rate_hz
-            and self.reversal_rate_hz <= thresholds.max_reversal_rate_hz
-        )
-
 
 class ContinuousPolyline(BaseCost):  # type: ignore[misc] # ruptures ships no types
     """Residual sums of squares of straight lines from sample to sample, all computed at once.
@@ -138,6 +130,15 @@ def fit_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
                 )
             )
     return pd.DataFrame(rows, columns=names)
+
+
+def passing(profiles: pd.DataFrame, limits: Thresholds) -> pd.Series:
+    """Which rows of ``fit_profiles`` are piecewise linear with few knots."""
+    return (
+        (profiles["rmse_mps"] <= limits.max_rmse_mps)
+        & (profiles["knot_rate_hz"] <= limits.max_knot_rate_hz)
+        & (profiles["reversal_rate_hz"] <= limits.max_reversal_rate_hz)
+    )
 
 
 def at_5_hz(time_s: Array, velocity_mps: Array) -> Array:

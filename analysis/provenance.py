@@ -32,11 +32,19 @@ SELECT provider, model_requested, model_served,
     min(started_at)::DATE AS first_day,
     max(started_at)::DATE AS last_day
 -- A recorded call that several trials use was made once.
-FROM (SELECT DISTINCT ON (call_key, attempt) * FROM calls)
+FROM (
+    SELECT DISTINCT ON (call_key, attempt)
+        * REPLACE (max(model_served) OVER (PARTITION BY call_key) AS model_served)
+    FROM calls
+)
 GROUP BY provider, model_requested, model_served ORDER BY ALL
 """
+SPECS = """
+SELECT DISTINCT split_part(trial_id, '/', 1) AS driver, variant, spec_hash, spec
+FROM specs JOIN trials USING (spec_hash) WHERE source <> 'human' ORDER BY ALL
+"""
 DECISIONS = """
-SELECT trials.spec_hash, variant, count(*) AS decisions,
+SELECT split_part(trial_id, '/', 1) AS driver, trials.spec_hash, variant, count(*) AS decisions,
     count(*) FILTER (NOT valid) AS invalid, count(*) FILTER (fallback) AS fallbacks
 FROM decisions JOIN trials USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL
 """
@@ -47,8 +55,8 @@ class Provenance:
     """What the report says about the origin of its numbers.
 
     ``sweeps``, ``calls`` and ``decisions`` are rows of the queries here; ``switches`` holds, by
-    spec_hash, the settings of the driving task that differ from the defaults; ``mismatches`` says
-    where another model answered than was asked for.
+    driver, variant and spec_hash, the settings of the driving task that differ from the defaults;
+    ``mismatches`` says where another model answered than was asked for.
     """
 
     sweeps: pd.DataFrame
@@ -73,10 +81,10 @@ def provenance(db: Path) -> Provenance:
 def _switches(db: Path) -> dict[str, str]:
     defaults = Scenario().model_dump()
     found = {}
-    for row in load("SELECT spec_hash, spec FROM specs ORDER BY ALL", db).itertuples():
+    for row in load(SPECS, db).itertuples():
         scenario = json.loads(row.spec).get("scenario", {})
         changed = [f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v]
-        found[row.spec_hash] = ", ".join(changed) or "defaults"
+        found[f"{row.driver}/{row.variant} ({row.spec_hash})"] = ", ".join(changed) or "defaults"
     return found
 
 

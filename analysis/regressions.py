@@ -26,6 +26,8 @@ GAP_TERMS = (
 )
 # firthmodels' default of 25 is too few under separation.
 MAX_ITERATIONS = 1000
+# Gaps of a program can be equal but for the rounding of a step: that is no effect.
+STEADY_GAP_M = 0.01
 
 
 class _Fit(Protocol):
@@ -73,15 +75,15 @@ def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:
     return design, (chosen["merged_first"] == "left").to_numpy(float)
 
 
-def gap_data(trials: pd.DataFrame) -> tuple[Array, Array, pd.DataFrame]:
+def gap_data(trials: pd.DataFrame, measure: str = "gap_m") -> tuple[Array, Array, pd.DataFrame]:
     """Design (n, 4) of intercept, |h|, |dv|, h*dv; gaps in m, shape (n,); and their trials."""
-    chosen = trials[(trials["status"] == "finished") & trials["gap_m"].notna()]
+    chosen = trials[(trials["status"] == "finished") & trials[measure].notna()]
     return (
         gap_design(
             chosen["projected_headway_m"].to_numpy(float),
             chosen["relative_velocity_mps"].to_numpy(float),
         ),
-        chosen["gap_m"].to_numpy(float),
+        chosen[measure].to_numpy(float),
         chosen,
     )
 
@@ -104,7 +106,7 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
     from statsmodels.tools.sm_exceptions import ConvergenceWarning
 
     design, left = who_first_data(trials)
-    problem = _unidentified(design, left) or _separated(design, left)
+    problem = unfit_for_logit(design, left)
     if problem:
         return Regression(len(left), {}, problem)
     with warnings.catch_warnings():
@@ -158,16 +160,18 @@ def gap_ols(trials: pd.DataFrame, *, robust: bool = False) -> Regression:
     from statsmodels.regression.linear_model import OLS
 
     design, gap, _ = gap_data(trials)
+    if not np.isfinite(gap).all():
+        return Regression(len(gap), {}, "a gap is not finite")
     freedom = len(gap) - design.shape[1]
     if freedom < 1 or np.linalg.matrix_rank(design) < design.shape[1]:
         return Regression(len(gap), {}, _too_few(len(gap), "with a gap"))
+    if np.ptp(gap) < STEADY_GAP_M:
+        return Regression(len(gap), {}, "the gaps vary by less than 1 cm: there is nothing to test")
     fit = OLS(gap, design).fit()
     if robust:
         if fit.get_influence().hat_matrix_diag.max() > 1 - 1e-9:
             return Regression(len(gap), {}, "a single trial decides a coefficient: no HC3 errors")
         fit = fit.get_robustcov_results("HC3", use_t=True)
-    if not (np.asarray(fit.bse) > 1e-12).all():
-        return Regression(len(gap), {}, "the gaps do not vary: there is nothing to test")
     return Regression(len(gap), _terms(GAP_TERMS, fit), freedom=freedom)
 
 
@@ -178,6 +182,11 @@ def _terms(names: tuple[str, ...], fit: _Fit) -> dict[str, Term]:
             names, fit.params, fit.bse, fit.tvalues, fit.pvalues, strict=True
         )
     }
+
+
+def unfit_for_logit(design: Array, left: Array) -> str:
+    """Why a logit has no finite maximum likelihood estimate, empty where it has."""
+    return _unidentified(design, left) or _separated(design, left)
 
 
 def _unidentified(design: Array, left: Array) -> str:

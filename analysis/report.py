@@ -5,13 +5,14 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 
 import jinja2
 import pandas as pd
 
 from analysis.conclusions import not_shown, shown
-from analysis.explain import Source, sources_of
+from analysis.explain import Source, sources_of, sql_command
 from analysis.figures import FIGURES, rendered, write_figures
 from analysis.forms import TableFormat
 from analysis.provenance import provenance
@@ -26,6 +27,7 @@ from merge_runner.provenance import git_state
 
 TEMPLATES = Path(__file__).with_name("templates")
 LISTED = 300
+LIBRARIES = ("statsmodels", "firthmodels", "scipy", "numpy", "pandas", "ruptures", "matplotlib")
 SUFFIXES = {
     TableFormat.TEXT: "txt",
     TableFormat.CSV: "csv",
@@ -100,6 +102,8 @@ def report_html(study: Study, tables: list[Table]) -> str:
         beside=[_view(against(table, PAPER), links) for table in tables if in_paper(table)],
         sources=[(number, sources) for sources, number in links.found.items()],
         listed=LISTED,
+        command=sql_command(study),
+        libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
         origin=origin,
         records=_records,
         readings=_records(published("readings")),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,6 +19,8 @@ from merge_runner.simulator.conditions import CONDITIONS
 
 HUMAN = "human"
 BASELINE = "baseline"
+# So many human trials in every condition make a reference; fewer are shown, but not drawn from.
+ENOUGH_PER_CONDITION = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,26 +79,26 @@ class Study:
         self.db = Path(db)
         trials = load_trials(self.db)
         self.human = _human_group(trials[trials["source"] == HUMAN])
-        every = _model_groups(trials[trials["source"] != HUMAN])
+        every = _model_groups(trials[trials["source"] != HUMAN], _tasks(self.db))
         valid = [HUMAN, *dict.fromkeys(group.driver for group in every)]
-        for name in models or ():
-            if name not in valid:
-                raise UsageError(f"{db} holds no driver {name!r}; valid: {', '.join(valid)}")
-        wanted = valid if models is None else models
+        wanted = valid if models is None else list(models)
+        unknown = [name for name in wanted if name not in valid]
+        if unknown or not wanted:
+            named = f"no driver {unknown[0]!r}" if unknown else "nothing that --models names"
+            raise UsageError(f"{db} holds {named}; valid: {', '.join(valid)}")
+        self.empty = not every
         self.models = [group for group in every if group.driver in wanted]
         self.groups = [self.human, *self.models] if HUMAN in wanted else self.models
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether enough human traces are imported to draw ceilings and limits from them."""
+        return self.human.measured and min(self.human.sizes) >= ENOUGH_PER_CONDITION
 
     @property
     def baselines(self) -> list[Group]:
         """The humans and every driver with the baseline prompt."""
         return [group for group in self.groups if group.setting in {"", BASELINE}]
-
-    def baseline_of(self, group: Group) -> Group | None:
-        """The baseline of a variant's driver."""
-        for other in self.models:
-            if other.driver == group.driver and other.setting == BASELINE:
-                return other
-        return None
 
     @cached_property
     def profiles(self) -> pd.DataFrame:
@@ -136,21 +140,37 @@ def _human_group(trials: pd.DataFrame) -> Group:
     return Group(HUMAN, "", None, human_outcomes(), measured=False)
 
 
-def _model_groups(trials: pd.DataFrame) -> list[Group]:
-    """Groups by driver and variant; equal names of different specs are told apart by the hash."""
+def _tasks(db: Path) -> dict[str, str]:
+    """Spec hash to a hash of what it covers beside the prompt: equal for variants of one study."""
+    tasks = {}
+    for row in load("SELECT spec_hash, spec FROM specs", db).itertuples():
+        spec = json.loads(row.spec)
+        spec.pop("prompt_blocks", None)
+        text = json.dumps(spec, sort_keys=True)
+        tasks[row.spec_hash] = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return tasks
+
+
+def _model_groups(trials: pd.DataFrame, tasks: dict[str, str]) -> list[Group]:
+    """Groups by driver and variant.
+
+    Where a driver was run under several settings of the task, all but the most frequent carry a
+    mark, the same for a baseline and its variants; likewise where a prompt was changed.
+    """
     if trials.empty:
         return []
     names = trials["trial_id"].str.split("/").str[0]
     sets = trials["sample_set"].map(lambda number: f"/set{number}" if number else "")
-    keyed = trials.assign(driver=names + sets)
-    specs = keyed.groupby(["driver", "variant"])["spec_hash"].nunique()
-    ambiguous = {driver for (driver, _), count in specs.items() if count > 1}
+    task = trials["spec_hash"].map(lambda spec_hash: tasks.get(spec_hash, spec_hash[:8]))
+    keyed = trials.assign(driver=names + sets, task=task)
+    keyed["driver"] += _marks(keyed, ["driver"], "task")
+    keyed["driver"] += _marks(keyed, ["driver", "variant"], "spec_hash")
     groups = [
         Group(
-            f"{driver} [{spec_hash[:8]}]" if driver in ambiguous else driver,
+            driver,
             variant,
             spec_hash,
-            rows.drop(columns="driver"),
+            rows.drop(columns=["driver", "task"]),
             scripted=bool(rows["scripted"].any()),
         )
         for (driver, variant, spec_hash), rows in keyed.groupby(["driver", "variant", "spec_hash"])
@@ -158,3 +178,20 @@ def _model_groups(trials: pd.DataFrame) -> list[Group]:
     return sorted(
         groups, key=lambda group: (group.driver, group.setting != BASELINE, group.setting)
     )
+
+
+def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:
+    """`` [mark]`` for all but the most frequent value of ``what`` within equal names."""
+    counts = keyed.groupby([*within, what]).size().reset_index(name="n")
+    ordered = counts.sort_values(
+        [*within, "n", what], ascending=[True] * len(within) + [False, True]
+    )
+    usual = ordered.drop_duplicates(within).set_index(within)[what]
+    keys = pd.MultiIndex.from_frame(keyed[within]) if len(within) > 1 else keyed[within[0]]
+    expected = usual.reindex(keys).to_numpy()
+    marks = (
+        keyed[what]
+        .where(keyed[what] != expected)
+        .map(lambda mark: f" [{mark[:8]}]", na_action="ignore")
+    )
+    return marks.fillna("")

@@ -13,7 +13,7 @@ import pandas as pd
 from analysis.ceiling import Ceiling, Population, ceiling, imported_humans, published_humans
 from analysis.indicators import Verdict, paper_verdicts, robust_verdicts
 from analysis.intervals import Estimate, proportion
-from analysis.piecewise import THRESHOLDS, Thresholds
+from analysis.piecewise import THRESHOLDS, Thresholds, passing
 from analysis.published import published
 from analysis.regressions import Regression, gap_ols, who_first_firth, who_first_logit
 from analysis.study import Group, Study, of_group
@@ -78,7 +78,7 @@ def score(study: Study, group: Group) -> Score:
 @cache
 def thresholds(study: Study) -> Thresholds:
     """The limits of I5; the reversal rate's is the human 95th percentile once it is known."""
-    if not study.human.measured:
+    if not study.calibrated:
         return THRESHOLDS
     human = of_group(study.profiles, study.human, study.human.finished)
     limit = float(human["reversal_rate_hz"].quantile(REVERSAL_QUANTILE))
@@ -88,14 +88,8 @@ def thresholds(study: Study) -> Thresholds:
 @cache
 def piecewise_trials(study: Study, group: Group) -> pd.Series:
     """Whether both profiles of each finished trial pass I5; indexed by trial_id."""
-    limits = thresholds(study)
     profiles = of_group(study.profiles, group, group.finished)
-    passes = (
-        (profiles["rmse_mps"] <= limits.max_rmse_mps)
-        & (profiles["knot_rate_hz"] <= limits.max_knot_rate_hz)
-        & (profiles["reversal_rate_hz"] <= limits.max_reversal_rate_hz)
-    )
-    return passes.groupby(profiles["trial_id"]).all()
+    return passing(profiles, thresholds(study)).groupby(profiles["trial_id"]).all()
 
 
 def piecewise_share(study: Study, group: Group) -> Estimate:
@@ -121,7 +115,7 @@ def piecewise_verdict(study: Study, group: Group) -> Verdict:
 def population(study: Study) -> Population:
     """The humans from whom the ceilings are drawn."""
     human = study.human
-    if not human.measured:
+    if not study.calibrated:
         return published_humans()
     passes = piecewise_trials(study, human)
     return imported_humans(human.ended, human.ended["trial_id"].map(passes).astype(float))

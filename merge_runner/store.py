@@ -20,7 +20,7 @@ from merge_runner.errors import StoreError, StoreLocked, UsageError
 from merge_runner.records import TrialRecord
 from merge_runner.rows import Row, call_rows, decision_rows, state_rows, trial_row
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 SCHEMA = Path(__file__).with_name("schema.sql")
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 30.0

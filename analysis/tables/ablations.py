@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from analysis.indicators import INDICATORS, TESTED
+from analysis.indicators import INDICATORS
 from analysis.measures import MEASURES, estimate, known, published_human
 from analysis.published import citation
 from analysis.study import Group, Study
@@ -17,18 +17,6 @@ from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import ceiling_notes, piecewise_notes, sample_notes
 from analysis.verdicts import Score, score
 
-VARIANTS = {
-    "": "",
-    "baseline": "Baseline",
-    "A1": "A1 (-History)",
-    "A2": "A2 (-Prev. acc. plan)",
-    "A3": "A3 (-Safety)",
-    "A4": "A4 (-Human)",
-    "A5": "A5 (-Distance)",
-    "A6": "A6 (-Reassess)",
-    "A7": "A7 (-Tactical plan)",
-}
-
 
 def ablation_qualitative(study: Study) -> Table:
     """Table VI: I1 to I5 of every driver and prompt variant."""
@@ -39,7 +27,7 @@ def ablation_qualitative(study: Study) -> Table:
             Column(f"{prefix}paper", name, "verdict", meaning=INDICATORS[name], optional=True),
             Column(
                 f"{prefix}robust",
-                "rob." if name in TESTED else "",
+                f"{name} rob.",
                 "verdict",
                 meaning=f"{name} by robust tests",
                 optional=True,
@@ -52,12 +40,12 @@ def ablation_qualitative(study: Study) -> Table:
         Column("score_robust", "S rob.", "count", 0, "indicators that hold by the robust rule"),
         Column(
             "ceiling_paper",
-            "humans pass I1-I4 (%)",
+            "humans I1-I4 (%)",
             "percent",
             0,
             "share of resampled human data sets of this size that pass I1 to I4, paper's rule",
         ),
-        Column("ceiling_robust", "rob. (%)", "percent", 0, "the same by the robust rule"),
+        Column("ceiling_robust", "humans, rob. (%)", "percent", 0, "the same by the robust rule"),
     ]
     return Table(
         "ablation-qualitative",
@@ -117,7 +105,7 @@ def _key_columns() -> tuple[Column, ...]:
 def _keys(group: Group) -> dict[str, Value]:
     return {
         "driver": group.driver,
-        "setting": VARIANTS.get(group.setting, group.setting),
+        "setting": group.setting,
         "n": len(group.ended),
     }
 
@@ -137,11 +125,11 @@ def _qualitative_row(study: Study, group: Group) -> Row:
 
 
 def _quantitative_row(group: Group) -> Row:
-    values, missing, shipped = _keys(group), [], False
+    values, missing, shipped = _keys(group), [], []
     for measure in MEASURES:
         if not known(group, measure):
             values[measure.name] = published_human(measure)
-            shipped = True
+            shipped.append(measure.name)
             continue
         found = estimate(group, measure)
         values[measure.name] = found.value
@@ -151,6 +139,6 @@ def _quantitative_row(group: Group) -> Row:
             missing.append(measure.heading)
     note = f"no trial with {', '.join(missing)}" if missing else ""
     if shipped:
-        note = "gap, RMSE and joint rate are published values, no human traces are imported "
-        note += f"({citation(SOURCE)})"
-    return Row(group.id, (group.id,), values, note)
+        note = "gap, RMSE and joint rate are published values, no human traces are imported"
+        note += f" ({citation(SOURCE)})"
+    return Row(group.id, (group.id,), values, note, printed=tuple(shipped))

@@ -72,7 +72,7 @@ def _beside(table: Table) -> tuple[list[Column], list[Row]]:
         printed = _row(published(name), driver, setting, term)
         values = dict(row.values)
         for ours, theirs in pairs.items():
-            values |= _compared(ours, row.values.get(ours), printed, theirs)
+            values |= _compared(row, ours, printed, theirs)
         rows.append(replace(row, values=values))
     return columns, rows
 
@@ -88,7 +88,7 @@ def _indicators(table: Table) -> tuple[list[Column], list[Row]]:
         driver, setting, item = _key(row)
         file, theirs, ours = INDICATOR_ROWS[item]
         printed = _row(published(file), driver, setting, "")
-        values = dict(row.values) | _compared(ours, row.values.get(ours), printed, theirs)
+        values = dict(row.values) | _compared(row, ours, printed, theirs)
         rows.append(replace(row, values=values))
     return columns, rows
 
@@ -100,6 +100,7 @@ def _key(row: Row) -> tuple[str, str, str]:
         return "human", "", "/".join(parts[1:])
     group = row.groups[0]
     driver, _, setting = group.rpartition("/")
+    driver = driver.partition(" [")[0].partition("/set")[0]
     return driver, setting, row.id.removeprefix(group).lstrip("/")
 
 
@@ -122,17 +123,18 @@ def _added(column: Column) -> bool:
     return column.name.endswith("_in_paper")
 
 
-def _compared(
-    name: str, ours: Value, printed: dict[str, Any] | None, theirs: str
-) -> dict[str, Value]:
+def _compared(row: Row, name: str, printed: dict[str, Any] | None, theirs: str) -> dict[str, Value]:
+    """The paper's value, and the difference unless ours is that very value."""
     if printed is None:
         return {}
-    value = printed[theirs]
-    if isinstance(value, str):  # a p-value like <0.001
-        return {f"{name}_in_paper": value if value.startswith("<") else float(value)}
+    ours, value = row.values.get(name), printed[theirs]
+    if isinstance(value, str):  # a column of p-values holds texts like <0.001
+        if value.startswith("<"):
+            return {f"{name}_in_paper": value}
+        value = float(value)
     if isinstance(ours, bool):
         return {f"{name}_in_paper": bool(value)}
     values: dict[str, Value] = {f"{name}_in_paper": value}
-    if isinstance(ours, (int, float)):
+    if isinstance(ours, (int, float)) and name not in row.printed:
         values[f"{name}_difference"] = ours - value
     return values

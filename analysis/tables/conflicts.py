@@ -66,7 +66,7 @@ def criticality(study: Study) -> Table:
         (
             "medians and quartiles of the finished trials that have the measure: one that never "
             "closes in after the merge has no time to collision",
-            *([] if measured else [f"{study.db} holds no trial"]),
+            *([] if measured else ["there is no measured trial to show"]),
             *sample_notes(study, measured),
         ),
     )
@@ -87,7 +87,7 @@ def _resolution(group: Group, condition: str) -> Row:
             f"published, not from traces ({citation('human_outcomes')})",
         )
     known = group.ended.loc[group.ended["condition"] == condition, "conflict_resolution_s"].dropna()
-    note = "" if len(known) else f"{condition}: no trial resolved the conflict"
+    note = "" if len(known) else f"{condition}: no trial that resolved the conflict"
     values = {name: float(known.quantile(q)) for name, q in QUARTILES.items() if len(known)}
     return Row(row, (group.id,), {**key, "n": len(known), **values}, note, where)
 

@@ -7,8 +7,10 @@ from collections.abc import Iterator
 from analysis.contrasts import Contrast, contrast_means, contrast_rates, corrected
 from analysis.measures import MEASURES, Measure, counts, estimate, known, published_human
 from analysis.study import BASELINE, Group, Study
-from analysis.tables.ablations import VARIANTS
 from analysis.tables.model import Column, Row, Table
+from analysis.tables.notes import sample_notes
+
+JOINT_NOTE = "human joint rate: 510 of 962 trials, from the 53.0 % that the paper prints"
 
 
 def contrasts(study: Study) -> Table:
@@ -27,7 +29,7 @@ def contrasts(study: Study) -> Table:
             Column("reference", "against"),
             Column("measure", "measure"),
             Column("difference", "difference", "number", 2, "first minus second"),
-            Column("ci", "95 % CI", "interval", 2, "Newcombe or Welch", optional=True),
+            Column("ci", "95 % CI", "interval", 2, "Newcombe; least squares", optional=True),
             Column("p", "p", "p", 3, "Fisher's exact or permutation test"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
             Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
@@ -36,15 +38,17 @@ def contrasts(study: Study) -> Table:
         ),
         rows,
         (
-            "rates: Fisher's exact test; means: permutation within conditions, seeded; a family is "
-            "one measure of one driver over its variants, or over all drivers against humans",
+            "rates: Fisher's exact test; means: their difference within conditions, tested by "
+            "permutation, seeded; a family is one measure of one driver over its variants, or over "
+            "all drivers against humans",
             *(
                 []
                 if study.human.measured
                 else ["gap and RMSE against humans need the recordings: merge-runner human import"]
             ),
             *_shared_notes(study),
-            *([] if rows else [f"{study.db} holds no pair of groups to compare"]),
+            *sample_notes(study, study.groups),
+            *([] if rows else ["there is no pair of groups to compare"]),
         ),
     )
 
@@ -85,7 +89,7 @@ def _corrected(pairs: list[tuple[Group, Group]], measure: Measure, reference: st
             (group.id, other.id),
             {
                 "driver": group.driver,
-                "setting": VARIANTS.get(group.setting, group.setting),
+                "setting": group.setting,
                 "reference": reference,
                 "measure": measure.heading,
                 "difference": contrast.difference * (100 if measure.rate else 1),
@@ -96,6 +100,7 @@ def _corrected(pairs: list[tuple[Group, Group]], measure: Measure, reference: st
                 "n": _n(group, measure),
                 "n_reference": _n(other, measure),
             },
+            JOINT_NOTE if not known(other, measure) else "",
             counts=measure.counts,
         )
         for i, (group, other, contrast) in enumerate(found)
@@ -107,8 +112,6 @@ def _contrast(group: Group, other: Group, measure: Measure) -> Contrast | None:
         first, second = counts(group, measure), _rate(other, measure)
         return contrast_rates(first, second) if first[1] and second[1] else None
     assert measure.column is not None
-    if not _n(group, measure) or not _n(other, measure):
-        return None
     return contrast_means(group.finished, other.finished, measure.column)
 
 
@@ -135,14 +138,11 @@ def _scaled(contrast: Contrast, measure: Measure) -> tuple[float, float] | None:
 
 def _shared_notes(study: Study) -> list[str]:
     """Variants share a reply with the baseline where their prompts are equal."""
-    drivers = {group.driver for group in study.models}
-    notes = []
-    for row in study.shared.itertuples():
-        driver = row.model_left if row.model_left == row.model_right else None
-        if row.shared and driver in drivers:
-            notes.append(
-                f"{driver}/{row.variant}: {row.shared} of {row.calls} calls share their reply with "
-                "the baseline, where prompt and slot are equal: the groups are not independent, "
-                "and the tests, which take them as such, are conservative there"
-            )
-    return notes
+    named = {group.spec_hash: group.id for group in study.models}
+    return [
+        f"{named[row.spec_hash]}: {row.shared} of {row.calls} calls share their reply with "
+        f"{named[row.baseline]}, where prompt and slot are equal: the groups are not independent, "
+        "and the tests, which take them as such, are conservative there"
+        for row in study.shared.itertuples()
+        if row.spec_hash in named and row.baseline in named
+    ]

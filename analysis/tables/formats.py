@@ -11,6 +11,16 @@ from analysis.forms import TableFormat
 from analysis.tables.model import Column, Row, Table, Value
 
 MISSING = "–"
+VARIANTS = {
+    "baseline": "Baseline",
+    "A1": "A1 (-History)",
+    "A2": "A2 (-Prev. acc. plan)",
+    "A3": "A3 (-Safety)",
+    "A4": "A4 (-Human)",
+    "A5": "A5 (-Distance)",
+    "A6": "A6 (-Reassess)",
+    "A7": "A7 (-Tactical plan)",
+}
 
 
 def render(tables: Sequence[Table], form: TableFormat) -> str:
@@ -167,6 +177,8 @@ def _text(column: Column, value: Value) -> str:
         return f"[{_rounded(value[0], column.digits)}, {_rounded(value[1], column.digits)}]"
     if isinstance(value, bool):
         return "✓" if value else "✗"
+    if column.name == "setting" and isinstance(value, str):
+        return VARIANTS.get(value, value)
     if column.kind == "p" and isinstance(value, float):
         return "<0.001" if value < 0.001 else f"{value:.3f}"
     if isinstance(value, float):

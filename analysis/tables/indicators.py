@@ -50,7 +50,7 @@ def indicators(study: Study) -> Table:
             ),
             Column(
                 "ceiling_robust",
-                "robust (%)",
+                "humans, robust (%)",
                 "percent",
                 0,
                 "share of resampled human data sets of this size that pass the robust rule",
@@ -134,7 +134,8 @@ def _measure_row(group: Group, measure: Measure) -> Row:
     row = f"{group.id}/{measure.name}"
     if not known(group, measure):
         source = f"published value, no human traces are imported ({citation(SOURCE)})"
-        return Row(row, (group.id,), {**key, "value": published_human(measure)}, source)
+        values = {**key, "value": published_human(measure)}
+        return Row(row, (group.id,), values, source, printed=("value",))
     found = estimate(group, measure)
     interval = None if found.low is None or found.high is None else (found.low, found.high)
     return Row(

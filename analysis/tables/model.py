@@ -32,7 +32,8 @@ class Column:
 class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
-    ``counts`` is the SQL predicate of its trials, where it is not that of the columns.
+    ``counts`` is the SQL predicate of its trials, where it is not that of the columns; ``printed``
+    names the columns whose values are the published ones.
     """
 
     id: str
@@ -40,6 +41,7 @@ class Row:
     values: Mapping[str, Value]
     note: str = ""
     counts: str = ""
+    printed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

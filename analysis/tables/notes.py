@@ -13,42 +13,47 @@ from analysis.verdicts import thresholds
 
 
 def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
-    """One note a group: its trials, and which of them are left out."""
-    notes = []
-    for group in groups:
-        finished = len(group.finished)
-        text = f"{group.id}: {finished} of {len(group.trials)} trials finished, left out: "
-        notes.append(text + group.left_out)
-    if not study.models:
+    """One note a group on its trials and those left out, and what else to know of the drivers."""
+    shown = list(groups)
+    notes = [
+        f"{group.id}: {len(group.finished)} of {len(group.trials)} trials finished, left out: "
+        + group.left_out
+        for group in shown
+    ]
+    if study.empty:
         notes.append(f"{study.db} holds no trial of a model; `make sweep` plays some")
-    if study.human.measured and study.human in study.groups:
-        notes += [f"human: {finding}" for finding in findings(human_counts(study.db))]
-    if not study.human.measured and study.human in study.groups:
-        notes.append(
+    if study.human in study.groups:
+        notes += _human_notes(study)
+    scripted = dict.fromkeys(group.driver for group in shown if group.scripted)
+    return [*notes, *(f"{driver} is a scripted stand-in, no language model" for driver in scripted)]
+
+
+def _human_notes(study: Study) -> list[str]:
+    if not study.human.measured:
+        return [
             "human: the published outcomes of 990 trials; for the rest `merge-runner human import "
             f"PATH` reads the recordings (doi {HUMAN_DOI})"
-        )
-    notes += [
-        f"{group.driver} is a scripted stand-in, no language model"
-        for group in dict.fromkeys(
-            g for g in groups if g.scripted and g.setting in {"", "baseline"}
-        )
+        ]
+    pairs = study.human.trials["pair"].nunique()
+    return [
+        *(f"human: {finding}" for finding in findings(human_counts(study.db))),
+        f"human: intervals and tests take the trials as independent, but they come from {pairs} "
+        "pairs who differ: they are too narrow",
     ]
-    return notes
 
 
 def ceiling_notes(study: Study) -> list[str]:
     """What the human ceiling is drawn from."""
     source = (
         "whole trials are resampled from the imported recordings"
-        if study.human.measured
+        if study.calibrated
         else "outcomes from the published counts, gaps from the published regression with "
         f"residuals of SD {HUMAN_GAP_SD_M} m"
     )
     return [
         f"humans pass: share of {DATA_SETS} human data sets with as many trials per condition as "
-        f"the row has (seed {SEED}; {source}); at the score: I1 to I4 together. No driver can be "
-        "expected to score above it"
+        f"the row has (seed {SEED}; {source}); at the score: I1 to I4 together. So often a perfect "
+        "copy of the humans passes"
     ]
 
 
@@ -56,9 +61,9 @@ def piecewise_notes(study: Study) -> list[str]:
     """The thresholds of I5."""
     limits = thresholds(study)
     state = (
-        "the reversal limit is the human 95th percentile"
-        if study.human.measured
-        else "uncalibrated, no human traces are imported"
+        "the reversal limit is the human 95th percentile, the others are uncalibrated"
+        if study.calibrated
+        else "uncalibrated: human traces of every condition are not imported"
     )
     return [
         f"I5: a trial passes where both speeds are fitted within {limits.max_rmse_mps:.2f} m/s "

@@ -42,7 +42,7 @@ def robustness(study: Study) -> Table:
             "track once either vehicle has passed the merge point",
             "undecided: the trial ended in a collision that this rule does not see, and the last "
             "plans, or the human trace, end before it is decided",
-            *([] if rows else [f"{study.db} holds no trial"]),
+            *([] if rows else ["there is no measured trial to show"]),
             *sample_notes(study, measured),
         ),
     )

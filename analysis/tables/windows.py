@@ -36,7 +36,7 @@ def speed_windows(study: Study) -> Table:
         (
             f"the paper prints {human} for humans; the window that gives both with the imported "
             "recordings is the paper's. Models have no tunnel: their trials start at its exit",
-            *([] if rows else [f"{study.db} holds no trial"]),
+            *([] if rows else ["there is no measured trial to show"]),
             *sample_notes(study, measured),
         ),
     )

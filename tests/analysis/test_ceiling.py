@@ -259,6 +259,14 @@ def test_a_condition_without_human_trials_is_left_out():
     assert _firth_tests(draws)["I1"].mean() > 0.9
 
 
+def test_equal_gaps_disturb_no_ceiling():
+    """All residuals are rounding then, some below 0."""
+    for gap in (3.7, 8.37):
+        gaps = tuple(np.where(np.isfinite(who), gap, np.nan) for who in HUMANS.left)
+        for passes in _gap_tests(_Draws(Population(HUMANS.left, gaps), even(2))):
+            assert not passes["I3"].all()
+
+
 @pytest.mark.usefixtures("few")
 def test_one_trial_per_condition_has_a_ceiling():
     found = ceiling(gapped(), even(1))

@@ -358,6 +358,12 @@ def test_equal_gaps_leave_nothing_to_test(gap, robust):
         no_fit(gap_ols(frame(rows), robust=robust), "the gaps do not vary")
 
 
+@pytest.mark.parametrize("robust", [False, True])
+def test_a_gap_that_is_not_finite_is_named(gaps, robust):
+    gaps = gaps.assign(gap_m=[np.inf, *gaps["gap_m"][1:]])
+    no_fit(gap_ols(gaps, robust=robust), "a gap is not finite")
+
+
 def test_a_single_trial_that_decides_a_coefficient_has_no_hc3_errors():
     """Only one trial has equal speeds."""
     cells = [cell for cell in CELLS if cell[1]] * 3 + [(0.0, 0.0)]
