@@ -23,11 +23,13 @@ from analysis.regressions import (
 Array = NDArray[np.float64]
 NODES = 25
 MIN_PAIRS = 3
-ALIKE = "the pairs do not differ: their variance is 0, and the pooled rows say it all"
+# Where the variance between pairs is this small beside that within, they do not differ.
+ALIKE = 1e-6
 
 
 def gap_mixed(trials: pd.DataFrame, measure: str = "gap_m") -> Regression:
     """Linear mixed model of a gap (restricted maximum likelihood), Wald z tests."""
+    from statsmodels.regression.linear_model import OLS
     from statsmodels.regression.mixed_linear_model import MixedLM
     from statsmodels.tools.sm_exceptions import ConvergenceWarning, SingularMatrixWarning
 
@@ -36,25 +38,24 @@ def gap_mixed(trials: pd.DataFrame, measure: str = "gap_m") -> Regression:
     if problem:
         return Regression(len(gap), {}, problem)
     model = MixedLM(gap, design, groups=chosen["pair"].to_numpy())
-    with warnings.catch_warnings():
-        # What they warn of is checked below.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        warnings.simplefilter("ignore", SingularMatrixWarning)
-        try:
-            fit = model.fit(reml=True, method=["lbfgs", "powell"])
-        except np.linalg.LinAlgError:
-            return Regression(len(gap), {}, ALIKE)
-    if float(fit.cov_re[0, 0]) < 1e-6 * float(fit.scale):
-        return Regression(len(gap), {}, ALIKE)
-    if not fit.converged or not np.isfinite(fit.bse_fe).all():
+    for method in (["bfgs", "lbfgs", "cg"], ["powell"]):
+        with warnings.catch_warnings():
+            # What they warn of is checked below.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            warnings.simplefilter("ignore", SingularMatrixWarning)
+            try:
+                fit = model.fit(reml=True, method=method)
+            except np.linalg.LinAlgError:  # a step to the edge, where pairs do not differ
+                continue
+        if float(fit.cov_re[0, 0]) < ALIKE * float(fit.scale):
+            break
+        if fit.converged and np.isfinite(fit.bse_fe).all():
+            return Regression(len(gap), _wald(GAP_TERMS, fit.fe_params, fit.bse_fe))
+    else:
         return Regression(len(gap), {}, "the mixed model does not converge")
-    return Regression(
-        len(gap),
-        {
-            name: Term(float(b), float(se), float(b / se), float(2 * stats.norm.sf(abs(b / se))))
-            for name, b, se in zip(GAP_TERMS, fit.fe_params, fit.bse_fe, strict=True)
-        },
-    )
+    pooled = OLS(gap, design).fit()
+    remark = "the pairs do not differ: their variance is 0, and the fit is the pooled one"
+    return Regression(len(gap), _wald(GAP_TERMS, pooled.params, pooled.bse), remark=remark)
 
 
 def who_first_mixed(trials: pd.DataFrame) -> Regression:
@@ -80,13 +81,14 @@ def who_first_mixed(trials: pd.DataFrame) -> Regression:
     variances = np.diag(covariance)[:3]
     if np.abs(found.jac).max() > 1e-2 or not (variances > 0).all():
         return Regression(len(left), {}, "the mixed logit does not converge")
-    return Regression(
-        len(left),
-        {
-            name: Term(float(b), float(se), float(b / se), float(2 * stats.norm.sf(abs(b / se))))
-            for name, b, se in zip(WHO_FIRST_TERMS, found.x[:3], np.sqrt(variances), strict=True)
-        },
-    )
+    return Regression(len(left), _wald(WHO_FIRST_TERMS, found.x[:3], np.sqrt(variances)))
+
+
+def _wald(names: tuple[str, ...], estimates: Array, errors: Array) -> dict[str, Term]:
+    return {
+        name: Term(float(b), float(se), float(b / se), float(2 * stats.norm.sf(abs(b / se))))
+        for name, b, se in zip(names, estimates, errors, strict=True)
+    }
 
 
 def _cells(design: Array, left: Array) -> tuple[Array, Array, Array]:

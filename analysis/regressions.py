@@ -53,13 +53,15 @@ class Term:
 class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms, and is else empty.
 
-    ``freedom`` is the residual degrees of freedom of a linear fit.
+    ``freedom`` is the residual degrees of freedom of a linear fit; ``remark`` is what to know of a
+    fit that has terms.
     """
 
     n: int
     terms: dict[str, Term]
     problem: str = ""
     freedom: int | None = None
+    remark: str = ""
 
 
 def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:

@@ -189,9 +189,8 @@ def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:
     usual = ordered.drop_duplicates(within).set_index(within)[what]
     keys = pd.MultiIndex.from_frame(keyed[within]) if len(within) > 1 else keyed[within[0]]
     expected = usual.reindex(keys).to_numpy()
-    marks = (
-        keyed[what]
-        .where(keyed[what] != expected)
-        .map(lambda mark: f" [{mark[:8]}]", na_action="ignore")
-    )
-    return marks.fillna("")
+    marks = [
+        "" if found == usually else f" [{found[:8]}]"
+        for found, usually in zip(keyed[what], expected, strict=True)
+    ]
+    return pd.Series(marks, index=keyed.index)

@@ -175,7 +175,7 @@ def _mixed_rows(group: Group, term: str, statistic: str) -> list[Row]:
                 "n": fit.n,
                 **_wald(fit, term, statistic),
             },
-            fit.problem,
+            fit.problem or fit.remark,
         )
         for model, label, fit in _mixed(group, "who-first" if statistic == "z" else "gap")
     ]

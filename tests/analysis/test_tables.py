@@ -22,6 +22,7 @@ from analysis.tables.against import against, in_paper
 from analysis.tables.formats import render
 from analysis.tables.model import Column, Row, Table
 from analysis.verdicts import score
+from merge_runner.config import Scenario
 from merge_runner.errors import UsageError
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.store import Store, query
@@ -219,8 +220,27 @@ def test_a_model_under_two_specs_makes_two_rows_that_tell_themselves_apart(tmp_p
                 f"INSERT INTO {name} SELECT * REPLACE ('changed' AS spec_hash) FROM other.{name}"
             )
     study = Study(db)
-    assert [group.driver for group in study.models] == ["o3 [changed]", "o3 [o3-basel]"]
-    assert [len(group.trials) for group in study.models] == [11, 22]
+    assert [group.driver for group in study.models] == ["o3", "o3 [changed]"]
+    assert [len(group.trials) for group in study.models] == [22, 11]
+
+
+def test_another_task_leaves_a_baseline_and_its_variants_together(tmp_path):
+    """A baseline that was also run with drag must not tear the ablation study apart."""
+    db = write_study(tmp_path / "t.duckdb", [*yielding("o3", reps=2), *yielding("o3", "A1", 2)])
+    other = write_study(tmp_path / "u.duckdb", yielding("o3", reps=1), Scenario(resistance="human"))
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(f"ATTACH '{other}' AS other (READ_ONLY)")
+        for name in ("specs", "trials", "states", "decisions"):
+            connection.execute(
+                f"INSERT INTO {name} SELECT * REPLACE ('drag' AS spec_hash) FROM other.{name}"
+            )
+    study = Study(db)
+    assert [group.id for group in study.models][:2] == ["o3/baseline", "o3/A1"]
+    assert study.models[2].driver.startswith("o3 [")
+    (table,) = make_tables(study, ["contrasts"])
+    assert any(row.id == "o3/A1/baseline/gap_m" for row in table.rows)
+    (beside,) = [against(t, "paper") for t in make_tables(study, ["ablation-quantitative"])]
+    assert cell(beside, f"{study.models[2].id}", "gap_m_in_paper") == 9.28
 
 
 def test_models_can_be_chosen_and_an_unknown_one_names_the_valid(study):
@@ -228,6 +248,10 @@ def test_models_can_be_chosen_and_an_unknown_one_names_the_valid(study):
     assert [group.id for group in chosen.groups] == ["other/baseline"]
     with pytest.raises(UsageError, match="valid: human, o3, other"):
         Study(study.db, ["gpt"])
+    with pytest.raises(UsageError, match="nothing that --models names"):
+        Study(study.db, [])
+    humans = make_tables(Study(study.db, ["human"]))
+    assert not any("holds no trial" in note for table in humans for note in table.notes)
 
 
 def test_every_cell_can_be_traced_to_its_trials_and_the_query_that_lists_them(study, tables):
