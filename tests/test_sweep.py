@@ -6,13 +6,13 @@ import asyncio
 import json
 import signal
 
-import duckdb
 import pytest
 from aiohttp import web
 from harness import watched
 
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.records import SLOT_HEADER
+from merge_runner.store import open_database
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--json")
 TWO = ("--conditions", "N_0_0,L_4_8")
@@ -267,7 +267,8 @@ async def test_a_locked_database_is_waited_for(merge_runner, tmp_path):
         *SMALL, *TWO, "--reps", 2, "--fault-rate", 0, "--in-flight", 1
     )
     await asyncio.sleep(1.2)
-    with duckdb.connect(str(tmp_path / "results/merge.duckdb")):
+    db = tmp_path / "results/merge.duckdb"
+    with open_database(db, read_only=False, patience_s=10):  # the sweep may be writing just now
         await asyncio.sleep(4)
     out, err = await process.communicate()
     assert process.returncode == 0, err

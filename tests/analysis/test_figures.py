@@ -111,6 +111,6 @@ def test_before_an_import_the_figure_says_what_is_missing_and_draws_the_publishe
 )
 def test_figures_of_next_to_nothing_are_drawn_all_the_same(drives, tmp_path, recwarn):
     study = Study(write_study(tmp_path / "t.duckdb", drives))
-    for name in FIGURES:
-        assert rendered(study, name, "png")
+    for draw, _ in FIGURES.values():
+        draw(study).draw_without_rendering()
     assert [str(w.message) for w in recwarn.list] == []

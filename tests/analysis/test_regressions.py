@@ -359,6 +359,19 @@ def test_equal_gaps_leave_nothing_to_test(gap, robust):
 
 
 @pytest.mark.parametrize("robust", [False, True])
+def test_gaps_that_vary_by_a_centimetre_are_fitted(robust):
+    shares = np.random.default_rng(6).permutation(np.linspace(0, 1, 2 * len(CELLS)))
+    for range_m, problem in ((0.0099, "the gaps vary by less than 1 cm"), (0.0101, "")):
+        rows = [
+            (h, dv, "finished", "left", 4 + range_m * share)
+            for (h, dv), share in zip(CELLS * 2, shares, strict=True)
+        ]
+        fit = gap_ols(frame(rows), robust=robust)
+        assert fit.problem.startswith(problem)
+        assert bool(fit.terms) == (not problem)
+
+
+@pytest.mark.parametrize("robust", [False, True])
 def test_a_gap_that_is_not_finite_is_named(gaps, robust):
     gaps = gaps.assign(gap_m=[np.inf, *gaps["gap_m"][1:]])
     no_fit(gap_ols(gaps, robust=robust), "a gap is not finite")

@@ -46,6 +46,14 @@ def page(study):
     return Page(report_html(study, make_tables(study)))
 
 
+@pytest.fixture
+def one_figure(monkeypatch):
+    """Drawing takes most of a report's time, and other tests look at the figures."""
+    name = "ablation-matrix"
+    for place in ("analysis.report.FIGURES", "analysis.figures.FIGURES"):
+        monkeypatch.setattr(place, {name: FIGURES[name]})
+
+
 def test_the_page_needs_no_network_and_runs_nothing(page):
     assert {"script", "link", "iframe", "object"}.isdisjoint(page.tags)
     assert page.sources
@@ -69,9 +77,8 @@ def test_numbers_lead_to_the_trials_behind_them(page):
     assert "merge-runner sql" in page.text
 
 
-def test_equal_results_give_equal_reports(tmp_path, monkeypatch):
-    name = "ablation-matrix"
-    monkeypatch.setattr("analysis.report.FIGURES", {name: FIGURES[name]})
+@pytest.mark.usefixtures("one_figure")
+def test_equal_results_give_equal_reports(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1))
     texts = {report_html(study, make_tables(study, ["gap"])) for study in (Study(db), Study(db))}
     assert len(texts) == 1
@@ -88,6 +95,7 @@ def test_conclusions_name_power_and_missing_traces(study):
     assert "o3, by one rule alone" in said
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_an_empty_database_concludes_nothing(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", []))
     assert shown(study) == []
@@ -111,6 +119,7 @@ def answered_by(folder, served):
     return Study(db)
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_another_served_model_is_loud_and_its_name_is_shown_as_text(tmp_path):
     study = answered_by(tmp_path, "<script>alert(1)</script>")
     page = Page(report_html(study, []))
@@ -126,6 +135,7 @@ def test_an_alias_is_no_other_model_and_a_shared_call_is_paid_once(tmp_path):
     assert (row.calls, row.retries, row.cost_usd) == (1, 1, 1.0)
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_the_report_can_write_all_its_parts_as_files(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
     paths = list(write_report(study, tmp_path / "r/report.html", tmp_path / "r/files"))
