@@ -99,7 +99,7 @@ def test_who_first_verdicts_equal_those_of_single_fits(sizes):
 
 @pytest.mark.usefixtures("few")
 def test_penalised_verdicts_equal_those_of_single_fits_also_where_they_fail():
-    draws = _Draws(HUMANS, even(1))
+    draws = _Draws(HUMANS, even(2))
     firth = _firth_tests(draws)
     found = [
         robust_verdicts(who_first_firth(rows(draws, number)), MISSING)["I2"].passed
