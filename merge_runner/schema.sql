@@ -87,7 +87,7 @@ CREATE TABLE IF NOT EXISTS calls (
     model_served VARCHAR,
     http_status INTEGER,
     outcome VARCHAR NOT NULL,
-    cached BOOLEAN NOT NULL,          -- the sweep found the reply recorded
+    cached BOOLEAN NOT NULL,          -- made before this run, which did not pay for it
     started_at TIMESTAMP,             -- when it was made, maybe long before this run
     latency_s DOUBLE,
     input_tokens BIGINT,              -- includes the cached ones
@@ -100,6 +100,44 @@ CREATE TABLE IF NOT EXISTS calls (
     reply JSON,
     error VARCHAR
 );
+
+-- The ledger of attempts: what became of each. retried: another one followed; driven: its plan was;
+-- fallback: it gave no valid plan (see failure), so that an older plan or 0 was driven; lost: its
+-- call ended without an answer, and with it the trial.
+CREATE VIEW IF NOT EXISTS attempts AS
+SELECT calls.*, source, variant, condition, sample_set, scripted,
+    if(side = 'left', model_left, model_right) AS model,
+    failure,
+    CASE WHEN attempt < max(attempt) OVER call THEN 'retried'
+        WHEN valid IS NULL THEN 'lost'
+        WHEN fallback THEN 'fallback'
+        ELSE 'driven' END AS fate
+FROM calls
+JOIN trials USING (trial_id, spec_hash)
+LEFT JOIN (SELECT trial_id, spec_hash, side, decision, valid, failure, fallback FROM decisions)
+    USING (trial_id, spec_hash, side, decision)
+WINDOW call AS (PARTITION BY calls.trial_id, calls.spec_hash, calls.side, calls.decision);
+
+-- What the replies of a trial cost, whoever paid, and what of it the run that played it paid.
+CREATE VIEW IF NOT EXISTS trial_costs AS
+SELECT trial_id, spec_hash,
+    count(call_key) AS attempts,
+    count(DISTINCT call_key) AS calls,
+    sum(input_tokens) AS input_tokens,
+    sum(cached_input_tokens) AS cached_input_tokens,
+    sum(output_tokens) AS output_tokens,
+    sum(reasoning_tokens) AS reasoning_tokens,
+    coalesce(sum(cost_usd), 0) AS cost_usd,
+    coalesce(sum(cost_usd) FILTER (NOT cached), 0) AS paid_usd,
+    count(*) FILTER (call_key IS NOT NULL AND cost_usd IS NULL) AS attempts_of_unknown_cost
+FROM trials LEFT JOIN calls USING (trial_id, spec_hash)
+GROUP BY ALL;
+
+CREATE VIEW IF NOT EXISTS sweep_costs AS
+SELECT sweep_id, count(*) AS trials, sum(calls) AS calls, sum(attempts) AS attempts,
+    sum(cost_usd) AS cost_usd, sum(attempts_of_unknown_cost) AS attempts_of_unknown_cost
+FROM (SELECT DISTINCT * FROM sweep_trials) JOIN trial_costs USING (trial_id, spec_hash)
+GROUP BY ALL;
 
 -- When a vehicle passes a level: linear within the step in which it does, else NULL.
 CREATE MACRO IF NOT EXISTS passing_s(level_m, before_m, now_m, before_s, now_s) AS

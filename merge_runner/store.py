@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,14 +15,20 @@ from typing import Any
 
 import duckdb
 
-from merge_runner.errors import StoreError, StoreLocked, UsageError
+from merge_runner.database import (
+    PATIENCE_S,
+    SCHEMA,
+    SCHEMA_VERSION,
+    migrate,
+    open_database,
+    read_database,
+    schema_version,
+    unreadable_is_usage,
+)
+from merge_runner.errors import StoreError, UsageError
 from merge_runner.records import TrialRecord
 from merge_runner.rows import Row, call_rows, decision_rows, state_rows, trial_row
 
-SCHEMA_VERSION = 2
-SCHEMA = Path(__file__).with_name("schema.sql")
-LOCK_RETRY_S = 0.05
-PATIENCE_S = 30.0
 TrialKey = tuple[str, str]
 """(trial_id, spec_hash)"""
 
@@ -41,54 +46,6 @@ class SweepRow:
     versions: str
 
 
-@contextmanager
-def open_database(
-    path: Path, *, read_only: bool, patience_s: float
-) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open the database, waiting for others to close it; raises StoreError."""
-    give_up = time.monotonic() + patience_s
-    while True:
-        try:
-            connection = duckdb.connect(str(path), read_only=read_only)
-            break
-        except duckdb.IOException as exc:
-            if "Could not set lock" not in str(exc):
-                raise StoreError(f"{path} cannot be opened as a database: {exc}") from exc
-            if time.monotonic() >= give_up:
-                raise StoreLocked(f"{path} is locked by another program") from exc
-            time.sleep(LOCK_RETRY_S)
-        except duckdb.Error as exc:
-            raise StoreError(f"{path} cannot be opened as a database: {exc}") from exc
-    try:
-        yield connection
-    finally:
-        connection.close()
-
-
-@contextmanager
-def read_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open an existing database of our schema for reading; raises UsageError."""
-    if not path.is_file():
-        raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
-    with (
-        _refused_as_usage(),
-        open_database(path, read_only=True, patience_s=PATIENCE_S) as connection,
-    ):
-        _check_version(connection, path)
-        yield connection
-
-
-@contextmanager
-def _refused_as_usage() -> Iterator[None]:
-    """A file that is no database at all is the user's to name another, before anything runs."""
-    try:
-        yield
-    except StoreLocked:
-        raise
-    except StoreError as exc:
-        raise UsageError(f"{exc}; name another with --db") from exc
-
-
 class Store:
     """Writes sweeps and whole trials; every method is one short transaction."""
 
@@ -100,13 +57,14 @@ class Store:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as exc:
             raise UsageError(f"{path.parent} cannot be made: {exc}") from exc
-        with _refused_as_usage(), self._writing() as connection:
-            tables = {name for (name,) in connection.execute("SHOW TABLES").fetchall()}
-            if tables:
-                _check_version(connection, path)
-            connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        with unreadable_is_usage(), self._writing() as connection:
+            tables = connection.execute("SHOW TABLES").fetchall()
+            older = bool(tables) and schema_version(connection, path) < SCHEMA_VERSION
             if not tables:
+                connection.execute(SCHEMA.read_text(encoding="utf-8"))
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
+        if older:
+            migrate(path)
 
     def begin_sweep(
         self, sweep: SweepRow, specs: dict[str, str], stored: Iterable[TrialKey]
@@ -340,19 +298,6 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
             decisions=decisions[0],
             invalid=decisions[1],
             fallbacks=decisions[2],
-        )
-
-
-def _check_version(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
-    try:
-        row = connection.execute("SELECT schema_version FROM meta").fetchone()
-    except duckdb.CatalogException:
-        raise UsageError(f"{path} is no database of merge-runner: name another with --db") from None
-    if row is None or row[0] != SCHEMA_VERSION:
-        raise UsageError(
-            f"{path} has schema version {row[0] if row else 'none'}, this program writes "
-            f"{SCHEMA_VERSION}: name another file with --db; a sweep into it is rebuilt from the "
-            "cache without a call"
         )
 
 

@@ -1,0 +1,161 @@
+"""Opens the results database, with patience for others, and brings an older one up to date."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import duckdb
+
+from merge_runner.errors import StoreError, StoreLocked, UsageError
+
+SCHEMA_VERSION = 3
+SCHEMA = Path(__file__).with_name("schema.sql")
+LOCK_RETRY_S = 0.05
+PATIENCE_S = 60.0
+LOG = logging.getLogger(__name__)
+REBUILD = (
+    "move it away, or name another with --db, and run the same sweep again: it is rebuilt from the "
+    "cache without a call"
+)
+
+
+@contextmanager
+def open_database(
+    path: Path, *, read_only: bool, patience_s: float
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open the database, waiting for others to close it; raises StoreError."""
+    began = time.monotonic()
+    told = False
+    while True:
+        try:
+            connection = duckdb.connect(str(path), read_only=read_only)
+            break
+        except duckdb.IOException as exc:
+            if "Could not set lock" not in str(exc):
+                raise StoreError(f"{path} cannot be opened as a database: {_first(exc)}") from exc
+            waited_s = time.monotonic() - began
+            if waited_s >= patience_s:
+                raise StoreLocked(f"{path} is locked by another program") from exc
+            if waited_s > 1 and not told:
+                told = True
+                LOG.warning(
+                    "waiting up to %.0f s for another program to close %s", patience_s, path
+                )
+            time.sleep(LOCK_RETRY_S)
+        except duckdb.Error as exc:
+            raise StoreError(f"{path} cannot be opened as a database: {_first(exc)}") from exc
+    try:
+        yield connection
+    finally:
+        connection.close()
+
+
+@contextmanager
+def read_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open an existing database for reading, of this schema or an older one; raises UsageError."""
+    if not path.is_file():
+        raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
+    with (
+        unreadable_is_usage(),
+        open_database(path, read_only=True, patience_s=PATIENCE_S) as connection,
+    ):
+        version = schema_version(connection, path)
+        if version == SCHEMA_VERSION:
+            yield connection
+            return
+    migrate(path)
+    with open_database(path, read_only=True, patience_s=PATIENCE_S) as connection:
+        yield connection
+
+
+@contextmanager
+def unreadable_is_usage() -> Iterator[None]:
+    """A file that is no database at all is the user's to replace, before anything runs."""
+    try:
+        yield
+    except StoreLocked:
+        raise
+    except StoreError as exc:
+        raise UsageError(f"{exc}; {REBUILD}") from exc
+
+
+def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
+    """The version of an existing database; raises UsageError for a newer or a foreign one."""
+    try:
+        row = connection.execute("SELECT schema_version FROM meta").fetchone()
+    except duckdb.CatalogException:
+        raise UsageError(f"{path} is no database of merge-runner: name another with --db") from None
+    if row is None:
+        raise UsageError(f"{path} has no schema version: {REBUILD}")
+    version: int = row[0]
+    if version > SCHEMA_VERSION:
+        raise UsageError(
+            f"{path} has schema version {version}, written by a newer merge-runner; this one reads "
+            f"up to {SCHEMA_VERSION}: update merge-runner, or name another file with --db"
+        )
+    return version
+
+
+def migrate(path: Path) -> None:
+    """Copy a database of an older schema into a new file of this one, which takes its name.
+
+    What an older schema lacked is NULL or has its default. The old file stays beside the new one,
+    as ``NAME.v1.duckdb``. Raises UsageError where that is not possible.
+    """
+    copy = path.with_name(f"{path.name}.migrating")
+    try:
+        copy.unlink(missing_ok=True)
+        # Opened for writing, so that nobody else writes into what is being copied.
+        with open_database(path, read_only=False, patience_s=PATIENCE_S) as connection:
+            version = schema_version(connection, path)
+            if version == SCHEMA_VERSION:
+                return  # another process was quicker
+            connection.execute("CHECKPOINT")
+            with duckdb.connect(str(copy)) as made:
+                made.execute(SCHEMA.read_text(encoding="utf-8"))
+            _copy_rows(connection, copy)
+            kept = path.with_name(f"{path.stem}.v{version}{path.suffix}")
+            shutil.copy2(path, kept)
+            os.replace(copy, path)
+    except (OSError, duckdb.Error, StoreError) as exc:
+        raise UsageError(
+            f"{path} has an older schema and cannot be brought to version {SCHEMA_VERSION} where "
+            f"it lies: {_first(exc)}. Copy it to a folder that can be written and name it with --db"
+        ) from exc
+    LOG.warning(
+        "%s was brought from schema %d to %d; the old file is kept as %s",
+        path,
+        version,
+        SCHEMA_VERSION,
+        kept,
+    )
+
+
+def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
+    quoted = str(copy).replace("'", "''")
+    connection.execute(f"ATTACH '{quoted}' AS copied")
+    old = {
+        table
+        for (table,) in connection.execute(
+            "SELECT table_name FROM duckdb_tables() WHERE database_name = current_database()"
+        ).fetchall()
+    }
+    new = connection.execute(
+        "SELECT table_name FROM duckdb_tables() WHERE database_name = 'copied'"
+    ).fetchall()
+    for (table,) in new:
+        if table in old and table != "meta":
+            connection.execute(f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table}")  # noqa: S608 # our tables
+    connection.execute("INSERT INTO copied.meta VALUES (?)", [SCHEMA_VERSION])
+    connection.execute("DETACH copied")
+
+
+def _first(exc: Exception) -> str:
+    """The first line: DuckDB adds a stack trace to what it takes for its own fault."""
+    return str(exc).split("\n", maxsplit=1)[0]
