@@ -5,19 +5,36 @@ from __future__ import annotations
 import resource
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
+from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, resolve_endpoint, running_emulator_url
 from merge_runner.emulator.process import emulator_process
 from merge_runner.errors import UsageError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.claims import Claims
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.transport import SealedTransport, Transport
 from merge_runner.plan import Limits
 
 SPARE_FILES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """On what terms a sweep asks.
+
+    ``ledger`` names its spending in the cache, over all its runs; ``trial_usd`` is the worst case
+    of a whole trial. ``strict`` stops at an answer of another model.
+    """
+
+    limits: Limits
+    ledger: str
+    trial_usd: float
+    strict: bool = False
 
 
 def sealed_clients(
@@ -35,7 +52,7 @@ def sealed_clients(
             cache=cache,
             transport=transport,
             limiter=Limiter(),
-            budget=Budget(),
+            sealed=True,
         )
         for name, entry in entries.items()
     }
@@ -45,7 +62,7 @@ async def live_clients(
     entries: Mapping[str, ModelEntry],
     endpoints: Mapping[str, str],
     cache: ResponseCache,
-    limits: Limits,
+    terms: Terms,
     *,
     emulator_options: Sequence[str],
     stack: AsyncExitStack,
@@ -56,8 +73,13 @@ async def live_clients(
     """
     from merge_runner.llm.http import HttpTransport
 
+    limits = terms.limits
     _allow_open_files(limits.connections + SPARE_FILES)
-    budget = Budget(limits.max_cost_usd)
+    budget = Budget(
+        Ledger(cache, terms.ledger), cap_usd=limits.max_cost_usd, trial_usd=terms.trial_usd
+    )
+    claims = Claims(cache.folder)
+    stack.callback(claims.close)
     pauses: dict[str, Pause] = {}
     clients = {}
     for name, entry in entries.items():
@@ -81,7 +103,9 @@ async def live_clients(
             cache=cache,
             transport=transport,
             limiter=limiter,
-            budget=budget,
+            budget=None if entry.price == "free" else budget,
+            claims=claims,
+            strict=terms.strict,
         )
     return clients
 
@@ -94,10 +118,13 @@ def _client(
     cache: ResponseCache,
     transport: Transport,
     limiter: Limiter,
-    budget: Budget,
+    budget: Budget | None = None,
+    claims: Claims | None = None,
+    sealed: bool = False,
+    strict: bool = False,
 ) -> LlmClient:
     price = pricing(entry)
-    if budget.cap_usd is not None and not price.known:
+    if budget is not None and budget.cap_usd is not None and not price.known:
         raise UsageError(
             f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
             "experiments/models.toml"
@@ -111,6 +138,9 @@ def _client(
         limiter=limiter,
         pricing=price,
         budget=budget,
+        claims=claims,
+        sealed=sealed,
+        strict=strict,
     )
 
 

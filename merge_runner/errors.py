@@ -7,7 +7,10 @@ MergeRunnerError
 ├── SweepStopped           the sweep cannot go on; what is done is kept
 │   ├── EndpointRefused    bad key, unknown or retired model                    exit 2
 │   ├── QuotaExhausted     the account has nothing left                         exit 3
-│   └── BudgetExhausted    --max-cost is reached                                exit 3
+│   ├── ProviderDown       trials fail and nothing is answered any more         exit 1
+│   ├── ModelSwapped       --strict-model, and another model answers            exit 1
+│   └── CacheFailed        replies cannot be kept or read                       exit 1
+├── TrialSuspended         --max-cost cannot pay for the trial to go on         exit 3
 ├── StoreError             the database cannot be written or read               exit 1
 │   └── StoreLocked        another program holds the database
 └── RecordingError         a recording is damaged or not one of ours            exit 1
@@ -34,14 +37,22 @@ class UsageError(MergeRunnerError):
 
 
 class CallFailed(MergeRunnerError):
-    """A call ended without an answer; ``attempts`` holds what was tried."""
+    """A call ended without an answer.
+
+    ``attempts`` holds what was tried, the first ``earlier`` times by earlier runs.
+    """
 
     def __init__(
-        self, message: str, request: ChatRequest, attempts: tuple[Attempt, ...] = ()
+        self,
+        message: str,
+        request: ChatRequest,
+        attempts: tuple[Attempt, ...] = (),
+        earlier: int = 0,
     ) -> None:
         super().__init__(message)
         self.request = request
         self.attempts = attempts
+        self.earlier = earlier
 
 
 class ReplayMiss(CallFailed):
@@ -66,8 +77,20 @@ class QuotaExhausted(SweepStopped):
     exit_code = 3
 
 
-class BudgetExhausted(SweepStopped):
-    """The next call could exceed ``--max-cost``."""
+class ProviderDown(SweepStopped):
+    """One trial after the other fails, and no call is answered between them."""
+
+
+class ModelSwapped(SweepStopped):
+    """Another model answers than was asked for, and the user wants none of it."""
+
+
+class CacheFailed(SweepStopped):
+    """The cache can be neither written nor read, so that no reply could be kept."""
+
+
+class TrialSuspended(MergeRunnerError):
+    """The next call could exceed ``--max-cost``; the trial's replies so far are kept."""
 
     exit_code = 3
 

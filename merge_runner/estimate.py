@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry
+from merge_runner.llm.cache import ModelFacts
 from merge_runner.llm.prices import pricing
 from merge_runner.plan import PROMPTS_PER_DRIVER, Limits, Plan
 from merge_runner.prompts.render import render_prompt
@@ -12,10 +15,29 @@ from merge_runner.records import Usage
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.simulator.world import World
 
+# A reply's JSON around the prompt, and later prompts with longer histories and numbers.
+PROMPT_MARGIN = 1.25
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """What a live run has yet to do.
+
+    ``trials`` have ended nowhere; ``calls`` are about how many each model has yet to answer;
+    ``facts`` is what the cache knows of each model's earlier answers.
+    """
+
+    trials: int
+    calls: Mapping[str, float]
+    facts: Mapping[str, ModelFacts]
+
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Trials, calls, tokens, USD (None: a price is unknown) and minutes of a live run."""
+    """Trials, calls, tokens, USD (None: a price is unknown) and minutes of a live run.
+
+    ``measured`` lists the models whose tokens and latency are those of their earlier answers.
+    """
 
     trials: int
     calls: int
@@ -24,50 +46,98 @@ class Estimate:
     cost_usd: float | None
     minutes: float
     free: bool
+    measured: tuple[str, ...]
 
 
-def estimate(plan: Plan, trials: int, limits: Limits) -> Estimate:
-    """The estimate for this many trials of a plan, as if nothing were recorded yet."""
+@dataclass(frozen=True, slots=True)
+class _PerCall:
+    """What one call of a model takes, as measured or as the registry has it."""
+
+    usage: Usage
+    latency_s: float
+    measured: bool
+
+
+def estimate(plan: Plan, missing: Missing, limits: Limits) -> Estimate:
+    """The estimate for what is missing of a plan."""
     calls = input_tokens = output_tokens = 0
     cost: float | None = 0.0
     slowest_s = 0.0
-    prompt_tokens = len(_typical_prompt(plan).encode()) // 4
+    measured = []
     for name, entry in plan.entries.items():
-        share = sum(side == name for side in plan.sides.values())
-        made = round(trials * share * PROMPTS_PER_DRIVER)
-        each = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
-        price = pricing(entry).cost_usd(each)
+        made = round(missing.calls[name])
+        each = _per_call(plan, entry, missing.facts[name])
+        price = pricing(entry).cost_usd(each.usage)
+        tokens_in, tokens_out = each.usage.input_tokens or 0, each.usage.output_tokens or 0
         calls += made
-        input_tokens += made * prompt_tokens
-        output_tokens += made * entry.typical_output_tokens
+        input_tokens += made * tokens_in
+        output_tokens += made * tokens_out
         cost = None if cost is None or price is None else cost + made * price
-        rounds = -(-2 * trials // limits.connections)
+        measured += [name] if each.measured else []
+        at_once = min(limits.connections, 2 * max(missing.trials, 1))
         slowest_s = max(
             slowest_s,
-            rounds * PROMPTS_PER_DRIVER * entry.typical_latency_s,
-            _limited_s(entry, limits, made, prompt_tokens),
+            math.ceil(made / at_once) * each.latency_s,
+            _limited_s(entry, limits, made, each),
         )
     return Estimate(
-        trials=trials,
+        trials=missing.trials,
         calls=calls,
         input_tokens=input_tokens,
         output_tokens=output_tokens,
         cost_usd=None if cost is None else round(cost, 2),
         minutes=round(slowest_s / 60, 1),
         free=all(entry.price == "free" for entry in plan.entries.values()),
+        measured=tuple(measured),
     )
 
 
-def _limited_s(entry: ModelEntry, limits: Limits, calls: int, prompt_tokens: int) -> float:
+def nothing_recorded(plan: Plan) -> Missing:
+    """All of a plan."""
+    calls = {
+        name: plan.trials * PROMPTS_PER_DRIVER * sum(s == name for s in plan.sides.values())
+        for name in plan.entries
+    }
+    return Missing(plan.trials, calls, dict.fromkeys(plan.entries, ModelFacts()))
+
+
+def worst_trial_usd(plan: Plan) -> float:
+    """What a whole trial may cost: every token of its prompts a byte, every answer at its cap."""
+    prompt_bytes = len(_typical_prompt(plan).encode()) * PROMPT_MARGIN
+    return sum(
+        math.ceil(PROMPTS_PER_DRIVER + 1)
+        * (
+            pricing(entry).cost_usd(
+                Usage(input_tokens=int(prompt_bytes), output_tokens=entry.max_output_tokens)
+            )
+            or 0.0
+        )
+        for entry in (plan.entries[n] for n in plan.sides.values() if n in plan.entries)
+    )
+
+
+def _per_call(plan: Plan, entry: ModelEntry, facts: ModelFacts) -> _PerCall:
+    if facts.measured:
+        usage = Usage(
+            input_tokens=round(facts.input_tokens / facts.measured),
+            output_tokens=round(facts.output_tokens / facts.measured),
+        )
+        return _PerCall(usage, facts.latency_s / facts.measured, True)
+    prompt_tokens = len(_typical_prompt(plan).encode()) // 4
+    usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
+    return _PerCall(usage, entry.typical_latency_s, False)
+
+
+def _limited_s(entry: ModelEntry, limits: Limits, calls: int, each: _PerCall) -> float:
     """How long the limits stretch the calls, in s.
 
     Within a minute's window a call counts with its output cap until its reply is in, and with
     its actual tokens from then on.
     """
     rpm, tpm = limits.rpm or entry.rpm, limits.tpm or entry.tpm
-    waiting = min(entry.typical_latency_s / 60, 1.0)
-    tokens = prompt_tokens + (
-        waiting * entry.max_output_tokens + (1 - waiting) * entry.typical_output_tokens
+    waiting = min(each.latency_s / 60, 1.0)
+    tokens = (each.usage.input_tokens or 0) + (
+        waiting * entry.max_output_tokens + (1 - waiting) * (each.usage.output_tokens or 0)
     )
     return max(60 * calls / rpm if rpm else 0.0, 60 * calls * tokens / tpm if tpm else 0.0)
 

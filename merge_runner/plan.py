@@ -36,6 +36,7 @@ class Choice:
     conditions: Sequence[str] | None = None
     variants: Sequence[str] | None = None
     sample_set: int = 0
+    order_seed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,12 @@ class Plan:
     repetitions: dict[str, int]
     conditions: tuple[str, ...]
     sample_set: int
+    order_seed: int
+
+    @property
+    def ledger(self) -> str:
+        """Under what name the sweep's spending is kept, over all its runs."""
+        return f"{self.name}/{self.model}/set{self.sample_set}"
 
     @property
     def trials(self) -> int:
@@ -98,7 +105,11 @@ class Plan:
         }
 
     def trial_specs(self, endpoints: Mapping[str, str]) -> list[TrialSpec]:
-        """All trials, repetition by repetition, so that what is finished is balanced."""
+        """All trials, repetition by repetition, so that what is finished is balanced.
+
+        Within a repetition the order is random, by the order seed, so that no condition or variant
+        is always asked first: a service that drifts over hours does so for all alike.
+        """
         hashes = {variant: spec_hash(text) for variant, text in self.specs(endpoints).items()}
         cells = [
             (repetition, variant, condition)
@@ -107,6 +118,7 @@ class Plan:
             if repetition <= wanted
             for condition in self.conditions
         ]
+        cells.sort(key=lambda cell: (cell[0], _lot(self.order_seed, *cell)))
         suffix = f"/set{self.sample_set}" if self.sample_set else ""
         return [
             TrialSpec(
@@ -137,6 +149,7 @@ class Plan:
             "repetitions": dict(self.repetitions),
             "conditions": list(self.conditions),
             "sample_set": self.sample_set,
+            "order_seed": self.order_seed,
             "prompt_blocks": prompt_blocks,
         }
 
@@ -151,6 +164,11 @@ class Plan:
             "headers": sent.headers,
             "body": sent.body,
         }
+
+
+def _lot(*what: object) -> str:
+    """A random place in a row that is the same on every machine."""
+    return hashlib.sha256("/".join(map(str, what)).encode()).hexdigest()
 
 
 def spec_hash(text: str) -> str:
@@ -184,6 +202,7 @@ def make_plan(choice: Choice) -> Plan:
         repetitions=_repetitions(name, file, choice),
         conditions=conditions,
         sample_set=choice.sample_set,
+        order_seed=choice.order_seed,
     )
 
 

@@ -11,13 +11,15 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from merge_runner.llm.meter import Meter
+from merge_runner.llm.meter import Meter, Wait
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
+NOTES_SHOWN = 10
+REASONS_SHOWN = 3
 
 
 @dataclass(slots=True)
@@ -63,6 +65,7 @@ class Progress:
             ("calls", f"{live} live, {cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
             ("cost", f"{cost:.2f}{cap} USD"),
+            *_waiting(self.meters),
             ("time", f"{elapsed:.0f} s{self._left(elapsed, live + cached)}"),
         ]
 
@@ -125,12 +128,29 @@ def _line(progress: Progress) -> str:
 
 
 def _notes(progress: Progress) -> list[str]:
-    """What the clients had to say since the last look, equal lines once."""
+    """What the clients had to say since the last look, equal lines once, not too many."""
     notes: dict[str, None] = {}
     for meter in progress.meters:
         while meter.notes:
             notes[meter.notes.popleft()] = None
-    return list(notes)
+    lines = list(notes)
+    more = [f"... and {len(lines) - NOTES_SHOWN} more like these"] * (len(lines) > NOTES_SHOWN)
+    return lines[:NOTES_SHOWN] + more
+
+
+def _waiting(meters: Sequence[Meter]) -> list[tuple[str, str]]:
+    """How many calls wait for what, and until when at the latest, where that is known."""
+    waits: dict[str, list[Wait]] = {}
+    for meter in meters:
+        for wait in meter.waits.values():
+            waits.setdefault(wait.what, []).append(wait)
+    texts = []
+    for what, those in sorted(waits.items(), key=lambda item: -len(item[1])):
+        ends = [wait.until for wait in those if wait.until is not None]
+        until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
+        texts.append(f"{len(those)} {what}{until}")
+    more = [f"{len(texts) - REASONS_SHOWN} other reasons"] * (len(texts) > REASONS_SHOWN)
+    return [("calls waiting", "; ".join(texts[:REASONS_SHOWN] + more))] if texts else []
 
 
 async def _stopped(stop: asyncio.Event, seconds: float) -> bool:

@@ -74,8 +74,9 @@ class Usage:
 class Attempt:
     """One HTTP attempt at a call.
 
-    ``outcome`` is ``ok``, ``refusal``, ``truncated`` or ``empty`` for an answer, else the named
-    reason of the failure. ``reply`` is the body as received, None if there was none.
+    ``outcome`` is ``ok``, ``refusal``, ``truncated`` or ``empty`` for an answer, ``unknown`` where
+    nobody knows what became of the attempt, else the named reason of the failure. ``reply`` is
+    the body as received, None if there was none.
     ``started_at`` is UTC in ISO 8601.
     """
 
@@ -113,13 +114,21 @@ class ChatRequest:
 
 @dataclass(frozen=True, slots=True)
 class ChatReply:
-    """The answer to a call: its text and outcome, and every attempt, the answering one last."""
+    """The answer to a call: its text and outcome, and every attempt, the answering one last.
+
+    The first ``earlier`` attempts were made before this run, or for another trial of it.
+    """
 
     text: str
     outcome: str
     request: ChatRequest
     attempts: tuple[Attempt, ...]
-    cached: bool
+    earlier: int
+
+    @property
+    def cached(self) -> bool:
+        """Whether the whole call was there already."""
+        return self.earlier == len(self.attempts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,12 +202,13 @@ class DecisionRow:
 
 @dataclass(frozen=True, slots=True)
 class FailedCall:
-    """A call without an answer, and what was tried."""
+    """A call without an answer, and what was tried, the first ``earlier`` times by earlier runs."""
 
     number: int
     side: Side
     request: ChatRequest
     attempts: tuple[Attempt, ...]
+    earlier: int = 0
 
 
 @dataclass(frozen=True, slots=True)

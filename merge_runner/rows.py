@@ -84,10 +84,10 @@ def call_rows(record: TrialRecord) -> Iterator[Row]:
         reply = row.decision.reply
         if reply is not None:
             for attempt in reply.attempts:
-                yield _call_row(record, row, reply.request, attempt, cached=reply.cached)
+                yield _call_row(record, row, reply.request, attempt, reply.earlier)
     for failed in record.failed_calls:
         for attempt in failed.attempts:
-            yield _call_row(record, failed, failed.request, attempt, cached=False)
+            yield _call_row(record, failed, failed.request, attempt, failed.earlier)
 
 
 def _call_row(
@@ -95,8 +95,7 @@ def _call_row(
     place: DecisionRow | FailedCall,
     request: ChatRequest,
     attempt: Attempt,
-    *,
-    cached: bool,
+    earlier: int,
 ) -> Row:
     return (
         request.key,
@@ -110,7 +109,7 @@ def _call_row(
         attempt.model_served,
         attempt.http_status,
         attempt.outcome,
-        cached,
+        attempt.number <= earlier,
         attempt.started_at and datetime.fromisoformat(attempt.started_at).replace(tzinfo=None),
         attempt.latency_s,
         attempt.usage.input_tokens,

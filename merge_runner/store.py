@@ -170,15 +170,39 @@ class Store:
 
 
 def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Run one read-only query; returns the column names and the rows. Raises UsageError."""
+    """Run one read-only query; returns the column names and the rows. Raises UsageError.
+
+    It reaches no file and no network, and changes no setting.
+    """
     with read_database(path) as connection:
-        connection.execute("SET enable_external_access = false; SET lock_configuration = true")
+        # External access alone leaves the database's own files open to COPY ... TO.
+        connection.execute(
+            "SET temp_directory = ''; SET enable_external_access = false; "
+            "SET disabled_filesystems = 'LocalFileSystem'; SET lock_configuration = true"
+        )
         try:
-            result = connection.execute(sql)
+            statements = connection.extract_statements(sql)
+            if len(statements) != 1 or not _reads(statements[0]):
+                raise UsageError(
+                    "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
+                    "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
+                )
+            result = connection.execute(statements[0])
             names = [column[0] for column in result.description or ()]
-            return names, result.fetchall() if names else []
+            return names, result.fetchall()
         except duckdb.Error as exc:
+            if "pytz" in str(exc):
+                raise UsageError("cast times with a zone, as in now()::TIMESTAMP") from exc
             raise UsageError(f"the query failed: {exc}") from exc
+
+
+def _reads(statement: duckdb.Statement) -> bool:
+    """Whether a statement is a query; a PIVOT consists of several."""
+    kinds = duckdb.StatementType
+    try:
+        return statement.type in (kinds.SELECT, kinds.EXPLAIN, kinds.MULTI)
+    except ValueError:  # a kind that the client library does not know
+        return False
 
 
 def results_digest(path: Path) -> tuple[str, int]:
@@ -255,11 +279,13 @@ def sweep_row(path: Path, sweep_id: str) -> dict[str, Any]:
 class SweepFacts:
     """What the database says of one sweep.
 
-    ``outcomes`` holds (variant, condition, status, merged_first, trials), ``failed`` (trial_id,
-    error), ``served`` (model requested, model served, answers).
+    ``outcomes`` holds (variant, condition, status, merged_first, had a fallback, trials),
+    ``ledger`` (model, variant, fate, outcome, attempts) as the view ``attempts`` names them,
+    ``failed`` (trial_id, error), ``served`` (model requested, model served, answers).
     """
 
-    outcomes: list[tuple[str, str, str, str | None, int]]
+    outcomes: list[tuple[str, str, str, str | None, bool, int]]
+    ledger: list[tuple[str, str, str, str, int]]
     failed: list[tuple[str, str]]
     served: list[tuple[str, str | None, int]]
     decisions: int
@@ -285,7 +311,15 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
         )[0]
         return SweepFacts(
             outcomes=rows(
-                "SELECT variant, condition, status, merged_first, count(*) FROM trials",
+                "SELECT variant, condition, status, merged_first, coalesce(fallen_back, false), "
+                "count(*) FROM trials LEFT JOIN (SELECT trial_id, spec_hash, "
+                "bool_or(fallback) AS fallen_back FROM decisions GROUP BY ALL) "
+                "USING (trial_id, spec_hash)",
+                "GROUP BY ALL ORDER BY ALL",
+            ),
+            ledger=rows(
+                "SELECT model, variant, fate, if(outcome = 'ok', coalesce(failure, outcome), "
+                "outcome), count(*) FROM attempts",
                 "GROUP BY ALL ORDER BY ALL",
             ),
             failed=rows(

@@ -4,26 +4,28 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from merge_runner.errors import ReplayMiss
+from merge_runner.estimate import Estimate
 from merge_runner.plan import Plan
 from merge_runner.store import SweepFacts
-from merge_runner.sweep import Outcome
+from merge_runner.sweep import Options, Outcome
 
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
+LEDGER = ("model", "variant", "fate", "outcome", "attempts")
 FAILURES_SHOWN = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A plan's outcome and where it is stored."""
+    """A plan's outcome, how it ran, and what was expected of it where that was estimated."""
 
     plan: Plan
     outcome: Outcome
-    db: Path
+    options: Options
+    expected: Estimate | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The summary as JSON values."""
@@ -35,25 +37,36 @@ class Summary:
             "scripted": self.plan.scripted,
             "exit_code": outcome.exit_code,
             "messages": outcome.messages,
-            "db": str(self.db),
+            "db": str(self.options.db),
             "trials": {
                 "planned": outcome.trials,
                 "stored_before": outcome.stored_before,
+                "suspended": outcome.suspended,
                 **(_statuses(facts) if facts else {}),
             },
             "calls": {"live": outcome.calls_live, "cached": outcome.calls_cached},
             "attempts": outcome.attempts,
             "cost_usd": round(outcome.cost_usd, 6),
             "calls_of_unknown_cost": outcome.calls_of_unknown_cost,
+            "estimate": None if self.expected is None else asdict(self.expected),
+            "sweep_cost_usd": round(outcome.spending.spent_usd, 6),
+            "set_aside_usd": round(outcome.spending.reserved_usd, 6),
+            "attempts_of_unknown_cost": outcome.spending.open_attempts,
+            "cache_cost_usd": round(outcome.cache_cost_usd, 6),
+            "damaged_entries": outcome.damaged,
             "decisions": facts.decisions if facts else None,
             "invalid_decisions": facts.invalid if facts else None,
             "fallbacks": facts.fallbacks if facts else None,
             "model_mismatches": self.mismatches(),
+            "ledger": [
+                dict(zip(LEDGER, row, strict=True)) for row in (facts.ledger if facts else ())
+            ],
             "failed": dict(facts.failed) if facts else {},
             "outcomes": [
                 {"variant": variant, "condition": condition, **_named(counts)}
                 for (variant, condition), counts in (_cells(facts) if facts else {}).items()
             ],
+            "outcomes_without_fallbacks": _named(_total(facts, fallbacks=False)) if facts else {},
         }
 
     def lines(self) -> Iterator[str]:
@@ -62,16 +75,10 @@ class Summary:
         if facts is not None:
             yield from self._table(facts)
             yield ""
-            yield (
-                f"decisions: {facts.decisions}, {facts.invalid} invalid, "
-                f"{facts.fallbacks} fallbacks to an earlier plan"
-            )
-        unknown = outcome.calls_of_unknown_cost
-        yield (
-            f"calls: {outcome.calls_live} live, {outcome.calls_cached} from recordings; "
-            f"cost {outcome.cost_usd:.4f} USD"
-            + (f" and {unknown} calls of unknown cost" if unknown else "")
-        )
+            yield from self._failures(facts)
+        yield from self._costs()
+        for key in outcome.damaged:
+            yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
         for pair, answers in self.mismatches().items():
             yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
         if self.plan.scripted:
@@ -83,7 +90,53 @@ class Summary:
                 yield f"... and {len(facts.failed) - FAILURES_SHOWN} more, in the table trials"
             if facts.failed and outcome.exit_code != ReplayMiss.exit_code:
                 yield "Run the same command again to play the failed trials anew."
-        yield f"database: {self.db}"
+        yield f"database: {self.options.db}"
+
+    def _failures(self, facts: SweepFacts) -> Iterator[str]:
+        """What went wrong on the way, and whether it may have changed the outcomes."""
+        share = f" ({facts.invalid / facts.decisions:.1%})" if facts.invalid else ""
+        yield (
+            f"decisions: {facts.decisions}, {facts.invalid} invalid{share}, "
+            f"{facts.fallbacks} fallbacks to an earlier plan"
+        )
+        cells: dict[tuple[str, str], Counter[str]] = {}
+        for model, variant, fate, outcome, attempts in facts.ledger:
+            if fate != "driven":
+                cells.setdefault((model, variant), Counter())[f"{fate} {outcome}"] += attempts
+        for (model, variant), counts in cells.items():
+            named = ", ".join(f"{count} {what}" for what, count in counts.most_common())
+            yield f"attempts of {model}, {variant}, that brought no plan: {named}"
+        if facts.fallbacks:
+            for name, fallbacks in (("all trials", None), ("without fallbacks", False)):
+                named_counts = _named(_total(facts, fallbacks=fallbacks))
+                yield f"{name}: " + ", ".join(f"{n} {what}" for what, n in named_counts.items())
+
+    def _costs(self) -> Iterator[str]:
+        outcome, spending = self.outcome, self.outcome.spending
+        unknown = outcome.calls_of_unknown_cost
+        yield (
+            f"calls: {outcome.calls_live} live, {outcome.calls_cached} from recordings; "
+            f"cost {outcome.cost_usd:.4f} USD"
+            + (f" and {unknown} calls of unknown cost" if unknown else "")
+        )
+        if self.expected is not None:
+            cost = self.expected.cost_usd
+            yield (
+                f"estimated before: {self.expected.calls} calls, "
+                + ("an unknown price" if cost is None else f"{cost:.2f} USD")
+            )
+        if spending.committed_usd:
+            open_ones = spending.open_attempts
+            yield (
+                f"this sweep over all its runs: {spending.spent_usd:.4f} USD"
+                + (
+                    f", and {spending.reserved_usd:.4f} set aside for {open_ones} attempts of "
+                    "unknown cost"
+                    if open_ones
+                    else ""
+                )
+                + f"; all replies in {self.options.cache}: {outcome.cache_cost_usd:.4f} USD"
+            )
 
     def mismatches(self) -> dict[str, int]:
         """Requested and served model, where the latter is neither the id nor an alias."""
@@ -115,14 +168,25 @@ class Summary:
 def _cells(facts: SweepFacts) -> dict[tuple[str, str], Counter[str]]:
     """(variant, condition) to counts of statuses and of first mergers."""
     cells: dict[tuple[str, str], Counter[str]] = {}
-    for variant, condition, status, merged_first, trials in facts.outcomes:
+    for variant, condition, status, merged_first, _, trials in facts.outcomes:
         counts = cells.setdefault((variant, condition), Counter())
         counts["trials"] += trials
-        if status == "finished":
-            counts[f"{merged_first} first"] += trials
-        else:
-            counts[status] += trials
+        counts[_ending(status, merged_first)] += trials
     return cells
+
+
+def _total(facts: SweepFacts, *, fallbacks: bool | None) -> Counter[str]:
+    """Counts over trials with or without fallbacks; None: over all."""
+    counts: Counter[str] = Counter()
+    for _, _, status, merged_first, fallen_back, trials in facts.outcomes:
+        if fallbacks in (None, fallen_back):
+            counts["trials"] += trials
+            counts[_ending(status, merged_first)] += trials
+    return counts
+
+
+def _ending(status: str, merged_first: str | None) -> str:
+    return f"{merged_first} first" if status == "finished" else status
 
 
 def _grouped(cells: dict[tuple[str, str], Counter[str]], index: int) -> dict[str, Counter[str]]:
@@ -138,7 +202,7 @@ def _named(counts: Counter[str]) -> dict[str, int]:
 
 def _statuses(facts: SweepFacts) -> dict[str, int]:
     counts: Counter[str] = Counter()
-    for _, _, status, _, trials in facts.outcomes:
+    for _, _, status, _, _, trials in facts.outcomes:
         counts[status] += trials
     return {status: counts[status] for status in ("finished", "collided", "timeout", "failed")}
 

@@ -10,24 +10,28 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from merge_runner.clients import live_clients, sealed_clients
+from merge_runner.clients import Terms, live_clients, sealed_clients
 from merge_runner.config import ModelEntry, endpoint_identity
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.llm_driver import LlmDriver
 from merge_runner.drivers.projected_order import ProjectedOrderDriver
 from merge_runner.errors import (
+    ProviderDown,
     RecordingError,
     ReplayMiss,
     StoreError,
     SweepStopped,
+    TrialSuspended,
     UsageError,
 )
+from merge_runner.estimate import Missing, worst_trial_usd
 from merge_runner.flusher import Flusher
 from merge_runner.interrupt import on_interrupt
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.keys import canonical_json
+from merge_runner.llm.ledger import Ledger, Spending
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.misses import Miss, explain, misses_of
 from merge_runner.plan import PROMPTS_PER_DRIVER, Limits, Plan, spec_hash
@@ -41,6 +45,7 @@ from merge_runner.trial import play_trial
 
 INTERRUPTED = 130
 SHOWN = 5
+FAILURES_IN_A_ROW = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,14 +64,18 @@ class Options:
     recording: Path | None = None
     emulator_options: Sequence[str] = ()
     faults_identity: str = ""
+    strict_model: bool = False
 
 
 @dataclass(slots=True)
 class Outcome:
     """What a run did.
 
-    ``stored_before`` trials were not played because they are stored. ``facts`` are those of the
-    database over all trials of the sweep, None where they are not stored.
+    ``stored_before`` trials were not played because they are stored; ``suspended`` ones wait for
+    money, with their replies kept. ``spending`` is that of the sweep over all its runs, and
+    ``cache_cost_usd`` what all replies in the cache cost when they were made. ``damaged`` lists
+    the keys of recorded replies that could not be read. ``facts`` are those of the database over
+    all trials of the sweep, None where they are not stored.
     """
 
     sweep_id: str
@@ -79,6 +88,10 @@ class Outcome:
     cost_usd: float = 0.0
     calls_of_unknown_cost: int = 0
     attempts: dict[str, int] = field(default_factory=dict)
+    suspended: int = 0
+    damaged: list[str] = field(default_factory=list)
+    spending: Spending = field(default_factory=Spending)
+    cache_cost_usd: float = 0.0
     facts: SweepFacts | None = None
 
     def fail(self, exit_code: int, message: str) -> None:
@@ -108,6 +121,10 @@ class Sweep:
         self._clients: dict[str, LlmClient] = {}
         self._sealed = SealedTransport()
         self._misses: list[Miss] = []
+        self._ledger = Ledger(self._cache, plan.ledger)
+        self._answers_before_failures = 0
+        self._failures_in_a_row = 0
+        self._suspended: list[TrialSuspended] = []
         self._progress = Progress(
             title=f"{plan.name}: {plan.model}" + (" (scripted stand-in)" if plan.scripted else ""),
             total=len(self._todo),
@@ -136,16 +153,54 @@ class Sweep:
             finally:
                 await self._finish(flusher, outcome)
             self._explain_misses(outcome)
+            outcome.spending = self._ledger.read()
+            outcome.cache_cost_usd = self._cache.cost_usd()
         for meter in meters:
+            outcome.damaged += meter.damaged
             outcome.calls_live += meter.calls_live
             outcome.calls_cached += meter.calls_cached
             outcome.cost_usd += meter.cost_usd
             outcome.calls_of_unknown_cost += meter.cost_unknown
             for name, count in meter.outcomes.items():
                 outcome.attempts[name] = outcome.attempts.get(name, 0) + count
+        if self._suspended:
+            outcome.suspended = len(self._suspended)
+            outcome.fail(
+                TrialSuspended.exit_code,
+                f"{len(self._suspended)} trials wait for money: {self._suspended[0]}. Their "
+                "replies are kept: raise --max-cost and run the same command again",
+            )
         if self._progress.done["failed"] and not self._misses:
             outcome.fail(1, f"{self._progress.done['failed']} trials failed")
         return outcome
+
+    async def rehearse(self) -> Missing:
+        """Play from the recorded replies alone, store nothing, and count what is missing."""
+        self._clients = sealed_clients(
+            self._plan.entries, self._endpoints, self._cache, SealedTransport()
+        )
+        trials = 0
+        calls = dict.fromkeys(self._plan.entries, 0.0)
+
+        def ended(record: TrialRecord | None) -> None:
+            nonlocal trials
+            if record is None or record.status != "failed":
+                return
+            trials += 1
+            for side, name in self._plan.sides.items():
+                if name in calls:
+                    answered = sum(row.side == side for row in record.decisions)
+                    calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
+
+        await run_bounded(
+            (partial(self._trial, spec) for spec in self._todo), in_flight=1, on_done=ended
+        )
+        facts = {name: self._cache.facts(e.id) for name, e in self._plan.entries.items()}
+        return Missing(trials, calls, facts)
+
+    def close(self) -> None:
+        """Close what was opened, where the sweep is not run."""
+        self._cache.close()
 
     def _explain_misses(self, outcome: Outcome) -> None:
         if not self._misses:
@@ -186,7 +241,12 @@ class Sweep:
             entries,
             endpoints,
             self._cache,
-            self._options.limits,
+            Terms(
+                self._options.limits,
+                self._plan.ledger,
+                worst_trial_usd(self._plan),
+                self._options.strict_model,
+            ),
             emulator_options=self._options.emulator_options,
             stack=stack,
         )
@@ -194,10 +254,13 @@ class Sweep:
     async def _play(self, flusher: Flusher, outcome: Outcome) -> None:
         """Run the trials until all have ended, or the sweep is stopped or interrupted."""
 
-        def ended(record: TrialRecord) -> None:
+        def ended(record: TrialRecord | None) -> None:
+            if record is None:
+                return
             self._progress.done[record.status] += 1
             self._misses += misses_of(record, self._sealed)
             flusher.add(record)
+            self._watch_for_outage(record)
 
         work = asyncio.create_task(
             run_bounded(
@@ -247,13 +310,32 @@ class Sweep:
         except StoreError as exc:
             outcome.fail(exc.exit_code, str(exc))
 
-    async def _trial(self, spec: TrialSpec) -> TrialRecord:
+    async def _trial(self, spec: TrialSpec) -> TrialRecord | None:
+        """Play a trial; None: there is no money for it to go on."""
         drivers = {side: self._driver(spec, side) for side in SIDES}
         self._progress.running += 1
         try:
             return await play_trial(spec, self._plan.scenario, drivers)
+        except TrialSuspended as exc:
+            self._suspended.append(exc)
+            return None
         finally:
             self._progress.running -= 1
+            for client in self._clients.values():
+                client.leave(spec.order)
+
+    def _watch_for_outage(self, record: TrialRecord) -> None:
+        """Stop when one trial after the other fails and no call is answered in between."""
+        answers = sum(client.meter.calls_live for client in self._clients.values())
+        if record.status != "failed" or answers > self._answers_before_failures:
+            self._failures_in_a_row, self._answers_before_failures = 0, answers
+        self._failures_in_a_row += record.status == "failed"
+        if self._failures_in_a_row >= FAILURES_IN_A_ROW and not self._options.replay:
+            raise ProviderDown(
+                f"the last {self._failures_in_a_row} trials failed and no call was answered in "
+                f"between ({record.error}): the rest is not tried. When the service answers "
+                "again, run the same command to go on"
+            )
 
     def _driver(self, spec: TrialSpec, side: Side) -> Driver:
         name, scenario = self._plan.sides[side], self._plan.scenario

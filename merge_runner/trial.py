@@ -49,7 +49,7 @@ async def play_trial(
         states=world.states(),
         decisions=tuple(decisions),
         failed_calls=tuple(
-            FailedCall(number - 1, side, exc.request, exc.attempts)
+            FailedCall(number - 1, side, exc.request, exc.attempts, exc.earlier)
             for side, exc in failures.items()
         ),
     )

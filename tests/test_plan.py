@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import groupby
+
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.estimate import estimate
+from merge_runner.estimate import estimate, nothing_recorded
 from merge_runner.plan import PROGRAMS, Choice, Limits, make_plan
 
 EMULATOR = {"emulator": "emulator"}
@@ -35,9 +37,27 @@ def test_finished_parts_of_a_sweep_are_balanced_over_conditions_and_variants():
 def test_ids_are_readable():
     mixed = make_plan(Choice("baseline", "o3+constant", repetitions=3, sample_set=1))
     specs = mixed.trial_specs({"o3": "openai"})
-    assert specs[-1].trial_id == "o3+constant/baseline/L_4_8/rep03/set1"
+    assert "o3+constant/baseline/L_4_8/rep03/set1" in {spec.trial_id for spec in specs}
     assert (specs[0].model_left, specs[0].model_right) == ("o3", "constant")
     assert make_plan(Choice("baseline", "o3+o3")).model == "o3"
+
+
+def places(plan):
+    """(repetition, variant, condition) of all trials in their order."""
+    return [(s.repetition, s.variant, s.condition) for s in plan.trial_specs({"emulator": "e"})]
+
+
+def test_the_order_is_random_within_a_repetition_and_balanced_over_them():
+    plans = [make_plan(Choice("ablations", "emulator", order_seed=seed)) for seed in (0, 0, 1)]
+    first, again, other = map(places, plans)
+    assert first == again != other
+    assert sorted(first) == sorted(other)
+    assert [repetition for repetition, _, _ in first] == sorted(r for r, _, _ in first)
+    blocks = [list(block) for _, block in groupby(first, key=lambda cell: cell[0])]
+    assert len(blocks) == max(plans[0].repetitions.values())
+    # No block begins with the conditions of another one in the same order.
+    assert len({tuple(cell[2] for cell in block[:11]) for block in blocks}) == len(blocks)
+    assert [plan.config({"emulator": "e"})["order_seed"] for plan in plans] == [0, 0, 1]
 
 
 def test_the_spec_hash_covers_what_determines_a_result_and_nothing_else(tmp_path):
@@ -122,7 +142,7 @@ def test_what_is_named_twice_is_played_once():
 )
 def test_the_estimate_takes_the_limits_into_account(limits, minutes):
     plan = make_plan(Choice("baseline", "o3"))
-    expected = estimate(plan, plan.trials, limits)
+    expected = estimate(plan, nothing_recorded(plan), limits)
     assert expected.minutes == pytest.approx(minutes, rel=0.08)
     assert expected.calls == 2310
     each = 2310 * (500 * 2 + 1500 * 8) / 1e6

@@ -1,42 +1,117 @@
-"""A cap on spending that holds whatever happens: the worst case is reserved before each attempt."""
+"""A cap on what a sweep spends, over all its runs, that holds whatever happens.
+
+The worst case of an attempt is set aside when it queues for its turn, and durably, in the ledger,
+right before it is sent. So that money ends trials instead of beginning ever more of them, a trial
+gets an allowance when it first spends: the worst case of a whole trial. Trials get theirs in the
+order of the sweep, as those before them end.
+"""
 
 from __future__ import annotations
 
 import asyncio
 
-from merge_runner.errors import BudgetExhausted
+from merge_runner.errors import TrialSuspended
+from merge_runner.llm.ledger import TOLERANCE_USD, Ledger
+from merge_runner.records import Attempt
 
 
 class Budget:
-    """Spending in USD against a cap; without a cap everything passes."""
+    """Spending of one sweep in USD; without a cap everything passes, and is recorded.
 
-    def __init__(self, cap_usd: float | None = None) -> None:
+    A trial is named by its order in the sweep.
+    """
+
+    def __init__(
+        self, ledger: Ledger, *, cap_usd: float | None = None, trial_usd: float = 0.0
+    ) -> None:
+        """``trial_usd`` is the worst case of a whole trial."""
+        self.ledger = ledger
         self.cap_usd = cap_usd
-        self._committed_usd = 0.0
+        self._trial_usd = trial_usd
+        self._allowances: dict[int, float] = {}
+        self._at_the_door: list[int] = []  # once for each side that asks
+        self._stuck: set[int] = set()
         self._in_flight = 0
-        self._settled = asyncio.Event()
+        self._queued_usd = 0.0
+        self._changed = asyncio.Event()
 
-    async def reserve(self, worst_usd: float) -> None:
-        """Set the worst case aside; waits for attempts in flight, else raises BudgetExhausted."""
-        cap = self.cap_usd
-        if cap is None:
-            return
-        while self._committed_usd + worst_usd > cap:
-            if self._in_flight == 0:
-                raise BudgetExhausted(
-                    f"the next call may cost {worst_usd:.4f} USD and {self._committed_usd:.4f} of "
-                    f"{cap:.2f} USD are spent: raise --max-cost and run the same command again"
-                )
-            self._settled.clear()
-            await self._settled.wait()
-        self._committed_usd += worst_usd
-        self._in_flight += 1
-
-    def settle(self, worst_usd: float, actual_usd: float | None) -> None:
-        """Replace the worst case by the actual cost; None (unknown) keeps it."""
+    async def admit(self, trial: int) -> None:
+        """Wait for a trial's allowance; raises TrialSuspended when no ending trial can free it."""
         if self.cap_usd is None:
             return
-        if actual_usd is not None:
-            self._committed_usd += actual_usd - worst_usd
+        self._at_the_door.append(trial)
+        try:
+            while trial not in self._allowances:
+                allowed = sum(self._allowances.values())
+                fits = (
+                    self._committed_usd + allowed + self._trial_usd <= self.cap_usd + TOLERANCE_USD
+                )
+                if fits and trial == min(self._at_the_door):
+                    self._allowances[trial] = self._trial_usd
+                elif not fits and not self._allowances and not self._in_flight:
+                    raise self._suspended(f"a whole trial may cost {self._trial_usd:.2f} USD")
+                else:
+                    await self._changed.wait()
+        finally:
+            self._at_the_door.remove(trial)
+            self._tell()
+
+    def leave(self, trial: int) -> None:
+        """The trial has ended: what is left of its allowance is free."""
+        if self._allowances.pop(trial, None) is not None:
+            self._tell()
+
+    async def reserve(self, trial: int, worst_usd: float) -> None:
+        """Set an attempt's worst case aside; waits for others, else raises TrialSuspended."""
+        while not self._taken(trial, worst_usd):
+            self._stuck.add(trial)
+            try:
+                if not self._in_flight and self._allowances.keys() <= self._stuck:
+                    raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
+                await self._changed.wait()
+            finally:
+                self._stuck.discard(trial)
+        self._in_flight += 1
+        self._queued_usd += worst_usd
+
+    async def begin(self, key: str, attempts: list[Attempt], worst_usd: float) -> None:
+        """The attempt is sent now: what is set aside for it becomes durable."""
+        if not await self.ledger.reserve(key, attempts, worst_usd, self.cap_usd):
+            raise self._suspended("another run of the sweep spends from the same cap")
+        self._queued_usd -= worst_usd
+
+    def give_back(self, worst_usd: float) -> None:
+        """The attempt was not begun."""
+        self._queued_usd -= worst_usd
+        self.settled()
+
+    def settled(self) -> None:
+        """An attempt has ended, and the ledger knows what it cost."""
         self._in_flight -= 1
-        self._settled.set()
+        self._tell()
+
+    @property
+    def _committed_usd(self) -> float:
+        return self.ledger.spending.committed_usd + self._queued_usd
+
+    def _taken(self, trial: int, worst_usd: float) -> bool:
+        """Take an attempt's worst case, from the trial's allowance as far as that goes."""
+        if self.cap_usd is None:
+            return True
+        own = min(worst_usd, self._allowances.get(trial, 0.0))
+        allowed = sum(self._allowances.values())
+        if self._committed_usd + allowed + worst_usd - own > self.cap_usd + TOLERANCE_USD:
+            return False
+        if own:
+            self._allowances[trial] -= own
+        return True
+
+    def _tell(self) -> None:
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _suspended(self, what: str) -> TrialSuspended:
+        return TrialSuspended(
+            f"{what}, and {self._committed_usd:.4f} of {self.cap_usd:g} USD are spent or set "
+            "aside"
+        )

@@ -1,31 +1,37 @@
 """Recorded replies on disk: one text entry per call key, never evicted, never pickled.
 
-An entry is the JSON of a request, its slot and every attempt, the answering one last. It is
-durable before anyone sees it: writes are batched into one synchronous SQLite transaction each.
+An entry is the JSON of a request, its slot and every attempt, the answering one last, behind a
+checksum. It is durable before anyone sees it: writes are batched into one synchronous SQLite
+transaction each. Beside the entries lie what is known of each model, what each sweep has spent
+(see ledger.py), the attempts of calls that have no answer yet, and damaged entries set aside.
 """
 
 from __future__ import annotations
 
-import asyncio
-import json
+import contextlib
+import hashlib
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import diskcache
-from diskcache.core import MODE_PICKLE
 from pydantic import TypeAdapter, ValidationError
 
-from merge_runner.errors import RecordingError, UsageError
+from merge_runner.errors import CacheFailed, RecordingError, UsageError
+from merge_runner.llm.batches import BatchWriter, Operation
+from merge_runner.llm.disk import FORMAT, open_disk, set_format
 from merge_runner.records import Attempt, ChatRequest
 
 ENTRY_VERSION = 1
-_NAMES = TypeAdapter(list[str])
-_ENDPOINTS = "endpoints "
-"""Prefix of the entries that list, per model id, the endpoint identities with recordings."""
+KEY_LENGTH = 64
+CHECKSUM_LENGTH = 32
+ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
+# Prefixes of keys that are no call keys.
+_MODEL, _UNANSWERED, _DAMAGED = "model ", "attempts ", "damaged "
+_OLD_ENDPOINTS = "endpoints "
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,17 +47,17 @@ class Entry:
 
     @classmethod
     def from_json(cls, text: str) -> Entry:
-        """Read an entry; raises RecordingError."""
+        """Read an entry; raises RecordingError, or UsageError for one of a newer version."""
         try:
             stored = _STORED.validate_json(text, strict=True)
         except ValidationError as exc:
             raise RecordingError(
                 f"the recorded reply is damaged: {exc.errors()[0]['msg']}"
             ) from exc
-        if stored.version != ENTRY_VERSION:
-            raise RecordingError(
-                f"the recorded reply has version {stored.version}, this program reads version "
-                f"{ENTRY_VERSION}"
+        if stored.version > ENTRY_VERSION:
+            raise UsageError(
+                f"a recorded reply has version {stored.version}, written by a newer merge-runner; "
+                f"this one reads up to {ENTRY_VERSION}: update merge-runner"
             )
         if not stored.entry.attempts:
             raise RecordingError("the recorded reply is damaged: it holds no attempt")
@@ -69,28 +75,37 @@ class _Stored:
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 
 
-class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
-    """Stores text alone, and refuses a pickled value: reading one would execute code."""
+@dataclass(slots=True)
+class ModelFacts:
+    """What the cache knows of a model: the endpoints that answered, and totals over its entries.
 
-    def store(self, value: object, read: bool, key: object = diskcache.UNKNOWN) -> Any:  # noqa: ANN401 # diskcache's signature
-        """Store a text."""
-        if not isinstance(value, str):
-            raise TypeError("the cache stores text only")
-        return super().store(value, read, key=key)
+    Tokens and latencies are those of the ``measured`` answers, which tell both.
+    """
 
-    def get(self, key: object, raw: bool) -> Any:  # noqa: ANN401 # diskcache's signature
-        """Read back a key."""
-        if not raw or not isinstance(key, str):
-            raise RecordingError(
-                "the cache holds a key that is no text, which is not ours: refused"
-            )
-        return super().get(key, raw)
+    endpoints: list[str] = field(default_factory=list)
+    answers: int = 0
+    attempts: int = 0
+    cost_usd: float = 0.0
+    measured: int = 0
+    input_tokens: int = 0
+    output_tokens: int = 0
+    latency_s: float = 0.0
 
-    def fetch(self, mode: int, filename: str | None, value: object, read: bool) -> Any:  # noqa: ANN401 # diskcache's signature
-        """Fetch a text."""
-        if mode == MODE_PICKLE:
-            raise RecordingError("the cache holds a pickled value, which is not ours: refused")
-        return super().fetch(mode, filename, value, read)
+    def add(self, entry: Entry) -> None:
+        """Count an entry."""
+        self.endpoints = sorted({*self.endpoints, entry.request.endpoint})
+        self.answers += 1
+        self.attempts += len(entry.attempts)
+        self.cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
+        last = entry.attempts[-1]
+        if last.usage.input_tokens is not None and last.usage.output_tokens is not None:
+            self.measured += 1
+            self.input_tokens += last.usage.input_tokens
+            self.output_tokens += last.usage.output_tokens
+            self.latency_s += last.latency_s or 0.0
+
+
+_FACTS = TypeAdapter(ModelFacts)
 
 
 class ResponseCache:
@@ -105,94 +120,178 @@ class ResponseCache:
         """
         self.folder = folder
         self._read_overlay = overlay
-        try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            folder.chmod(0o700)
-            self._disk = diskcache.Cache(
-                str(folder),
-                disk=TextDisk,
-                eviction_policy="none",
-                cull_limit=0,
-                size_limit=2**62,
-                sqlite_synchronous=2,  # FULL: an acknowledged reply survives a power cut
-                disk_min_file_size=2**40,  # everything in the one SQLite file
-            )
-        except (OSError, sqlite3.Error) as exc:
-            raise UsageError(f"the cache {folder} cannot be used: {exc}") from exc
-        self._pending: list[Entry] = []
-        self._next_batch: asyncio.Task[list[Entry]] | None = None
-        self._one_batch_at_a_time = asyncio.Lock()
+        self._disk, version = open_disk(folder)
+        self._writer = BatchWriter(self.run_now)
+        self._new: list[Entry] = []
+        if version < FORMAT:
+            self._bring_up_to_date()
 
     @cached_property
     def _overlay(self) -> Mapping[str, Entry]:
         return self._read_overlay() if self._read_overlay else {}
 
     def get(self, key: str) -> Entry | None:
-        """The entry of a call key."""
+        """The entry of a call key; raises RecordingError for a damaged one."""
         if key in self._overlay:
             return self._overlay[key]
-        text: str | None = self._disk.get(key)
-        return None if text is None else Entry.from_json(text)
+        text = self.read(key)
+        return None if text is None else _unsealed(text)
 
-    async def put(self, entry: Entry) -> Entry:
+    async def put(self, entry: Entry, also: Operation | None = None) -> Entry:
         """Keep an entry; returns the one that is kept when it is durable.
 
         That is another one where another process was first: a kept reply is never replaced.
+        ``also`` runs in the same transaction.
         """
-        if self._next_batch is None:
-            self._next_batch = asyncio.create_task(self._write_batch())
-        batch, place = self._next_batch, len(self._pending)
-        self._pending.append(entry)
-        # Shielded: whoever gives up waiting takes nobody else's entry with it.
-        return (await asyncio.shield(batch))[place]
+
+        def operation() -> Entry:
+            kept = self._keep(entry)
+            if also is not None:
+                also()
+            return kept
+
+        kept: Entry = await self.write(operation)
+        return kept
 
     def put_now(self, entries: Iterable[Entry]) -> list[Entry]:
         """Keep entries in one transaction, in this thread; returns those that are kept."""
-        kept = []
+        return self.run_now([partial(self._keep, entry) for entry in entries])
+
+    def set_aside(self, key: str) -> None:
+        """Move a damaged entry out of the way, where it can still be looked at."""
         with self._disk.transact(retry=True):
-            for entry in entries:
-                if self._disk.add(entry.request.key, entry.to_json()):
-                    self._note_endpoint(entry.request)
-                    kept.append(entry)
-                else:
-                    kept.append(Entry.from_json(self._disk[entry.request.key]))
-        return kept
+            self._disk.set(_DAMAGED + key, self._disk[key])
+            del self._disk[key]
+
+    def unanswered(self, key: str) -> tuple[Attempt, ...]:
+        """The attempts at a call that earlier runs made without an answer."""
+        text = self.read(_UNANSWERED + key)
+        try:
+            return () if text is None else ATTEMPTS.validate_json(text)
+        except ValidationError as exc:
+            raise RecordingError(f"the list of earlier attempts at {key} is damaged") from exc
+
+    def keep_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
+        """An operation: keep the attempts at a call that has no answer yet."""
+        self._disk.set(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())
+
+    async def write(self, operation: Callable[[], Any]) -> Any:  # noqa: ANN401 # the operation's own result
+        """Run an operation on this cache in the next durable batch; raises CacheFailed."""
+        return await self._writer.write(operation)
+
+    def run_now(self, operations: list[Operation]) -> list[Any]:
+        """Run operations in one durable transaction, in this thread."""
+        try:
+            with self._disk.transact(retry=True):
+                results = [operation() for operation in operations]
+                self._count(self._new)
+        except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
+            raise CacheFailed(
+                f"the cache {self.folder} cannot be written: {exc}. Every reply up to now is kept, "
+                "those in flight are lost; when that is mended, run the same command again"
+            ) from exc
+        finally:
+            self._new = []
+        return results
+
+    def read(self, name: str) -> str | None:
+        """The text under a name; raises CacheFailed where the folder cannot be read."""
+        try:
+            text: str | None = self._disk.get(name)
+        except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
+            raise CacheFailed(
+                f"the cache {self.folder} cannot be read: {exc}. Mend or move it; the database and "
+                "any exported recording are not affected"
+            ) from exc
+        return text
+
+    def replace(self, name: str, text: str) -> None:
+        """An operation: keep a text under a name that is no call key."""
+        self._disk.set(name, text)
 
     def entries(self) -> Iterator[Entry]:
         """All entries, of the folder and of the overlay."""
-        for key in self._disk:
-            if not key.startswith(_ENDPOINTS):
-                yield Entry.from_json(self._disk[key])
+        for key in self._keys():
+            yield _unsealed(self._disk[key])
         yield from self._overlay.values()
 
     def recorded_endpoints(self, model: str) -> list[str]:
         """The endpoint identities of a model's replies: the recording's, else the folder's."""
         requests = (entry.request for entry in self._overlay.values())
         overlaid = sorted({r.endpoint for r in requests if r.model == model})
-        return overlaid or self._endpoints(model)
+        return overlaid or self.facts(model).endpoints
+
+    def facts(self, model: str) -> ModelFacts:
+        """What the folder knows of a model."""
+        text = self.read(_MODEL + model)
+        try:
+            return ModelFacts() if text is None else _FACTS.validate_json(text)
+        except ValidationError as exc:
+            raise RecordingError(f"the cache's facts about {model} are damaged: {exc}") from exc
+
+    def cost_usd(self) -> float:
+        """What all entries of the folder cost when they were made."""
+        return sum(
+            self.facts(key.removeprefix(_MODEL)).cost_usd
+            for key in self._disk
+            if key.startswith(_MODEL)
+        )
 
     def close(self) -> None:
         """Close the folder."""
         self._disk.close()
 
-    async def _write_batch(self) -> list[Entry]:
-        """Write all that has gathered while the batch before this one was written."""
-        async with self._one_batch_at_a_time:
-            entries, self._pending, self._next_batch = self._pending, [], None
-            try:
-                return await asyncio.to_thread(self.put_now, entries)
-            except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
-                raise UsageError(f"the cache {self.folder} cannot be written: {exc}") from exc
+    def _keep(self, entry: Entry) -> Entry:
+        key = entry.request.key
+        if not self._disk.add(key, _sealed(entry)):
+            return _unsealed(self._disk[key])
+        self._disk.delete(_UNANSWERED + key)
+        self._new.append(entry)
+        return entry
 
-    def _note_endpoint(self, request: ChatRequest) -> None:
-        known = self._endpoints(request.model)
-        if request.endpoint not in known:
-            text = json.dumps(sorted([*known, request.endpoint]))
-            self._disk.set(_ENDPOINTS + request.model, text)
+    def _keys(self) -> Iterator[str]:
+        return (key for key in self._disk if len(key) == KEY_LENGTH and " " not in key)
 
-    def _endpoints(self, model: str) -> list[str]:
-        text = self._disk.get(_ENDPOINTS + model)
-        try:
-            return [] if text is None else _NAMES.validate_json(text)
-        except ValidationError as exc:
-            raise RecordingError(f"the cache's list of endpoints is damaged: {exc}") from exc
+    def _count(self, entries: Iterable[Entry]) -> None:
+        """Within a transaction: add entries to the facts about their models."""
+        facts: dict[str, ModelFacts] = {}
+        for entry in entries:
+            model = entry.request.model
+            if model not in facts:
+                facts[model] = self.facts(model)
+            facts[model].add(entry)
+        for model, known in facts.items():
+            self._disk.set(_MODEL + model, _FACTS.dump_json(known).decode())
+
+    def _bring_up_to_date(self) -> None:
+        """The first format knew the endpoints of each model and nothing else."""
+        with self._disk.transact(retry=True):
+            for key in [key for key in self._disk if key.startswith(_OLD_ENDPOINTS)]:
+                del self._disk[key]
+            self._count(self._undamaged())
+            set_format(self._disk)
+
+    def _undamaged(self) -> Iterator[Entry]:
+        """A damaged entry is reported when it is needed, not before."""
+        for key in self._keys():
+            with contextlib.suppress(RecordingError):
+                yield _unsealed(self._disk[key])
+
+
+def _sealed(entry: Entry) -> str:
+    """An entry as it is stored: its JSON behind a checksum."""
+    text = entry.to_json()
+    return _checksum(text) + text
+
+
+def _unsealed(text: str) -> Entry:
+    """A stored entry; those of the first format have no checksum. Raises RecordingError."""
+    if not text.startswith("{"):
+        told, text = text[:CHECKSUM_LENGTH], text[CHECKSUM_LENGTH:]
+        if told != _checksum(text):
+            raise RecordingError("the recorded reply is damaged: its checksum is wrong")
+    return Entry.from_json(text)
+
+
+def _checksum(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH]

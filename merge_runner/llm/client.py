@@ -8,17 +8,25 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from merge_runner.config import ModelEntry
-from merge_runner.errors import CallFailed, EndpointRefused, QuotaExhausted, RecordingError
+from merge_runner.errors import (
+    CallFailed,
+    EndpointRefused,
+    MergeRunnerError,
+    ModelSwapped,
+    QuotaExhausted,
+    RecordingError,
+)
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.claims import Claims
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.limiter import Limiter, Permit
-from merge_runner.llm.meter import Meter
+from merge_runner.llm.meter import Meter, Wait
 from merge_runner.llm.prices import Pricing
 from merge_runner.llm.retry import (
     OutOfTime,
@@ -32,15 +40,23 @@ from merge_runner.llm.verdicts import RawReply, Verdict, judge
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
 
 EMPTY_RETRIES = 2
-SHOWN_PAUSE_S = 1.0
+CLAIM_POLL_S = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """Leave to make one attempt: a place under the limits, and the money set aside for it."""
+@dataclass(slots=True)
+class _Call:
+    """A call under way: its attempts so far, of which the first ``earlier`` by earlier runs.
 
-    permit: Permit
-    reserved_usd: float
+    ``worst`` bounds its tokens, ``worst_usd`` its cost; ``spent_usd`` is what the answer cost.
+    """
+
+    request: ChatRequest
+    order: int
+    attempts: list[Attempt]
+    earlier: int
+    worst: Usage
+    worst_usd: float
+    spent_usd: float | None = None
 
 
 @dataclass(slots=True)
@@ -49,7 +65,9 @@ class LlmClient:
 
     ``endpoint`` is the identity that enters the keys. A call that is under way is shared by all
     who ask for the same key, and goes on when they are cancelled, so that what is paid for is
-    kept; ``drain`` waits for it.
+    kept; ``drain`` waits for it. ``claims`` keep other processes from making the same call.
+    ``budget`` is that of a model which costs money. ``sealed`` says that nothing may be asked
+    anew; ``strict`` that an answer of another model stops the sweep.
     """
 
     name: str
@@ -59,39 +77,78 @@ class LlmClient:
     transport: Transport
     limiter: Limiter
     pricing: Pricing
-    budget: Budget = field(default_factory=Budget)
+    budget: Budget | None = None
+    claims: Claims | None = None
+    sealed: bool = False
+    strict: bool = False
     meter: Meter = field(default_factory=Meter)
-    _calls: dict[str, asyncio.Task[Entry]] = field(default_factory=dict)
-    _waiting: set[str] = field(default_factory=set)
+    _calls: dict[str, asyncio.Task[tuple[Entry, int]]] = field(default_factory=dict)
     _stopping: bool = False
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
-        """The model's reply for a slot; lower ``order`` is served first. Raises CallFailed."""
+        """The model's reply for a slot; lower ``order`` is served first.
+
+        Raises CallFailed, TrialSuspended or SweepStopped.
+        """
         request = self._request(prompt, slot)
-        try:
-            entry = self.cache.get(request.key)
-        except RecordingError as exc:
-            raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-        cached = entry is not None
-        if entry is None:
-            call = self._calls.get(request.key)
-            cached = call is not None
-            entry = await asyncio.shield(call or self._start(request, order))
-        reply = self._reply(entry, cached=cached)
-        self.meter.count_reply(reply, frozenset({self.entry.id, *self.entry.aliases}))
+        if recorded := self._recorded(request):
+            entry, earlier = recorded, len(recorded.attempts)
+        elif call := self._calls.get(request.key):
+            entry, _ = await asyncio.shield(call)
+            earlier = len(entry.attempts)  # who asked first tells of them
+        else:
+            entry, earlier = await asyncio.shield(self._start(request, order))
+        reply = self._reply(entry, earlier)
+        self.meter.count_reply(reply, self.accepted)
+        self._check_served(reply)
         return reply
 
     async def drain(self) -> None:
         """Let attempts in flight end and be saved, and give up calls that wait for one."""
         self._stopping = True
-        for key in self._waiting:
+        for key in list(self.meter.waits):
             self._calls[key].cancel()
         await asyncio.gather(*self._calls.values(), return_exceptions=True)
+
+    def leave(self, order: int) -> None:
+        """The trial of this order has ended, and needs no more money."""
+        if self.budget is not None:
+            self.budget.leave(order)
 
     @property
     def flying(self) -> int:
         """How many calls are in flight or being saved."""
-        return len(self._calls) - len(self._waiting)
+        return len(self._calls) - len(self.meter.waits)
+
+    @property
+    def accepted(self) -> frozenset[str]:
+        """The names under which the model may answer."""
+        return frozenset({self.entry.id, *self.entry.aliases})
+
+    def _recorded(self, request: ChatRequest) -> Entry | None:
+        """The recorded call; a damaged one is set aside, unless nothing can be asked anew."""
+        try:
+            return self.cache.get(request.key)
+        except RecordingError as exc:
+            if self.sealed:
+                raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
+            self.cache.set_aside(request.key)
+            self.meter.damaged.append(request.key)
+            self.meter.notes.append(
+                f"{self.name}: {_who(request.slot)}: {exc}; it is set aside in the cache as "
+                f"'damaged {request.key}', and asked again"
+            )
+            return None
+
+    def _check_served(self, reply: ChatReply) -> None:
+        served = reply.attempts[-1].model_served
+        if self.strict and served is not None and served not in self.accepted:
+            raise ModelSwapped(
+                f"{self.name}: {served} answered where {self.entry.id} was asked for, at "
+                f"{_who(reply.request.slot)}; --strict-model stops the sweep. The reply is kept. "
+                "To go on with it, leave --strict-model out, or name it in `aliases` in "
+                "experiments/models.toml"
+            )
 
     def _request(self, prompt: str, slot: Slot) -> ChatRequest:
         wire = FORMATS[self.entry.format].request(self.entry, prompt)
@@ -105,11 +162,11 @@ class LlmClient:
             slot=slot,
         )
 
-    def _start(self, request: ChatRequest, order: int) -> asyncio.Task[Entry]:
-        call = asyncio.create_task(self._call(request, order))
+    def _start(self, request: ChatRequest, order: int) -> asyncio.Task[tuple[Entry, int]]:
+        call = asyncio.create_task(self._claimed(request, order))
         self._calls[request.key] = call
 
-        def forget(done: asyncio.Task[Entry]) -> None:
+        def forget(done: asyncio.Task[tuple[Entry, int]]) -> None:
             del self._calls[request.key]
             if not done.cancelled():
                 done.exception()  # all who asked may be gone by now
@@ -117,89 +174,149 @@ class LlmClient:
         call.add_done_callback(forget)
         return call
 
-    async def _call(self, request: ChatRequest, order: int) -> Entry:
+    async def _claimed(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
+        """Make a call unless another process does; returns the entry and its earlier attempts."""
+        if self.claims is None:
+            return await self._make(request, order)
+        while not self.claims.take(request.key):
+            with self._giving_way(request, "for another merge-runner that makes the same call"):
+                await asyncio.sleep(CLAIM_POLL_S)
+        try:
+            made = self._recorded(request)  # maybe just now
+            return (made, len(made.attempts)) if made else await self._make(request, order)
+        finally:
+            self.claims.release(request.key)
+
+    async def _make(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
         """Make attempts until there is an answer, and save it with all of them."""
-        attempts: list[Attempt] = []
+        earlier = () if self.sealed else self.cache.unanswered(request.key)
         worst = self._worst_case(request)
+        worst_usd = self.pricing.cost_usd(worst) or 0.0
+        call = _Call(request, order, list(earlier), len(earlier), worst, worst_usd)
 
-        async def take_turn() -> Turn:
-            with self._giving_way(request):
-                worst_usd = self.pricing.cost_usd(worst) or 0.0
-                # Money first: a permit must be used when it is given, or the limits do not hold.
-                await self.budget.reserve(worst_usd)
-                turn: Turn | None = None
-                try:
-                    permit = await self.limiter.acquire(_estimated_tokens(worst), order=order)
-                    turn = Turn(permit, worst_usd)
-                finally:
-                    if turn is None:
-                        self.budget.settle(worst_usd, 0.0)
-                return turn
+        async def take_turn() -> Permit:
+            return await self._take_turn(call)
 
-        async def attempt(turn: Turn, number: int, seconds_left: float) -> None:
-            await self._attempt(request, turn, number, seconds_left, attempts)
+        async def attempt(permit: Permit, number: int, seconds_left: float) -> None:
+            await self._attempt(call, permit, call.earlier + number, seconds_left)
 
         async def sleep(seconds: float) -> None:
-            with self._giving_way(request):
+            until = datetime.now(UTC) + timedelta(seconds=seconds)
+            with self._giving_way(request, f"after {_last_failure(call)}", until):
                 await asyncio.sleep(seconds)
 
+        answered = False
         try:
             await call_with_retries(
                 take_turn, attempt, deadline_s=self.entry.deadline_s, sleep=sleep
             )
+            answered = True
         except (OutOfTime, RequestFailed) as exc:
-            reason = attempts[-1].error or attempts[-1].outcome
+            made = len(call.attempts) - call.earlier
             raise CallFailed(
-                f"{self.name}: {exc} ({reason}), {len(attempts)} attempts",
+                f"{self.name}: {exc} ({_last_failure(call)}), {made} attempts",
                 request,
-                tuple(attempts),
+                tuple(call.attempts),
+                call.earlier,
             ) from exc
-        return await self.cache.put(Entry(request, tuple(attempts)))
+        finally:
+            if not answered:
+                await self._keep_unanswered(call)
+        return await self._keep(call), call.earlier
+
+    async def _keep(self, call: _Call) -> Entry:
+        entry = Entry(call.request, tuple(call.attempts))
+        if self.budget is None:
+            return await self.cache.put(entry)
+        try:
+            return await self.budget.ledger.keep(entry, call.worst_usd, call.spent_usd)
+        finally:
+            self.budget.settled()
+
+    async def _keep_unanswered(self, call: _Call) -> None:
+        """Keep the attempts for a later run; the ledger of a paid model did so already."""
+        kept = tuple(call.attempts)
+        if self.budget is None and len(kept) > call.earlier:
+            await self.cache.write(lambda: self.cache.keep_unanswered(call.request.key, kept))
+
+    async def _take_turn(self, call: _Call) -> Permit:
+        """Money first: a permit must be used when it is given, or the limits do not hold."""
+        if self.budget is not None:
+            with self._giving_way(call.request, "for trials before it to end, under --max-cost"):
+                await self.budget.admit(call.order)
+                await self.budget.reserve(call.order, call.worst_usd)
+        permit: Permit | None = None
+        try:
+            with self._giving_way(call.request, "for a turn under the rate limits"):
+                permit = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
+        finally:
+            if permit is None and self.budget is not None:
+                self.budget.give_back(call.worst_usd)
+        return permit
 
     @contextmanager
-    def _giving_way(self, request: ChatRequest) -> Iterator[None]:
+    def _giving_way(
+        self, request: ChatRequest, what: str, until: datetime | None = None
+    ) -> Iterator[None]:
         """Within this, nothing of the call is in flight, so that a drain gives it up."""
         if self._stopping:
             raise CallFailed("the sweep was stopped", request)
-        self._waiting.add(request.key)
+        wait = Wait(f"{self.name}: {_who(request.slot)}", what, until)
+        self.meter.begin_wait(request.key, wait)
         try:
             yield
         finally:
-            self._waiting.discard(request.key)
+            del self.meter.waits[request.key]
 
-    async def _attempt(
-        self,
-        request: ChatRequest,
-        turn: Turn,
-        number: int,
-        seconds_left: float,
-        attempts: list[Attempt],
-    ) -> None:
-        """One attempt, appended to ``attempts``; returns if it is the answer."""
+    async def _attempt(self, call: _Call, permit: Permit, number: int, seconds_left: float) -> None:
+        """One attempt, appended to the call's; returns if it is the answer."""
+        await self._begin(call)
         started_at, started = datetime.now(UTC), time.perf_counter()
         spent: float | None = None
         try:
             raw = await self.transport.send(
-                request, attempt=number, timeout_s=min(self.entry.timeout_s, seconds_left)
+                call.request, attempt=number, timeout_s=min(self.entry.timeout_s, seconds_left)
             )
             verdict = judge(raw, FORMATS[self.entry.format])
             record = self._record(number, raw, verdict)
             # A failed request is not charged; an answer without usage may be.
             spent = record.cost_usd if raw.status == 200 else 0.0
-            self._settle_tokens(turn.permit, record.usage)
+            self._settle_tokens(permit, record.usage)
         except TransportFailure as exc:
             verdict = None
             record = Attempt(number, exc.outcome, error=str(exc))
-        finally:
-            self.budget.settle(turn.reserved_usd, spent)
+            spent = None if exc.sent else 0.0
         record = _timed(record, started_at, time.perf_counter() - started)
-        attempts.append(record)
+        call.attempts.append(record)
         self.meter.count_attempt(record)
-        if verdict is None:
-            raise TryAgain(record.error or record.outcome)
-        self._act_on(verdict, attempts)
+        try:
+            if verdict is None:
+                raise TryAgain(record.error or record.outcome)
+            self._act_on(verdict, call)
+        except MergeRunnerError:
+            await self._settle_failed(call, spent)
+            raise
+        call.spent_usd = spent
 
-    def _act_on(self, verdict: Verdict, attempts: list[Attempt]) -> None:
+    async def _begin(self, call: _Call) -> None:
+        """Note durably that an attempt is made, where it may cost something."""
+        if self.budget is None:
+            return
+        try:
+            await self.budget.begin(call.request.key, call.attempts, call.worst_usd)
+        except MergeRunnerError:
+            self.budget.give_back(call.worst_usd)
+            raise
+
+    async def _settle_failed(self, call: _Call, spent_usd: float | None) -> None:
+        if self.budget is not None:
+            await self.budget.ledger.settle(
+                call.request.key, call.attempts, call.worst_usd, spent_usd
+            )
+            self.budget.settled()
+
+    def _act_on(self, verdict: Verdict, call: _Call) -> None:
+        attempts = call.attempts[call.earlier :]
         message = verdict.message or verdict.outcome
         if verdict.delay_s and verdict.delay_s > self.entry.deadline_s:
             raise QuotaExhausted(
@@ -210,10 +327,11 @@ class LlmClient:
         if verdict.pause:
             pause_s = verdict.delay_s or backoff_s(len(attempts))
             self.limiter.pause(pause_s)
-            if pause_s >= SHOWN_PAUSE_S:
-                self.meter.notes.append(
-                    f"{self.name}: rate limit, all its calls wait {pause_s:.1f} s"
-                )
+            until = datetime.now(UTC) + timedelta(seconds=pause_s)
+            self.meter.notes.append(
+                f"{self.name}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
+                f"{message}"
+            )
         if verdict.action == "retry":
             raise TryAgain(message, verdict.delay_s)
         if verdict.action == "fail":
@@ -260,7 +378,7 @@ class LlmClient:
         if usage.output_tokens is not None:
             permit.settle((usage.input_tokens or 0) + usage.output_tokens)
 
-    def _reply(self, entry: Entry, *, cached: bool) -> ChatReply:
+    def _reply(self, entry: Entry, earlier: int) -> ChatReply:
         last = entry.attempts[-1]
         payload: Any = json.loads(last.reply or "{}")
         text = FORMATS[self.entry.format].read(payload).text if last.http_status == 200 else ""
@@ -269,7 +387,7 @@ class LlmClient:
             outcome=last.outcome,
             request=entry.request,
             attempts=entry.attempts,
-            cached=cached,
+            earlier=earlier,
         )
 
 
@@ -284,3 +402,13 @@ def _timed(attempt: Attempt, started_at: datetime, latency_s: float) -> Attempt:
         started_at=started_at.isoformat(timespec="milliseconds"),
         latency_s=round(latency_s, 4),
     )
+
+
+def _who(slot: Slot) -> str:
+    """A slot for a reader."""
+    return f"{slot.condition} rep {slot.repetition} {slot.side}, decision {slot.decision}"
+
+
+def _last_failure(call: _Call) -> str:
+    last = call.attempts[-1]
+    return last.error or last.outcome

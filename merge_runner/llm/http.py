@@ -59,7 +59,10 @@ class HttpTransport:
         except (httpx.RequestError, aiohttp.ClientError) as exc:
             # The libraries report refused, reset and cut connections alike, and pass on some
             # errors of the other's: whatever it is, there is no reply.
-            raise TransportFailure("connection_lost", str(exc) or type(exc).__name__) from exc
+            reason = str(exc) or type(exc).__name__
+            if isinstance(exc.__cause__ or exc, aiohttp.ClientConnectorError):
+                raise TransportFailure("no_connection", reason, sent=False) from exc
+            raise TransportFailure("connection_lost", reason) from exc
         body = reply.text
         # A provider may echo the key in an error; it must not get into a log or a database.
         for secret in self._secrets:

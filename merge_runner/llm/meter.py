@@ -5,15 +5,30 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 
 from merge_runner.records import Attempt, ChatReply
 
 MINUTE_S = 60.0
+TOLD_WAIT = timedelta(seconds=5)
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """Who waits for what, and until when on the wall clock, UTC; None: until it happens."""
+
+    who: str
+    what: str
+    until: datetime | None = None
 
 
 @dataclass(slots=True)
 class Meter:
-    """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts."""
+    """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts.
+
+    ``waits`` are those of the present, by call key; ``damaged`` are the keys of recorded replies
+    that could not be read.
+    """
 
     calls_live: int = 0
     calls_cached: int = 0
@@ -22,7 +37,15 @@ class Meter:
     outcomes: Counter[str] = field(default_factory=Counter)
     mismatches: Counter[str] = field(default_factory=Counter)
     notes: deque[str] = field(default_factory=deque)
+    waits: dict[str, Wait] = field(default_factory=dict)
+    damaged: list[str] = field(default_factory=list)
     events: deque[tuple[float, int]] = field(default_factory=deque)
+
+    def begin_wait(self, key: str, wait: Wait) -> None:
+        """A call waits; a long wait whose end is known is told by itself."""
+        self.waits[key] = wait
+        if wait.until is not None and wait.until - datetime.now(UTC) >= TOLD_WAIT:
+            self.notes.append(f"{wait.who} waits until {wait.until:%H:%M:%S} UTC {wait.what}")
 
     def count_attempt(self, attempt: Attempt) -> None:
         """Count one live attempt."""

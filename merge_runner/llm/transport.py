@@ -10,11 +10,15 @@ from merge_runner.records import ChatRequest
 
 
 class TransportFailure(MergeRunnerError):
-    """An attempt brought no reply; ``outcome`` names it in the calls table."""
+    """An attempt brought no reply; ``outcome`` names it in the calls table.
 
-    def __init__(self, outcome: str, message: str) -> None:
+    ``sent`` is False where the request surely never left: nobody can charge for it.
+    """
+
+    def __init__(self, outcome: str, message: str, *, sent: bool = True) -> None:
         super().__init__(message)
         self.outcome = outcome
+        self.sent = sent
 
 
 class Transport(Protocol):

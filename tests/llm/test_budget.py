@@ -1,15 +1,24 @@
+"""A cap that holds whatever happens, and money that ends trials instead of beginning many."""
+
+from __future__ import annotations
+
 import asyncio
+import tempfile
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.errors import BudgetExhausted
+from merge_runner.errors import TrialSuspended
 from merge_runner.llm.budget import Budget
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.ledger import Ledger
 
 CAP = 100
-spending = st.lists(
+calls = st.lists(
     st.tuples(
+        st.integers(0, 8),  # the trial
         st.integers(0, 120),  # the worst case
         st.none() | st.integers(0, 100),  # the share of it that is spent, None if unknown
         st.integers(0, 4),  # how long it is in flight
@@ -18,96 +27,167 @@ spending = st.lists(
 )
 
 
-@settings(deadline=None)
-@given(spending)
-def test_what_is_spent_and_reserved_never_exceeds_the_cap(plan):
-    budget = Budget(CAP)
-    committed = 0
-
-    async def call(worst, share, turns):
-        nonlocal committed
-        await budget.reserve(worst)
-        committed += worst
-        assert committed <= CAP
-        for _ in range(turns):
-            await asyncio.sleep(0)
-        actual = None if share is None else worst * share // 100
-        committed += 0 if actual is None else actual - worst
-        budget.settle(worst, actual)
-
-    async def all_calls():
-        # The limit only ends a test in which somebody waits for ever.
-        async with asyncio.timeout(5):
-            return await asyncio.gather(*(call(*each) for each in plan), return_exceptions=True)
-
-    for (worst, _, _), result in zip(plan, asyncio.run(all_calls()), strict=True):
-        assert result is None or isinstance(result, BudgetExhausted)
-        # Who was refused would not have fitted in the end either.
-        assert result is None or committed + worst > CAP
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    opened = ResponseCache(tmp_path_factory.mktemp("responses"))
+    yield opened
+    opened.close()
 
 
-async def soon(budget, worst):
-    """A reservation under way, after everybody could run."""
-    task = asyncio.create_task(budget.reserve(worst))
-    await asyncio.sleep(0)
-    await asyncio.sleep(0)
+@pytest.fixture
+def ledger(cache, request):
+    return Ledger(cache, request.node.name)
+
+
+async def attempt(budget, trial, worst, actual, turns=0):
+    """Spend on one attempt as a client does."""
+    await budget.admit(trial)
+    await budget.reserve(trial, worst)
+    await budget.begin("key", [], worst)
+    for _ in range(turns):
+        await asyncio.sleep(0)
+    await budget.ledger.settle("key", [], worst, actual)
+    budget.settled()
+
+
+async def soon(job):
+    """A job under way, after everybody could run."""
+    task = asyncio.create_task(job)
+    for _ in range(5):
+        await asyncio.sleep(0)
     return task
 
 
-async def test_a_reservation_waits_for_what_is_in_flight():
-    budget = Budget(1.0)
-    await budget.reserve(0.75)
-    waiting = await soon(budget, 0.5)
+@settings(deadline=None, max_examples=30)
+@given(calls, st.integers(0, 60))
+def test_what_is_spent_and_set_aside_never_exceeds_the_cap(plan, trial_usd):
+    async def all_calls(ledger):
+        budget = Budget(ledger, cap_usd=CAP, trial_usd=trial_usd)
+        reserve = ledger.reserve
+
+        async def watched(*arguments):
+            begun = await reserve(*arguments)
+            assert ledger.spending.committed_usd <= CAP + 1e-6
+            return begun
+
+        ledger.reserve = watched
+
+        async def call(trial, worst, share, turns):
+            actual = None if share is None else worst * share / 100
+            try:
+                await attempt(budget, trial, worst, actual, turns)
+            finally:
+                budget.leave(trial)
+
+        # The limit only ends a test in which somebody waits for ever.
+        async with asyncio.timeout(20):
+            return await asyncio.gather(*(call(*each) for each in plan), return_exceptions=True)
+
+    with tempfile.TemporaryDirectory() as folder:
+        cache = ResponseCache(Path(folder))
+        ledger = Ledger(cache, "all")
+        results = asyncio.run(all_calls(ledger))
+        cache.close()
+    assert all(result is None or isinstance(result, TrialSuspended) for result in results)
+    assert ledger.spending.open_attempts == sum(
+        result is None and share is None
+        for (_, _, share, _), result in zip(plan, results, strict=True)
+    )
+
+
+async def test_spending_is_that_of_all_runs(ledger, cache):
+    await attempt(Budget(ledger, cap_usd=1.0), 1, 0.5, 0.4)
+    again = Budget(Ledger(cache, ledger._name.removeprefix("spent ")), cap_usd=1.0)
+    with pytest.raises(TrialSuspended, match=r"0\.4000 of 1 USD"):
+        await attempt(again, 1, 0.7, 0.7)
+    await attempt(again, 1, 0.6, 0.6)
+
+
+async def test_an_attempt_of_unknown_cost_counts_with_its_worst_case_for_ever(ledger):
+    budget = Budget(ledger, cap_usd=1.0)
+    await attempt(budget, 1, 0.75, None)
+    with pytest.raises(TrialSuspended):
+        await attempt(budget, 1, 0.5, 0.5)
+    await attempt(budget, 1, 0.25, 0.25)
+    assert (ledger.spending.reserved_usd, ledger.spending.open_attempts) == (0.75, 1)
+
+
+async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
+    dead = Budget(ledger, cap_usd=1.0)
+    await dead.reserve(1, 0.75)
+    await dead.begin("a key", [], 0.75)
+    assert [a.outcome for a in cache.unanswered("a key")] == ["unknown"]
+    with pytest.raises(TrialSuspended):
+        await Budget(ledger, cap_usd=1.0).reserve(1, 0.5)
+
+
+async def test_a_reservation_waits_for_what_is_in_flight(ledger):
+    budget = Budget(ledger, cap_usd=1.0)
+    await budget.reserve(1, 0.75)
+    waiting = await soon(budget.reserve(2, 0.5))
     assert not waiting.done()
-    budget.settle(0.75, 0.25)
+    budget.give_back(0.75)
     await waiting
 
 
-async def test_a_reservation_is_refused_when_what_was_in_flight_has_spent_too_much():
-    budget = Budget(1.0)
-    await budget.reserve(0.75)
-    waiting = await soon(budget, 0.5)
-    budget.settle(0.75, 0.75)
-    with pytest.raises(BudgetExhausted, match="--max-cost"):
-        await waiting
+async def test_a_trial_begins_only_where_it_could_end_within_the_cap(ledger):
+    budget = Budget(ledger, cap_usd=10.0, trial_usd=4.0)
+    for trial in (1, 2):
+        await attempt(budget, trial, 1.0, 0.5)
+    third = await soon(attempt(budget, 3, 1.0, 0.5))
+    # 1 USD is spent and 3 + 3 are allowed: another 4 do not fit.
+    assert not third.done()
+    await attempt(budget, 1, 1.0, 0.5)
+    await asyncio.sleep(0.01)
+    assert not third.done()
+    budget.leave(1)
+    await third
 
 
-async def test_with_nothing_in_flight_the_next_call_is_refused_at_once():
-    budget = Budget(1.0)
-    await budget.reserve(1.0)
-    budget.settle(1.0, 1.0)
-    with pytest.raises(BudgetExhausted):
-        await budget.reserve(0.01)
+async def test_trials_begin_in_their_order_and_the_first_is_never_overtaken(ledger):
+    budget = Budget(ledger, cap_usd=5.0, trial_usd=4.0)
+    begun = []
+
+    async def trial(order):
+        await budget.admit(order)
+        begun.append(order)
+
+    await trial(1)
+    waiting = [await soon(trial(order)) for order in (4, 3, 2)]
+    for order in (1, 2, 3):
+        budget.leave(order)
+        await asyncio.sleep(0.01)
+    await asyncio.gather(*waiting)
+    assert begun == [1, 2, 3, 4]
 
 
-async def test_the_cap_itself_can_be_spent():
-    budget = Budget(1.0)
-    await budget.reserve(0.5)
-    await budget.reserve(0.5)
+async def test_without_money_for_a_whole_trial_none_begins(ledger):
+    budget = Budget(ledger, cap_usd=3.0, trial_usd=4.0)
+    with pytest.raises(TrialSuspended, match="a whole trial may cost 4.00 USD"):
+        await budget.admit(1)
 
 
-async def test_an_unknown_cost_keeps_the_whole_reservation():
-    budget = Budget(1.0)
-    await budget.reserve(0.75)
-    budget.settle(0.75, None)
-    with pytest.raises(BudgetExhausted):
-        await budget.reserve(0.5)
-    await budget.reserve(0.25)
+async def test_a_begun_trial_is_paid_before_another_begins(ledger):
+    budget = Budget(ledger, cap_usd=5.0, trial_usd=4.0)
+    await budget.admit(1)
+    other = await soon(budget.reserve(2, 2.0))  # 4 of 5 USD are the first trial's
+    assert not other.done()
+    await attempt(budget, 1, 4.0, 4.0)
+    budget.leave(1)
+    with pytest.raises(TrialSuspended):
+        await other
 
 
-async def test_all_who_wait_are_looked_at_after_each_settlement():
-    budget = Budget(1.0)
-    await budget.reserve(1.0)
-    large, small, smaller = [await soon(budget, worst) for worst in (0.75, 0.25, 0.125)]
-    budget.settle(1.0, 0.5)
-    await asyncio.gather(small, smaller)
-    with pytest.raises(BudgetExhausted):
-        await large
+async def test_a_trial_that_needs_more_than_its_allowance_is_suspended_at_the_cap(ledger):
+    budget = Budget(ledger, cap_usd=4.0, trial_usd=3.0)
+    for _ in range(4):
+        await attempt(budget, 1, 1.0, 1.0)
+    with pytest.raises(TrialSuspended):
+        await attempt(budget, 1, 1.0, 1.0)
 
 
-async def test_without_a_cap_everything_passes():
-    budget = Budget()
-    for _ in range(3):
-        await budget.reserve(10.0**9)
-    budget.settle(10.0**9, 10.0**9)
-    await budget.reserve(10.0**9)
+async def test_without_a_cap_everything_passes_and_is_recorded(ledger):
+    budget = Budget(ledger)
+    for trial in range(3):
+        await attempt(budget, trial, 10.0**9, 10.0**6)
+    assert ledger.read().spent_usd == 3 * 10.0**6

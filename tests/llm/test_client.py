@@ -9,16 +9,17 @@ import pytest
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import (
-    BudgetExhausted,
     CallFailed,
     EndpointRefused,
     QuotaExhausted,
     ReplayMiss,
+    TrialSuspended,
     UsageError,
 )
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.transport import SealedTransport, TransportFailure
@@ -164,7 +165,7 @@ def make(cache):
             transport=transport or Server(*replies),
             limiter=limiter or Limiter(),
             pricing=pricing(entry),
-            budget=Budget(cap),
+            budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), cap_usd=cap),
         )
 
     return make
@@ -263,16 +264,30 @@ async def test_words_that_no_file_can_hold_lose_no_reply(make, cache):
 
 
 @on_a_clock
-async def test_a_damaged_reply_fails_its_call_and_is_not_asked_again(make, cache):
+async def test_a_damaged_reply_fails_its_call_in_a_replay_and_is_not_asked_again(make, cache):
     recorded = await make(answer()).ask("prompt", slot())
     with diskcache.Cache(str(cache.folder)) as stock:
         stock[recorded.request.key] = "no JSON"
     client = make(answer())
+    client.sealed = True
     with pytest.raises(CallFailed, match=recorded.request.key) as caught:
         await client.ask("prompt", slot())
     assert caught.value.request == recorded.request
     assert client.transport.sent == []
-    assert (await client.ask("prompt", slot(2))).outcome == "ok"
+
+
+@on_a_clock
+async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
+    key = (await make(answer("old")).ask("prompt", slot())).request.key
+    with diskcache.Cache(str(cache.folder)) as stock:
+        # One character of the answer differs, and all else is as it was.
+        damaged = stock[key] = stock[key].replace("old", "odd")
+    client = make(answer("new"))
+    assert (await client.ask("prompt", slot())).text == "new"
+    assert client.meter.damaged == [key]
+    assert any(key in note and "set aside" in note for note in client.meter.notes)
+    assert cache.read(f"damaged {key}") == damaged
+    assert (await make(answer("third")).ask("prompt", slot())).text == "new"
 
 
 @on_a_clock
@@ -539,10 +554,11 @@ async def test_no_call_is_made_that_could_pass_the_cap(make):
     client = make(answer(usage=(10, 5)), price=PRICE)
     await client.ask("prompt", slot())
     worst = worst_case_usd(client)
-    enough = make(answer(), price=PRICE, cap=worst * 1.001)
+    spent = client.budget.ledger.read().spent_usd
+    enough = make(answer(usage=(10, 5)), price=PRICE, cap=spent + worst * 1.001)
     assert (await enough.ask("prompt", slot(2))).outcome == "ok"
-    too_little = make(answer(), price=PRICE, cap=worst * 0.999)
-    with pytest.raises(BudgetExhausted):
+    too_little = make(answer(), price=PRICE, cap=2 * spent + worst * 0.999)
+    with pytest.raises(TrialSuspended):
         await too_little.ask("prompt", slot(3))
     assert too_little.transport.sent == []
 
@@ -564,7 +580,8 @@ async def test_a_call_that_gets_no_turn_gives_its_money_back(make):
     await ticks()
     await client.drain()
     await asyncio.gather(asked, return_exceptions=True)
-    await client.budget.reserve(0.0015)
+    await client.budget.reserve(0, 0.0015)
+    assert client.budget.ledger.read().committed_usd == 0
 
 
 @on_a_clock
@@ -579,11 +596,17 @@ async def test_a_call_above_the_token_limit_gives_its_money_back(make):
 async def test_an_attempt_without_a_reply_may_have_been_charged(make):
     failure = TransportFailure("timeout", "no reply")
     client = make(failure, answer(), price=PRICE, cap=0.0015)
-    with pytest.raises(BudgetExhausted):
+    with pytest.raises(TrialSuspended):
         await client.ask("prompt", slot())
     assert len(client.transport.sent) == 1
-    # The server that refuses does not charge.
-    refused = make(error(500), answer(), price=PRICE, cap=0.0015)
+
+
+@on_a_clock
+@pytest.mark.parametrize(
+    "failure", [error(500), TransportFailure("no_connection", "refused", sent=False)]
+)
+async def test_an_attempt_that_is_refused_or_never_sent_is_not_charged(make, failure):
+    refused = make(failure, answer(), price=PRICE, cap=0.0015)
     assert (await refused.ask("prompt", slot())).outcome == "ok"
 
 
