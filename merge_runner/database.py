@@ -38,7 +38,9 @@ def open_database(
             break
         except duckdb.IOException as exc:
             if "Could not set lock" not in str(exc):
-                raise StoreError(f"{path} cannot be opened as a database: {_first(exc)}") from exc
+                raise StoreError(
+                    f"{path} cannot be opened as a database: {first_line(exc)}"
+                ) from exc
             waited_s = time.monotonic() - began
             if waited_s >= patience_s:
                 raise StoreLocked(f"{path} is locked by another program") from exc
@@ -49,7 +51,7 @@ def open_database(
                 )
             time.sleep(LOCK_RETRY_S)
         except duckdb.Error as exc:
-            raise StoreError(f"{path} cannot be opened as a database: {_first(exc)}") from exc
+            raise StoreError(f"{path} cannot be opened as a database: {first_line(exc)}") from exc
     try:
         yield connection
     finally:
@@ -65,24 +67,27 @@ def read_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
         unreadable_is_usage(),
         open_database(path, read_only=True, patience_s=PATIENCE_S) as connection,
     ):
-        version = schema_version(connection, path)
-        if version == SCHEMA_VERSION:
-            yield connection
-            return
-    migrate(path)
-    with open_database(path, read_only=True, patience_s=PATIENCE_S) as connection:
+        older = schema_version(connection, path) < SCHEMA_VERSION
+    if older:
+        migrate(path)
+    with (
+        unreadable_is_usage(),
+        open_database(path, read_only=True, patience_s=PATIENCE_S) as connection,
+    ):
         yield connection
 
 
 @contextmanager
 def unreadable_is_usage() -> Iterator[None]:
-    """A file that is no database at all is the user's to replace, before anything runs."""
+    """A file that is no database, or a damaged one, is the user's to replace."""
     try:
         yield
     except StoreLocked:
         raise
     except StoreError as exc:
         raise UsageError(f"{exc}; {REBUILD}") from exc
+    except duckdb.IOException as exc:
+        raise UsageError(f"the database cannot be read: {first_line(exc)}; {REBUILD}") from exc
 
 
 def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
@@ -126,7 +131,7 @@ def migrate(path: Path) -> None:
     except (OSError, duckdb.Error, StoreError) as exc:
         raise UsageError(
             f"{path} has an older schema and cannot be brought to version {SCHEMA_VERSION} where "
-            f"it lies: {_first(exc)}. Copy it to a folder that can be written and name it with --db"
+            f"it lies: {first_line(exc)}. Copy it to a folder that can be written and name it with --db"
         ) from exc
     LOG.warning(
         "%s was brought from schema %d to %d; the old file is kept as %s",
@@ -156,6 +161,6 @@ def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
     connection.execute("DETACH copied")
 
 
-def _first(exc: Exception) -> str:
+def first_line(exc: Exception) -> str:
     """The first line: DuckDB adds a stack trace to what it takes for its own fault."""
     return str(exc).split("\n", maxsplit=1)[0]

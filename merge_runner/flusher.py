@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from merge_runner.errors import StoreError
+from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.records import TrialRecord
 from merge_runner.store import Store
 
 EVERY_S = 1.0
 LOCK_PATIENCE_S = 2.0
-LAST_PATIENCE_S = 60.0
+# At the end: with a lock, which somebody will release, and with anything else, as a full disk.
+LAST_LOCK_PATIENCE_S, LAST_PATIENCE_S = 60.0, 3.0
 
 
 class Flusher:
@@ -28,6 +29,7 @@ class Flusher:
         self._say = say
         self._pending: list[TrialRecord] = []
         self._problem = ""
+        self._locked = False
         self._closing = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
@@ -36,18 +38,19 @@ class Flusher:
         self._pending.append(record)
 
     async def close(self) -> None:
-        """Store what is left; raises StoreError if that does not work for a minute."""
+        """Store what is left; raises StoreError if that does not work after a while."""
         self._closing.set()
         await self._task
-        give_up = asyncio.get_running_loop().time() + LAST_PATIENCE_S
+        began = asyncio.get_running_loop().time()
         while self._pending and not await self._flush():
-            if asyncio.get_running_loop().time() >= give_up:
+            patience_s = LAST_LOCK_PATIENCE_S if self._locked else LAST_PATIENCE_S
+            if asyncio.get_running_loop().time() - began >= patience_s:
                 raise StoreError(
                     f"{len(self._pending)} trials are not stored: {self._problem}. When that is "
                     "mended, run the same command again: it writes them from the recorded replies "
                     "without a call."
                 )
-            await asyncio.sleep(min(EVERY_S, LAST_PATIENCE_S))
+            await asyncio.sleep(min(EVERY_S, patience_s))
 
     async def _run(self) -> None:
         while not self._closing.is_set():
@@ -68,6 +71,7 @@ class Flusher:
             )
         except StoreError as exc:
             self._pending = batch + self._pending
+            self._locked = isinstance(exc, StoreLocked)
             if str(exc) != self._problem:
                 self._problem = str(exc)
                 self._say(f"waiting to store {len(self._pending)} trials: {exc}")

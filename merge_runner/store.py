@@ -19,6 +19,7 @@ from merge_runner.database import (
     PATIENCE_S,
     SCHEMA,
     SCHEMA_VERSION,
+    first_line,
     migrate,
     open_database,
     read_database,
@@ -166,7 +167,7 @@ class Store:
                 yield connection
                 connection.commit()
             except duckdb.Error as exc:
-                raise StoreError(f"{self.path} cannot be written: {exc}") from exc
+                raise StoreError(f"{self.path} cannot be used: {first_line(exc)}") from exc
 
 
 def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:

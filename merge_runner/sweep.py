@@ -12,6 +12,7 @@ from pathlib import Path
 
 from merge_runner.clients import Terms, live_clients, sealed_clients
 from merge_runner.config import ModelEntry, endpoint_identity
+from merge_runner.database import unreadable_is_usage
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.llm_driver import LlmDriver
@@ -115,7 +116,8 @@ class Sweep:
             (spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs(self._endpoints)
         }
         # A replay derives everything from the recorded replies alone, so it plays every trial.
-        ended = set() if options.replay else self._store.ended_trials(specs)
+        with unreadable_is_usage():
+            ended = set() if options.replay else self._store.ended_trials(specs)
         self._stored = [key for key in specs if key in ended]
         self._todo = [spec for key, spec in specs.items() if key not in ended]
         self._clients: dict[str, LlmClient] = {}
@@ -140,7 +142,9 @@ class Sweep:
 
     async def run(self) -> Outcome:
         """Play what is missing and store it; what goes wrong is in the outcome."""
-        outcome = Outcome(self._begin(), self._plan.trials, len(self._stored))
+        with unreadable_is_usage():
+            sweep_id = self._begin()
+        outcome = Outcome(sweep_id, self._plan.trials, len(self._stored))
         async with AsyncExitStack() as stack:
             stack.callback(self._cache.close)
             self._clients = await self._connect(stack)

@@ -10,9 +10,9 @@ import pytest
 from aiohttp import web
 from harness import watched
 
+from merge_runner.database import open_database
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.records import SLOT_HEADER
-from merge_runner.database import open_database
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--json")
 TWO = ("--conditions", "N_0_0,L_4_8")

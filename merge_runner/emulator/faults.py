@@ -5,15 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from merge_runner.config import read_toml
 from merge_runner.emulator.chance import draw, draw_between
+from merge_runner.emulator.scenarios import SCENARIOS
 from merge_runner.errors import UsageError
 
 Fault = Literal[
     "rate_limit",
     "request_timeout",
+    "conflict",
     "server_error",
     "bad_gateway",
     "overloaded",
@@ -31,9 +40,20 @@ OUTCOMES: frozenset[Fault] = frozenset({"empty", "refused", "malformed"})
 TRANSIENT: tuple[Fault, ...] = tuple(fault for fault in FAULTS if fault not in OUTCOMES)
 
 
+def _known(scenario: str) -> str:
+    if scenario not in SCENARIOS:
+        raise ValueError(f"there is no scenario {scenario!r}")
+    return scenario
+
+
+Rate = Annotated[float, Field(ge=0, le=1)]
+ScenarioName = Annotated[str, AfterValidator(_known)]
+
+
 class FaultPlan(BaseModel):
     """How often which fault occurs; ``rates`` are probabilities per attempt.
 
+    ``scenarios`` are rates as well, of what providers are known to send, by name.
     ``latency_s`` delays every answer. ``delay_s`` is what a rate limit asks to wait. A hang is
     silent for ``hang_s``, longer than a client's patience, and then closes.
     """
@@ -41,30 +61,33 @@ class FaultPlan(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: int = 0
-    rates: dict[Fault, Annotated[float, Field(ge=0, le=1)]] = {}
+    rates: dict[Fault, Rate] = {}
+    scenarios: dict[ScenarioName, Rate] = {}
     latency_s: Annotated[float, Field(ge=0)] = 0.0
     delay_s: Annotated[float, Field(ge=0)] = 0.05
     hang_s: Annotated[float, Field(ge=0)] = 30.0
 
     @model_validator(mode="after")
     def _at_most_one_fault(self) -> FaultPlan:
-        if sum(self.rates.values()) > 1 + 1e-9:
+        if sum(self.rates.values()) + sum(self.scenarios.values()) > 1 + 1e-9:
             raise ValueError("the rates add up to more than 1")
         return self
 
     @property
     def identity(self) -> str:
         """What tells the emulator's answers apart from those without faults: mostly nothing."""
-        outcomes = {fault: self.rates[fault] for fault in sorted(OUTCOMES & self.rates.keys())}
+        outcomes = {str(fault): self.rates[fault] for fault in sorted(OUTCOMES & self.rates.keys())}
+        outcomes |= dict(sorted(self.scenarios.items()))
         return f"#faults-{self.seed}-{outcomes}" if any(outcomes.values()) else ""
 
-    def fault(self, where: str, attempt: int) -> Fault | None:
-        """The fault of an attempt, None for none; ``where`` names the request."""
+    def fault(self, where: str, attempt: int) -> str | None:
+        """The fault or scenario of an attempt, None for none; ``where`` names the request."""
         chance = draw("fault", self.seed, where, attempt)
-        for fault in FAULTS:
-            chance -= self.rates.get(fault, 0.0)
+        in_order = [(fault, self.rates.get(fault, 0.0)) for fault in FAULTS]
+        for name, rate in (*in_order, *sorted(self.scenarios.items())):
+            chance -= rate
             if chance < 0:
-                return fault
+                return name
         return None
 
     def wait_s(self, where: str, attempt: int) -> float:
@@ -85,8 +108,10 @@ def load_faults(path: Path) -> FaultPlan:
         return FaultPlan.model_validate(read_toml(path))
     except ValidationError as exc:
         first = exc.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
+        place = [str(part) for part in first["loc"] if part != "[key]"]
+        wrong = first["msg"].removeprefix("Value error, ")
+        names = {"rates": FAULTS, "scenarios": SCENARIOS}
+        valid = names.get(place[0], FaultPlan.model_fields) if place else FaultPlan.model_fields
         raise UsageError(
-            f"{path}: {place or 'rates'}: {first['msg']}; valid keys: "
-            f"{', '.join(FaultPlan.model_fields)}; valid faults: {', '.join(FAULTS)}"
+            f"{path}: {'.'.join(place) or 'rates'}: {wrong}; valid: {', '.join(valid)}"
         ) from exc

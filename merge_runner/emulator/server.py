@@ -6,14 +6,19 @@ import asyncio
 import hashlib
 import json
 import re
+import socket
+import struct
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime, timedelta
 
 from aiohttp import web
 
 from merge_runner.config import Format
-from merge_runner.emulator.faults import Fault, FaultPlan
+from merge_runner.emulator.faults import FaultPlan
+from merge_runner.emulator.scenarios import SCENARIOS
+from merge_runner.emulator.scenarios.base import Scene
 from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
 from merge_runner.errors import UsageError
@@ -21,16 +26,22 @@ from merge_runner.records import ATTEMPT_HEADER, SIDES, SLOT_HEADER, Slot
 from merge_runner.simulator.conditions import CONDITIONS
 
 HOST = "127.0.0.1"
+# The names by which a browser or a client may ask for it.
+OWN_NAMES = ("127.0.0.1", "localhost", "[::1]")
 MODELS = ("scripted-driver",)
-STATUS_FAULTS: dict[Fault, int] = {
+STATUS_FAULTS = {
     "request_timeout": 408,
+    "conflict": 409,
     "server_error": 500,
     "overloaded": 503,
 }
 # What a client can send that is no chat request: refused with 400, whatever it breaks.
 UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
-ENDINGS: dict[Fault, Ending] = {"refused": "refused", "empty": "empty"}
+ENDINGS: dict[str, Ending] = {"refused": "refused", "empty": "empty"}
 MALFORMED = "M\n\nI would rather describe my plan in words than write a list of numbers."
+# Lingering for no time at all sends a reset instead of an orderly end.
+RESET_AT_CLOSE = struct.pack("ii", 1, 0)
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class Emulator:
@@ -39,7 +50,7 @@ class Emulator:
     def __init__(self, faults: FaultPlan | None = None) -> None:
         self._faults = faults or FaultPlan()
         self._asked: Counter[str] = Counter()
-        self.app = web.Application(client_max_size=2**22)
+        self.app = web.Application(client_max_size=2**22, middlewares=[_only_by_own_name])
         self.app.add_routes(
             [
                 web.post("/v1/chat/completions", self._chat),
@@ -79,8 +90,10 @@ class Emulator:
         where = request.headers.get(SLOT_HEADER) or hashlib.sha256(raw).hexdigest()
         attempt = self._attempt(request, where)
         fault = self._faults.fault(where, attempt)
-        if self._faults.latency_s:
-            await asyncio.sleep(self._faults.latency_s)
+        scene = SCENARIOS.get(fault or "", {}).get(wire)
+        await asyncio.sleep(self._faults.latency_s + (scene.after_s if scene else 0.0))
+        if scene and scene.breaks:
+            fault = scene.breaks
         if fault in ("hang", "reset", "truncated_body"):
             return await self._break_off(request, fault)
         if fault == "bad_gateway":
@@ -90,12 +103,13 @@ class Emulator:
             return _send(error_in(wire, 429, "Rate limit reached.", wait))
         if fault is not None and fault in STATUS_FAULTS:
             return _send(error_in(wire, STATUS_FAULTS[fault], "An emulated fault."))
+        reply_id = hashlib.sha256(raw + f"{request.path} {where} {attempt}".encode()).hexdigest()
         text = MALFORMED if fault == "malformed" else answer(prompt, slot)
         ending = ENDINGS.get(fault, "stop") if fault else "stop"
-        reply = answer_in(wire, model, prompt, text, ending)
+        reply = answer_in(wire, reply_id[:24], model, prompt, text, ending)
         if fault == "truncated_json":
             return web.Response(body=dumps(reply.body)[:-20], content_type="application/json")
-        return _send(reply)
+        return _play(scene, reply) if scene else _send(reply)
 
     def _attempt(self, request: web.Request, where: str) -> int:
         """The attempt's number: the client's own count, else how often this was asked."""
@@ -103,10 +117,13 @@ class Emulator:
         self._asked[where] += 1
         return int(told) if re.fullmatch("[0-9]{1,6}", told) else self._asked[where]
 
-    async def _break_off(self, request: web.Request, fault: Fault) -> web.StreamResponse:
+    async def _break_off(self, request: web.Request, fault: str) -> web.StreamResponse:
         """Say nothing for long, or cut the connection before or within the reply."""
         if fault == "hang":
             await asyncio.sleep(self._faults.hang_s)
+        elif fault == "reset" and request.transport is not None:
+            connection = request.transport.get_extra_info("socket")
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_AT_CLOSE)
         elif fault == "truncated_body" and request.transport is not None:
             request.transport.write(
                 b"HTTP/1.1 200 OK\r\ncontent-type: application/json\r\n"
@@ -116,6 +133,19 @@ class Emulator:
         if request.transport is not None and fault != "truncated_body":
             request.transport.abort()
         return web.Response(status=500)
+
+
+@web.middleware
+async def _only_by_own_name(request: web.Request, handler: Handler) -> web.StreamResponse:
+    """Refuse a page of the web that has its own name resolved to loopback (DNS rebinding)."""
+    assert request.transport is not None
+    port = request.transport.get_extra_info("sockname")[1]
+    host = request.headers.get("host", "").lower()
+    if host.removesuffix(f":{port}") not in OWN_NAMES:
+        return web.Response(
+            status=403, text=f"This is the emulator of merge-runner: ask for {HOST}:{port}."
+        )
+    return await handler(request)
 
 
 def _slot(header: str | None) -> Slot | None:
@@ -128,6 +158,19 @@ def _slot(header: str | None) -> Slot | None:
     if not known or not all(type(number) is int for number in numbers):
         raise ValueError("no such slot")
     return slot
+
+
+def _play(scene: Scene, usual: Answer) -> web.Response:
+    """A scene's reply, made from the usual one."""
+    body = scene.body(usual.body)
+    now = datetime.now(UTC)
+    headers = {
+        name: f"{now + told:%Y-%m-%dT%H:%M:%SZ}" if isinstance(told, timedelta) else told
+        for name, told in scene.headers.items()
+    }
+    if isinstance(body, str):
+        return web.Response(status=scene.status, headers=headers, text=body)
+    return _send(Answer(body, scene.status, headers))
 
 
 def _send(reply: Answer) -> web.Response:

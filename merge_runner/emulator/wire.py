@@ -14,6 +14,7 @@ CREATED = 1_760_000_000
 OPENAI_ERRORS = {
     400: "invalid_request_error",
     408: "timeout",
+    409: "conflict",
     429: "rate_limit_exceeded",
     500: "server_error",
     503: "server_is_overloaded",
@@ -25,6 +26,7 @@ ERROR_NAMES: dict[Format, dict[int, str]] = {
     "gemini": {
         400: "INVALID_ARGUMENT",
         408: "DEADLINE_EXCEEDED",
+        409: "ABORTED",
         429: "RESOURCE_EXHAUSTED",
         500: "INTERNAL",
         503: "UNAVAILABLE",
@@ -32,6 +34,7 @@ ERROR_NAMES: dict[Format, dict[int, str]] = {
     "anthropic": {
         400: "invalid_request_error",
         408: "timeout_error",
+        409: "conflict_error",
         429: "rate_limit_error",
         500: "api_error",
         503: "overloaded_error",
@@ -44,15 +47,16 @@ Ending = Literal["stop", "refused", "empty"]
 class Answer:
     """What is sent back: a JSON body with its status and headers."""
 
-    body: dict[str, Any]
+    body: Any
     status: int = 200
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class _Said:
-    """What the model said, and what it counted."""
+    """What the model said, and what it counted; ``reply`` tells this reply from all others."""
 
+    reply: str
     model: str
     text: str
     ending: Ending
@@ -81,8 +85,13 @@ def prompt_of(wire: Format, body: dict[str, Any]) -> str:
     return "".join(str(part.get("text", "")) for part in content)
 
 
-def answer_in(wire: Format, model: str, prompt: str, text: str, ending: Ending) -> Answer:
-    """An answer of a model; token counts are about a quarter of the bytes."""
+def answer_in(
+    wire: Format, reply: str, model: str, prompt: str, text: str, ending: Ending
+) -> Answer:
+    """An answer of a model; token counts are about a quarter of the bytes.
+
+    ``reply`` becomes part of its id.
+    """
     text = "" if ending == "empty" else text
     tokens_in = len(prompt.encode()) // 4
     visible = len(text.encode()) // 4
@@ -93,7 +102,7 @@ def answer_in(wire: Format, model: str, prompt: str, text: str, ending: Ending) 
         "gemini": _gemini,
         "anthropic": _anthropic,
     }[wire]
-    return Answer(build(_Said(model, text, ending, tokens_in, visible, reasoning)))
+    return Answer(build(_Said(reply, model, text, ending, tokens_in, visible, reasoning)))
 
 
 def error_in(wire: Format, status: int, message: str, delay_s: float = 0.0) -> Answer:
@@ -134,7 +143,7 @@ def error_in(wire: Format, status: int, message: str, delay_s: float = 0.0) -> A
 def _chat(said: _Said) -> dict[str, Any]:
     refused = said.ending == "refused"
     return {
-        "id": "chatcmpl-emulated",
+        "id": f"chatcmpl-{said.reply}",
         "object": "chat.completion",
         "created": CREATED,
         "model": said.model,
@@ -170,7 +179,7 @@ def _responses(said: _Said) -> dict[str, Any]:
         else {"type": "output_text", "text": said.text, "annotations": []}
     )
     return {
-        "id": "resp_emulated",
+        "id": f"resp_{said.reply}",
         "object": "response",
         "created_at": CREATED,
         "status": "completed",
@@ -183,10 +192,10 @@ def _responses(said: _Said) -> dict[str, Any]:
         "tool_choice": "auto",
         "tools": [],
         "output": [
-            {"type": "reasoning", "id": "rs_emulated", "summary": []},
+            {"type": "reasoning", "id": f"rs_{said.reply}", "summary": []},
             {
                 "type": "message",
-                "id": "msg_emulated",
+                "id": f"msg_{said.reply}",
                 "role": "assistant",
                 "status": "completed",
                 "content": [part],
@@ -218,13 +227,13 @@ def _gemini(said: _Said) -> dict[str, Any]:
             "totalTokenCount": said.tokens_in + said.output,
         },
         "modelVersion": said.model,
-        "responseId": "emulated",
+        "responseId": said.reply,
     }
 
 
 def _anthropic(said: _Said) -> dict[str, Any]:
     return {
-        "id": "msg_emulated",
+        "id": f"msg_{said.reply}",
         "type": "message",
         "role": "assistant",
         "model": said.model,
@@ -244,6 +253,6 @@ def _anthropic(said: _Said) -> dict[str, Any]:
     }
 
 
-def dumps(body: dict[str, Any]) -> bytes:
+def dumps(body: object) -> bytes:
     """A body as it is sent."""
     return json.dumps(body, ensure_ascii=False).encode()

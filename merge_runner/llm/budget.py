@@ -112,6 +112,5 @@ class Budget:
 
     def _suspended(self, what: str) -> TrialSuspended:
         return TrialSuspended(
-            f"{what}, and {self._committed_usd:.4f} of {self.cap_usd:g} USD are spent or set "
-            "aside"
+            f"{what}, and {self._committed_usd:.4f} of {self.cap_usd:g} USD are spent or set aside"
         )

@@ -318,9 +318,10 @@ class LlmClient:
     def _act_on(self, verdict: Verdict, call: _Call) -> None:
         attempts = call.attempts[call.earlier :]
         message = verdict.message or verdict.outcome
-        if verdict.delay_s and verdict.delay_s > self.entry.deadline_s:
+        delay_s = verdict.delay_s or 0.0
+        if verdict.action == "retry" and delay_s > self.entry.deadline_s:
             raise QuotaExhausted(
-                f"{self.name}: the provider asks to wait {verdict.delay_s:.0f} s, longer than a "
+                f"{self.name}: the provider asks to wait {delay_s:.0f} s, longer than a "
                 f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
                 "is saved; run the same command again later to go on."
             )

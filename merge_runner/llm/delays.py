@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import Any
 
-from merge_runner.llm.formats.base import as_dict, as_list, as_text
+from merge_runner.llm.formats.base import as_text, error_info
 
-_GO_DURATION = re.compile(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s)?(?:(\d+(?:\.\d+)?)ms)?")
+_UNIT_S = {"ms": 0.001, "s": 1, "m": 60, "h": 3600, "d": 86400}
+# 1.574s and 5m, but also 5 minutes.
+_PART = (
+    r"(\d+(?:\.\d+)?)\s*"
+    r"(ms|milliseconds?|s|secs?|seconds?|m|mins?|minutes?|h|hrs?|hours?|d|days?)(?![a-z])"
+)
+_PARTS = re.compile(_PART, re.I)
+_DURATION = re.compile(rf"{_PART}(?:(?:,|\s|and)*{_PART})*", re.I)
 _PROTOBUF_DURATION = re.compile(r"(\d+(?:\.\d+)?)s")
-_IN_TEXT = re.compile(r"(?:try again|retry) in ([\d.hms]+)", re.I)
+_IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_DURATION.pattern})", re.I)
+# Azure counts on below zero.
+_NONE_REMAINS = re.compile(r"0|-\d+")
 
 
 def server_delay_s(
@@ -21,29 +30,32 @@ def server_delay_s(
     """The delay in s that a failed reply asks for, None where it says nothing usable.
 
     Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), Gemini's
-    RetryInfo, "try again in 1.574s" in the message, then the reset times of exhausted limits.
+    RetryInfo, "try again in 1.574s" or "retry after 5 minutes" in the message, then the reset
+    times of exhausted limits.
     ``headers`` have lower-case names; ``now`` gives the UTC time.
     """
     clock = now or (lambda: datetime.now(UTC))
-    error = as_dict(as_dict(payload).get("error"))
+    error = error_info(payload, "")
     candidates = (
         _scaled(headers.get("retry-after-ms"), 1000),
         _retry_after(headers.get("retry-after"), clock),
-        _retry_info(error),
-        _in_text(as_text(error.get("message")) or ""),
+        _retry_info(error.details),
+        _in_text(error.message),
         _openai_resets(headers),
         _anthropic_resets(headers, clock),
     )
     return next((d for d in candidates if d is not None and 0 < d < float("inf")), None)
 
 
-def go_duration_s(text: str) -> float | None:
-    """Seconds of a Go-style duration like ``6m0s``, ``1h30m`` or ``120ms``; Azure sends ``64``."""
-    match = _GO_DURATION.fullmatch(text.strip())
-    if not match or not any(match.groups()):
+def duration_s(text: str) -> float | None:
+    """Seconds of ``6m0s``, ``1h30m``, ``120ms`` or ``5 minutes``; Azure sends a bare ``64``."""
+    if not _DURATION.fullmatch(text.strip()):
         return _scaled(text, 1)
-    hours, minutes, seconds, milliseconds = (float(group or 0) for group in match.groups())
-    return hours * 3600 + minutes * 60 + seconds + milliseconds / 1000
+    return sum(float(number) * _UNIT_S[_unit(word)] for number, word in _PARTS.findall(text))
+
+
+def _unit(word: str) -> str:
+    return "ms" if word.lower() in ("ms", "millisecond", "milliseconds") else word[0].lower()
 
 
 def _scaled(text: str | None, per_second: float) -> float | None:
@@ -63,9 +75,9 @@ def _retry_after(text: str | None, clock: Callable[[], datetime]) -> float | Non
         return None
 
 
-def _retry_info(error: dict[str, Any]) -> float | None:
-    for detail in as_list(error.get("details")):
-        match = _PROTOBUF_DURATION.fullmatch(as_text(as_dict(detail).get("retryDelay")) or "")
+def _retry_info(details: Sequence[dict[str, Any]]) -> float | None:
+    for detail in details:
+        match = _PROTOBUF_DURATION.fullmatch(as_text(detail.get("retryDelay")) or "")
         if match:
             return float(match.group(1))
     return None
@@ -73,15 +85,15 @@ def _retry_info(error: dict[str, Any]) -> float | None:
 
 def _in_text(message: str) -> float | None:
     match = _IN_TEXT.search(message)
-    return go_duration_s(match.group(1).rstrip(".")) if match else None
+    return duration_s(match.group(1)) if match else None
 
 
 def _openai_resets(headers: Mapping[str, str]) -> float | None:
     """The longest reset among the limits of which nothing remains."""
     delays = [
-        go_duration_s(headers.get(f"x-ratelimit-reset-{kind}", ""))
+        duration_s(headers.get(f"x-ratelimit-reset-{kind}", ""))
         for kind in ("requests", "tokens")
-        if headers.get(f"x-ratelimit-remaining-{kind}") == "0"
+        if _NONE_REMAINS.fullmatch(headers.get(f"x-ratelimit-remaining-{kind}", ""))
     ]
     return max((delay for delay in delays if delay is not None), default=None)
 
@@ -89,7 +101,7 @@ def _openai_resets(headers: Mapping[str, str]) -> float | None:
 def _anthropic_resets(headers: Mapping[str, str], clock: Callable[[], datetime]) -> float | None:
     delays = []
     for kind in ("requests", "tokens", "input-tokens", "output-tokens"):
-        if headers.get(f"anthropic-ratelimit-{kind}-remaining") != "0":
+        if not _NONE_REMAINS.fullmatch(headers.get(f"anthropic-ratelimit-{kind}-remaining", "")):
             continue
         try:
             reset = datetime.fromisoformat(headers.get(f"anthropic-ratelimit-{kind}-reset", ""))

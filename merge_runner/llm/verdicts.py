@@ -6,10 +6,17 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 from merge_runner.llm.delays import server_delay_s
-from merge_runner.llm.formats.base import Reading, WireFormat, as_dict, as_list, as_text
+from merge_runner.llm.formats.base import (
+    ErrorInfo,
+    Reading,
+    WireFormat,
+    as_dict,
+    as_list,
+    error_info,
+)
 
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
 
@@ -23,6 +30,7 @@ QUOTA_CODES = frozenset(
         "organization_usage_limit_exceeded",
         "enforced_spend_limit_reached",
         "contract_spend_limit_reached",
+        "budget_exceeded",
     }
 )
 # Anthropic reports these as invalid requests.
@@ -69,15 +77,6 @@ class Verdict:
     pause: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorInfo:
-    """An error body in one shape: servers send nested, flat, listed and string errors."""
-
-    message: str
-    names: frozenset[str]
-    details: tuple[dict[str, Any], ...]
-
-
 def judge(raw: RawReply, wire: WireFormat) -> Verdict:
     """The verdict on a reply, by the rules of docs/providers.md."""
     payload = _json(raw.body)
@@ -86,31 +85,6 @@ def judge(raw: RawReply, wire: WireFormat) -> Verdict:
     if isinstance(payload, list):  # Gemini wraps its errors where it streams
         payload = payload[0] if payload else None
     return _judge_error(raw.status, raw, payload)
-
-
-def error_info(payload: object, body: str) -> ErrorInfo:
-    """Read an error body of any known shape; the text itself serves where it is no JSON."""
-    top = as_dict(payload)
-    nested = top.get("error")
-    if nested is None:
-        choice = as_dict(next(iter(as_list(top.get("choices"))), None))
-        nested = choice.get("error")
-    error = as_dict(nested) or ({"message": nested} if isinstance(nested, str) else top)
-    details = error.get("details")
-    listed = [as_dict(detail) for detail in as_list(details)] or [as_dict(details)]
-    names = {
-        str(name)
-        for name in (
-            error.get("type"),
-            error.get("code"),
-            error.get("status"),
-            *(detail.get("error_code") for detail in listed),
-            *(detail.get("reason") for detail in listed),
-        )
-        if name is not None
-    }
-    message = as_text(error.get("message")) or " ".join(body.split())[:200]
-    return ErrorInfo(message, frozenset(names), tuple(listed))
 
 
 def _json(body: str) -> object:
@@ -149,7 +123,7 @@ def _judge_error(status: int, raw: RawReply, payload: object) -> Verdict:
         return Verdict("accept", "refusal", Reading("refusal"), message)
     if _quota_exhausted(status, raw, error):
         return Verdict("quota", "quota_exhausted", reading, message)
-    if _endpoint_refuses(status, error):
+    if _endpoint_refuses(status, error) and should_retry != "true":
         outcome = "unknown_model" if _names_model(status, error) else "not_allowed"
         return Verdict("refused", outcome, reading, message)
     if status in (402, 429):

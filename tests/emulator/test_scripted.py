@@ -67,7 +67,7 @@ async def play(condition, repetition, sample_set):
                 body={"prompt": prompt},
                 slot=slot,
             )
-            return ChatReply(answer(prompt, slot), "ok", request, (), cached=False)
+            return ChatReply(answer(prompt, slot), "ok", request, (), earlier=0)
 
         return ask
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from urllib.parse import urlsplit
 
 import aiohttp
@@ -53,6 +54,11 @@ async def ask(url, wire, prompt, headers=None):
     return status, reply_headers, json.loads(body)
 
 
+def without_ids(body):
+    """A reply without what tells it from the same one to another request."""
+    return json.loads(re.sub(r'"[a-z_-]*[0-9a-f]{24}"', '"ID"', json.dumps(body)))
+
+
 def error_names(wire, body):
     """The words by which a provider's error goes."""
     if wire == "anthropic":
@@ -72,13 +78,11 @@ async def bytes_until_closed(url):
     where = urlsplit(url)
     reader, writer = await asyncio.open_connection(where.hostname, where.port)
     writer.write(
-        b"POST /v1/chat/completions HTTP/1.1\r\nhost: emulator\r\ncontent-length: 2\r\n\r\n{}"
+        b"POST /v1/chat/completions HTTP/1.1\r\nhost: localhost\r\ncontent-length: 2\r\n\r\n{}"
     )
     try:
         async with asyncio.timeout(10):
             return await reader.read()
-    except ConnectionResetError:
-        return b""
     finally:
         writer.close()
 
@@ -179,7 +183,8 @@ async def test_the_prompt_is_the_text_of_the_last_message(emulator, driving_prom
     filled = json.dumps(body).replace("PRO", driving_prompt.replace("\n", "\\n")).replace("MPT", "")
     _, _, listed = await post(url, PATHS[wire], filled)
     _, _, plain = await ask(url, wire, driving_prompt)
-    assert json.loads(listed) == plain | ({} if wire == "gemini" else {"model": "scripted-driver"})
+    model = {} if wire == "gemini" else {"model": "scripted-driver"}
+    assert without_ids(json.loads(listed)) == without_ids(plain | model)
 
 
 @all_wires
@@ -194,7 +199,7 @@ async def test_the_slot_changes_nothing_but_what_is_chosen(emulator, driving_pro
         # The visible tokens follow from the text; the others must not move.
         assert usage.output_tokens == usage.reasoning_tokens + len(reading.text.encode()) // 4
         body.pop("usageMetadata" if wire == "gemini" else "usage")
-        envelope = json.dumps(body).replace(json.dumps(reading.text), "TEXT")
+        envelope = json.dumps(without_ids(body)).replace(json.dumps(reading.text), "TEXT")
         envelopes.add(
             (status, *headers.keys(), usage.input_tokens, usage.reasoning_tokens, envelope)
         )
@@ -205,8 +210,25 @@ async def test_the_slot_changes_nothing_but_what_is_chosen(emulator, driving_pro
 @all_wires
 async def test_a_reply_is_the_same_each_time_it_is_asked_for(emulator, driving_prompt, wire):
     url = await emulator()
-    once, again = [await ask(url, wire, driving_prompt, headers_for()) for _ in range(2)]
+    once, again = [await ask(url, wire, driving_prompt, headers_for(attempt=1)) for _ in range(2)]
     assert once[2] == again[2]
+
+
+@all_wires
+async def test_each_reply_has_an_id_of_its_own(emulator, driving_prompt, wire):
+    url = await emulator()
+    asked = [
+        (driving_prompt, headers_for(attempt=1)),
+        (driving_prompt, headers_for(attempt=2)),
+        (driving_prompt, headers_for({**SLOT, "repetition": 2}, attempt=1)),
+        ("another prompt", headers_for(attempt=1)),
+        (driving_prompt, headers_for(None)),
+        (driving_prompt, headers_for(None)),  # the second time it was asked
+    ]
+    replies = [(await ask(url, wire, *each))[2] for each in asked]
+    assert len({reply["responseId" if wire == "gemini" else "id"] for reply in replies}) == 6
+    # No other member tells one from another.
+    assert without_ids(replies[0]) == without_ids(replies[1])
 
 
 @pytest.mark.parametrize(
@@ -293,6 +315,8 @@ async def test_an_unreadable_attempt_number_does_no_harm(emulator, driving_promp
         ("openai-responses", "server_error", 500, "server_error"),
         ("gemini", "server_error", 500, "INTERNAL"),
         ("anthropic", "server_error", 500, "api_error"),
+        ("gemini", "conflict", 409, "ABORTED"),
+        ("anthropic", "conflict", 409, "conflict_error"),
         ("gemini", "overloaded", 503, "UNAVAILABLE"),
         ("anthropic", "overloaded", 503, "overloaded_error"),
     ],
@@ -306,7 +330,8 @@ async def test_an_error_goes_by_its_providers_name(emulator, wire, fault, status
 
 @all_wires
 @pytest.mark.parametrize(
-    ("fault", "status"), [("request_timeout", 408), ("server_error", 500), ("overloaded", 503)]
+    ("fault", "status"),
+    [("request_timeout", 408), ("conflict", 409), ("server_error", 500), ("overloaded", 503)],
 )
 async def test_a_status_fault_is_an_error_in_the_providers_envelope(
     emulator, driving_prompt, wire, fault, status
@@ -395,9 +420,38 @@ async def test_a_malformed_answer_is_prose_without_a_plan(emulator, driving_prom
     assert (parsed.failure, parsed.tactical) == ("no_array", "M")
 
 
-async def test_a_reset_closes_the_connection_without_a_byte(emulator):
+async def test_a_scenario_is_played_in_the_formats_that_it_concerns(emulator, driving_prompt):
+    url = await emulator(FaultPlan(scenarios={"openai/insufficient_quota": 1.0}))
+    for wire, expected in zip(WIRES, (429, 429, 200, 200), strict=True):
+        status, _, body = await ask(url, wire, driving_prompt)
+        assert status == expected
+        if status == 429:
+            assert error_names(wire, body) == {"insufficient_quota"}
+
+
+async def test_a_scenarios_answer_is_the_ordinary_one_but_for_what_it_changes(
+    emulator, driving_prompt
+):
+    url = await emulator(FaultPlan(scenarios={"gemini/substituted": 1.0}))
+    _, _, played = await ask(url, "gemini", driving_prompt)
+    _, _, usual = await ask(await emulator(), "gemini", driving_prompt)
+    assert played == usual | {"modelVersion": "gemini-3.8-flash"}
+
+
+async def test_a_scenario_tells_points_in_time_from_now_on(emulator, driving_prompt):
+    url = await emulator(FaultPlan(scenarios={"anthropic/rate_limit": 1.0}))
+    status, headers, body = await ask(url, "anthropic", driving_prompt)
+    assert status == 429
+    assert re.fullmatch(
+        r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", headers["anthropic-ratelimit-requests-reset"]
+    )
+    assert 30 < server_delay_s({k.lower(): v for k, v in headers.items()}, body) <= 42
+
+
+async def test_a_reset_is_one(emulator):
     url = await emulator(FaultPlan(rates={"reset": 1.0}))
-    assert await bytes_until_closed(url) == b""
+    with pytest.raises(ConnectionResetError):
+        await bytes_until_closed(url)
 
 
 async def test_a_truncated_body_is_shorter_than_announced(emulator):
@@ -480,6 +534,33 @@ async def test_the_emulator_is_bound_to_loopback_alone():
         assert url == f"http://127.0.0.1:{runner.addresses[0][1]}"
     finally:
         await runner.cleanup()
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1:PORT", 200),
+        ("localhost:PORT", 200),
+        ("LocalHost:PORT", 200),
+        ("[::1]:PORT", 200),
+        ("localhost", 200),
+        ("evil.example:PORT", 403),
+        ("localhost.evil.example:PORT", 403),
+        ("evil.example", 403),
+        ("127.0.0.1:1", 403),
+        ("127.0.0.2:PORT", 403),
+        ("", 403),
+    ],
+)
+async def test_a_request_in_another_name_is_refused(emulator, host, status):
+    """A page of the web can have its own name resolved to loopback, but not forge the header."""
+    url = await emulator()
+    headers = {"host": host.replace("PORT", str(urlsplit(url).port))}
+    async with aiohttp.ClientSession() as session:
+        async with session.get(f"{url}/v1/models", headers=headers) as listed:
+            assert listed.status == status
+        async with session.post(f"{url}/v1/chat/completions", headers=headers, json={}) as reply:
+            assert reply.status == status
 
 
 async def test_a_port_in_use_is_a_usage_error(emulator):

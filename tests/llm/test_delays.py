@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.llm.delays import go_duration_s, server_delay_s
+from merge_runner.llm.delays import duration_s, server_delay_s
 
 NOW = datetime(2026, 10, 21, 7, 28, 0, tzinfo=UTC)
 
@@ -71,11 +71,29 @@ def test_gemini_retry_info(duration, seconds):
         ("Please try again in 52ms.", 0.052),
         ("Please try again in 52ms", 0.052),
         ("Please try again in 20s.", 20),
+        ("Please try again in 5 minutes.", 300),
+        ("Try again in 1 minute and 30 seconds.", 90),
+        ("Try again in 2 hours, 1 min.", 7260),
+        ("Please try again in 250 milliseconds", 0.25),
+        ("You have reached your limit. Try again in 1 day.", 86400),
+        ("of your current OpenAI S0 pricing tier. Please retry after 26 seconds. Go to", 26),
         ("You exceeded your current quota. Please retry in 38.804097346s.", 38.804097346),
     ],
 )
 def test_a_delay_in_the_message(text, seconds):
     assert delay(payload=message(text)) == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        {"error": "busy, try again in 7s"},
+        {"object": "error", "message": "busy, try again in 7s"},
+        {"choices": [{"error": {"code": 429, "message": "busy, try again in 7s"}}]},
+    ],
+)
+def test_a_delay_is_read_from_an_error_of_any_shape(payload):
+    assert delay(payload=payload) == 7
 
 
 @pytest.mark.parametrize(
@@ -101,6 +119,13 @@ def test_a_delay_in_the_message(text, seconds):
 def test_the_reset_of_an_exhausted_limit(kind, text, seconds):
     headers = {f"x-ratelimit-remaining-{kind}": "0", f"x-ratelimit-reset-{kind}": text}
     assert delay(headers) == (None if seconds is None else pytest.approx(seconds))
+
+
+@pytest.mark.parametrize("remaining", ["-1", "-27689"])
+def test_a_limit_that_counts_on_below_zero_is_exhausted(remaining):
+    prefix = "x-ratelimit"
+    headers = {f"{prefix}-remaining-tokens": remaining, f"{prefix}-reset-tokens": "64"}
+    assert delay(headers) == 64
 
 
 @pytest.mark.parametrize("remaining", ["1", "4999", "00", None])
@@ -200,6 +225,8 @@ def test_a_date_that_has_passed_is_no_delay():
         message("Rate limit reached. Please slow down."),
         message("Please try again in a while."),
         message("Please try again in ...s"),
+        message("Please try again in 2 weeks."),
+        message("Please try again in 3 attempts."),
         message("Resource has been exhausted (e.g. check quota)."),
     ],
     ids=str,
@@ -212,7 +239,7 @@ def test_nothing_usable_is_none(payload):
 @given(st.text(), st.text("0123456789.hms"))
 def test_no_text_makes_it_raise(text, digits):
     for each in (text, digits):
-        go_duration_s(each)
+        duration_s(each)
         names = ["retry-after-ms", "retry-after", "x-ratelimit-reset-tokens"]
         resets = {"anthropic-ratelimit-tokens-remaining": "0", "x-ratelimit-remaining-tokens": "0"}
         for name in [*names, "anthropic-ratelimit-tokens-reset"]:

@@ -305,14 +305,14 @@ async def test_a_broken_connection_is_a_lost_one(emulator, fault):
     url = await emulator(FaultPlan(rates={fault: 1.0}))
     with pytest.raises(TransportFailure) as failure:
         await send(endpoint_at(f"{url}/v1"))
-    assert failure.value.outcome == "connection_lost"
+    assert (failure.value.outcome, failure.value.sent) == ("connection_lost", True)
     assert str(failure.value)
 
 
-async def test_a_refused_connection_is_a_lost_one(dead_port):
+async def test_a_refused_connection_cannot_be_charged(dead_port):
     with pytest.raises(TransportFailure) as failure:
         await send(endpoint_at(f"http://127.0.0.1:{dead_port}"))
-    assert failure.value.outcome == "connection_lost"
+    assert (failure.value.outcome, failure.value.sent) == ("no_connection", False)
 
 
 @pytest.mark.parametrize(
@@ -373,6 +373,7 @@ SEEN_AS = {
     None: "ok",
     "rate_limit": "rate_limited",
     "request_timeout": "request_timeout",
+    "conflict": "conflict",
     "server_error": "server_error",
     "bad_gateway": "server_error",
     "overloaded": "overloaded",

@@ -126,6 +126,7 @@ ERRORS = [
     # The server's own word on a retry goes before the rule for the status.
     ("openai-chat", 500, openai(), {"x-should-retry": "false"}, "fail", "server_error"),
     ("openai-chat", 400, openai(), {"x-should-retry": "true"}, "retry", "http_400"),
+    ("openai-chat", 404, openai(), {"x-should-retry": "true"}, "retry", "http_404"),
     ("openai-chat", 500, openai(), {"x-should-retry": "true"}, "retry", "server_error"),
     (
         "openai-chat",
@@ -268,6 +269,15 @@ ERRORS = [
     ),
     ("openai-chat", 502, openrouter(502, raw="upstream"), {}, "retry", "server_error"),
     ("openai-chat", 503, openrouter(503), {}, "retry", "overloaded"),
+    # LiteLLM's own budgets.
+    (
+        "openai-chat",
+        429,
+        openai("Budget has been exceeded! Current cost: 10.51", "budget_exceeded", "429"),
+        {},
+        "quota",
+        "quota_exhausted",
+    ),
     # Azure.
     ("openai-chat", 401, {"error": {"code": "401", "message": "m"}}, {}, "refused", "not_allowed"),
     (
@@ -428,6 +438,8 @@ SUCCESSES = [
     # Responses fail with status 200.
     ("openai-responses", failed("server_error"), "retry", "server_error"),
     ("openai-responses", failed("invalid_prompt"), "fail", "bad_request"),
+    # One that ended early, whatever the reason.
+    ("openai-responses", {"status": "incomplete", "output": []}, "accept", "truncated"),
     # So does OpenRouter, at the top or in the choice.
     ("openai-chat", openrouter(502), "retry", "server_error"),
     ("openai-chat", openrouter(503), "retry", "overloaded"),
@@ -486,6 +498,7 @@ def test_a_body_that_is_nested_too_deep_is_no_json(status, outcome):
     ("body", "message"),
     [
         (openai("the words"), "HTTP 400: the words"),
+        (openai("the words\n* in  lines\n"), "HTTP 400: the words * in lines"),
         ([openai("the words")], "HTTP 400: the words"),
         ({"error": "the words"}, "HTTP 400: the words"),
         ({"message": "the words", "object": "error"}, "HTTP 400: the words"),

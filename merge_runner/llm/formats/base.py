@@ -50,6 +50,15 @@ class WireFormat(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class ErrorInfo:
+    """An error body in one shape: servers send nested, flat, listed and string errors."""
+
+    message: str
+    names: frozenset[str]
+    details: tuple[dict[str, Any], ...]
+
+
 def outcome_of(text: str, *, truncated: bool, refused: bool) -> str:
     """The outcome of an answer, from its text and what its finish reason means."""
     if refused:
@@ -88,3 +97,29 @@ def total(*counts: int | None) -> int | None:
     """The sum of the counts that are there; None where none is."""
     known = [count for count in counts if count is not None]
     return sum(known) if known else None
+
+
+def error_info(payload: object, body: str) -> ErrorInfo:
+    """Read an error body of any known shape; the text itself serves where it is no JSON."""
+    top = as_dict(payload)
+    nested = top.get("error")
+    if nested is None:
+        choice = as_dict(next(iter(as_list(top.get("choices"))), None))
+        nested = choice.get("error")
+    error = as_dict(nested) or ({"message": nested} if isinstance(nested, str) else top)
+    details = error.get("details")
+    listed = [as_dict(detail) for detail in as_list(details)] or [as_dict(details)]
+    names = {
+        str(name)
+        for name in (
+            error.get("type"),
+            error.get("code"),
+            error.get("status"),
+            *(detail.get("error_code") for detail in listed),
+            *(detail.get("reason") for detail in listed),
+        )
+        if name is not None
+    }
+    # It reaches a user as one line; Gemini's has several.
+    message = " ".join((as_text(error.get("message")) or body[:200]).split())
+    return ErrorInfo(message, frozenset(names), tuple(listed))

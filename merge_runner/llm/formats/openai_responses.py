@@ -57,7 +57,7 @@ class OpenAIResponses:
             if status == "failed" or payload.get("error")
             else outcome_of(
                 text,
-                truncated=reason == "max_output_tokens",
+                truncated=reason == "max_output_tokens" or status == "incomplete",
                 refused=bool(refusal) or reason == "content_filter",
             ),
             text=text or refusal,

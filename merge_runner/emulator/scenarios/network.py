@@ -1,0 +1,16 @@
+"""What a network does, whatever is spoken over it."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+from merge_runner.config import Format
+from merge_runner.emulator.scenarios.base import Break, Scenario, Scene
+
+FORMATS: tuple[Format, ...] = get_args(Format)
+BREAKS: tuple[Break, ...] = get_args(Break)
+
+NETWORK: dict[str, Scenario] = {
+    "slow": dict.fromkeys(FORMATS, Scene(after_s=35.0)),
+    **{name: dict.fromkeys(FORMATS, Scene(breaks=name)) for name in BREAKS},
+}

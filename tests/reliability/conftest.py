@@ -1,0 +1,68 @@
+"""Folders that cannot be written or are full, and a cache as any program may open it."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+import sys
+
+import diskcache
+import pytest
+
+
+def mounted(*arguments):
+    """Mount something; skips where the system does not let us."""
+    if sys.platform != "linux" or shutil.which("mount") is None:
+        pytest.skip("mounting needs Linux")
+    done = subprocess.run(["mount", *map(str, arguments)], capture_output=True, check=False)
+    if done.returncode:
+        pytest.skip(f"mounting needs more rights: {done.stderr.decode().strip()}")
+
+
+@contextlib.contextmanager
+def mount(folder, *arguments):
+    mounted(*arguments, folder)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.fixture
+def read_only():
+    """Makes a folder read-only for everybody, root too."""
+
+    @contextlib.contextmanager
+    def make(folder):
+        with mount(folder, "--bind", folder):
+            subprocess.run(["mount", "-o", "remount,bind,ro", str(folder)], check=True)
+            yield
+
+    return make
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A folder on a disk of its own, of a few megabytes."""
+
+    @contextlib.contextmanager
+    def make(megabytes):
+        folder = tmp_path / "small"
+        folder.mkdir()
+        with mount(folder, "-t", "tmpfs", "-o", f"size={megabytes}m", "tmpfs"):
+            yield folder
+
+    return make
+
+
+@pytest.fixture
+def stock():
+    """Opens a cache folder as diskcache does without us."""
+
+    @contextlib.contextmanager
+    def opened(folder):
+        with diskcache.Cache(str(folder)) as cache:
+            yield cache
+
+    return opened

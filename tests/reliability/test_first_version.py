@@ -1,0 +1,106 @@
+"""Recordings are data and outlive the code: what the first version wrote is read for ever."""
+
+from __future__ import annotations
+
+import hashlib
+import tarfile
+from pathlib import Path
+
+import duckdb
+import pytest
+from harness import PROJECT
+
+from merge_runner.database import SCHEMA_VERSION
+from merge_runner.llm.disk import FORMAT
+
+ARCHIVE = PROJECT / "tests/data/first-version.tar.gz"
+# As the first version printed it.
+DIGEST = "994fd80fb9b17a385b8aac6086b4c3cb4ed1db1f7abf75af83222c6a07ba3203  1 trials\n"
+REPLAY = ("replay", "baseline", "--reps", 1, "--conditions", "L_4_0", "--cache", "cache")
+
+
+@pytest.fixture
+def old(tmp_path):
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(tmp_path, filter="data")
+    return tmp_path
+
+
+def content(path: Path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+async def test_its_database_is_brought_up_to_date_and_kept(merge_runner, old):
+    before = content(old / "results.duckdb")
+    digest = await merge_runner("digest", "--db", "results.duckdb")
+    assert (digest.code, digest.out) == (0, DIGEST)
+    assert "was brought from schema 1" in digest.err
+    assert content(old / "results.v1.duckdb") == before
+    again = await merge_runner("digest", "--db", "results.duckdb")
+    assert (again.out, again.err) == (DIGEST, "")
+    with duckdb.connect(str(old / "results.duckdb"), read_only=True) as database:
+        assert database.execute("FROM meta").fetchall() == [(SCHEMA_VERSION,)]
+        calls = database.execute("SELECT count(*), count(started_at) FROM calls").fetchone()
+        assert calls == (19, 0)
+        (failed,) = database.execute(
+            "SELECT count(*) FROM attempts WHERE fate IN ('retried', 'fallback')"
+        ).fetchone()
+        assert failed == 4
+
+
+async def test_a_sweep_goes_on_in_its_database(merge_runner, old):
+    run = await merge_runner("sweep", "baseline", "--reps", 1, "--model", "constant",
+                             "--db", "results.duckdb", "--json")  # fmt: skip
+    assert run.code == 0, run.err
+    both = await merge_runner("sql", "select count(*) as n from trials", "--db", "results.duckdb")
+    assert both.out.split() == ["n", "12"]
+
+
+async def test_its_cache_replays_to_the_same_digest(merge_runner, old):
+    run = await merge_runner(*REPLAY, "--db", "new.duckdb", "--json")
+    assert run.code == 0, run.err
+    assert run.summary["calls"] == {"live": 0, "cached": 18}
+    assert (await merge_runner("digest", "--db", "new.duckdb")).out == DIGEST
+
+
+async def test_its_database_in_a_folder_that_cannot_be_written_says_so(
+    merge_runner, old, read_only
+):
+    with read_only(old):
+        run = await merge_runner("digest", "--db", "results.duckdb")
+    assert run.code == 2
+    assert "Copy it to a folder that can be written" in run.err
+    assert (await merge_runner("digest", "--db", "results.duckdb")).out == DIGEST
+
+
+async def test_a_newer_database_is_left_alone(merge_runner, old):
+    with duckdb.connect(str(old / "results.duckdb")) as database:
+        database.execute("UPDATE meta SET schema_version = 99")
+    before = content(old / "results.duckdb")
+    for command in (("digest",), ("sweep", "baseline", "--model", "constant")):
+        run = await merge_runner(*command, "--db", "results.duckdb")
+        assert run.code == 2
+        assert "schema version 99, written by a newer merge-runner" in run.err
+        assert run.err.count("\n") == 1
+    assert content(old / "results.duckdb") == before
+
+
+async def test_a_newer_cache_is_left_alone(merge_runner, old, stock):
+    with stock(old / "cache") as cache:
+        cache["format"] = str(FORMAT + 1)
+    run = await merge_runner(*REPLAY)
+    assert run.code == 2
+    assert f"format {FORMAT + 1}, written by a newer merge-runner" in run.err
+    assert run.err.count("\n") == 1
+
+
+async def test_a_newer_reply_in_a_cache_of_today_stops_the_sweep(merge_runner, old, stock):
+    await merge_runner(*REPLAY)
+    with stock(old / "cache") as cache:
+        key = next(key for key in cache if len(key) == 64)
+        text = cache[key] = cache[key].replace('{"version":1', '{"version":2', 1)
+    run = await merge_runner(*REPLAY, "--db", "new.duckdb")
+    assert run.code == 2
+    assert "update merge-runner" in run.err
+    with stock(old / "cache") as cache:
+        assert cache[key] == text

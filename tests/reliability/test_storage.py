@@ -1,0 +1,177 @@
+"""Disks that are full, read-only, locked or damaged: one clear line, and nothing good is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+
+import pytest
+from harness import watched
+
+SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
+LOCK = """
+import duckdb, sys, time
+held = duckdb.connect(sys.argv[1])
+print("held", flush=True)
+time.sleep(float(sys.argv[2]))
+"""
+
+
+def line(run):
+    """The one error line of a run that had nothing else to say."""
+    (only,) = [text for text in run.err.splitlines() if text.startswith("error: ")]
+    return only
+
+
+async def digest(merge_runner, db="results/merge.duckdb"):
+    return (await merge_runner("digest", "--db", db)).out
+
+
+@pytest.fixture
+async def quiet(merge_runner):
+    """The digest of an undisturbed run."""
+    await merge_runner(*SWEEP, "--db", "quiet", "--cache", "quiet-cache")
+    return await digest(merge_runner, "quiet")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["cache", "db"])
+async def test_a_disk_that_fills_up_ends_the_run_and_the_next_one_goes_on(
+    merge_runner, small_disk, quiet, what, tmp_path
+):
+    async with watched() as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        with small_disk(1 if what == "cache" else 2) as folder:
+            place = folder / what
+            run = await merge_runner(*SWEEP, f"--{what}", place, **env)
+            assert run.code == 1, run.err
+            assert "run the same command again" in line(run)
+            assert "Traceback" not in run.err
+            # With room again nothing that was kept is lost.
+            moved = tmp_path / f"larger-{what}"
+            if place.is_dir():
+                await copied(place, moved)
+            elif place.exists():
+                moved.write_bytes(place.read_bytes())
+        answered = set(server.asked)
+        again = await merge_runner(*SWEEP, f"--{what}", moved, **env)
+    assert again.code == 0, again.err
+    if what == "db":
+        assert set(server.asked) == answered, "all replies were in the cache"
+        assert set(server.asked.values()) == {1}
+    else:
+        assert again.summary["calls"]["cached"] > 0
+    assert await digest(merge_runner, moved if what == "db" else "results/merge.duckdb") == quiet
+
+
+async def copied(source, target):
+    process = await asyncio.create_subprocess_exec("cp", "-a", source, target)
+    assert await process.wait() == 0
+
+
+@pytest.mark.parametrize("what", ["cache", "db"])
+async def test_a_read_only_folder_is_told_before_anything_is_asked(
+    merge_runner, read_only, tmp_path, what
+):
+    folder = tmp_path / "results"
+    async with watched() as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        place = folder / ("r.duckdb" if what == "db" else "responses")
+        assert (await merge_runner(*SWEEP, "--reps", 1, f"--{what}", place, **env)).code == 0
+        asked = server.requests
+        for again in (place, folder / "new"):
+            with read_only(folder):
+                run = await merge_runner(*SWEEP, "--reps", 2, f"--{what}", again, **env)
+            assert run.code == 2, run.err
+            assert str(again.parent) in line(run)
+            assert f"--{what}" in line(run)
+        assert server.requests == asked
+
+
+@pytest.mark.slow
+async def test_a_database_that_another_program_holds_for_30_s_is_waited_for(merge_runner, tmp_path):
+    async with watched() as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        await merge_runner(*SWEEP, "--conditions", "N_0_0", **env)
+        other = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", LOCK, tmp_path / "results/merge.duckdb", "30",
+            stdout=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        await other.stdout.readline()
+        run = await merge_runner(*SWEEP, "--conditions", "N_0_0,L_4_8", **env)
+        assert await other.wait() == 0
+    assert run.code == 0, run.err
+    assert "for another program to close results/merge.duckdb" in run.err
+    assert run.summary["trials"]["planned"] == 2
+
+
+async def test_a_truncated_database_is_left_alone_and_rebuilt_from_the_cache(
+    merge_runner, tmp_path, quiet
+):
+    db = tmp_path / "results/merge.duckdb"
+    async with watched() as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        assert (await merge_runner(*SWEEP, **env)).code == 0
+        asked = server.requests
+        for kept in (0.6, 0.001):
+            db.write_bytes(db.read_bytes()[: int(db.stat().st_size * kept)])
+            before = db.read_bytes()
+            for command in (SWEEP, ("digest",), ("tables", "who-first")):
+                run = await merge_runner(*command, **env)
+                assert run.code == 2, (command, run.err)
+                assert "rebuilt from the cache without a call" in line(run)
+                assert db.read_bytes() == before
+        db.rename(tmp_path / "damaged")
+        assert (await merge_runner(*SWEEP, **env)).code == 0
+        assert server.requests == asked
+    assert await digest(merge_runner) == quiet
+
+
+async def test_a_damaged_reply_is_asked_again_in_a_sweep_and_never_in_a_replay(
+    merge_runner, tmp_path, stock, quiet
+):
+    async with watched() as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        await merge_runner(*SWEEP, **env)
+        with stock(tmp_path / "cache/responses") as cache:
+            key = next(key for key in cache if len(key) == 64)
+            cache[key] = damaged = cache[key].replace("0.0", "0.9", 1)
+        asked = server.requests
+        replay = await merge_runner("replay", *SWEEP[1:], "--db", "new", **env)
+        assert replay.code == 1
+        (failed,) = replay.summary["failed"].values()
+        assert key in failed
+        assert "damaged" in failed
+        assert server.requests == asked
+        run = await merge_runner(*SWEEP, "--db", "new", **env)
+        assert run.code == 0, run.err
+        assert run.summary["damaged_entries"] == [key]
+        assert f"'damaged {key}'" in run.err
+        assert server.requests == asked + 1
+    with stock(tmp_path / "cache/responses") as cache:
+        assert cache[f"damaged {key}"] == damaged
+    assert await digest(merge_runner, "new") == quiet
+
+
+async def test_a_damaged_cache_file_is_told_in_one_line(merge_runner, tmp_path):
+    await merge_runner(*SWEEP)
+    file = tmp_path / "cache/responses/cache.db"
+    content = file.read_bytes()
+    file.write_bytes(b"no SQLite" + content[9:])
+    run = await merge_runner(*SWEEP, "--db", "new")
+    assert run.code == 2
+    assert "recording import" in line(run)
+    # Its first page is whole, the others are noise.
+    file.write_bytes(content[:4096] + bytes(reversed(content[4096:])))
+    run = await merge_runner(*SWEEP, "--db", "new")
+    assert run.code in {1, 2}
+    assert "Traceback" not in run.err
+    assert line(run)
+
+
+async def test_results_say_what_a_database_is_not(merge_runner, tmp_path):
+    (tmp_path / "text.duckdb").write_text("no database")
+    run = await merge_runner(*SWEEP, "--db", "text.duckdb")
+    assert run.code == 2
+    assert json.dumps("text.duckdb").strip('"') in line(run)
