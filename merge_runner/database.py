@@ -131,7 +131,8 @@ def migrate(path: Path) -> None:
     except (OSError, duckdb.Error, StoreError) as exc:
         raise UsageError(
             f"{path} has an older schema and cannot be brought to version {SCHEMA_VERSION} where "
-            f"it lies: {first_line(exc)}. Copy it to a folder that can be written and name it with --db"
+            f"it lies: {first_line(exc)}. Copy it to a folder that can be written and name the "
+            "copy with --db"
         ) from exc
     LOG.warning(
         "%s was brought from schema %d to %d; the old file is kept as %s",

@@ -191,6 +191,8 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
             result = connection.execute(statements[0])
             names = [column[0] for column in result.description or ()]
             return names, result.fetchall()
+        except duckdb.IOException:
+            raise  # no query reaches a file but the database, so that one is damaged
         except duckdb.Error as exc:
             if "pytz" in str(exc):
                 raise UsageError("cast times with a zone, as in now()::TIMESTAMP") from exc

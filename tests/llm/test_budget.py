@@ -163,7 +163,7 @@ async def test_trials_begin_in_their_order_and_the_first_is_never_overtaken(ledg
 
 async def test_without_money_for_a_whole_trial_none_begins(ledger):
     budget = Budget(ledger, cap_usd=3.0, trial_usd=4.0)
-    with pytest.raises(TrialSuspended, match="a whole trial may cost 4.00 USD"):
+    with pytest.raises(TrialSuspended, match=r"a whole trial may cost 4\.00 USD"):
         await budget.admit(1)
 
 

@@ -1,0 +1,179 @@
+"""What is spent is known and bounded, over all runs of a sweep, also where a process dies."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+import pytest
+from aiohttp import web
+from harness import watched
+
+SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
+# o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and no trial
+# can cost more than 3.4 USD (2 x 12 prompts, 16,000 tokens of output each).
+ROOM_FOR_SOME = 3.9
+
+
+def account(server):
+    return {
+        "OPENAI_API_KEY": "a-dummy-key",
+        "OPENAI_BASE_URL": f"{server.url}/v1",
+    }
+
+
+class Bill:
+    """What the server charges: the price of every answer that it counts."""
+
+    def __init__(self):
+        self.usd = 0.0
+
+    async def middle(self, request, handler):
+        reply = await handler(request)
+        usage = json.loads(reply.body)["usage"]
+        self.usd += (2 * usage["prompt_tokens"] + 8 * usage["completion_tokens"]) / 1e6
+        return reply
+
+
+async def sql(merge_runner, query):
+    return json.loads((await merge_runner("sql", query, "--format", "json")).out)
+
+
+async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner):
+    bill = Bill()
+    async with watched(bill.middle) as server:
+        env = account(server)
+        sweep = (*SWEEP, "--reps", 6, "--yes", "--rpm", 100_000, "--tpm", 10**9)
+        run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)
+        assert run.code == 3, run.err
+        assert 0 < bill.usd <= ROOM_FOR_SOME
+        assert run.summary["cost_usd"] == pytest.approx(bill.usd)
+        assert run.summary["trials"]["suspended"] > 0
+        assert "raise --max-cost and run the same command again" in run.err
+        # What is finished is balanced: no condition is two repetitions ahead of another one.
+        counts = await sql(
+            merge_runner, "select condition, count(*) as n from trials group by all order by n"
+        )
+        assert len(counts) == 3
+        assert counts[-1]["n"] - counts[0]["n"] <= 1
+        spent = bill.usd
+        # The same cap again: nothing is left to begin a trial with.
+        again = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)
+        assert (again.code, bill.usd) == (3, spent)
+        assert again.summary["sweep_cost_usd"] == pytest.approx(spent)
+        done = await merge_runner(*sweep, "--max-cost", 50, **env)
+        assert done.code == 0, done.err
+        (calls,) = await sql(merge_runner, "select count(*) as n from calls")
+        assert calls["n"] == server.requests, "nothing was paid for twice"
+    assert done.summary["sweep_cost_usd"] == pytest.approx(bill.usd)
+    assert done.summary["cache_cost_usd"] == pytest.approx(bill.usd)
+    assert done.summary["set_aside_usd"] == 0
+    (costs,) = await sql(merge_runner, "select sum(cost_usd) as usd from trial_costs")
+    assert costs["usd"] == pytest.approx(bill.usd)
+    (whole,) = await sql(
+        merge_runner, "select cost_usd as usd from sweep_costs order by sweep_id desc limit 1"
+    )
+    assert whole["usd"] == pytest.approx(bill.usd)
+
+
+async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(merge_runner):
+    async def middle(request, handler):
+        reply = await handler(request)
+        body = json.loads(reply.body)
+        # Every answer costs as much as it can, and some ask in vain, at an unknown cost.
+        body["usage"]["completion_tokens"] = 16_000
+        if server.requests % 2 == 0:
+            raise web.HTTPOk(text='{"cut')
+        return web.json_response(body)
+
+    async with watched(middle) as server:
+        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", "--tpm", 10**9)
+        env = account(server)
+        run = await merge_runner(*sweep, "--max-cost", 3.5, **env)
+        assert run.code == 3, run.err
+        assert run.summary["trials"]["suspended"] == 1
+        assert run.summary["sweep_cost_usd"] + run.summary["set_aside_usd"] <= 3.5
+        assert run.summary["set_aside_usd"] > 0.1
+        first = server.requests
+        assert first > 15
+        done = await merge_runner(*sweep, "--max-cost", 30, **env)
+    assert done.code == 0, done.err
+    assert done.summary["calls"]["cached"] >= first - run.summary["attempts_of_unknown_cost"] - 1
+
+
+async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(merge_runner):
+    async def middle(request, handler):
+        if server.requests <= 2:
+            arrived.set()
+            await asyncio.Event().wait()
+        return await handler(request)
+
+    arrived = asyncio.Event()
+    sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes")
+    async with watched(middle) as server:
+        env = account(server)
+        process = await merge_runner.start(*sweep, **env)
+        await arrived.wait()
+        await asyncio.sleep(0.3)
+        process.kill()
+        await process.wait()
+        run = await merge_runner(*sweep, **env)
+    assert run.code == 0, run.err
+    assert run.summary["attempts_of_unknown_cost"] == 2
+    assert 0.25 < run.summary["set_aside_usd"] < 0.3
+    fates = await sql(
+        merge_runner,
+        "select outcome, fate, cached, count(*) as n from attempts where attempt = 1 "
+        "and decision = 0 group by all",
+    )
+    assert fates == [{"outcome": "unknown", "fate": "retried", "cached": True, "n": 2}]
+
+
+async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner):
+    async with watched() as server:
+        env = account(server)
+        sweep = (*SWEEP, "--reps", 1, "--tpm", 10**9)
+        assert (await merge_runner(*sweep, "--dry-run", **env)).summary["measured"] == []
+        first = await merge_runner(*sweep, "--yes", **env)
+        more = (*SWEEP, "--reps", 2, "--tpm", 10**9)
+        dry = (await merge_runner(*more, "--dry-run", **env)).summary
+        assert dry["trials"] == 3
+        assert dry["calls"] == 3 * 21
+        assert dry["measured"] == ["o3"]
+        per_call = first.summary["cost_usd"] / first.summary["calls"]["live"]
+        assert dry["cost_usd"] == pytest.approx(dry["calls"] * per_call, rel=0.02)
+        second = await merge_runner(*more, "--yes", **env)
+        assert second.summary["calls"]["live"] == server.requests - first.summary["calls"]["live"]
+        assert second.summary["estimate"]["calls"] == dry["calls"]
+        text = await merge_runner(*more[:-5], "--reps", 3, "--yes", **env)
+        assert "estimated before: " in text.out
+        replay = await merge_runner("replay", *SWEEP[1:], "--reps", 2, "--db", "other", **env)
+    assert replay.summary["cost_usd"] == 0
+    assert replay.summary["calls"]["live"] == 0
+    (paid,) = await sql(merge_runner, "select sum(paid_usd) as usd from trial_costs")
+    assert paid["usd"] > 0
+    other = await merge_runner("sql", "select sum(paid_usd) from trial_costs", "--db", "other")
+    assert other.out.split()[-1] == "0.0"
+
+
+async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, tmp_path):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/models.toml").write_text(
+        '[mine]\nprovider = "openai"\nformat = "openai-chat"\nid = "nobody-knows"\n'
+        "max_output_tokens = 1000\n"
+    )
+    (tmp_path / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 1\n")
+    async with watched() as server:
+        env = account(server)
+        sweep = ("sweep", "baseline", "--model", "mine", "--conditions", "L_4_0", "--json")
+        asked = await merge_runner(*sweep, **env)
+        assert asked.code == 2
+        assert "an unknown price" in asked.err
+        assert "--yes" in asked.err
+        capped = await merge_runner(*sweep, "--yes", "--max-cost", 1, **env)
+        assert capped.code == 2
+        assert "--max-cost cannot hold" in capped.err
+        assert server.requests == 0
+        run = await merge_runner(*sweep, "--yes", **env)
+    assert run.code == 0, run.err
+    assert run.summary["calls_of_unknown_cost"] == server.requests

@@ -1,0 +1,140 @@
+"""A provider that is down, another model behind a name, and waits that are told."""
+
+from __future__ import annotations
+
+import json
+
+from aiohttp import web
+from harness import watched
+
+from merge_runner.records import SLOT_HEADER
+
+MODELS = """
+[patient]
+provider = "emulator"
+format = "openai-chat"
+id = "scripted-driver"
+max_output_tokens = 2000
+price = "free"
+timeout_s = 2
+deadline_s = {deadline_s}
+"""
+
+
+def configured(folder, deadline_s):
+    """A copy of the baseline sweep with a model that is given up soon."""
+    (folder / "experiments").mkdir(exist_ok=True)
+    (folder / "experiments/models.toml").write_text(MODELS.format(deadline_s=deadline_s))
+    (folder / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 10\n")
+    return ("sweep", "baseline", "--model", "patient", "--json")
+
+
+def down(request):
+    return web.json_response({"error": {"message": "The engine is down."}}, status=503)
+
+
+async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tmp_path):
+    async def middle(request, handler):
+        slot = json.loads(request.headers[SLOT_HEADER])
+        broken = slot["condition"] == "L_4_8" and slot["side"] == "left" and slot["decision"] == 2
+        return down(request) if broken and not mended else await handler(request)
+
+    mended = False
+    sweep = configured(tmp_path, deadline_s=1.2)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, **env)
+        assert run.code == 1
+        assert run.summary["trials"]["finished"] == 10
+        ((trial, error),) = run.summary["failed"].items()
+        assert trial == "patient/baseline/L_4_8/rep01"
+        assert "no answer within 1 s (HTTP 503: The engine is down.), 2 attempts" in error
+        before = server.requests
+        mended = True
+        again = await merge_runner(*sweep, "--reps", 1, **env)
+        assert again.code == 0, again.err
+    # The attempts in vain are not forgotten, and what had been answered was not asked again.
+    told = await merge_runner(
+        "sql",
+        "select fate, count(*) as n from attempts where outcome = 'overloaded' group by all",
+        "--format", "json",
+    )  # fmt: skip
+    assert json.loads(told.out) == [{"fate": "retried", "n": 2}]
+    assert server.requests - before < 20
+    assert again.summary["trials"]["stored_before"] == 10
+
+
+async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_path):
+    async def middle(request, handler):
+        return await handler(request) if working else down(request)
+
+    working = False
+    sweep = configured(tmp_path, deadline_s=0.6)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--in-flight", 4, **env)
+        assert run.code == 1, run.err
+        assert "the last 10 trials failed and no call was answered in between" in run.err
+        assert "run the same command to go on" in run.err
+        assert run.summary["trials"]["failed"] <= 14
+        # Two sides of at most 14 of 110 trials, with two or three attempts each.
+        assert server.requests <= 2 * 14 * 3
+        working = True
+        configured(tmp_path, deadline_s=60)
+        again = await merge_runner(*sweep, "--in-flight", 20, **env)
+    assert again.code == 0, again.err
+    assert again.summary["trials"]["finished"] + again.summary["trials"]["collided"] == 110
+
+
+async def test_nobody_listens(merge_runner, tmp_path):
+    sweep = configured(tmp_path, deadline_s=0.6)
+    run = await merge_runner(*sweep, EMULATOR_BASE_URL="http://127.0.0.1:9/v1")
+    assert run.code == 1
+    assert "Traceback" not in run.err
+    assert "no call was answered" in run.err
+
+
+async def test_waits_are_told(merge_runner, tmp_path):
+    async def middle(request, handler):
+        if server.requests > 1:
+            return await handler(request)
+        return web.json_response(
+            {"error": {"message": "Slow down."}}, status=429, headers={"retry-after": "7"}
+        )
+
+    sweep = configured(tmp_path, deadline_s=60)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, "--conditions", "L_4_8", **env)
+    assert run.code == 0
+    told = [text for text in run.err.splitlines() if "UTC" in text]
+    assert any("all its calls wait 7.0 s, until" in text and "Slow down." in text for text in told)
+    assert any(
+        "L_4_8 rep 1" in text and "decision 0 waits until" in text and "HTTP 429" in text
+        for text in told
+    )
+    assert any("calls waiting: " in text for text in run.err.splitlines())
+
+
+async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
+    async def middle(request, handler):
+        reply = await handler(request)
+        body = json.loads(reply.body)
+        if server.requests > 5:
+            body["model"] = "o3-mini"
+        return web.json_response(body)
+
+    sweep = ("sweep", "baseline", "--reps", 2, "--model", "o3", "--yes", "--json")
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--in-flight", 2, "--strict-model", **env)
+        assert run.code == 1
+        assert "o3-mini answered where o3-2025-04-16 was asked for" in run.err
+        stopped_at = server.requests
+        assert stopped_at < 20
+        # Its replies are kept: the same command stops at once, and without the option it goes on.
+        again = await merge_runner(*sweep, "--strict-model", "--in-flight", 2, **env)
+        assert again.code == 1
+        loose = await merge_runner(*sweep, "--conditions", "L_4_0", "--tpm", 10**9, **env)
+        assert loose.code == 0
+    assert loose.summary["model_mismatches"]
