@@ -7,6 +7,7 @@ CREATE TABLE IF NOT EXISTS sweeps (
     name VARCHAR NOT NULL,
     started_at TIMESTAMP NOT NULL,
     ended_at TIMESTAMP,               -- NULL: running, or ended without a word
+    exit_code INTEGER,                -- 0 where all trials ended
     config JSON NOT NULL,
     git_commit VARCHAR,
     git_dirty BOOLEAN,

@@ -73,7 +73,7 @@ class Store:
         """Add a sweep, what its spec hashes stand for, and its trials that are stored already."""
         with self._writing() as connection:
             connection.execute(
-                "INSERT INTO sweeps VALUES (?, ?, ?, NULL, ?, ?, ?, ?)",
+                "INSERT INTO sweeps VALUES (?, ?, ?, NULL, NULL, ?, ?, ?, ?)",
                 [
                     sweep.sweep_id,
                     sweep.name,
@@ -87,11 +87,12 @@ class Store:
             _add_specs(connection, specs)
             _append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
 
-    def end_sweep(self, sweep_id: str, ended_at: datetime) -> None:
-        """Note when a sweep ended."""
+    def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
+        """Note when and how a sweep ended."""
         with self._writing() as connection:
             connection.execute(
-                "UPDATE sweeps SET ended_at = ? WHERE sweep_id = ?", [ended_at, sweep_id]
+                "UPDATE sweeps SET ended_at = ?, exit_code = ? WHERE sweep_id = ?",
+                [ended_at, exit_code, sweep_id],
             )
 
     def ended_trials(self, keys: Iterable[TrialKey]) -> set[TrialKey]:

@@ -155,7 +155,7 @@ class Sweep:
                 async with shown(self._progress):
                     await self._play(flusher, outcome)
             finally:
-                await self._finish(flusher, outcome)
+                await self._store_rest(flusher, outcome)
             self._explain_misses(outcome)
             outcome.spending = self._ledger.read()
             outcome.cache_cost_usd = self._cache.cost_usd()
@@ -176,6 +176,7 @@ class Sweep:
             )
         if self._progress.done["failed"] and not self._misses:
             outcome.fail(1, f"{self._progress.done['failed']} trials failed")
+        self._end(outcome)
         return outcome
 
     async def rehearse(self) -> Missing:
@@ -298,8 +299,8 @@ class Sweep:
         for client in self._clients.values():
             await client.drain()
 
-    async def _finish(self, flusher: Flusher, outcome: Outcome) -> None:
-        """Store what has ended, and read back what the database holds of the sweep."""
+    async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> None:
+        """Store what has ended and is not stored yet."""
         try:
             await flusher.close()
             if flusher.differing:
@@ -309,7 +310,14 @@ class Sweep:
                     f"{self._options.db}, which are left as they are: "
                     f"{', '.join(flusher.differing[:SHOWN])}. Replay into another --db.",
                 )
-            self._store.end_sweep(outcome.sweep_id, datetime.now(UTC).replace(tzinfo=None))
+        except StoreError as exc:
+            outcome.fail(exc.exit_code, str(exc))
+
+    def _end(self, outcome: Outcome) -> None:
+        """Note how the sweep ended, and read back what the database holds of it."""
+        ended_at = datetime.now(UTC).replace(tzinfo=None)
+        try:
+            self._store.end_sweep(outcome.sweep_id, ended_at, outcome.exit_code)
             outcome.facts = sweep_facts(self._options.db, outcome.sweep_id)
         except StoreError as exc:
             outcome.fail(exc.exit_code, str(exc))

@@ -23,7 +23,7 @@ class Claims:
         """Claim a key; False while another process holds it."""
         try:
             fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, _offset(key))
-        except BlockingIOError:
+        except (BlockingIOError, PermissionError):  # the two ways in which systems say so
             return False
         return True
 
