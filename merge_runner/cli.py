@@ -6,7 +6,9 @@ import asyncio
 import csv
 import json
 import sys
+import tempfile
 from enum import StrEnum
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
     from merge_runner.emulator.faults import FaultPlan
     from merge_runner.estimate import Estimate
     from merge_runner.plan import Choice, Plan
-    from merge_runner.sweep import Options
+    from merge_runner.sweep import Options, Sweep
 
 
 app = typer.Typer(
@@ -103,14 +105,21 @@ def sweep(
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
     sample_set: SampleSetOption = 0,
+    order_seed: Annotated[
+        int, typer.Option("--order-seed", help="Draws another order of the trials.")
+    ] = 0,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
     in_flight: InFlightOption = 200,
     rpm: Annotated[int | None, typer.Option(help="Requests a minute.", min=1)] = None,
     tpm: Annotated[int | None, typer.Option(help="Tokens a minute.", min=1)] = None,
     max_cost: Annotated[
-        float | None, typer.Option(help="Stop before more than this many USD are spent.", min=0)
+        float | None,
+        typer.Option(help="Never spend more USD on this sweep, over all its runs.", min=0),
     ] = None,
+    strict_model: Annotated[
+        bool, typer.Option("--strict-model", help="Stop when another model answers.")
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only estimate.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before spending.")] = False,
     replay: Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")] = False,
@@ -137,6 +146,7 @@ def sweep(
         recording=recording,
         emulator_options=_emulator_options(fault_rate, faults, seed),
         faults_identity=_faults(fault_rate, faults, seed).identity,
+        strict_model=strict_model,
     )
     choice = Choice(
         sweep=name,
@@ -145,6 +155,7 @@ def sweep(
         conditions=listed(conditions),
         variants=listed(variants),
         sample_set=sample_set,
+        order_seed=order_seed,
     )
     _run(choice, options, dry_run=dry_run, yes=yes, as_json=as_json)
 
@@ -208,6 +219,41 @@ def digest(db: DbOption = DEFAULT_DB) -> None:
 
     value, trials = results_digest(db)
     print_out(f"{value}  {trials} trials")
+
+
+@app.command()
+def audit(
+    db: DbOption = DEFAULT_DB,
+    sweep_id: Annotated[
+        str | None, typer.Option("--sweep", help="A sweep_id; everything if not given.")
+    ] = None,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Check this file, and no database.")
+    ] = None,
+    cache: Annotated[
+        Path | None, typer.Option("--cache", help="Look every reply up in this folder too.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check that every sample is there, once, and that every reply belongs to its request."""
+    from merge_runner.audit import audit_cache, audit_database, audit_recording, audit_sweep
+
+    if recording is not None:
+        if sweep_id is not None or cache is not None:
+            raise UsageError("--recording is checked by itself: without --sweep and --cache")
+        audits = [audit_recording(recording)]
+    else:
+        audits = audit_database(db) if sweep_id is None else [audit_sweep(db, sweep_id)]
+        if cache is not None:
+            audits.append(audit_cache(db, cache, sweep_id))
+    ok = all(found.ok for found in audits)
+    if as_json:
+        whole = {"ok": ok, "audits": [found.as_dict() for found in audits]}
+        print_out(json.dumps(whole, ensure_ascii=False))
+    else:
+        for line in chain.from_iterable(found.lines() for found in audits):
+            print_out(line)
+    sys.exit(0 if ok else 1)
 
 
 @app.command()
@@ -316,24 +362,24 @@ def recording_info(file: RecordingFile) -> None:
 
 
 def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json: bool) -> None:
-    from merge_runner.estimate import estimate
     from merge_runner.plan import make_plan
     from merge_runner.summary import Summary
     from merge_runner.sweep import INTERRUPTED, Sweep
 
     plan = make_plan(choice)
     if dry_run:
-        _print_estimate(estimate(plan, plan.trials, options.limits), as_json=as_json)
+        _print_estimate(_dry_run(plan, options), as_json=as_json)
         return
     prepared = Sweep(plan, options, say=say)
+    expected = None
     if not options.replay and prepared.trials_to_play:
-        _confirm(plan, prepared.trials_to_play, options, yes=yes)
+        expected = _confirm(plan, prepared, options, yes=yes)
     try:
         outcome = asyncio.run(prepared.run())
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
         sys.exit(INTERRUPTED)
-    summary = Summary(plan, outcome, options.db)
+    summary = Summary(plan, outcome, options, expected)
     if as_json:
         print_out(json.dumps(summary.as_dict(), ensure_ascii=False))
     else:
@@ -344,7 +390,24 @@ def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json:
     sys.exit(outcome.exit_code)
 
 
-def _confirm(plan: Plan, trials: int, options: Options, *, yes: bool) -> None:
+def _dry_run(plan: Plan, options: Options) -> Estimate:
+    """What is not recorded yet; makes neither a database nor a cache."""
+    from dataclasses import replace
+
+    from merge_runner.estimate import estimate, nothing_recorded
+    from merge_runner.sweep import Sweep
+
+    if not options.cache.is_dir():
+        return estimate(plan, nothing_recorded(plan), options.limits)
+    with tempfile.TemporaryDirectory() as folder:
+        db = options.db if options.db.is_file() else Path(folder) / "none.duckdb"
+        prepared = Sweep(plan, replace(options, db=db), say=say)
+        missing = asyncio.run(prepared.rehearse())
+        prepared.close()
+    return estimate(plan, missing, options.limits)
+
+
+def _confirm(plan: Plan, prepared: Sweep, options: Options, *, yes: bool) -> Estimate | None:
     """Check the keys, say what a live run of a paid model will cost, and ask once."""
     from merge_runner.config import resolve_endpoint
     from merge_runner.estimate import estimate
@@ -353,16 +416,16 @@ def _confirm(plan: Plan, trials: int, options: Options, *, yes: bool) -> None:
         resolve_endpoint(name, entry)
         if entry.shutdown:
             say(f"note: {name} ({entry.id}) is announced to shut down on {entry.shutdown}")
-    expected = estimate(plan, trials, options.limits)
-    if expected.free:
-        return
+    if all(entry.price == "free" for entry in plan.entries.values()):
+        return None
+    expected = estimate(plan, asyncio.run(prepared.rehearse()), options.limits)
     cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
     say(
-        f"{trials} trials, about {expected.calls} calls, {cost}, "
-        f"{expected.minutes} minutes or more, if nothing is recorded yet"
+        f"{expected.trials} trials, about {expected.calls} calls that are not recorded yet, "
+        f"{cost}, {expected.minutes} minutes or more"
     )
     if yes:
-        return
+        return expected
     if not sys.stdin.isatty():
         raise UsageError(
             "this run spends money and there is no terminal to ask at: add --yes to go ahead, or "
@@ -370,6 +433,7 @@ def _confirm(plan: Plan, trials: int, options: Options, *, yes: bool) -> None:
         )
     if not typer.confirm("Go ahead?", err=True):
         raise UsageError("nothing was sent")
+    return expected
 
 
 def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
@@ -380,10 +444,14 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         return
     cost = "unknown" if expected.cost_usd is None else f"{expected.cost_usd:.2f} USD"
     for name, text in (
-        ("trials", str(expected.trials)),
-        ("calls", f"about {expected.calls}"),
-        ("tokens", f"about {expected.input_tokens} in, {expected.output_tokens} out"),
-        ("cost", f"about {cost}, less what is recorded already"),
+        ("trials", f"{expected.trials} that have not ended yet"),
+        ("calls", f"about {expected.calls} that are not recorded yet"),
+        (
+            "tokens",
+            f"about {expected.input_tokens} in, {expected.output_tokens} out"
+            + (", as measured before" if expected.measured else ""),
+        ),
+        ("cost", f"about {cost}"),
         ("time", f"about {expected.minutes} minutes"),
     ):
         print_out(f"{name:<8}{text}")

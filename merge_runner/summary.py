@@ -62,6 +62,7 @@ class Summary:
                 dict(zip(LEDGER, row, strict=True)) for row in (facts.ledger if facts else ())
             ],
             "failed": dict(facts.failed) if facts else {},
+            "audit": None if outcome.audit is None else outcome.audit.as_dict(),
             "outcomes": [
                 {"variant": variant, "condition": condition, **_named(counts)}
                 for (variant, condition), counts in (_cells(facts) if facts else {}).items()
@@ -84,6 +85,11 @@ class Summary:
         if self.plan.scripted:
             yield "The model `emulator` is a scripted stand-in, no language model."
         if facts is not None:
+            audit = outcome.audit
+            if audit is not None:
+                checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
+                yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
+                yield from (f"note: {text}" for text in (*audit.notes, *map(str, audit.sharings)))
             for trial_id, error in facts.failed[:FAILURES_SHOWN]:
                 yield f"failed: {trial_id}: {error}"
             if len(facts.failed) > FAILURES_SHOWN:
@@ -102,14 +108,15 @@ class Summary:
         cells: dict[tuple[str, str], Counter[str]] = {}
         for model, variant, fate, outcome, attempts in facts.ledger:
             if fate != "driven":
-                cells.setdefault((model, variant), Counter())[f"{fate} {outcome}"] += attempts
+                why = f"{fate} after {outcome}"
+                cells.setdefault((model, variant), Counter())[why] += attempts
         for (model, variant), counts in cells.items():
             named = ", ".join(f"{count} {what}" for what, count in counts.most_common())
-            yield f"attempts of {model}, {variant}, that brought no plan: {named}"
+            yield f"attempts without a plan, {model}, {variant}: {named}"
         if facts.fallbacks:
-            for name, fallbacks in (("all trials", None), ("without fallbacks", False)):
-                named_counts = _named(_total(facts, fallbacks=fallbacks))
-                yield f"{name}: " + ", ".join(f"{n} {what}" for what, n in named_counts.items())
+            for name, fallbacks in (("all trials", None), ("trials without fallbacks", False)):
+                of_them = _named(_total(facts, fallbacks=fallbacks))
+                yield f"outcomes of {name}: " + ", ".join(f"{n} {w}" for w, n in of_them.items())
 
     def _costs(self) -> Iterator[str]:
         outcome, spending = self.outcome, self.outcome.spending

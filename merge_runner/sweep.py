@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from merge_runner.audit import Audit, audit_sweep
 from merge_runner.clients import Terms, live_clients, sealed_clients
 from merge_runner.config import ModelEntry, endpoint_identity
 from merge_runner.database import unreadable_is_usage
@@ -76,7 +77,7 @@ class Outcome:
     money, with their replies kept. ``spending`` is that of the sweep over all its runs, and
     ``cache_cost_usd`` what all replies in the cache cost when they were made. ``damaged`` lists
     the keys of recorded replies that could not be read. ``facts`` are those of the database over
-    all trials of the sweep, None where they are not stored.
+    all trials of the sweep, and ``audit`` what was checked there, None where they are not stored.
     """
 
     sweep_id: str
@@ -94,6 +95,7 @@ class Outcome:
     spending: Spending = field(default_factory=Spending)
     cache_cost_usd: float = 0.0
     facts: SweepFacts | None = None
+    audit: Audit | None = None
 
     def fail(self, exit_code: int, message: str) -> None:
         """Note a problem; the first one decides the exit code."""
@@ -314,13 +316,22 @@ class Sweep:
             outcome.fail(exc.exit_code, str(exc))
 
     def _end(self, outcome: Outcome) -> None:
-        """Note how the sweep ended, and read back what the database holds of it."""
+        """Note how the sweep ended, read back what the database holds of it, and audit that."""
         ended_at = datetime.now(UTC).replace(tzinfo=None)
         try:
             self._store.end_sweep(outcome.sweep_id, ended_at, outcome.exit_code)
             outcome.facts = sweep_facts(self._options.db, outcome.sweep_id)
+            outcome.audit = audit_sweep(
+                self._options.db, outcome.sweep_id, finished=outcome.exit_code == 0
+            )
         except StoreError as exc:
             outcome.fail(exc.exit_code, str(exc))
+            return
+        # Another model's answers are told apart from this, and are an error where she says so.
+        findings = [f for f in outcome.audit.findings if f.kind != "served"]
+        if findings:
+            outcome.fail(1, f"the audit found {len(findings)} faults, see `merge-runner audit`:")
+        outcome.messages += map(str, findings[:SHOWN])
 
     async def _trial(self, spec: TrialSpec) -> TrialRecord | None:
         """Play a trial; None: there is no money for it to go on."""

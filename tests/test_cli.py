@@ -14,7 +14,7 @@ import merge_runner as package
 from analysis.commands import app
 
 COMMANDS = {
-    *("sweep", "replay", "sql", "digest", "models", "emulate", "recording"),
+    *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
     *("tables", "figures", "report", "explain", "human"),
 }
 # The promised options; more may be there.

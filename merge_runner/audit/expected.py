@@ -1,0 +1,150 @@
+"""What a sweep's configuration promises: its trials, and what their specs hold."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
+
+from merge_runner.config import Scenario
+from merge_runner.records import SIDES
+
+
+class _Facts(BaseModel):
+    """Read leniently: an older or newer program may have written more."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class ModelFacts(_Facts):
+    """What a sweep says of one of its models."""
+
+    id: str
+    provider: str
+    aliases: tuple[str, ...] = ()
+    parameters: dict[str, JsonValue] = {}
+    path: str | None = None
+
+    @property
+    def accepted(self) -> list[str]:
+        """The names under which the model may answer."""
+        return [self.id, *self.aliases]
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Where in a sweep a trial stands."""
+
+    variant: str
+    condition: str
+    repetition: int
+
+
+class SweepConfig(_Facts):
+    """The configuration of a sweep as its row holds it."""
+
+    model: str
+    models: dict[str, ModelFacts]
+    endpoints: dict[str, str]
+    scenario: dict[str, JsonValue]
+    repetitions: dict[str, int]
+    conditions: tuple[str, ...]
+    sample_set: int
+    prompt_blocks: dict[str, dict[str, str]]
+
+    @property
+    def sides(self) -> dict[str, str]:
+        """Side to the name of its driver."""
+        left, _, right = self.model.partition("+")
+        return {"left": left, "right": right or left}
+
+    @cached_property
+    def trials(self) -> dict[str, Cell]:
+        """Trial id to its cell, spelled as the plan spells them."""
+        suffix = f"/set{self.sample_set}" if self.sample_set else ""
+        return {
+            f"{self.model}/{variant}/{condition}/rep{repetition:02d}{suffix}": Cell(
+                variant, condition, repetition
+            )
+            for variant, repetitions in self.repetitions.items()
+            for condition in self.conditions
+            for repetition in range(1, repetitions + 1)
+        }
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What a spec hash stands for, as stored; ``content`` is empty where it cannot be read."""
+
+    spec_hash: str
+    text: str
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """The spec as JSON values."""
+        try:
+            content = json.loads(self.text)
+        except ValueError:
+            return {}
+        return content if isinstance(content, dict) else {}
+
+    @cached_property
+    def scenario(self) -> Scenario | None:
+        """The scenario, None where it cannot be read; what it lacks has its default."""
+        fields = self.content.get("scenario")
+        if not isinstance(fields, dict):
+            return None
+        try:
+            return Scenario.model_validate(
+                {name: fields[name] for name in Scenario.model_fields if name in fields}
+            )
+        except ValidationError:
+            return None
+
+    def driver(self, side: str) -> dict[str, Any]:
+        """What drives on a side."""
+        driver = self.content.get(side)
+        return driver if isinstance(driver, dict) else {}
+
+    def asks(self, side: str) -> bool:
+        """Whether a language model drives on a side."""
+        return "endpoint" in self.driver(side)
+
+    def disagreements(self, config: SweepConfig, variant: str) -> Iterator[str]:
+        """In what the spec of a variant is another than the sweep's configuration says."""
+        if self.content.get("scenario") != config.scenario:
+            yield "scenario"
+        if self.content.get("sample_set") != config.sample_set:
+            yield "sample set"
+        # Programs read no prompt, so that their specs hold none.
+        if config.models and self.content.get("prompt_blocks") != config.prompt_blocks.get(variant):
+            yield "prompt blocks"
+        for side in SIDES:
+            name = config.sides[side]
+            for what in _differences(self.driver(side), name, config):
+                yield f"{side} {what}"
+
+
+def _differences(driver: dict[str, Any], name: str, config: SweepConfig) -> Iterator[str]:
+    model = config.models.get(name)
+    if model is None:
+        if driver.get("program") != name:
+            yield "program"
+        return
+    if driver.get("endpoint") != config.endpoints.get(name):
+        yield "endpoint"
+    body = driver.get("body")
+    if not isinstance(body, dict):
+        yield "body"
+        return
+    # Gemini names the model in the path alone.
+    in_path = f"/{model.id}:" in str(driver.get("path")) or model.path is not None
+    if body["model"] != model.id if "model" in body else not in_path:
+        yield "model"
+    sent = {**body, **(body.get("generationConfig") or {})}
+    if any(sent.get(parameter) != value for parameter, value in model.parameters.items()):
+        yield "parameters"

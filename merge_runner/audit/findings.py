@@ -1,0 +1,83 @@
+"""What an audit says: findings, what is shared on purpose, and how much was checked."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+SHOWN = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that does not hold, and where; docs/audit.md lists the kinds."""
+
+    kind: str
+    text: str
+    sweep: str | None = None
+    trial: str | None = None
+    side: str | None = None
+    decision: int | None = None
+
+    def __str__(self) -> str:
+        number = None if self.decision is None else f"decision {self.decision}"
+        where = ", ".join(filter(None, (self.sweep, self.trial, self.side, number)))
+        return f"{self.kind}: {where}: {self.text}" if where else f"{self.kind}: {self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class Sharing:
+    """What two sweeps or two prompt variants have in common, which is no fault.
+
+    ``what`` is ``trials`` (of two sweeps) or ``calls`` (identical requests of the same slot).
+    """
+
+    what: str
+    first: str
+    second: str
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.first} and {self.second} share {self.count} {self.what}"
+
+
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """What was checked of ``subject``: a sweep, a database, a recording or a cache.
+
+    ``counts`` say how much was checked, in the order of checking; of a sweep among them
+    ``missing`` and ``failed`` trials. All holds where there is no finding.
+    """
+
+    subject: str
+    counts: dict[str, int]
+    findings: tuple[Finding, ...] = ()
+    sharings: tuple[Sharing, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether all holds."""
+        return not self.findings
+
+    def as_dict(self) -> dict[str, Any]:
+        """The audit as JSON values."""
+        return {**asdict(self), "ok": self.ok}
+
+    def lines(self) -> Iterator[str]:
+        """The audit for a reader; of each kind the first findings."""
+        number = len(self.findings)
+        yield f"{self.subject}: " + (f"{number} findings" if number else "all holds")
+        yield "  checked: " + ", ".join(f"{n} {name}" for name, n in self.counts.items())
+        for text in (*self.notes, *map(str, self.sharings)):
+            yield f"  note: {text}"
+        shown: Counter[str] = Counter()
+        for finding in self.findings:
+            shown[finding.kind] += 1
+            if shown[finding.kind] <= SHOWN:
+                yield f"  {finding}"
+        for kind, count in shown.items():
+            if count > SHOWN:
+                yield f"  {kind}: and {count - SHOWN} more, all of them with --json"

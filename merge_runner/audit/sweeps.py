@@ -1,0 +1,291 @@
+"""Audits of a database: of one sweep, or of everything that it holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import duckdb
+from pydantic import ValidationError
+
+from merge_runner.audit.checks import CHECKS
+from merge_runner.audit.expected import Spec, SweepConfig
+from merge_runner.audit.findings import Audit, Finding, Sharing
+from merge_runner.audit.replies import (
+    REPLY_IDS,
+    USED,
+    answers_alike,
+    calls_in_common,
+    check_keys,
+    check_sharing,
+)
+from merge_runner.audit.slots import Slots, check_slots
+from merge_runner.database import read_database
+from merge_runner.errors import StoreError, UsageError
+from merge_runner.llm.keys import canonical_json
+from merge_runner.records import SIDES
+
+TABLES = """
+CREATE OR REPLACE TEMP TABLE rules (spec_hash VARCHAR, executed INTEGER, plan_actions INTEGER,
+    timeout_steps INTEGER, restarts BOOLEAN);
+CREATE OR REPLACE TEMP TABLE drivers (spec_hash VARCHAR, side VARCHAR, endpoint VARCHAR,
+    body VARCHAR);
+CREATE OR REPLACE TEMP TABLE done AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
+CREATE OR REPLACE TEMP TABLE entries (name VARCHAR, id VARCHAR, provider VARCHAR,
+    accepted VARCHAR[]);
+"""
+AUDITED = """
+CREATE OR REPLACE TEMP TABLE audited AS
+SELECT trial_id, spec_hash, model_left, model_right, condition, rep, sample_set, status,
+    merged_first, end_time_s, error, scripted
+FROM trials SEMI JOIN (SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?)
+USING (trial_id, spec_hash) ANTI JOIN done USING (trial_id, spec_hash)
+"""
+COUNTS = {
+    "decisions": "SELECT count(*) FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)",
+    "invalid": "SELECT count(*) FROM decisions SEMI JOIN audited USING (trial_id, spec_hash) "
+    "WHERE NOT valid",
+    "calls": "SELECT count(DISTINCT call_key) FROM calls "
+    "SEMI JOIN audited USING (trial_id, spec_hash)",
+    "attempts": "SELECT count(*) FROM calls SEMI JOIN audited USING (trial_id, spec_hash)",
+    "reply ids": "SELECT count(DISTINCT reply_id) FROM reply_ids "
+    "SEMI JOIN audited USING (trial_id, spec_hash)",
+}
+# What a sweep did not play, since earlier ones had.
+TAKEN_OVER = """
+SELECT b.sweep_id, count(*)
+FROM (SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?)
+JOIN (SELECT DISTINCT * FROM sweep_trials) AS b USING (trial_id, spec_hash)
+JOIN sweeps ON sweeps.sweep_id = b.sweep_id
+    AND started_at < (SELECT started_at FROM sweeps WHERE sweep_id = ?)
+GROUP BY ALL ORDER BY ALL
+"""
+# What belongs to nothing: a table's name, the trial, and how many rows.
+LOOSE = """
+SELECT 'trials', trial_id, count(*) FROM trials
+ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human' GROUP BY ALL
+UNION ALL SELECT 'states', trial_id, count(*) FROM states
+ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY ALL
+UNION ALL SELECT 'decisions', trial_id, count(*) FROM decisions
+ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY ALL
+UNION ALL SELECT 'calls', trial_id, count(*) FROM calls
+ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY ALL
+UNION ALL SELECT 'sweep_trials', trial_id, count(*) FROM sweep_trials
+ANTI JOIN sweeps USING (sweep_id) GROUP BY ALL
+ORDER BY ALL
+"""
+LOOSE_TEXTS = {
+    "trials": "no sweep has this trial",
+    "sweep_trials": "it is a trial of a sweep that is not stored",
+}
+MANY_REPEATED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class _Sweep:
+    """A row of ``sweeps``, as far as it is audited."""
+
+    sweep_id: str
+    config: str
+    ended: bool
+
+
+def audit_sweep(path: Path, sweep_id: str, *, finished: bool | None = None) -> Audit:
+    """Audit one sweep of a database.
+
+    ``finished`` says whether the sweep claims to have played everything, so that a missing or
+    failed trial is a finding; without it a sweep that has ended claims so. Raises UsageError.
+    """
+    with _reading(path) as connection:
+        known = _sweeps(connection)
+        sweep = next((sweep for sweep in known if sweep.sweep_id == sweep_id), None)
+        if sweep is None:
+            names = ", ".join(sweep.sweep_id for sweep in known) or "none"
+            raise UsageError(f"{path} holds no sweep {sweep_id}; valid: {names}")
+        specs = _prepare(connection)
+        audit = _audit(connection, sweep, specs, finished=finished)
+        return replace(audit, sharings=(*audit.sharings, *calls_in_common(connection)))
+
+
+def audit_database(path: Path) -> list[Audit]:
+    """Audit every sweep, oldest first, and then what belongs to none.
+
+    A trial that several sweeps have is audited with the newest of them. Raises UsageError.
+    """
+    with _reading(path) as connection:
+        specs = _prepare(connection)
+        audits = []
+        for sweep in reversed(_sweeps(connection)):
+            audits.append(_audit(connection, sweep, specs))
+            connection.execute("INSERT INTO done SELECT trial_id, spec_hash FROM audited")
+        connection.execute("CREATE OR REPLACE TEMP TABLE audited AS FROM trials")
+        return [*reversed(audits), _whole(connection, path, bool(audits))]
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
+    try:
+        with read_database(path) as connection:
+            yield connection
+    except duckdb.Error as exc:
+        raise StoreError(f"{path} cannot be audited: {exc}") from exc
+
+
+def _audit(
+    connection: duckdb.DuckDBPyConnection,
+    sweep: _Sweep,
+    specs: Mapping[str, Spec],
+    *,
+    finished: bool | None = None,
+) -> Audit:
+    connection.execute(AUDITED, [sweep.sweep_id])
+    slots = Slots()
+    models: list[tuple[Any, ...]] = []
+    try:
+        config = SweepConfig.model_validate_json(sweep.config)
+    except ValidationError as exc:
+        text = f"its configuration cannot be read, so that its trials are not known: {_first(exc)}"
+        slots.findings.append(Finding("config", text))
+    else:
+        claims = sweep.ended if finished is None else finished
+        slots = check_slots(connection, sweep.sweep_id, config, specs, finished=claims)
+        models = [(name, m.id, m.provider, m.accepted) for name, m in config.models.items()]
+    connection.execute("DELETE FROM entries")
+    _fill(connection, "entries", models)
+    findings = [
+        *slots.findings,
+        *_rule_findings(connection),
+        *check_keys(connection, specs),
+        *check_sharing(connection),
+    ]
+    return Audit(
+        subject=sweep.sweep_id,
+        counts=slots.counts | {name: _count(connection, sql) for name, sql in COUNTS.items()},
+        findings=tuple(replace(finding, sweep=sweep.sweep_id) for finding in findings),
+        sharings=tuple(_taken_over(connection, sweep.sweep_id)),
+        notes=(*slots.notes, *_alike_notes(connection)),
+    )
+
+
+def _whole(connection: duckdb.DuckDBPyConnection, path: Path, sweeps: bool) -> Audit:
+    """What a database holds beside and between its sweeps."""
+    loose = connection.execute(LOOSE).fetchall()
+    human = _count(connection, "SELECT count(*) FROM trials WHERE source = 'human'")
+    return Audit(
+        subject=str(path),
+        counts={
+            "sweeps": _count(connection, "SELECT count(*) FROM sweeps"),
+            "trials": _count(connection, "SELECT count(*) FROM trials"),
+            "human trials": human,
+        },
+        findings=tuple(
+            Finding(
+                "loose",
+                LOOSE_TEXTS.get(table, f"{rows} rows of {table} belong to no trial"),
+                trial=trial_id,
+            )
+            for table, trial_id, rows in loose
+        ),
+        sharings=tuple(calls_in_common(connection)),
+        notes=() if sweeps else ("there is no sweep in this database",),
+    )
+
+
+def _sweeps(connection: duckdb.DuckDBPyConnection) -> list[_Sweep]:
+    rows = connection.execute(
+        # Of sweeps of earlier versions only whether they ended is known, not how.
+        "SELECT sweep_id, config, coalesce(exit_code = 0, ended_at IS NOT NULL) FROM sweeps "
+        "ORDER BY started_at, sweep_id"
+    ).fetchall()
+    return [_Sweep(*row) for row in rows]
+
+
+def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
+    """Make the temporary tables that the checks read; returns the stored specs."""
+    specs = {
+        name: Spec(name, text)
+        for name, text in connection.execute("SELECT spec_hash, spec FROM specs").fetchall()
+    }
+    connection.execute(TABLES)
+    _fill(
+        connection,
+        "rules",
+        (
+            (
+                spec.spec_hash,
+                scenario.executed_actions,
+                scenario.plan_actions,
+                scenario.timeout_steps,
+                scenario.fallback == "restart",
+            )
+            for spec in specs.values()
+            if (scenario := spec.scenario) is not None
+        ),
+    )
+    _fill(
+        connection,
+        "drivers",
+        (
+            (
+                spec.spec_hash,
+                side,
+                spec.driver(side).get("endpoint"),
+                canonical_json(spec.driver(side).get("body")) if spec.asks(side) else None,
+            )
+            for spec in specs.values()
+            for side in SIDES
+        ),
+    )
+    connection.execute(REPLY_IDS)
+    connection.execute(USED)
+    return specs
+
+
+def _rule_findings(connection: duckdb.DuckDBPyConnection) -> Iterable[Finding]:
+    for check in CHECKS:
+        rows = connection.execute(f"{check.sql} ORDER BY ALL").fetchall()
+        for trial_id, side, decision, text in rows:
+            yield Finding(check.kind, text, trial=trial_id, side=side, decision=decision)
+
+
+def _taken_over(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> Iterable[Sharing]:
+    for other, count in connection.execute(TAKEN_OVER, [sweep_id, sweep_id]).fetchall():
+        yield Sharing("trials", sweep_id, other, count)
+
+
+def _alike_notes(connection: duckdb.DuckDBPyConnection) -> Iterable[str]:
+    """A model that samples never gives only answers that it has given before.
+
+    A proxy that caches and gives each reply a new id does, and so does a model at temperature 0:
+    in both cases the repetitions are no samples. The emulator has a few phrases.
+    """
+    repeated, alike = answers_alike(connection)
+    scripted = _count(connection, "SELECT count(*) FROM audited WHERE scripted")
+    if alike == repeated >= MANY_REPEATED and not scripted:
+        yield (
+            f"all {repeated} answers to prompts that were asked before are word for word as "
+            "before: are they samples?"
+        )
+
+
+def _fill(
+    connection: duckdb.DuckDBPyConnection, table: str, rows: Iterable[tuple[Any, ...]]
+) -> None:
+    appender = connection.appender(table)
+    appender.append_rows(list(rows))
+    appender.flush()
+
+
+def _count(connection: duckdb.DuckDBPyConnection, sql: str) -> int:
+    row = connection.execute(sql).fetchone()
+    assert row is not None
+    number: int = row[0]
+    return number
+
+
+def _first(exc: ValidationError) -> str:
+    error = exc.errors()[0]
+    return f"{'.'.join(map(str, error['loc']))}: {error['msg']}"
