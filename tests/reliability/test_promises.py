@@ -1,0 +1,23 @@
+"""docs/reliability.md names a test for each promise: it has to be there."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+
+from harness import PROJECT
+
+
+def test_every_promise_has_its_test():
+    text = (PROJECT / "docs/reliability.md").read_text()
+    named = set(re.findall(r"`(test_\w+)`", text))
+    defined = Counter(
+        name
+        for file in (PROJECT / "tests").rglob("test_*.py")
+        for name in re.findall(r"^(?:async )?def (test_\w+)", file.read_text(), re.MULTILINE)
+    )
+    assert {name for name in named if defined[name] != 1} == set()
+    rows = [row for row in text.splitlines() if row.startswith("| ") and "|---" not in row]
+    headings = [row for row in rows if row.endswith("| test |")]
+    assert all("`test_" in row for row in rows if row not in headings)
+    assert len(rows) > 30
