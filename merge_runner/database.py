@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import shutil
@@ -25,19 +26,66 @@ REBUILD = (
 )
 
 
+class Instance:
+    """A DuckDB instance, to which files are attached and detached: that takes and frees their lock.
+
+    To make one takes longer than most of what is done with it, so there is one for all. After an
+    error it may be of no use any more, and a new one is made.
+    """
+
+    def __init__(self) -> None:
+        self._connection: duckdb.DuckDBPyConnection | None = None
+        self._numbers = itertools.count()
+
+    def cursor(self) -> duckdb.DuckDBPyConnection:
+        """A connection of its own."""
+        if self._connection is None:
+            self._connection = duckdb.connect()
+        return self._connection.cursor()
+
+    def name(self) -> str:
+        """A name for a file that no other one has."""
+        return f"results_{next(self._numbers)}"
+
+    def drop(self) -> None:
+        """Make a new instance next time."""
+        self._connection = None
+
+
+SHARED = Instance()
+# Another process holds the file; another connection of this one does.
+_BUSY = ("Could not set lock", "Unique file handle conflict", "already attached")
+
+
 @contextmanager
 def open_database(
-    path: Path, *, read_only: bool, patience_s: float
+    path: Path, *, read_only: bool, patience_s: float, instance: Instance = SHARED
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open the database, waiting for others to close it; raises StoreError."""
+    connection, name = _attached(path, read_only, patience_s, instance)
+    try:
+        yield connection
+        connection.execute(f"USE memory; DETACH {name}")
+    except BaseException:
+        instance.drop()
+        raise
+    finally:
+        connection.close()
+
+
+def _attached(
+    path: Path, read_only: bool, patience_s: float, instance: Instance
+) -> tuple[duckdb.DuckDBPyConnection, str]:
+    connection, name = instance.cursor(), instance.name()
+    mode = "READ_ONLY" if read_only else "READ_WRITE"
     began = time.monotonic()
     told = False
     while True:
         try:
-            connection = duckdb.connect(str(path), read_only=read_only)
-            break
-        except duckdb.IOException as exc:
-            if "Could not set lock" not in str(exc):
+            connection.execute(f"ATTACH '{quoted(path)}' AS {name} ({mode}); USE {name}")
+        except duckdb.Error as exc:
+            if not any(words in str(exc) for words in _BUSY):
+                instance.drop()
                 raise StoreError(
                     f"{path} cannot be opened as a database: {first_line(exc)}"
                 ) from exc
@@ -50,31 +98,34 @@ def open_database(
                     "waiting up to %.0f s for another program to close %s", patience_s, path
                 )
             time.sleep(LOCK_RETRY_S)
-        except duckdb.Error as exc:
-            raise StoreError(f"{path} cannot be opened as a database: {first_line(exc)}") from exc
-    try:
-        yield connection
-    finally:
-        connection.close()
+        else:
+            return connection, name
 
 
 @contextmanager
-def read_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
+def read_database(path: Path, instance: Instance = SHARED) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open an existing database for reading, of this schema or an older one; raises UsageError."""
     if not path.is_file():
         raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
+    with _current(path, instance) as connection:
+        if connection is not None:
+            yield connection
+            return
+    migrate(path)
+    with _current(path, instance) as connection:
+        assert connection is not None
+        yield connection
+
+
+@contextmanager
+def _current(path: Path, instance: Instance) -> Iterator[duckdb.DuckDBPyConnection | None]:
+    """The database for reading; None where its schema is older."""
     with (
         unreadable_is_usage(),
-        open_database(path, read_only=True, patience_s=PATIENCE_S) as connection,
+        open_database(path, read_only=True, patience_s=PATIENCE_S, instance=instance) as connection,
     ):
         older = schema_version(connection, path) < SCHEMA_VERSION
-    if older:
-        migrate(path)
-    with (
-        unreadable_is_usage(),
-        open_database(path, read_only=True, patience_s=PATIENCE_S) as connection,
-    ):
-        yield connection
+        yield None if older else connection
 
 
 @contextmanager
@@ -144,8 +195,7 @@ def migrate(path: Path) -> None:
 
 
 def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
-    quoted = str(copy).replace("'", "''")
-    connection.execute(f"ATTACH '{quoted}' AS copied")
+    connection.execute(f"ATTACH '{quoted(copy)}' AS copied")
     old = {
         table
         for (table,) in connection.execute(
@@ -160,6 +210,11 @@ def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
             connection.execute(f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table}")  # noqa: S608 # our tables
     connection.execute("INSERT INTO copied.meta VALUES (?)", [SCHEMA_VERSION])
     connection.execute("DETACH copied")
+
+
+def quoted(path: Path) -> str:
+    """A path as it stands between the quotes of a statement."""
+    return str(path).replace("'", "''")
 
 
 def first_line(exc: Exception) -> str:

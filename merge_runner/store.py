@@ -19,6 +19,7 @@ from merge_runner.database import (
     PATIENCE_S,
     SCHEMA,
     SCHEMA_VERSION,
+    Instance,
     first_line,
     migrate,
     open_database,
@@ -176,7 +177,8 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 
     It reaches no file and no network, and changes no setting.
     """
-    with read_database(path) as connection:
+    # The settings hold for a whole instance, and cannot be taken back.
+    with read_database(path, Instance()) as connection:
         # External access alone leaves the database's own files open to COPY ... TO.
         connection.execute(
             "SET temp_directory = ''; SET enable_external_access = false; "
