@@ -174,40 +174,49 @@ def _firth(draws: _Draws, alive: NDArray[np.bool_], free: tuple[int, ...]) -> tu
     Newton steps on Firth's score with the whole design's information, halved where they do not
     increase the penalised likelihood (Heinze and Schemper 2002).
     """
-    design, n, left = LOGIT_DESIGN, draws.n, draws.left
-
-    def likelihood(b: Array) -> Array:
-        linear = b @ design.T
-        p = expit(linear)
-        information = np.einsum("bi,ij,ik->bjk", n * p * (1 - p), design, design)
-        determinant = np.where(alive, np.linalg.det(information), 1.0)
-        fit = (left * linear - n * np.logaddexp(0, linear)).sum(axis=1)
-        return np.asarray(fit + np.log(np.maximum(determinant, 1e-300)) / 2)
-
-    b = np.zeros((DATA_SETS, 3))
-    best = likelihood(b)
+    b, best = np.zeros((DATA_SETS, 3)), np.zeros(DATA_SETS)
+    rows = np.flatnonzero(alive)  # a data set that has converged is left as it is
+    best[rows] = _penalised(draws.n[rows], draws.left[rows], b[rows])
     for _ in range(FIRTH_STEPS):
-        p = expit(b @ design.T)
-        weights = n * p * (1 - p)
-        covariance, _ = _inverse(design, weights, alive)
-        leverage = weights * np.einsum("ij,bjk,ik->bi", design, covariance, design)
-        score = (left - n * p + leverage * (0.5 - p)) @ design
-        step = np.zeros_like(b)
-        step[:, free] = np.einsum(
-            "bjk,bk->bj", _inverse(design[:, free], weights, alive)[0], score[:, free]
-        )
-        step = np.clip(step, -5, 5)
+        n, left = draws.n[rows], draws.left[rows]
+        step = _firth_step(n, left, b[rows], free)
         for _ in range(HALVINGS):
-            tried = likelihood(b + step)
-            worse = tried < best
+            tried = _penalised(n, left, b[rows] + step)
+            worse = tried < best[rows]
             if not worse.any():
                 break
             step[worse] /= 2
-        step[tried < best] = 0
-        b, best = b + step, np.maximum(tried, best)
-        if np.abs(step).max() < 1e-8:
+        step[tried < best[rows]] = 0
+        b[rows] += step
+        best[rows] = np.maximum(tried, best[rows])
+        rows = rows[np.abs(step).max(axis=1) >= 1e-8]
+        if not len(rows):
             break
     return best, b
+
+
+def _penalised(n: Array, left: Array, b: Array) -> Array:
+    """Log-likelihoods of the coefficients ``b`` (sets, 3) with Firth's penalty."""
+    linear = b @ LOGIT_DESIGN.T
+    p = expit(linear)
+    determinant = np.linalg.det(_information(LOGIT_DESIGN, n * p * (1 - p)))
+    fit = (left * linear - n * np.logaddexp(0, linear)).sum(axis=1)
+    return np.asarray(fit + np.log(np.maximum(determinant, 1e-300)) / 2)
+
+
+def _firth_step(n: Array, left: Array, b: Array, free: tuple[int, ...]) -> Array:
+    """A Newton step (sets, 3) of the ``free`` coefficients from ``b``."""
+    design, alive = LOGIT_DESIGN, np.ones(len(b), bool)
+    p = expit(b @ design.T)
+    weights = n * p * (1 - p)
+    covariance, _ = _inverse(design, weights, alive)
+    leverage = weights * (covariance.reshape(-1, 9) @ _products(design).T)
+    score = (left - n * p + leverage * (0.5 - p)) @ design
+    step = np.zeros_like(b)
+    step[:, free] = np.einsum(
+        "bjk,bk->bj", _inverse(design[:, free], weights, alive)[0], score[:, free]
+    )
+    return np.clip(step, -5, 5)
 
 
 def _gap_tests(draws: _Draws) -> tuple[Passes, Passes]:
@@ -244,15 +253,26 @@ def _inverse(
     design: Array, weights: Array, alive: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.bool_]]:
     """(X' W X)^-1 for each row of ``weights``, and where it exists; elsewhere the identity."""
-    information = np.einsum("bi,ij,ik->bjk", weights, design, design)
+    information = _information(design, weights)
     size = design.shape[1]
     sound = alive & (np.linalg.det(information) > 1e-12)
     return np.linalg.inv(np.where(sound[:, None, None], information, np.eye(size))), sound
 
 
 def _rank(design: Array, n: Array) -> NDArray[np.bool_]:
-    information = np.einsum("bi,ij,ik->bjk", (n > 0).astype(float), design, design)
+    information = _information(design, (n > 0).astype(float))
     return np.asarray(np.linalg.matrix_rank(information) == design.shape[1])
+
+
+def _information(design: Array, weights: Array) -> Array:
+    """X' W X for each row of ``weights`` (sets, conditions)."""
+    size = design.shape[1]
+    return np.asarray((weights @ _products(design)).reshape(-1, size, size))
+
+
+def _products(design: Array) -> Array:
+    """The products of each two regressors, (conditions, regressors squared)."""
+    return np.asarray((design[:, :, None] * design[:, None, :]).reshape(len(design), -1))
 
 
 def _published_gap() -> Array:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import dataclass
+
 from analysis.contrasts import contrast_rates
 from analysis.indicators import ALPHA, INDICATORS, TESTED, Verdict
 from analysis.measures import MEASURES, counts, estimate
-from analysis.provenance import Provenance
+from analysis.provenance import Mismatch, Provenance, tally
 from analysis.study import Group, Study
 from analysis.verdicts import Score, score
 
@@ -18,6 +21,91 @@ NAMES = {
     "I5": "speeds are piecewise linear",
 }
 LOW_POWER = 0.8
+MANY_FALLBACKS = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """What a reader must know before any number."""
+
+    title: str
+    text: str
+
+
+def alarms(study: Study, origin: Provenance) -> list[Alarm]:
+    """What puts the results of a study in doubt, the worst first."""
+    found = [Alarm("Another model answered", _mismatch(one)) for one in origin.mismatches]
+    for title, parts, rest in (
+        (
+            "Trials failed",
+            [_failed(group) for group in study.models if len(group.trials) > len(group.ended)],
+            "They are in no measure; the same sweep again plays them anew.",
+        ),
+        (
+            "Many fallbacks",
+            _fallbacks(study),
+            "There the older plan was driven, or none: the table fallbacks shows whether that "
+            "changes the results.",
+        ),
+        (
+            "Attempts of unknown fate",
+            _unknown(study),
+            "A run was killed before their reply was seen: they may have been paid for.",
+        ),
+        (
+            "Several settings under one name",
+            _mixed(study),
+            "They are never pooled: all but the most frequent carry a mark.",
+        ),
+    ):
+        if parts:
+            found.append(Alarm(title, f"{'; '.join(parts)}. {rest}"))
+    return found
+
+
+def _mismatch(one: Mismatch) -> str:
+    answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
+    sweeps = f"sweep{'s' * (len(one.sweeps) != 1)} {', '.join(one.sweeps) or 'unknown'}"
+    return (
+        f"{one.requested} was asked for, {one.served} answered: {answers}, {sweeps}. "
+        "These trials are not what they claim to be."
+    )
+
+
+def _failed(group: Group) -> str:
+    failed = group.trials[group.trials["status"] == "failed"]
+    reasons = failed["error"].fillna("no reason is stored").value_counts()
+    more = ", among other reasons" if len(reasons) > 1 else ""
+    return f"{len(failed)} of {len(group.trials)} of {group.id} ({reasons.index[0]}{more})"
+
+
+def _fallbacks(study: Study) -> list[str]:
+    return [
+        f"{found.fallbacks} of {found.decisions} decisions of {group.id} "
+        f"({100 * found.fallbacks / found.decisions:.1f} %)"
+        for group in study.models
+        for found in [tally(study, group)]
+        if found.fallbacks > MANY_FALLBACKS * found.decisions
+    ]
+
+
+def _unknown(study: Study) -> list[str]:
+    return [
+        f"{found.unknown} of {found.attempts} of {group.id}"
+        for group in study.models
+        for found in [tally(study, group)]
+        if found.unknown
+    ]
+
+
+def _mixed(study: Study) -> list[str]:
+    drivers = dict.fromkeys(group.driver for group in study.models)
+    bare = Counter(driver.split(" [")[0] for driver in drivers)
+    return [
+        ", ".join(driver for driver in drivers if driver.split(" [")[0] == name)
+        for name, count in bare.items()
+        if count > 1
+    ]
 
 
 def shown(study: Study) -> list[str]:
@@ -29,10 +117,7 @@ def not_shown(study: Study, origin: Provenance) -> list[str]:
     """What cannot be concluded, and why."""
     models = [group for group in study.baselines if group.setting]
     texts = [text for group in models for text in _limits(study, group)]
-    texts += [
-        f"Another model answered: {text}. These trials are not what they claim to be."
-        for text in origin.mismatches
-    ]
+    texts += [f"Another model answered: {_mismatch(one)}" for one in origin.mismatches]
     if not models:
         texts.append("There is no baseline trial of a driver to show: nothing can be concluded.")
     if not study.human.measured:

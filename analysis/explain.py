@@ -9,7 +9,7 @@ from functools import cache
 import duckdb
 
 from analysis.published import citation
-from analysis.study import Group, Study
+from analysis.study import Group, Study, of_group
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.errors import UsageError
@@ -80,6 +80,8 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
     if column is not None and column.name.startswith("ceiling"):
         return (_resampled(study),)
     predicate = row.counts or _predicate(table, column)
+    if column is not None and column.within:
+        predicate += f" AND {column.within}"
     return tuple(
         _source(study, group, predicate)
         if group.measured or not row.note
@@ -111,17 +113,31 @@ def _source(study: Study, group: Group, predicate: str) -> Source:
         text = f"published, not from traces: {citation('human_outcomes')}; see the table's notes"
         return Source(group.id, text, "", ())
     query = query_of(group, predicate)
-    trials = tuple(row[0] for row in _table(group).filter(predicate).order("trial_id").fetchall())
+    found = _tables(study, group).sql(
+        f"SELECT trial_id FROM trials WHERE {predicate} ORDER BY trial_id"  # noqa: S608 # ours
+    )
+    trials = tuple(trial_id for (trial_id,) in found.fetchall())
     text = f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}"
     return Source(group.id, text, query, trials)
 
 
 @cache
-def _table(group: Group) -> duckdb.DuckDBPyRelation:
-    """The columns of ``load_trials``, for predicates in SQL."""
-    connection = duckdb.connect()
-    connection.register("frame", group.trials)
-    return connection.sql("CREATE TABLE trials AS FROM frame; FROM trials")
+def _tables(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
+    """A group's trials, attempts and decisions as tables, for predicates in SQL."""
+    connection = _database().cursor()
+    for name, frame in (
+        ("trials", group.trials),
+        ("attempts", of_group(study.calls.attempts, group, group.trials)),
+        ("decisions", of_group(study.calls.decisions, group, group.trials)),
+    ):
+        connection.register(name, frame)
+    return connection
+
+
+@cache
+def _database() -> duckdb.DuckDBPyConnection:
+    """One for all groups: what a cursor registers is its own."""
+    return duckdb.connect()
 
 
 def _find(table: Table, row_id: str) -> Row:

@@ -191,7 +191,9 @@ def rendered(study: Study, name: str, form: Literal["pdf", "png", "svg"]) -> byt
 def _figure(study: Study, name: str) -> Figure:
     """A figure, laid out once for all its forms."""
     figure = FIGURES[name][0](study)
-    figure.draw_without_rendering()
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.execute(figure)
     figure.set_layout_engine(None)  # or every form would be laid out anew
     return figure
 

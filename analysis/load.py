@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
+from merge_runner.database import read_database
 from merge_runner.places import DEFAULT_DB
 from merge_runner.store import query
 
@@ -50,6 +53,25 @@ FROM used AS one JOIN used AS base USING (call_key) JOIN totals ON totals.spec_h
 WHERE one.variant <> 'baseline' AND base.variant = 'baseline' GROUP BY ALL ORDER BY ALL
 """
 
+# One row a trial and kind of attempt; a retried attempt has no share in the answer's failure.
+ATTEMPTS = """
+SELECT trial_id, spec_hash, fate, outcome, if(fate = 'retried', NULL, failure) AS failure,
+    model_requested, model_served, count(*) AS attempts
+FROM attempts GROUP BY ALL ORDER BY ALL
+"""
+# One row a trial and kind of decision.
+DECISIONS = """
+SELECT trial_id, spec_hash, fallback, count(*) AS decisions
+FROM decisions GROUP BY ALL ORDER BY ALL
+"""
+# Names under which a model may answer, as the sweeps were configured.
+ALIASES = """
+SELECT DISTINCT value->>'id' AS model_requested, unnest((value->'aliases')::VARCHAR[]) AS alias
+FROM sweeps, json_each(config, '$.models') ORDER BY ALL
+"""
+
+SPECS = "SELECT spec_hash, spec FROM specs"
+
 
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     """The rows of one read-only query; raises UsageError."""
@@ -62,11 +84,40 @@ def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     return load(TRIALS, db)
 
 
-def load_speeds(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """One row a vehicle: lists of times in s and speeds in m/s from the start of control on."""
-    return load(SPEEDS, db)
+def load_each(queries: Mapping[str, str], db: Path | str = DEFAULT_DB) -> dict[str, pd.DataFrame]:
+    """The rows of our own queries, by name; opening a database takes longer than most of them."""
+    with read_database(Path(db)) as connection:
+        found = {}
+        for name, sql in queries.items():
+            result = connection.execute(sql)
+            columns = [column[0] for column in result.description or ()]
+            found[name] = pd.DataFrame(result.fetchall(), columns=columns)
+        return found
 
 
-def load_plans(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """One row a trial: its valid plans, how coarse they are and how much they were revised."""
-    return load(PLANS, db)
+@dataclass(frozen=True, slots=True)
+class Calls:
+    """What became of the calls.
+
+    ``attempts``: one row a trial and kind of attempt, with the number of these; ``decisions``: one
+    row a trial, its fallbacks apart; ``aliases``: pairs of a model's id and another name under
+    which it may answer.
+    """
+
+    attempts: pd.DataFrame
+    decisions: pd.DataFrame
+    aliases: set[tuple[str, str]]
+
+
+def load_calls(db: Path | str = DEFAULT_DB) -> Calls:
+    """Read what became of the calls; the columns have their types also where there is none."""
+    found = load_each({"attempts": ATTEMPTS, "decisions": DECISIONS, "aliases": ALIASES}, db)
+    keys = ("trial_id", "spec_hash")
+    texts = (*keys, "fate", "outcome", "failure", "model_requested", "model_served")
+    return Calls(
+        found["attempts"].astype(dict.fromkeys(texts, "string") | {"attempts": int}),
+        found["decisions"].astype(
+            dict.fromkeys(keys, "string") | {"fallback": bool, "decisions": int}
+        ),
+        set(found["aliases"].itertuples(index=False, name=None)),
+    )

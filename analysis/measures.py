@@ -60,12 +60,23 @@ MEASURES = (
     ),
 )
 
+LEFT_FIRST = Measure(
+    "left_first_percent",
+    "left first (%)",
+    "share of finished trials with a first merger in which it is the left vehicle",
+    "merged_first",
+    True,
+    "status = 'finished' AND merged_first IS NOT NULL",
+)
+
 
 def counts(group: Group, measure: Measure) -> tuple[int, int]:
     """Successes and n of a rate."""
     if measure.column is None:
         return int((group.ended["status"] == "collided").sum()), len(group.ended)
     known = group.finished[measure.column].dropna()
+    if measure is LEFT_FIRST:
+        return int((known == "left").sum()), len(known)
     return int(known.astype(bool).sum()), len(known)
 
 

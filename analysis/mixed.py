@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -105,7 +106,7 @@ def _marginal(parameters: Array, design: Array, trials: Array, left: Array) -> f
         """Log of likelihood times prior density, at intercepts ``effect`` of shape (k,)."""
         linear = fixed[:, None] + effect[None, :]
         fit = (left[:, None] * linear - trials[:, None] * np.logaddexp(0, linear)).sum(axis=0)
-        return np.asarray(fit + stats.norm.logpdf(effect, scale=sd))
+        return np.asarray(fit - effect**2 / (2 * sd**2) - np.log(sd * np.sqrt(2 * np.pi)))
 
     mode = 0.0
     for _ in range(50):
@@ -115,11 +116,17 @@ def _marginal(parameters: Array, design: Array, trials: Array, left: Array) -> f
         mode += slope / curvature
         if abs(slope / curvature) < 1e-10:
             break
-    nodes, weights = np.polynomial.hermite.hermgauss(NODES)
+    nodes, weights = _nodes()
     scale = np.sqrt(2 / curvature)
     return float(
         logsumexp(joint(mode + scale * nodes) + nodes**2 + np.log(weights)) + np.log(scale)
     )
+
+
+@cache
+def _nodes() -> tuple[Array, Array]:
+    """Nodes and weights of Gauss-Hermite quadrature."""
+    return np.polynomial.hermite.hermgauss(NODES)
 
 
 def _hessian(function: object, at: Array) -> Array:

@@ -109,7 +109,7 @@ def fit_profile(velocity_mps: Array) -> Profile:
 
 
 def fit_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
-    """Fit all vehicles of ``load_speeds`` that drove for at least 4 samples.
+    """Fit all vehicles of ``load.SPEEDS`` that drove for at least 4 samples.
 
     Columns: trial_id, spec_hash, side, knot_rate_hz, rmse_mps, reversal_rate_hz.
     """

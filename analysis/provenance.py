@@ -1,15 +1,18 @@
-"""Where the results come from: sweeps, specs, and what the calls came to."""
+"""Where the results come from: sweeps, specs, what the calls came to, and what they cost."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
 
-from analysis.load import load
-from merge_runner.config import Scenario, load_models
+from analysis.load import ALIASES, load_each
+from analysis.study import Group, Study, of_group
+from merge_runner.config import Scenario
 
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
@@ -43,58 +46,162 @@ SPECS = """
 SELECT DISTINCT split_part(trial_id, '/', 1) AS driver, variant, spec_hash, spec
 FROM specs JOIN trials USING (spec_hash) WHERE source <> 'human' ORDER BY ALL
 """
-DECISIONS = """
-SELECT split_part(trial_id, '/', 1) AS driver, trials.spec_hash, variant, count(*) AS decisions,
-    count(*) FILTER (NOT valid) AS invalid, count(*) FILTER (fallback) AS fallbacks
-FROM decisions JOIN trials USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL
+# Answers by another model than was asked for, by either name.
+SERVED = """
+SELECT model_requested, model_served,
+    count(DISTINCT (trial_id, spec_hash, side, decision)) AS answers,
+    list_sort(list(DISTINCT sweep_id) FILTER (sweep_id IS NOT NULL)) AS sweeps
+FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
+WHERE fate IN ('driven', 'fallback') AND model_served <> model_requested
+GROUP BY ALL ORDER BY ALL
 """
+SWEEP_COSTS = """
+SELECT sweep_id, name, sweep_costs.* EXCLUDE (sweep_id)
+FROM sweeps JOIN sweep_costs USING (sweep_id) ORDER BY started_at, sweep_id
+"""
+MODEL_COSTS = """
+SELECT split_part(trial_id, '/', 1) AS driver, count(*) AS trials,
+    sum(calls) AS calls, sum(attempts) AS attempts,
+    sum(input_tokens) AS input_tokens, sum(cached_input_tokens) AS cached_input_tokens,
+    sum(output_tokens) AS output_tokens, sum(reasoning_tokens) AS reasoning_tokens,
+    sum(cost_usd) AS cost_usd, sum(paid_usd) AS paid_usd,
+    sum(attempts_of_unknown_cost) AS attempts_of_unknown_cost
+FROM trials JOIN trial_costs USING (trial_id, spec_hash)
+WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
+"""
+# Failures with an own column of the tables; the others are malformed answers.
+ANSWERS = ("refusal", "truncated", "empty")
+
+
+@dataclass(frozen=True, slots=True)
+class Mismatch:
+    """Answers by ``served`` to calls that asked for ``requested``, in these sweeps."""
+
+    requested: str
+    served: str
+    answers: int
+    sweeps: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
     """What the report says about the origin of its numbers.
 
-    ``sweeps``, ``calls`` and ``decisions`` are rows of the queries here; ``switches`` holds, by
-    driver, variant and spec_hash, the settings of the driving task that differ from the defaults;
-    ``mismatches`` says where another model answered than was asked for.
+    ``sweeps``, ``calls``, ``sweep_costs`` and ``model_costs`` are rows of the queries here;
+    ``switches`` holds, by driver, variant and spec_hash, the settings of the driving task that
+    differ from the defaults; ``mismatches`` says where another model answered than was asked for.
     """
 
     sweeps: pd.DataFrame
     calls: pd.DataFrame
-    decisions: pd.DataFrame
+    sweep_costs: pd.DataFrame
+    model_costs: pd.DataFrame
     switches: dict[str, str]
-    mismatches: list[str]
+    mismatches: list[Mismatch]
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What became of the calls of one group of trials.
+
+    A call is asked at one decision, in one or more attempts. ``retried`` attempts were followed by
+    another, ``lost`` calls ended without an answer. ``failures`` counts the answers without a valid
+    plan by reason, ``fallbacks`` the ``decisions`` that were driven from an older plan, or none.
+    ``unknown`` attempts were under way when the run was killed; ``others`` are answers of another
+    model than was asked for.
+    """
+
+    trials: int
+    failed: int
+    calls: int
+    attempts: int
+    retried: int
+    lost: int
+    failures: Counter[str]
+    decisions: int
+    fallbacks: int
+    unknown: int
+    others: int
+
+    @property
+    def answers(self) -> int:
+        """Calls with an answer of any kind."""
+        return self.calls - self.lost
+
+    @property
+    def invalid(self) -> int:
+        """Answers without a valid plan."""
+        return self.failures.total()
 
 
 def provenance(db: Path) -> Provenance:
     """Read the origin of a database's results."""
-    calls = load(CALLS, db)
+    found = load_each(
+        {
+            "sweeps": SWEEPS,
+            "calls": CALLS,
+            "sweep_costs": SWEEP_COSTS,
+            "model_costs": MODEL_COSTS,
+            "specs": SPECS,
+            "served": SERVED,
+            "aliases": ALIASES,
+        },
+        db,
+    )
     return Provenance(
-        sweeps=load(SWEEPS, db),
-        calls=calls,
-        decisions=load(DECISIONS, db),
-        switches=_switches(db),
-        mismatches=_mismatches(calls),
+        sweeps=found["sweeps"],
+        calls=found["calls"],
+        sweep_costs=found["sweep_costs"],
+        model_costs=found["model_costs"],
+        switches=_switches(found["specs"]),
+        mismatches=_mismatches(found["served"], found["aliases"]),
     )
 
 
-def _switches(db: Path) -> dict[str, str]:
+@cache
+def tally(study: Study, group: Group) -> Tally:
+    """Count a group's calls, attempts and decisions."""
+    attempts = of_group(study.calls.attempts, group, group.trials)
+    decisions = of_group(study.calls.decisions, group, group.trials)
+    by_fate = Counter(attempts.groupby("fate")["attempts"].sum().to_dict())
+    answered = attempts[attempts["fate"].isin(("driven", "fallback"))]
+    return Tally(
+        trials=len(group.trials),
+        failed=len(group.trials) - len(group.ended),
+        calls=by_fate.total() - by_fate["retried"],
+        attempts=by_fate.total(),
+        retried=by_fate["retried"],
+        lost=by_fate["lost"],
+        failures=Counter(answered.groupby("failure")["attempts"].sum().to_dict()),
+        decisions=int(decisions["decisions"].sum()),
+        fallbacks=int(decisions.loc[decisions["fallback"], "decisions"].sum()),
+        unknown=int(attempts.loc[attempts["outcome"] == "unknown", "attempts"].sum()),
+        others=int(answered.loc[_other_model(study, answered), "attempts"].sum()),
+    )
+
+
+def _other_model(study: Study, answered: pd.DataFrame) -> list[bool]:
+    pairs = zip(answered["model_requested"], answered["model_served"], strict=True)
+    return [
+        not pd.isna(served) and served != asked and (asked, served) not in study.calls.aliases
+        for asked, served in pairs
+    ]
+
+
+def _switches(specs: pd.DataFrame) -> dict[str, str]:
     defaults = Scenario().model_dump()
     found = {}
-    for row in load(SPECS, db).itertuples():
+    for row in specs.itertuples():
         scenario = json.loads(row.spec).get("scenario", {})
         changed = [f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v]
         found[f"{row.driver}/{row.variant} ({row.spec_hash})"] = ", ".join(changed) or "defaults"
     return found
 
 
-def _mismatches(calls: pd.DataFrame) -> list[str]:
-    accepted: dict[str, set[str]] = {}
-    for entry in load_models().values():
-        accepted.setdefault(entry.id, set()).update({entry.id, *entry.aliases})
+def _mismatches(served: pd.DataFrame, aliases: pd.DataFrame) -> list[Mismatch]:
+    declared = set(aliases.itertuples(index=False, name=None))
     return [
-        f"{row.model_served} answered {row.calls} calls that asked for {row.model_requested}"
-        for row in calls.itertuples()
-        if isinstance(row.model_served, str)
-        and row.model_served not in accepted.get(row.model_requested, {row.model_requested})
+        Mismatch(row.model_requested, row.model_served, row.answers, tuple(row.sweeps or ()))
+        for row in served.itertuples()
+        if (row.model_requested, row.model_served) not in declared
     ]

@@ -11,7 +11,7 @@ from pathlib import Path
 import jinja2
 import pandas as pd
 
-from analysis.conclusions import not_shown, shown
+from analysis.conclusions import alarms, not_shown, shown
 from analysis.explain import Source, sources_of, sql_command
 from analysis.figures import FIGURES, rendered, write_figures
 from analysis.forms import TableFormat
@@ -88,6 +88,7 @@ def report_html(study: Study, tables: list[Table]) -> str:
     origin = provenance(study.db)
     return environment.get_template("report.html").render(
         study=study,
+        alarms=alarms(study, origin),
         shown=shown(study),
         not_shown=not_shown(study, origin),
         figures=[

@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import pandas as pd
 
-from analysis.load import load
+from analysis.load import SPECS, load_each
 from merge_runner.config import CollisionRule, Scenario
 from merge_runner.simulator.collision import collided
 from merge_runner.simulator.conditions import CONDITIONS
@@ -41,11 +41,15 @@ def outcomes(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
 
     ``status`` is finished, collided, timeout or undecided.
     """
-    specs = load("SELECT spec_hash, spec FROM specs", db).set_index("spec_hash")["spec"]
     ended = trials[trials["status"] != "failed"]
-    frames = [_driven(ended[ended["source"] != "human"], load(PLANS, db), specs)]
-    if (ended["source"] == "human").any():
-        frames.append(_judged(ended, load(HUMAN_TRACES, db)))
+    humans = bool((ended["source"] == "human").any())
+    found = load_each(
+        {"specs": SPECS, "plans": PLANS} | ({"traces": HUMAN_TRACES} if humans else {}), db
+    )
+    specs = found["specs"].set_index("spec_hash")["spec"]
+    frames = [_driven(ended[ended["source"] != "human"], found["plans"], specs)]
+    if humans:
+        frames.append(_judged(ended, found["traces"]))
     return pd.concat(frames, ignore_index=True)
 
 

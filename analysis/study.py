@@ -6,12 +6,12 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import pandas as pd
 
-from analysis.load import SHARED, load, load_plans, load_speeds, load_trials
+from analysis.load import PLANS, SHARED, SPECS, SPEEDS, TRIALS, Calls, load_calls, load_each
 from analysis.published import human_outcomes
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
@@ -77,9 +77,10 @@ class Study:
     def __init__(self, db: Path | str = DEFAULT_DB, models: Sequence[str] | None = None) -> None:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
         self.db = Path(db)
-        trials = load_trials(self.db)
+        found = load_each({"trials": TRIALS, "specs": SPECS}, self.db)
+        trials = found["trials"]
         self.human = _human_group(trials[trials["source"] == HUMAN])
-        every = _model_groups(trials[trials["source"] != HUMAN], _tasks(self.db))
+        every = _model_groups(trials[trials["source"] != HUMAN], _tasks(found["specs"]))
         valid = [HUMAN, *dict.fromkeys(group.driver for group in every)]
         wanted = valid if models is None else list(models)
         unknown = [name for name in wanted if name not in valid]
@@ -110,22 +111,30 @@ class Study:
     @cached_property
     def speeds(self) -> pd.DataFrame:
         """One row a vehicle: its speeds from the start of control on."""
-        return load_speeds(self.db)
+        return self._read(SPEEDS)
 
     @cached_property
     def deviations(self) -> pd.DataFrame:
         """One row a trial and window: RMSE of the speeds from the initial ones, and joint."""
-        return load("SELECT * FROM speed_deviations ORDER BY ALL", self.db)
+        return self._read("SELECT * FROM speed_deviations ORDER BY ALL")
 
     @cached_property
     def plans(self) -> pd.DataFrame:
         """One row a trial with valid plans: how coarse they are, how much they were revised."""
-        return load_plans(self.db)
+        return self._read(PLANS)
+
+    @cached_property
+    def calls(self) -> Calls:
+        """What became of the calls, by trial."""
+        return load_calls(self.db)
 
     @cached_property
     def shared(self) -> pd.DataFrame:
         """One row a variant: how many of its calls share their reply with the baseline."""
-        return load(SHARED, self.db)
+        return self._read(SHARED)
+
+    def _read(self, sql: str) -> pd.DataFrame:
+        return load_each({"rows": sql}, self.db)["rows"]
 
 
 def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.DataFrame:
@@ -137,13 +146,19 @@ def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.Data
 def _human_group(trials: pd.DataFrame) -> Group:
     if len(trials):
         return Group(HUMAN, "", str(trials["spec_hash"].iloc[0]), trials)
+    return _published_group()
+
+
+@cache
+def _published_group() -> Group:
+    """One object for all studies: what is computed from it is computed once."""
     return Group(HUMAN, "", None, human_outcomes(), measured=False)
 
 
-def _tasks(db: Path) -> dict[str, str]:
+def _tasks(specs: pd.DataFrame) -> dict[str, str]:
     """Spec hash to a hash of what it covers beside the prompt: equal for variants of one study."""
     tasks = {}
-    for row in load("SELECT spec_hash, spec FROM specs", db).itertuples():
+    for row in specs.itertuples():
         spec = json.loads(row.spec)
         spec.pop("prompt_blocks", None)
         text = json.dumps(spec, sort_keys=True)

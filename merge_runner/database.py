@@ -65,12 +65,22 @@ def open_database(
     connection, name = _attached(path, read_only, patience_s, instance)
     try:
         yield connection
-        connection.execute(f"USE memory; DETACH {name}")
     except BaseException:
         instance.drop()
         raise
+    else:
+        _detach(connection, name, instance)
     finally:
         connection.close()
+
+
+def _detach(connection: duckdb.DuckDBPyConnection, name: str, instance: Instance) -> None:
+    try:
+        connection.execute(f"USE memory; DETACH {name}")
+    except duckdb.Error as exc:
+        # What was committed lies in the log beside the file; there is no room to move it over.
+        LOG.warning("the database was not closed in order: %s", first_line(exc))
+        instance.drop()
 
 
 def _attached(

@@ -3,25 +3,54 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from harness import PROGRAM, Run, environment
 from hypothesis import settings
+from zygote import Zygote
 
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)
 settings.load_profile("gate")
 
 
+@pytest.fixture(scope="session")
+def zygote():
+    """What the program is forked from."""
+    with Zygote() as forking:
+        yield forking
+
+
+@pytest.fixture(scope="session")
+def emulator_url():
+    """An emulator without faults, for all tests that need no other."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "merge_runner", "emulate", "--port", "0", "--until-stdin-closes"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=environment(),
+        text=True,
+    )
+    yield process.stdout.readline().strip() + "/v1"
+    process.stdin.close()
+    process.wait()
+
+
 @pytest.fixture
-def merge_runner(tmp_path):
-    """Runs ``merge-runner`` in an empty folder."""
+def merge_runner(tmp_path, zygote, emulator_url):
+    """Runs ``merge-runner`` in an empty folder, beside an emulator.
+
+    With ``EMULATOR_BASE_URL=""``, or with faults, a sweep starts an emulator of its own.
+    """
 
     async def run(*arguments: object, cwd: Path = tmp_path, **changes: str) -> Run:
-        process = await start(*arguments, cwd=cwd, **changes)
-        out, err = await process.communicate()
-        return Run(process.returncode, out.decode(), err.decode())
+        own = any(str(argument).startswith("--fault") for argument in arguments)
+        url = {} if own else {"EMULATOR_BASE_URL": emulator_url}
+        env = environment(**{**url, **changes})
+        return Run(*await zygote.run(arguments, cwd=cwd, env=env))
 
     async def start(*arguments: object, cwd: Path = tmp_path, **changes: str):
         return await asyncio.create_subprocess_exec(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import struct
 import zipfile
 import zlib
@@ -66,7 +67,7 @@ def open_files(path: Path) -> Iterator[list[File]]:
         _refuse_paths_outside(path, archive.infolist())
         yield [
             File(
-                member.filename.replace("\\", "/"),
+                _shown(member.filename.replace("\\", "/")),
                 member.file_size,
                 member.compress_size,
                 _reader(archive, member),
@@ -100,10 +101,18 @@ def _files_below(folder: Path) -> Iterator[File]:
         for name in names:
             path = Path(parent, name)
             size = path.stat().st_size if path.is_file() else 0
-            yield File(str(path.relative_to(folder)), size, size, partial(_read_file, path))
+            shown = _shown(str(path.relative_to(folder)))
+            yield File(shown, size, size, partial(_read_file, path))
+
+
+def _shown(name: str) -> str:
+    """A name as it may be printed: whoever made the download chose its characters."""
+    return "".join(character if character.isprintable() else "?" for character in name)
 
 
 def _read_file(path: Path) -> bytes:
+    if path.exists() and not path.is_file():
+        raise Unreadable("it is no regular file")  # a device or a pipe may never end
     try:
         return path.read_bytes()
     except OSError as exc:
@@ -125,6 +134,8 @@ def _reader(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Callable[[], b
     def read() -> bytes:
         if member.flag_bits & ENCRYPTED:
             raise Unreadable("it is encrypted: unpack the zip and import the folder")
+        if stat.S_ISLNK(member.external_attr >> 16):
+            raise Unreadable("it is a link and no file")
         # Only these two unpack no more bytes than asked for.
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise Unreadable("its compression is not deflate: unpack the zip, import the folder")

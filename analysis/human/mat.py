@@ -10,8 +10,10 @@ import struct
 import zlib
 from collections.abc import Iterator
 
-from analysis.human.archive import MAX_FILE_BYTES, Unreadable
+from analysis.human.archive import Unreadable
 
+# A recording has 0.2 MB. What is read becomes Python numbers, up to 32 times as large.
+MAX_BYTES = 16 * 2**20
 HEADER_BYTES = 128
 VERSION_5 = b"\x00\x01IM"
 MATRIX, COMPRESSED = 14, 15
@@ -28,6 +30,8 @@ def read_mat(content: bytes) -> dict[str, list[float | str]]:
     """
     if content[HEADER_BYTES - 4 : HEADER_BYTES] != VERSION_5:
         raise Unreadable("it is no MAT file of version 5")
+    if len(content) > MAX_BYTES:
+        raise Unreadable(f"it has {len(content)} bytes, far too large for a recording")
     try:
         elements = _unpacked_elements(memoryview(content)[HEADER_BYTES:])
         return dict(_variable(data) for kind, data in elements if kind == MATRIX)
@@ -36,9 +40,12 @@ def read_mat(content: bytes) -> dict[str, list[float | str]]:
 
 
 def _unpacked_elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+    left = MAX_BYTES
     for kind, content in _elements(data):
         if kind == COMPRESSED:
-            yield from _elements(_unpacked(content))
+            unpacked = _unpacked(content, left)
+            left -= len(unpacked)
+            yield from _elements(unpacked)
         else:
             yield kind, content
 
@@ -58,10 +65,10 @@ def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         data = data[start + size + padding :]
 
 
-def _unpacked(data: memoryview) -> memoryview:
+def _unpacked(data: memoryview, most_bytes: int) -> memoryview:
     unpacking = zlib.decompressobj()
-    content = unpacking.decompress(data, MAX_FILE_BYTES)
-    if not unpacking.eof:
+    content = unpacking.decompress(data, most_bytes + 1)  # 0 would be no limit
+    if not unpacking.eof or len(content) > most_bytes:
         raise ValueError("an element is cut off or far too large")
     return memoryview(content)
 

@@ -8,8 +8,10 @@ import pandas as pd
 
 from analysis.study import Study
 from analysis.tables.ablations import ablation_qualitative, ablation_quantitative
+from analysis.tables.attempts import attempts
 from analysis.tables.conflicts import conflict_resolution, criticality
 from analysis.tables.contrasts import contrasts
+from analysis.tables.fallbacks import fallbacks
 from analysis.tables.formats import value_rows
 from analysis.tables.indicators import indicators
 from analysis.tables.model import Table
@@ -31,6 +33,8 @@ TABLES: dict[str, Callable[[Study], Table]] = {
     "criticality": criticality,
     "speed-windows": speed_windows,
     "robustness": robustness,
+    "attempts": attempts,
+    "fallbacks": fallbacks,
 }
 
 

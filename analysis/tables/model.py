@@ -17,6 +17,7 @@ class Column:
 
     ``meaning`` says in words what stands in it, and ``counts`` is the SQL predicate of the
     trials that its values rest on. A value may be missing without a note where ``optional``.
+    ``within`` narrows the trials of its rows, also of those that name their own.
     """
 
     name: str
@@ -26,6 +27,7 @@ class Column:
     meaning: str = ""
     counts: str = "status = 'finished'"
     optional: bool = False
+    within: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cache
 
 from analysis.ceiling import DATA_SETS, SEED
 from analysis.human.counts import findings, human_counts
@@ -28,18 +29,19 @@ def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
     return [*notes, *(f"{driver} is a scripted stand-in, no language model" for driver in scripted)]
 
 
-def _human_notes(study: Study) -> list[str]:
+@cache
+def _human_notes(study: Study) -> tuple[str, ...]:
     if not study.human.measured:
-        return [
+        return (
             "human: the published outcomes of 990 trials; for the rest `merge-runner human import "
-            f"PATH` reads the recordings (doi {HUMAN_DOI})"
-        ]
+            f"PATH` reads the recordings (doi {HUMAN_DOI})",
+        )
     pairs = study.human.trials["pair"].nunique()
-    return [
+    return (
         *(f"human: {finding}" for finding in findings(human_counts(study.db))),
         f"human: intervals and tests take the trials as independent, but they come from {pairs} "
         "pairs who differ: they are too narrow",
-    ]
+    )
 
 
 def ceiling_notes(study: Study) -> list[str]:

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from merge_runner.config import Scenario
 from merge_runner.records import (
     SIDES,
+    Attempt,
+    ChatReply,
+    ChatRequest,
     Decision,
     DecisionRow,
+    FailedCall,
+    Side,
+    Slot,
     TrialRecord,
     TrialSpec,
 )
@@ -21,11 +29,30 @@ from merge_runner.simulator.world import World
 from merge_runner.store import Store, SweepRow
 
 SCENARIO = Scenario()
+ANSWERS = ("ok", "refusal", "truncated", "empty")
+
+
+@dataclass(frozen=True)
+class Said:
+    """What became of the left driver's call: the outcomes of its attempts, the answer's last.
+
+    With a ``failure`` the answer holds no plan, and with ``lost`` there is no answer; what is
+    driven is the same. ``served`` is the model that answered.
+    """
+
+    outcomes: tuple[str, ...] = ("ok",)
+    failure: str | None = None
+    lost: bool = False
+    served: str | None = None
 
 
 @dataclass(frozen=True)
 class Drive:
-    """One trial: its cell, and the normalised action of either driver in every second."""
+    """One trial: its cell, and the normalised action of either driver in every second.
+
+    ``said`` holds what was said at which decision, elsewhere the call was answered at once; None:
+    no model was asked.
+    """
 
     driver: str
     variant: str
@@ -33,14 +60,16 @@ class Drive:
     rep: int
     left: tuple[float, ...]
     right: tuple[float, ...]
+    said: Mapping[int, Said] | None = None
 
 
 def played(drive: Drive, scenario: Scenario = SCENARIO) -> TrialRecord:
     """Play a trial; after the last given second the drivers keep their speed."""
     world = World(scenario, CONDITIONS[drive.condition])
-    decisions = []
+    decisions: list[DecisionRow] = []
+    lost: list[FailedCall] = []
     number = 0
-    while world.status is None:
+    while world.status is None and not lost:
         plans = {
             side: tuple(
                 actions[number + later] if number + later < len(actions) else 0.0
@@ -49,12 +78,14 @@ def played(drive: Drive, scenario: Scenario = SCENARIO) -> TrialRecord:
             )
             for side, actions in (("left", drive.left), ("right", drive.right))
         }
-        decisions += [
-            DecisionRow(number, world.time_s, side, Decision(plans[side], plans[side][:5]))
-            for side in SIDES
-        ]
+        for side in SIDES:
+            found = answered(drive, side, number, Decision(plans[side], plans[side][:5]))
+            if isinstance(found, FailedCall):
+                lost.append(found)
+            else:
+                decisions.append(DecisionRow(number, world.time_s, side, found))
         for index in range(5):
-            if world.status is None:
+            if world.status is None and not lost:
                 world.advance({side: plans[side][index] for side in SIDES})
         number += 1
     return TrialRecord(
@@ -70,18 +101,50 @@ def played(drive: Drive, scenario: Scenario = SCENARIO) -> TrialRecord:
             sample_set=0,
             order=0,
         ),
-        status=world.status,
-        merged_first=world.merged_first(),
+        status="failed" if lost else world.status,
+        merged_first=None if lost else world.merged_first(),
         end_time_s=world.time_s,
-        error=None,
+        error="no answer after 2 attempts" if lost else None,
         states=world.states(),
         decisions=tuple(decisions),
+        failed_calls=tuple(lost),
     )
 
 
-def write_study(path: Path, drives: Iterable[Drive], scenario: Scenario = SCENARIO) -> Path:
-    """Write the trials of a sweep into a new database."""
+def answered(drive: Drive, side: Side, number: int, decision: Decision) -> Decision | FailedCall:
+    """The decision with its call, as this was answered; a call without an answer has failed."""
+    if drive.said is None:
+        return decision
+    said = drive.said.get(number, Said()) if side == "left" else Said()
+    slot = Slot(drive.condition, drive.rep, side, number, 0)
+    key = f"{drive.driver}/{drive.variant}/{drive.condition}/{drive.rep}/{side}/{number}"
+    request = ChatRequest(key, "openai", "openai", drive.driver, "/chat", {}, "{}", slot)
+    attempts = tuple(
+        Attempt(
+            index,
+            outcome,
+            model_served=(said.served or drive.driver) if outcome in ANSWERS else None,
+            cost_usd=None if outcome == "unknown" else 0.01,
+        )
+        for index, outcome in enumerate(said.outcomes, 1)
+    )
+    if said.lost:
+        return FailedCall(number, side, request, attempts)
+    return replace(
+        decision,
+        plan=None if said.failure else decision.plan,
+        failure=said.failure,
+        fallback=said.failure is not None,
+        reply=ChatReply("", said.outcomes[-1], request, attempts, earlier=0),
+    )
+
+
+def write_study(
+    path: Path, drives: Iterable[Drive], scenario: Scenario = SCENARIO, config: object = None
+) -> Path:
+    """Write the trials of a sweep, which was configured so, into a new database."""
     records = [played(drive, scenario) for drive in drives]
+    path.write_bytes(_empty())
     store = Store(path)
     specs = {
         record.spec.spec_hash: json.dumps({"scenario": scenario.model_dump()}) for record in records
@@ -90,7 +153,7 @@ def write_study(path: Path, drives: Iterable[Drive], scenario: Scenario = SCENAR
         "sweep-1",
         "test",
         datetime(2026, 11, 21, tzinfo=UTC).replace(tzinfo=None),
-        "{}",
+        json.dumps(config or {}),
         None,
         None,
         "{}",
@@ -98,6 +161,15 @@ def write_study(path: Path, drives: Iterable[Drive], scenario: Scenario = SCENAR
     store.begin_sweep(sweep, specs, [])
     store.write("sweep-1", records, patience_s=5)
     return path
+
+
+@cache
+def _empty() -> bytes:
+    """A database without a row: making one takes longer than writing a study."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "empty.duckdb"
+        Store(path)
+        return path.read_bytes()
 
 
 def yielding(driver: str, variant: str = "baseline", reps: int = 3) -> list[Drive]:

@@ -18,6 +18,8 @@ from analysis.verdicts import population, score, thresholds
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.store import Store
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory):

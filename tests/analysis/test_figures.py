@@ -17,29 +17,37 @@ from merge_runner.errors import UsageError
 from merge_runner.simulator.conditions import CONDITIONS
 
 
-def test_equal_results_give_equal_files(tmp_path):
-    db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1))
-    one, other = Study(db), Study(db)
-    for form in ("pdf", "png"):  # the report's test has the SVG
-        assert rendered(one, "figure2", form) == rendered(other, "figure2", form)
+@pytest.fixture(scope="module")
+def written(small, tmp_path_factory):
+    """A folder with all figures."""
+    folder = tmp_path_factory.mktemp("figures")
+    list(write_figures(small, folder))
+    return folder
 
 
-def test_figures_are_written_as_vector_pdf_and_as_png_of_page_width(tmp_path):
-    study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
-    paths = list(write_figures(study, tmp_path / "figures"))
-    assert {p.name for p in paths} == {f"{n}.{e}" for n in FIGURES for e in ("pdf", "png")}
-    pdf = (tmp_path / "figures/figure2.pdf").read_bytes()
+def test_equal_results_give_equal_files(small, written):
+    again = Study(small.db)
+    for name, form in (("figure2", "pdf"), ("distributions", "png")):
+        assert rendered(again, name, form) == (written / f"{name}.{form}").read_bytes()
+    assert rendered(again, "figure2", "svg") == rendered(small, "figure2", "svg")
+
+
+def test_figures_are_written_as_vector_pdf_and_as_png_of_page_width(written):
+    assert {p.name for p in written.iterdir()} == {
+        f"{n}.{e}" for n in FIGURES for e in ("pdf", "png")
+    }
+    pdf = (written / "figure2.pdf").read_bytes()
     box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", pdf)
     assert float(box[1]) == pytest.approx(72 * PAGE_IN, abs=0.5)
     assert b"/Type /Font" in pdf, "text stays text"
-    width, _ = struct.unpack(">II", (tmp_path / "figures/figure2.png").read_bytes()[16:24])
+    width, _ = struct.unpack(">II", (written / "figure2.png").read_bytes()[16:24])
     assert width == round(300 * PAGE_IN)
 
 
-def test_a_folder_that_cannot_be_made_is_said(study, tmp_path):
+def test_a_folder_that_cannot_be_made_is_said(small, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="cannot be made"):
-        list(write_figures(study, tmp_path / "file"))
+        list(write_figures(small, tmp_path / "file"))
 
 
 def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(study):
@@ -101,6 +109,7 @@ def test_before_an_import_the_figure_says_what_is_missing_and_draws_the_publishe
     assert heights[4] == pytest.approx(3.54 + 4 * 0.17)
 
 
+@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     "drives",
     [

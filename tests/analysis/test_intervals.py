@@ -18,11 +18,12 @@ VALUES = st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=30)
 
 @pytest.mark.parametrize("n", [1, 2, 7, 110, 962, 990])
 def test_a_proportion_has_the_wilson_interval(n):
-    for successes in range(n + 1):
-        found = proportion(successes, n)
-        interval = proportion_confint(successes, n, alpha=0.05, method="wilson")
-        assert (found.low, found.high) == pytest.approx(interval, abs=1e-12)
-        assert (found.value, found.n) == (successes / n, n)
+    successes = np.arange(n + 1)
+    found = [proportion(int(count), n) for count in successes]
+    intervals = proportion_confint(successes, n, alpha=0.05, method="wilson")
+    for bounds, expected in zip(("low", "high"), intervals, strict=True):
+        assert [getattr(f, bounds) for f in found] == pytest.approx(list(expected), abs=1e-12)
+    assert [(f.value, f.n) for f in found] == [(count / n, n) for count in successes]
 
 
 def test_28_of_990_lie_between_1_96_and_4_06_percent():

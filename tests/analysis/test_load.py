@@ -9,10 +9,8 @@ import analysis
 from analysis import Study, load_trials, table
 
 
-async def test_a_notebook_gets_one_row_a_trial_with_its_metrics(merge_runner, tmp_path):
-    assert (
-        await merge_runner("sweep", "baseline", "--model", "projected-order", "--reps", 1)
-    ).code == 0
+def test_a_notebook_gets_one_row_a_trial_with_its_metrics(in_process, tmp_path):
+    assert in_process("sweep", "baseline", "--model", "projected-order", "--reps", 1) == 0
     frame = load_trials(tmp_path / "results/merge.duckdb")
     assert len(frame) == 11
     assert frame["gap_m"].between(0, 30).all()

@@ -80,9 +80,16 @@ def rmse(trace, condition, until_s):
 
 def overlap_bounds(at_m):
     """Between which positions the other vehicle overlaps one that stands at ``at_m``."""
-    grid = np.arange(80, 160, 0.0005)
-    inside = [x for x in grid if abs(x - at_m) < 6 and rectangles_overlap(at_m, x, 4.5, 1.8)]
-    return min(inside), max(inside)
+
+    def edge(outside):
+        inside = at_m
+        for _ in range(40):
+            middle = (inside + outside) / 2
+            overlaps = rectangles_overlap(at_m, middle, 4.5, 1.8)
+            inside, outside = (middle, outside) if overlaps else (inside, middle)
+        return inside
+
+    return edge(at_m - 6), edge(at_m + 6)
 
 
 BOUNDS = {at_m: overlap_bounds(at_m) for at_m in (90.6066, 100.0, 150.0)}

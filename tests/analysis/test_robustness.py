@@ -15,7 +15,11 @@ from merge_runner.records import StateRow, TrialRecord, TrialSpec
 from merge_runner.store import Store
 
 KEY = ["trial_id", "spec_hash"]
-OWN_EXIT = "[repetitions]\nbaseline = 1\n[scenario]\ncontrol_start = 'own_exit'\n"
+OWN_EXIT = """
+conditions = ["R_-4_-8", "N_0_0", "L_0_-8"]
+repetitions = {baseline = 1}
+scenario = {control_start = "own_exit"}
+"""
 CRUISE = [0.0] * 5  # a decision's actions
 
 
@@ -45,31 +49,27 @@ def test_the_rules_are_those_of_the_scenario():
     assert RULES == ("euclid2d", "rectangle", "shared_lane")
 
 
-async def test_a_sweeps_trials_have_their_stored_outcomes_under_their_own_rule(
-    merge_runner, tmp_path
-):
-    run = await merge_runner("replay", "baseline", "--recording", RECORDING, "--reps", 2)
-    assert run.code == 0, run.err
+def test_a_sweeps_trials_have_their_stored_outcomes_under_their_own_rule(in_process, tmp_path):
+    assert in_process("replay", "baseline", "--recording", RECORDING, "--reps", 1) == 0
     db = tmp_path / "results/merge.duckdb"
     trials = load_trials(db)
-    assert len(trials) == 22
+    assert len(trials) == 11
     found = by_rule(outcomes(db, trials))
     assert same(found["euclid2d"], trials)
     # Where nothing collided the recorded positions tell what a shared lane makes of it.
     pairs = load("SELECT *, greatest(left_m, right_m) AS first_m FROM vehicle_pairs", db)
     close = pairs[(pairs["first_m"] >= 100) & ((pairs["left_m"] - pairs["right_m"]).abs() < 4.5)]
     finished = trials["status"] == "finished"
-    assert finished.sum() > 10
+    assert finished.sum() > 5
     shared = trials["status"].mask(trials["trial_id"].isin(close["trial_id"]), "collided")
     expected = trials.assign(status=shared)
     assert same(found["shared_lane"][finished], expected[finished])
 
 
-async def test_constant_drivers_collide_under_every_rule_and_failed_trials_are_left_out(
-    merge_runner, tmp_path
+def test_constant_drivers_collide_under_every_rule_and_failed_trials_are_left_out(
+    in_process, tmp_path
 ):
-    run = await merge_runner("sweep", "baseline", "--model", "constant", "--reps", 1)
-    assert run.code == 0, run.err
+    assert in_process("sweep", "baseline", "--model", "constant", "--reps", 1) == 0
     db = tmp_path / "results/merge.duckdb"
     trials = load_trials(db)
     assert set(trials["status"]) == {"collided"}
@@ -79,11 +79,10 @@ async def test_constant_drivers_collide_under_every_rule_and_failed_trials_are_l
     assert set(outcomes(db, failed)["trial_id"]) == set(trials["trial_id"][1:])
 
 
-async def test_a_vehicle_that_came_out_later_cruised_before(merge_runner, tmp_path):
+def test_a_vehicle_that_came_out_later_cruised_before(in_process, tmp_path):
     """Under own_exit the drivers' first decisions lie apart."""
     (tmp_path / "own.toml").write_text(OWN_EXIT)
-    run = await merge_runner("sweep", "own.toml", "--model", "projected-order")
-    assert run.code == 0, run.err
+    assert in_process("sweep", "own.toml", "--model", "projected-order") == 0
     db = tmp_path / "results/merge.duckdb"
     starts = load("SELECT min(time_s) AS first_s FROM decisions GROUP BY trial_id, side", db)
     assert starts["first_s"].max() > 0

@@ -13,6 +13,7 @@ SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "
 # o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and no trial
 # can cost more than 3.4 USD (2 x 12 prompts, 16,000 tokens of output each).
 ROOM_FOR_SOME = 3.9
+FAST = ("--rpm", 10**6, "--tpm", 10**9)
 
 
 def account(server):
@@ -43,7 +44,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
     bill = Bill()
     async with watched(bill.middle) as server:
         env = account(server)
-        sweep = (*SWEEP, "--reps", 6, "--yes", "--rpm", 100_000, "--tpm", 10**9)
+        sweep = (*SWEEP, "--reps", 6, "--yes", *FAST)
         run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)
         assert run.code == 3, run.err
         assert 0 < bill.usd <= ROOM_FOR_SOME
@@ -87,7 +88,7 @@ async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(m
         return web.json_response(body)
 
     async with watched(middle) as server:
-        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", "--tpm", 10**9)
+        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
         env = account(server)
         run = await merge_runner(*sweep, "--max-cost", 3.5, **env)
         assert run.code == 3, run.err
@@ -132,10 +133,10 @@ async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(me
 async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner):
     async with watched() as server:
         env = account(server)
-        sweep = (*SWEEP, "--reps", 1, "--tpm", 10**9)
+        sweep = (*SWEEP, "--reps", 1, *FAST)
         assert (await merge_runner(*sweep, "--dry-run", **env)).summary["measured"] == []
         first = await merge_runner(*sweep, "--yes", **env)
-        more = (*SWEEP, "--reps", 2, "--tpm", 10**9)
+        more = (*SWEEP, "--reps", 2, *FAST)
         dry = (await merge_runner(*more, "--dry-run", **env)).summary
         assert dry["trials"] == 3
         assert dry["calls"] == 3 * 21
@@ -145,7 +146,8 @@ async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_r
         second = await merge_runner(*more, "--yes", **env)
         assert second.summary["calls"]["live"] == server.requests - first.summary["calls"]["live"]
         assert second.summary["estimate"]["calls"] == dry["calls"]
-        text = await merge_runner(*more[:-5], "--reps", 3, "--yes", **env)
+        words = [word for word in SWEEP if word != "--json"]
+        text = await merge_runner(*words, "--reps", 3, "--yes", *FAST, **env)
         assert "estimated before: " in text.out
         replay = await merge_runner("replay", *SWEEP[1:], "--reps", 2, "--db", "other", **env)
     assert replay.summary["cost_usd"] == 0

@@ -1,0 +1,139 @@
+"""What became of the calls: retried, lost, answered without a plan, driven from an older one."""
+
+from __future__ import annotations
+
+from analysis.provenance import ANSWERS, Tally, tally
+from analysis.study import Group, Study
+from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.notes import sample_notes
+
+NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
+FALLBACK = (
+    "trials.trial_id IN (SELECT trial_id FROM decisions "
+    "WHERE decisions.spec_hash = trials.spec_hash AND fallback)"
+)
+
+
+def attempts(study: Study) -> Table:
+    """One row a driver and variant: trials, calls, attempts, and what went wrong with them."""
+    found = {group.id: tally(study, group) for group in study.models}
+    reasons = dict.fromkeys(
+        reason for one in found.values() for reason in sorted(one.failures) if reason not in ANSWERS
+    )
+    return Table(
+        "attempts",
+        "What became of the calls",
+        _columns(study, tuple(reasons)),
+        [_row(group, found[group.id], tuple(reasons)) for group in study.models],
+        (
+            "a call is asked at one decision, in one or more attempts; retried: another attempt "
+            "followed, of all attempts; lost: the call ended without an answer, and its trial "
+            "failed, of all calls; refused, truncated, empty and invalid: of the answers; "
+            "fallback: an older plan was driven, or none, of all decisions",
+            "unknown: attempts that were under way when a run was killed, whose reply nobody saw; "
+            "other model: answers of another model than the one asked for, by no declared alias",
+            *sample_notes(study, study.models),
+        ),
+    )
+
+
+def _columns(study: Study, reasons: tuple[str, ...]) -> list[Column]:
+    headings = {"refusal": "refused"}
+    parts = [
+        _count("trials", "all trials, also those that failed", "true"),
+        _count("failed", "trials that failed", "status = 'failed'"),
+        _count("calls", "decisions at which a model was asked", _with("true")),
+        _count("attempts", "HTTP attempts at these calls", _with("true")),
+        *_rated("retried", "attempts that were followed by another", _with("fate = 'retried'")),
+        *_rated("lost", "calls that ended without an answer", _with("fate = 'lost'")),
+    ]
+    for reason in ANSWERS:
+        name = headings.get(reason, reason)
+        parts += _rated(name, f"answers that are {name}, without a plan", _failed(reason))
+    parts += [
+        _count(reason, f"answers without a valid plan: {reason}", _failed(reason))
+        for reason in reasons
+    ]
+    return [
+        Column("driver", "driver"),
+        Column("setting", "setting"),
+        *parts,
+        *_rated(
+            "invalid",
+            "answers without a valid plan, for any reason",
+            _with("fate IN ('driven', 'fallback') AND failure IS NOT NULL"),
+        ),
+        *_rated("fallback", "decisions driven from an older plan, or from none", FALLBACK),
+        _count("unknown", "attempts of unknown fate", _with("outcome = 'unknown'")),
+        _count("other_model", "answers of another model", _other_model(study)),
+    ]
+
+
+def _count(name: str, meaning: str, counts: str) -> Column:
+    return Column(name, name.replace("_", " "), "count", 0, meaning, counts)
+
+
+def _rated(name: str, meaning: str, counts: str) -> tuple[Column, Column]:
+    """A number and its share."""
+    return (
+        _count(name, meaning, counts),
+        Column(f"{name}_percent", "(%)", "percent", 2, f"share of {meaning}", counts),
+    )
+
+
+def _with(what: str) -> str:
+    """The predicate of trials with attempts of which this holds."""
+    return (
+        "trials.trial_id IN (SELECT trial_id FROM attempts "  # noqa: S608 # ours
+        f"WHERE attempts.spec_hash = trials.spec_hash AND {what})"
+    )
+
+
+def _failed(reason: str) -> str:
+    return _with(f"fate IN ('driven', 'fallback') AND failure = {_quoted(reason)}")
+
+
+def _other_model(study: Study) -> str:
+    declared = "".join(
+        f" AND NOT (model_requested = {_quoted(asked)} AND model_served = {_quoted(alias)})"
+        for asked, alias in sorted(study.calls.aliases)
+    )
+    return _with(f"fate IN ('driven', 'fallback') AND model_served <> model_requested{declared}")
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
+
+
+def _row(group: Group, found: Tally, reasons: tuple[str, ...]) -> Row:
+    values: dict[str, Value] = {
+        "driver": group.driver,
+        "setting": group.setting,
+        "trials": found.trials,
+        "failed": found.failed,
+        "calls": found.calls,
+        "attempts": found.attempts,
+        **_share("retried", found.retried, found.attempts),
+        **_share("lost", found.lost, found.calls),
+        **_share("refused", found.failures["refusal"], found.answers),
+        **_share("truncated", found.failures["truncated"], found.answers),
+        **_share("empty", found.failures["empty"], found.answers),
+        **{reason: found.failures[reason] for reason in reasons},
+        **_share("invalid", found.invalid, found.answers),
+        **_share("fallback", found.fallbacks, found.decisions),
+        "unknown": found.unknown,
+        "other_model": found.others,
+    }
+    return Row(group.id, (group.id,), values, _note(found))
+
+
+def _share(name: str, count: int, of: int) -> dict[str, Value]:
+    return {name: count, f"{name}_percent": 100 * count / of if of else None}
+
+
+def _note(found: Tally) -> str:
+    if not found.calls:
+        return NO_CALLS if found.decisions else f"{NO_CALLS}; no decision is stored"
+    if not found.answers:
+        return "no call was answered" + ("" if found.decisions else ", and no decision made")
+    return ""

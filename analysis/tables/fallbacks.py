@@ -1,0 +1,181 @@
+"""Whether failures bias the results: outcomes with and without the trials that had a fallback."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from analysis.indicators import INDICATORS, TESTED, Verdict, paper_verdicts, robust_verdicts
+from analysis.intervals import Estimate
+from analysis.measures import LEFT_FIRST, MEASURES, Measure, estimate
+from analysis.study import Group, Study, of_group
+from analysis.tables.attempts import FALLBACK
+from analysis.tables.indicators import RULES
+from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.notes import sample_notes
+from analysis.verdicts import Fits, fits
+
+COLLISIONS, *OTHERS = MEASURES
+COMPARED = (COLLISIONS, LEFT_FIRST, *OTHERS)
+GAP = MEASURES[1]
+# What an indicator's regression is fitted to.
+FITTED = {"I1": LEFT_FIRST, "I2": LEFT_FIRST, "I3": GAP, "I4": GAP}
+# The two sides: name, suffix of the columns, predicate of the trials.
+ALL = ("all", "", "")
+KEPT = ("without", "_without", f"NOT {FALLBACK}")
+
+
+def fallbacks(study: Study) -> Table:
+    """One row a group and measure, and one a group and indicator: all trials, and those without."""
+    rows = [row for group in study.models for row in _rows(study, group)]
+    return Table(
+        "fallbacks",
+        "Outcomes with and without the trials that had a fallback",
+        (
+            Column("driver", "driver"),
+            Column("setting", "setting"),
+            Column("measure", "measure"),
+            *_numbers(*ALL),
+            *_numbers(*KEPT),
+            Column("difference", "difference", "number", 2, "without minus all", optional=True),
+            _verdict("paper", "paper's rule", *ALL),
+            _verdict("paper", "paper's rule", *KEPT),
+            _verdict("robust", "robust", *ALL),
+            _verdict("robust", "robust", *KEPT),
+            Column("differ", "", meaning="where a verdict changes", optional=True),
+        ),
+        rows,
+        (
+            "all: every trial; without: those in which every decision was driven from its own "
+            "answer. Intervals: Wilson for rates, Student's t for means. Where the two are far "
+            "apart, failed answers bias the result",
+            RULES,
+            *(f"{name}: {INDICATORS[name]}" for name in TESTED),
+            *([] if rows else ["there is no trial of a driver to compare"]),
+            *sample_notes(study, study.models),
+        ),
+    )
+
+
+def _numbers(name: str, suffix: str, within: str) -> tuple[Column, ...]:
+    return (
+        Column(f"n{suffix}", f"n {name}", "count", 0, f"trials that count, {name}", within=within),
+        Column(name, name, "number", 2, f"the measure, {name}", optional=True, within=within),
+        Column(
+            f"ci{suffix}",
+            "95 % CI",
+            "interval",
+            2,
+            f"Wilson or t, {name}",
+            optional=True,
+            within=within,
+        ),
+    )
+
+
+def _verdict(rule: str, heading: str, name: str, suffix: str, within: str) -> Column:
+    return Column(
+        f"{rule}{suffix}",
+        f"{heading}, {name}",
+        "verdict",
+        meaning=f"whether the indicator holds, {heading}, {name}",
+        optional=True,
+        within=within,
+    )
+
+
+def _rows(study: Study, group: Group) -> list[Row]:
+    kept = without_fallbacks(study, group)
+    why = _why(group, kept)
+    return [
+        *(_measure_row(group, kept, measure, why) for measure in COMPARED),
+        *(_verdict_row(group, kept, name, why) for name in TESTED),
+    ]
+
+
+def without_fallbacks(study: Study, group: Group) -> Group:
+    """The group with only those trials that had no fallback; itself where none had."""
+    own = of_group(study.calls.decisions, group, group.trials)
+    had = set(own.loc[own["fallback"], "trial_id"])
+    if not had:
+        return group
+    return replace(group, trials=group.trials[~group.trials["trial_id"].isin(had)])
+
+
+def _why(group: Group, kept: Group) -> str:
+    """What a reader should know of the comparison, where it is none."""
+    if group.ended.empty:
+        return "no trial ended"
+    if len(kept.ended) == len(group.ended):
+        whose = "no trial had" if kept is group else "no trial that ended had"
+        return f"{whose} a fallback: nothing differs"
+    if kept.ended.empty:
+        return "every trial had a fallback: nothing is left without"
+    return ""
+
+
+def _measure_row(group: Group, kept: Group, measure: Measure, why: str) -> Row:
+    found, without = estimate(group, measure), estimate(kept, measure)
+    values: dict[str, Value] = {
+        **_keys(group, measure.heading),
+        **_estimated(found, "all", ""),
+        **_estimated(without, "without", "_without"),
+    }
+    if found.value is not None and without.value is not None:
+        values["difference"] = without.value - found.value
+    missing = found.value is None or (without.value is None and not why)
+    nothing = f"{measure.heading}: no trial with this measure" if missing else ""
+    return Row(
+        f"{group.id}/{measure.name}",
+        (group.id,),
+        values,
+        "; ".join(filter(None, (why, nothing))),
+        measure.counts,
+    )
+
+
+def _estimated(found: Estimate, name: str, suffix: str) -> dict[str, Value]:
+    interval = None if found.low is None or found.high is None else (found.low, found.high)
+    return {f"n{suffix}": found.n, name: found.value, f"ci{suffix}": interval}
+
+
+def _verdict_row(group: Group, kept: Group, name: str, why: str) -> Row:
+    found, without = _judged(fits(group), name), _judged(fits(kept), name)
+    changed = any(
+        None not in {one.passed, other.passed} and one.passed != other.passed
+        for one, other in zip(found, without, strict=True)
+    )
+    sides = (("", found), *(() if why else ((" without", without),)))
+    reasons = dict.fromkeys(
+        f"{name}{side}: {verdict.why}"
+        for side, verdicts in sides
+        for verdict in verdicts
+        if verdict.why
+    )
+    return Row(
+        f"{group.id}/{name}",
+        (group.id,),
+        {
+            **_keys(group, name),
+            "n": estimate(group, FITTED[name]).n,
+            "paper": found[0].passed,
+            "robust": found[1].passed,
+            "n_without": estimate(kept, FITTED[name]).n,
+            "paper_without": without[0].passed,
+            "robust_without": without[1].passed,
+            "differ": "≠" if changed else None,
+        },
+        "; ".join(filter(None, (why, *reasons))),
+        FITTED[name].counts,
+    )
+
+
+def _judged(found: Fits, name: str) -> tuple[Verdict, Verdict]:
+    """An indicator by the paper's rule and by the robust one."""
+    return (
+        paper_verdicts(found.logit, found.ols)[name],
+        robust_verdicts(found.firth, found.hc3)[name],
+    )
+
+
+def _keys(group: Group, measure: str) -> dict[str, Value]:
+    return {"driver": group.driver, "setting": group.setting, "measure": measure}
