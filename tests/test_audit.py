@@ -522,8 +522,10 @@ async def test_a_proxy_that_caches_is_found_in_repetitions_and_in_a_fresh_set_of
         part = ("sweep", "baseline", "--conditions", "L_4_8", "--reps")
         assert (await merge_runner(*part, 1, **env)).code == 0
         assert audit("--db", tmp_path / "results/merge.duckdb").code == 0
-        assert (await merge_runner(*part, 2, **env)).code == 0
-        assert (await merge_runner(*part, 1, "--sample-set", 1, **env)).code == 0
+        for more in ((2,), (1, "--sample-set", 1)):
+            run = await merge_runner(*part, *more, **env)
+            assert run.code == 1, "the sweep itself finds it at its end"
+            assert "faults, see `merge-runner audit`" in run.err
     found = audit("--db", tmp_path / "results/merge.duckdb")
     assert found.code == 1
     assert found.kinds == {"shared"}

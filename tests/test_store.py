@@ -235,7 +235,7 @@ async def test_trials_wait_in_memory_while_the_database_is_locked(store, path, h
 async def test_a_database_that_stays_locked_is_given_up_with_what_to_do(
     store, path, holder, monkeypatch
 ):
-    monkeypatch.setattr(flusher, "LAST_PATIENCE_S", 0.5)
+    monkeypatch.setattr(flusher, "LAST_LOCK_PATIENCE_S", 0.5)
     monkeypatch.setattr(flusher, "LOCK_PATIENCE_S", 0.2)
     record = await asyncio.to_thread(played)
     process = holder()

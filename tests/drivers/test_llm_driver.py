@@ -29,7 +29,7 @@ def valid(plan):
 
 
 def chat_reply(text, outcome="ok"):
-    return ChatReply(text=text, outcome=outcome, request=REQUEST, attempts=(), cached=False)
+    return ChatReply(text=text, outcome=outcome, request=REQUEST, attempts=(), earlier=0)
 
 
 async def decide(*replies, seen=SEEN, variant="baseline", **scenario):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 
 import pytest
@@ -78,12 +79,15 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
 
 
 async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(merge_runner):
+    numbers = itertools.count()
+
     async def middle(request, handler):
+        number = next(numbers)
         reply = await handler(request)
         body = json.loads(reply.body)
-        # Every answer costs as much as it can, and some ask in vain, at an unknown cost.
+        # Every answer costs as much as it can, and every other one is cut, at an unknown cost.
         body["usage"]["completion_tokens"] = 16_000
-        if server.requests % 2 == 0:
+        if number % 2:
             raise web.HTTPOk(text='{"cut')
         return web.json_response(body)
 
