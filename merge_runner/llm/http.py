@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+from http.cookiejar import DefaultCookiePolicy
+from typing import Any
 
 import aiohttp
 import httpx
-from httpx_aiohttp import HttpxAiohttpClient
+from httpx_aiohttp import AiohttpTransport, HttpxAiohttpClient
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.keys import canonical_json
@@ -17,6 +19,37 @@ from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 # A shorter dummy key may be part of any text.
 SHORTEST_SECRET = 8
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+
+
+class CookielessClient(HttpxAiohttpClient):
+    """Keeps no cookie: one would tie calls together that should be independent samples."""
+
+    def __init__(self, **options: Any) -> None:  # noqa: ANN401 # those of httpx.AsyncClient
+        super().__init__(**options)
+        self.cookies.jar.set_policy(DefaultCookiePolicy(allowed_domains=[]))
+
+    def _init_transport(self, *args: Any, **options: Any) -> httpx.AsyncBaseTransport:  # noqa: ANN401
+        return _cookieless(super()._init_transport(*args, **options))
+
+    def _init_proxy_transport(self, *args: Any, **options: Any) -> httpx.AsyncBaseTransport:  # noqa: ANN401
+        return _cookieless(super()._init_proxy_transport(*args, **options))
+
+
+def _cookieless(transport: httpx.AsyncBaseTransport) -> httpx.AsyncBaseTransport:
+    """The same transport with a session that ignores cookies."""
+    assert isinstance(transport, AiohttpTransport)
+    limits, ssl_context = transport.limits, transport.ssl_context
+
+    def session() -> aiohttp.ClientSession:
+        connector = aiohttp.TCPConnector(
+            limit=limits.max_connections or 0,
+            keepalive_timeout=limits.keepalive_expiry,
+            ssl=ssl_context,
+        )
+        return aiohttp.ClientSession(connector=connector, cookie_jar=aiohttp.DummyCookieJar())
+
+    transport.client = session
+    return transport
 
 
 class HttpTransport:
@@ -34,7 +67,7 @@ class HttpTransport:
             if len(secret := value.removeprefix("Bearer ")) >= SHORTEST_SECRET
         ]
         limits = httpx.Limits(max_connections=connections, max_keepalive_connections=connections)
-        self._client = HttpxAiohttpClient(
+        self._client = CookielessClient(
             limits=limits,
             mounts={f"all://{host}": None for host in LOOPBACK},
             timeout=None,  # every attempt runs under its own timeout
