@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tomllib
 from collections.abc import Mapping
@@ -12,13 +13,35 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    JsonValue,
+    ValidationError,
+    model_validator,
+)
 
 from merge_runner.errors import UsageError
 from merge_runner.places import PROJECT
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(gt=0)]
+MOST_STEPS = MOST_REPETITIONS = 100_000
+
+
+def _finite(value: JsonValue) -> JsonValue:
+    try:
+        json.dumps(value, allow_nan=False)
+    except ValueError as exc:
+        raise ValueError("numbers must be finite") from exc
+    return value
+
+
+# Strict, or else "4" and true would be numbers.
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Count = Annotated[int, Field(gt=0, strict=True)]
+Json = Annotated[JsonValue, AfterValidator(_finite)]
 Format = Literal["openai-chat", "openai-responses", "gemini", "anthropic"]
 CollisionRule = Literal["euclid2d", "rectangle", "shared_lane"]
 Resistance = Literal["none", "human"]
@@ -90,6 +113,8 @@ class Scenario(Frozen):
             ("1 / prompt_rate_hz", 1 / self.prompt_rate_hz),
         ):
             steps = seconds / self.step_s
+            if steps > MOST_STEPS:
+                raise ValueError(f"{name} = {seconds:g} s is more than {MOST_STEPS} steps")
             if abs(steps - round(steps)) > 1e-9 or round(steps) < 1:
                 raise ValueError(f"{name} = {seconds:g} s is no whole number of {self.step_s} s")
         if self.executed_actions > self.plan_actions:
@@ -100,9 +125,9 @@ class Scenario(Frozen):
 class Price(Frozen):
     """USD per million tokens, and where the figures were read."""
 
-    input: Annotated[float, Field(ge=0)]
-    cached_input: Annotated[float, Field(ge=0)] | None = None
-    output: Annotated[float, Field(ge=0)]
+    input: NotNegative
+    cached_input: NotNegative | None = None
+    output: NotNegative
     source: str
 
 
@@ -122,8 +147,8 @@ class ModelEntry(Frozen):
     format: Format
     id: str
     aliases: tuple[str, ...] = ()
-    parameters: dict[str, JsonValue] = {}
-    applied_defaults: dict[str, JsonValue] = {}
+    parameters: dict[str, Json] = {}
+    applied_defaults: dict[str, Json] = {}
     max_output_tokens: Count
     cap_field: Literal["max_completion_tokens", "max_tokens"] = "max_completion_tokens"
     rpm: Count | None = None
@@ -145,7 +170,7 @@ class SweepFile(Frozen):
     """One sweep: its prompt variants with their repetitions per condition, and the scenario."""
 
     description: str = ""
-    repetitions: dict[str, Count]
+    repetitions: dict[str, Annotated[Count, Field(le=MOST_REPETITIONS)]]
     conditions: tuple[str, ...] | None = None
     scenario: Scenario = Scenario()
 
@@ -218,6 +243,11 @@ def resolve_endpoint(
             f"{name} needs a key: set {' or '.join(key_envs)}. Without one: `make sweep` runs the "
             f"emulator, and `make replay MODEL={name} RECORDING=FILE.parquet` replays a recording."
         )
+    if key is not None and not (key.isascii() and key.isprintable() and " " not in key):
+        raise UsageError(
+            f"{name} needs another key: {' or '.join(key_envs)} holds a space, a line break or "
+            "another character that no key has"
+        )
     return Endpoint(
         provider=entry.provider,
         identity=endpoint_identity(name, entry, env),
@@ -260,6 +290,12 @@ def normalised_url(url: str) -> str:
         raise UsageError(f"{url!r} is no base URL: {exc}") from exc
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise UsageError(f"{url!r} is no base URL: it must begin with http:// or https://")
+    if "@" in parts.netloc or parts.query or parts.fragment:
+        # Not shown: what stands there may be a secret, and the registry's entry is stored.
+        raise UsageError(
+            f"the base URL of {parts.hostname} has a user name, a password or a part after ? or #, "
+            "which are not sent: set the provider's key variable"
+        )
     host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
     default_port = 443 if parts.scheme == "https" else 80
     port = "" if port_number in (None, default_port) else f":{port_number}"
@@ -275,10 +311,16 @@ def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | 
 def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
     """The registry, name to entry; raises UsageError."""
     path = path or find_experiments() / "models.toml"
-    return {
+    entries = {
         name: _validate(ModelEntry, table, f"{path}: [{name}]")
         for name, table in read_toml(path).items()
     }
+    for name, entry in entries.items():
+        try:
+            endpoint_identity(name, entry, {})
+        except UsageError as exc:
+            raise UsageError(_one_line(f"{path}: [{name}]: {exc}")) from exc
+    return entries
 
 
 def load_sweep(name: str) -> tuple[str, SweepFile]:
@@ -287,8 +329,8 @@ def load_sweep(name: str) -> tuple[str, SweepFile]:
     if path.suffix != ".toml":
         folder = find_experiments()
         path = folder / f"{name}.toml"
-        if not path.is_file():
-            known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "models")
+        known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "models")
+        if name not in known:
             raise UsageError(f"there is no sweep {name!r}; valid: {', '.join(known)}, or a path")
     return path.stem, _validate(SweepFile, read_toml(path), str(path))
 
@@ -299,8 +341,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UsageError(f"{path} does not exist") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as exc:
-        raise UsageError(f"{path}: {exc}") from exc
+    except OSError as exc:
+        raise UsageError(f"{path} cannot be read: {exc.strerror}") from exc
+    except (ValueError, RecursionError) as exc:  # also a number of thousands of digits
+        raise UsageError(f"{path} is no TOML file: {exc}") from exc
 
 
 def find_experiments() -> Path:
@@ -332,7 +376,12 @@ def _validate(model: type[ModelT], value: object, where: str) -> ModelT:
     try:
         return model.model_validate(value)
     except ValidationError as exc:
-        raise UsageError(f"{where}: {'; '.join(_explain(exc, model))}") from exc
+        raise UsageError(_one_line(f"{where}: {'; '.join(_explain(exc, model))}")) from exc
+
+
+def _one_line(text: str) -> str:
+    """The text without control characters: a TOML key may hold any."""
+    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 NESTED: dict[str, type[BaseModel]] = {"scenario": Scenario, "price": Price}
@@ -346,5 +395,6 @@ def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
             owner = NESTED.get(str(error["loc"][0]), model) if len(error["loc"]) > 1 else model
             lines.append(f"unknown key {place!r}; valid: {', '.join(owner.model_fields)}")
         else:
-            lines.append(f"{place}: {error['msg']}" if place else error["msg"])
+            text = error["msg"].removeprefix("Value error, ")
+            lines.append(f"{place}: {text}" if place else text)
     return lines

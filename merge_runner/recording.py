@@ -2,6 +2,9 @@
 
 One row per call: the parts of its key, the exact request body, and all attempts as JSON. The
 file's key-value metadata hold where it comes from. Any Parquet tool can query it.
+
+A recording may come from anybody: nothing of it is executed, it is read in bounded memory, and
+nothing of it is kept unless all of it is what an export writes.
 """
 
 from __future__ import annotations
@@ -9,10 +12,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +26,8 @@ from pydantic import TypeAdapter
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.keys import KEY_VERSION, call_key
-from merge_runner.records import Attempt, ChatRequest, Slot
+from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
+from merge_runner.records import SIDES, Attempt, ChatRequest, Slot
 
 FORMAT = "merge-runner recording 1"
 COLUMNS = {
@@ -40,8 +45,23 @@ COLUMNS = {
     "body": "VARCHAR",
     "attempts": "VARCHAR",
 }
+TEXTS = [name for name, kind in COLUMNS.items() if kind == "VARCHAR"]
 BATCH = 1_000
 ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
+HEADERS = TypeAdapter(dict[str, str])
+# Far beyond any sweep; a file that claims more was made to harm.
+MOST_CALLS = 10_000_000
+BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
+"""DuckDB hands out this many rows at once, and their texts may have this many bytes."""
+LARGEST_NUMBER = 2**31 - 1
+READING: dict[str, str | bool | int | float | list[str]] = {
+    "autoinstall_known_extensions": False,
+    "autoload_known_extensions": False,
+    "memory_limit": "1GB",  # what is unpacked counts too
+    "threads": 1,
+}
+# What hostile content can raise; RecursionError for JSON that is nested too deeply.
+DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +111,7 @@ def export_recording(
         pairs = ", ".join(f"{_quoted(name)}: {_quoted(text)}" for name, text in metadata.items())
         connection.execute(
             f"COPY calls TO {_quoted(str(partial))} "
-            f"(FORMAT parquet, COMPRESSION zstd, KV_METADATA {{{pairs}}})"
+            f"(FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE 10240, KV_METADATA {{{pairs}}})"
         )
         os.replace(partial, file)
     return len(keys)
@@ -100,7 +120,8 @@ def export_recording(
 def read_recording(file: Path) -> Iterator[Entry]:
     """All entries of a recording, each verified against its key; raises RecordingError."""
     with _opened(file) as connection:
-        rows = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM recording")  # noqa: S608 # constants
+        with _readable(file):
+            rows = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM recording")  # noqa: S608 # constants
         seen: set[str] = set()
         content = hashlib.sha256()
         number = 0
@@ -205,26 +226,39 @@ def _row(entry: Entry) -> tuple[Any, ...]:
 
 def _verified(file: Path, number: int, row: dict[str, Any]) -> Entry:
     try:
-        slot = Slot(
-            row["condition"], row["repetition"], row["side"], row["decision"], row["sample_set"]
-        )
-        headers: dict[str, str] = json.loads(row["headers"])
-        key = call_key(
-            endpoint=row["endpoint"],
-            path=row["path"],
-            headers=headers,
-            body=row["body"],
-            slot=slot,
-        )
-        attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
-    except (ValueError, TypeError, KeyError) as exc:
-        raise RecordingError(f"{file}: row {number} is damaged: {exc!r}") from exc
-    if key != row["call_key"]:
-        raise RecordingError(
-            f"{file}: the content of row {number} does not belong to its key {row['call_key']}"
-        )
-    if not attempts:
+        entry = _entry(row)
+    except DAMAGED as exc:
+        raise RecordingError(f"{file}: row {number} is damaged: {_first_line(exc)}") from exc
+    if entry.request.key != row["call_key"]:
+        raise RecordingError(f"{file}: the content of row {number} does not belong to its key")
+    if not entry.attempts:
         raise RecordingError(f"{file}: row {number} holds no reply")
+    return entry
+
+
+def _entry(row: dict[str, Any]) -> Entry:
+    """The entry of a row, under the key of its content; raises one of DAMAGED."""
+    if empty := [name for name, value in row.items() if value is None]:
+        raise ValueError(f"it has no {', '.join(empty)}")
+    if row["side"] not in SIDES:
+        raise ValueError(f"its side is none of {', '.join(SIDES)}")
+    body = json.loads(row["body"])
+    if not isinstance(body, dict) or canonical_json(body) != row["body"]:
+        raise ValueError("its request is no canonical JSON object")
+    slot = Slot(
+        row["condition"], row["repetition"], row["side"], row["decision"], row["sample_set"]
+    )
+    headers = HEADERS.validate_json(row["headers"], strict=True)
+    key = call_key(
+        endpoint=row["endpoint"],
+        path=row["path"],
+        headers=headers,
+        body=row["body"],
+        slot=slot,
+    )
+    attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
+    for attempt in attempts:
+        _check(attempt)
     request = ChatRequest(
         key=key,
         provider=row["provider"],
@@ -238,46 +272,112 @@ def _verified(file: Path, number: int, row: dict[str, Any]) -> Entry:
     return Entry(request, attempts)
 
 
+def _check(attempt: Attempt) -> None:
+    """Raise one of DAMAGED for what no attempt can hold and a replay or a table cannot take."""
+    numbers = (
+        *(attempt.number, attempt.http_status, attempt.latency_s, attempt.cost_usd),
+        *astuple(attempt.usage),
+    )
+    if any(number is not None and not 0 <= number <= LARGEST_NUMBER for number in numbers):
+        raise ValueError("an attempt has a number that no attempt can have")
+    if attempt.started_at is not None:
+        datetime.fromisoformat(attempt.started_at)
+    answer = json.loads(attempt.reply or "{}") if attempt.http_status == 200 else {}
+    if not isinstance(answer, dict) and attempt.outcome != "bad_body":
+        raise ValueError("a reply is no JSON object")
+
+
 def _opened(file: Path) -> duckdb.DuckDBPyConnection:
     """A connection with the view ``recording``; raises for anything but one of our files."""
     if not file.is_file():
         raise UsageError(f"there is no recording {file}")
-    connection = duckdb.connect()
+    connection = duckdb.connect(config=READING)
     try:
         connection.execute(
-            f"CREATE VIEW recording AS FROM read_parquet({_quoted(str(file.resolve()))})"
+            "CREATE VIEW recording AS FROM "
+            f"read_parquet({_pattern(file)}, file_row_number = true, hive_partitioning = false)"
         )
         found = {
             name: kind for name, kind, *_ in connection.execute("DESCRIBE recording").fetchall()
         }
     except duckdb.Error as exc:
-        raise RecordingError(f"{file} is no Parquet file that can be read: {exc}") from exc
+        raise RecordingError(
+            f"{file} is no Parquet file that can be read: {_first_line(exc)}"
+        ) from exc
+    found.pop("file_row_number", None)
     if found != COLUMNS:
         raise RecordingError(
-            f"{file} is no recording of ours: it has the columns {', '.join(found)}, "
-            f"a recording has {', '.join(COLUMNS)}"
+            f"{file} is no recording of ours: it has the columns {_listed(found)}; "
+            f"a recording has {_listed(COLUMNS)}"
         )
     version = _metadata(file).get("key_version")
     if version != str(KEY_VERSION):
         raise RecordingError(
-            f"{file} has keys of version {version}, this program reads version {KEY_VERSION}"
+            f"{file} has keys of version {version!r}, this program reads version {KEY_VERSION}"
         )
+    _refuse_bombs(file, connection)
     return connection
 
 
+def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
+    """Raise RecordingError for more rows or longer texts than recordings have."""
+    bytes_of_row = " + ".join(f"coalesce(strlen({name}), 0)" for name in TEXTS)
+    with _readable(file):
+        calls = _number(connection, "SELECT count(*) FROM recording")
+        longest = 0
+        if calls <= MOST_CALLS:
+            longest = _number(
+                connection,
+                f"SELECT max(block) FROM (SELECT sum({bytes_of_row}) AS block FROM recording "  # noqa: S608 # constants
+                f"GROUP BY file_row_number // {BLOCK})",
+            )
+    if calls > MOST_CALLS or longest > MOST_BLOCK_BYTES:
+        raise RecordingError(
+            f"{file} is no recording of ours: it claims {calls} calls, {longest} bytes in "
+            f"{BLOCK} of them"
+        )
+
+
+def _number(connection: duckdb.DuckDBPyConnection, sql: str) -> int:
+    row = connection.execute(sql).fetchone()
+    return int(row[0] or 0) if row else 0
+
+
 def _metadata(file: Path) -> dict[str, str]:
-    with duckdb.connect() as connection:
+    with _readable(file), duckdb.connect(config=READING) as connection:
         rows = connection.execute(
-            f"SELECT key, value FROM parquet_kv_metadata({_quoted(str(file.resolve()))})"  # noqa: S608 # quoted
+            f"SELECT key, value FROM parquet_kv_metadata({_pattern(file)})"  # noqa: S608 # quoted
         ).fetchall()
-    return {key.decode(): value.decode() for key, value in rows}
+        return {key.decode(): value.decode() for key, value in rows}
 
 
 def _fetch(rows: duckdb.DuckDBPyConnection, file: Path) -> list[tuple[Any, ...]]:
-    try:
+    with _readable(file):
         return rows.fetchmany(BATCH)
-    except duckdb.Error as exc:
-        raise RecordingError(f"{file} is damaged: {exc}") from exc
+
+
+@contextmanager
+def _readable(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except (duckdb.Error, UnicodeDecodeError) as exc:
+        raise RecordingError(f"{file} is damaged: {_first_line(exc)}") from exc
+
+
+def _first_line(exc: Exception) -> str:
+    return str(exc).partition("\n")[0]
+
+
+def _listed(columns: dict[str, str]) -> str:
+    """Columns with their types; in a file of somebody else's they may have any name."""
+    named = [f"{name[:40]} {kind[:40]}" for name, kind in columns.items()]
+    text = ", ".join(named[: 2 * len(COLUMNS)])
+    return "".join(character if character.isprintable() else "?" for character in text)
+
+
+def _pattern(file: Path) -> str:
+    """The file as a quoted pattern that matches it alone, whatever its name."""
+    return _quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))
 
 
 def _quoted(text: str) -> str:

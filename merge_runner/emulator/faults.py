@@ -58,7 +58,7 @@ class FaultPlan(BaseModel):
     silent for ``hang_s``, longer than a client's patience, and then closes.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     seed: int = 0
     rates: dict[Fault, Rate] = {}

@@ -39,7 +39,8 @@ class ParsedReply:
 
 def parse_reply(text: str, plan_actions: int) -> ParsedReply:
     """Read a reply that should hold one list of ``plan_actions`` numbers in [-1, 1]."""
-    text = text.replace("\r\n", "\n")
+    # Half a surrogate pair, which JSON can spell, is a character that no table can hold.
+    text = text.encode(errors="replace").decode().replace("\r\n", "\n")
     prose, code = _split(text)
     plan, failure = _plan(code, plan_actions)
     tactical, rationale = _tactical(prose.strip())
@@ -55,7 +56,7 @@ def _split(text: str) -> tuple[str, str]:
 
 
 def _plan(code: str, plan_actions: int) -> tuple[tuple[float, ...] | None, str | None]:
-    arrays = {_entries(match) for match in _ARRAY.findall(_COMMENT.sub("", code))}
+    arrays = {_entries(match) for match in set(_ARRAY.findall(_COMMENT.sub("", code)))}
     if not arrays:
         return None, "no_array"
     if len(arrays) > 1:

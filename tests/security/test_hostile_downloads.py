@@ -1,0 +1,225 @@
+"""``human import`` of a zip that was made to harm: refused or read past, and nothing is run."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import stat
+import struct
+import subprocess
+import zipfile
+import zlib
+from contextlib import suppress
+
+import pytest
+from harness import PROGRAM, Run, environment
+from recordings import drive, write_folder, write_zip
+
+from analysis.human.archive import Unreadable, open_files
+from analysis.human.mat import MAX_BYTES, read_mat
+from merge_runner.errors import UsageError
+from merge_runner.store import query
+
+GOOD = {"a/experiment_4_iter_1.csv": drive("L_4_0").csv()}
+TRIAL = "experiment_9_iter_9"
+MAT = drive("L_4_0").mat()
+
+
+class Bomb:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.fixture
+def imported(tmp_path):
+    """Imports a download with the program, in an empty folder."""
+
+    def run(path):
+        done = subprocess.run(
+            [PROGRAM, "human", "import", str(path)],
+            cwd=tmp_path,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            check=False,
+            stdin=subprocess.DEVNULL,
+        )
+        assert "Traceback" not in done.stderr
+        return Run(done.returncode, done.stdout, done.stderr)
+
+    return run
+
+
+def trials(tmp_path):
+    return query(tmp_path / "results/merge.duckdb", "SELECT count(*) FROM trials")[1][0][0]
+
+
+def with_link(path, name, target):
+    with zipfile.ZipFile(path, "a") as archive:
+        member = zipfile.ZipInfo(name)
+        member.create_system = 3
+        member.external_attr = (stat.S_IFLNK | 0o777) << 16
+        archive.writestr(member, target)
+    return path
+
+
+def test_a_member_that_leads_out_refuses_the_zip(imported, tmp_path):
+    path = write_zip(tmp_path / "d.zip", {**GOOD, "../out.csv": b"x"})
+    before = set(tmp_path.parent.rglob("*"))
+    run = imported(path)
+    assert (run.code, len(run.err.splitlines())) == (2, 1)
+    assert "is unsafe" in run.err
+    assert set(tmp_path.parent.rglob("*")) == before
+
+
+def test_a_link_in_a_zip_is_no_file(imported, tmp_path):
+    secret = tmp_path / "secret"
+    secret.write_text("private")
+    path = with_link(write_zip(tmp_path / "d.zip", GOOD), f"{TRIAL}.csv", str(secret))
+    run = imported(path)
+    assert run.code == 1
+    assert f"error: {TRIAL}.csv: it is a link and no file" in run.err
+    assert "private" not in run.err + run.out
+    assert trials(tmp_path) == 1
+
+
+def test_a_device_or_a_pipe_in_a_folder_is_not_read(tmp_path):
+    folder = write_folder(tmp_path / "d", GOOD)
+    (folder / f"{TRIAL}.csv").symlink_to("/dev/zero")
+    os.mkfifo(folder / f"{TRIAL}.mat")
+    with open_files(folder) as files:
+        for file in files:
+            if TRIAL in file.name:
+                with pytest.raises(Unreadable, match="no regular file"):
+                    file.read()
+
+
+def test_a_zip_within_the_zip_is_not_opened(imported, tmp_path):
+    inner = write_zip(tmp_path / "inner.zip", {f"{TRIAL}.csv": drive("N_0_0").csv()}).read_bytes()
+    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, "inner.zip": inner}))
+    assert run.code == 0
+    assert trials(tmp_path) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(bytes(10**6), "unpacks from"), (os.urandom(65 * 2**20), "bytes unpacked")],
+    ids=["ratio", "size"],
+)
+def test_a_bomb_refuses_the_zip_before_anything_is_unpacked(imported, tmp_path, content, says):
+    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.csv": content}))
+    assert (run.code, len(run.err.splitlines())) == (2, 1)
+    assert says in run.err
+    assert not (tmp_path / "results").exists()
+
+
+def test_pickles_are_never_read_under_any_name(imported, tmp_path):
+    mark = tmp_path / "mark"
+    bomb = pickle.dumps(Bomb(mark))
+    hostile = {f"{TRIAL[:-1]}{k}.{suffix}": bomb for k, suffix in enumerate(("pkl", "csv", "mat"))}
+    hostile |= {"auto_save.pkl": bomb, "experiment_4_iter_1.pkl": bomb}
+    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, **hostile}))
+    assert run.code == 1
+    assert f"{TRIAL[:-1]}0.pkl: it exists only as PKL" in run.err
+    assert "3 files could not be read" in run.out
+    assert trials(tmp_path) == 1
+    assert not mark.exists()
+    pickle.loads(bomb)
+    assert mark.exists(), "or else this test would show nothing"
+
+
+def test_names_cannot_speak_to_the_terminal(imported, tmp_path):
+    name = f"two\nlines\x1b[2J\u202e/{TRIAL}.csv"
+    for path in (
+        write_zip(tmp_path / "d.zip", {name: b"x"}),
+        write_folder(tmp_path / "folder", {name: b"x"}),
+    ):
+        run = imported(path)
+        assert run.code == 1
+        error, note = run.err.splitlines()
+        assert error.startswith(f"error: two?lines?[2J?/{TRIAL}.csv: it lacks ")
+        assert error.isprintable()
+        assert note.startswith("note: ")
+
+
+def test_text_that_looks_like_sql_or_a_formula_is_text(imported, tmp_path):
+    recording = drive("L_4_0")
+    recording.columns["end_state"] = ["'); DROP TABLE trials; --"]
+    content = recording.csv()
+    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.csv": content}))
+    assert run.code == 1
+    assert "DROP TABLE trials; --" in run.err
+    assert trials(tmp_path) == 1
+
+
+def packed(content):
+    data = zlib.compress(content)
+    return struct.pack("<II", 15, len(data)) + data
+
+
+def numbers(name, count):
+    """A matrix of so many one-byte numbers."""
+    flags = struct.pack("<IIII", 6, 8, 6, 0)
+    dimensions = struct.pack("<IIii", 5, 8, 1, count)
+    label = struct.pack("<II", 1, 8) + name.ljust(8).encode()
+    values = struct.pack("<II", 2, count) + bytes(count + -count % 8)
+    inside = flags + dimensions + label + values
+    return struct.pack("<II", 14, len(inside)) + inside
+
+
+def test_many_compressed_elements_may_not_unpack_to_more_than_one_file_may():
+    one = packed(numbers("x", 2**20))
+    assert len(read_mat(MAT[:128] + one)["x       "]) == 2**20
+    # Of no known type, so that they are unpacked and no more.
+    element = packed(struct.pack("<II", 99, 2**23) + bytes(2**23))
+    assert len(element) < 10_000
+    assert read_mat(MAT[:128] + element + one)
+    with pytest.raises(Unreadable, match="far too large"):
+        read_mat(MAT[:128] + 2 * element)
+
+
+def test_where_nothing_is_left_to_unpack_that_is_a_limit_too():
+    full = packed(struct.pack("<II", 99, MAX_BYTES - 8) + bytes(MAX_BYTES - 8))
+    assert read_mat(MAT[:128] + full) == {}
+    with pytest.raises(Unreadable, match="far too large"):
+        read_mat(MAT[:128] + full + packed(b"\0"))
+
+
+def test_a_mat_file_that_is_far_too_large_is_not_turned_into_numbers():
+    with pytest.raises(Unreadable, match="far too large"):
+        read_mat(MAT[:128] + numbers("x", 17 * 2**20))
+
+
+def test_every_archive_that_is_damaged_is_refused_or_its_files_are(tmp_path):
+    chance = random.Random(1)
+    whole = write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.mat": MAT[:2000]}).read_bytes()
+    # Near the ends are the headers.
+    places = [*range(100), *range(len(whole) - 300, len(whole))]
+    for _ in range(500):
+        damaged = bytearray(whole)
+        for _ in range(chance.choice((1, 3))):
+            damaged[chance.choice(places)] = chance.randrange(256)
+        (tmp_path / "d.zip").write_bytes(damaged)
+        with suppress(UsageError), open_files(tmp_path / "d.zip") as files:
+            read_all(files)
+
+
+def read_all(files):
+    for file in files:
+        assert file.name.isprintable()
+        with suppress(Unreadable):
+            assert file.size > 2**20 or file.read()
+
+
+def test_nothing_is_written_whatever_the_members_are_called(tmp_path):
+    names = ("a/b/c.csv", "d.csv/", f"{TRIAL}.csv", "x" * 300, "con.csv", "~/e.csv", "$HOME/f.csv")
+    path = write_zip(tmp_path / "d.zip", dict.fromkeys(names, b"x"))
+    with open_files(path) as files:
+        read_all(files)
+    assert list(tmp_path.rglob("*")) == [path]
