@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner.errors import MergeRunnerError, UsageError, printable
 from merge_runner.places import DEFAULT_CACHE, DEFAULT_DB
 
 if TYPE_CHECKING:
@@ -491,9 +491,9 @@ def _print_table(names: list[str], rows: list[tuple[Any, ...]]) -> None:
 
 def print_out(text: str) -> None:
     """Print a result."""
-    print(text, flush=True)  # noqa: T201 # the command line's output
+    print(printable(text), flush=True)  # noqa: T201 # the command line's output
 
 
 def say(text: str) -> None:
     """Print a message beside the result."""
-    print(text, file=sys.stderr, flush=True)  # noqa: T201 # the command line's messages
+    print(printable(text), file=sys.stderr, flush=True)  # noqa: T201 # the command line's messages

@@ -153,10 +153,14 @@ def unreadable_is_usage() -> Iterator[None]:
 
 def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
     """The version of an existing database; raises UsageError for a newer or a foreign one."""
-    try:
-        row = connection.execute("SELECT schema_version FROM meta").fetchone()
-    except duckdb.CatalogException:
-        raise UsageError(f"{path} is no database of merge-runner: name another with --db") from None
+    # A table: a view of this name could read any file.
+    ours = connection.execute(
+        "SELECT count(*) FROM duckdb_tables() "
+        "WHERE table_name = 'meta' AND database_name = current_database()"
+    ).fetchone()
+    if ours != (1,):
+        raise UsageError(f"{path} is no database of merge-runner: name another with --db")
+    row = connection.execute("SELECT schema_version FROM meta").fetchone()
     if row is None:
         raise UsageError(f"{path} has no schema version: {REBUILD}")
     version: int = row[0]

@@ -7,7 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from merge_runner.config import ModelEntry, Scenario, SweepFile, load_models, load_sweep
+from merge_runner.config import (
+    MOST_REPETITIONS,
+    ModelEntry,
+    Scenario,
+    SweepFile,
+    load_models,
+    load_sweep,
+)
 from merge_runner.drivers import projected_order
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
@@ -209,8 +216,8 @@ def make_plan(choice: Choice) -> Plan:
 def _repetitions(name: str, file: SweepFile, choice: Choice) -> dict[str, int]:
     for variant in (*file.repetitions, *(choice.variants or ())):
         _require(variant, tuple(VARIANTS), "variant")
-    if choice.repetitions is not None and choice.repetitions < 1:
-        raise UsageError("--reps is a whole number from 1")
+    if choice.repetitions is not None and not 1 <= choice.repetitions <= MOST_REPETITIONS:
+        raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
     wanted: dict[str, int] = {}
     for variant in file.repetitions if choice.variants is None else choice.variants:
         repetitions = choice.repetitions or file.repetitions.get(variant)

@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from merge_runner.errors import printable
 from merge_runner.llm.meter import Meter, Wait
 
 if TYPE_CHECKING:
@@ -93,15 +94,16 @@ async def shown(progress: Progress) -> AsyncIterator[None]:
 async def _show_live(progress: Progress, stop: asyncio.Event) -> None:
     from rich.console import Console
     from rich.live import Live
+    from rich.text import Text
 
     console = Console(stderr=True)
     with Live(_table(progress), console=console, auto_refresh=False) as live:
         while not await _stopped(stop, LIVE_EVERY_S):
             for note in _notes(progress):
-                console.print(note)
+                console.print(Text(note))
             live.update(_table(progress), refresh=True)
         for note in _notes(progress):
-            console.print(note)
+            console.print(Text(note))
         live.update(_table(progress), refresh=True)
 
 
@@ -116,10 +118,11 @@ async def _show_plain(progress: Progress, stop: asyncio.Event) -> None:
 
 def _table(progress: Progress) -> Table:
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(title=progress.title, title_justify="left", show_header=False, box=None)
     for name, text in progress.fields():
-        table.add_row(name, text)
+        table.add_row(name, Text(printable(text)))  # a server's words are no markup
     return table
 
 
@@ -133,7 +136,7 @@ def _notes(progress: Progress) -> list[str]:
     for meter in progress.meters:
         while meter.notes:
             notes[meter.notes.popleft()] = None
-    lines = list(notes)
+    lines = [printable(note) for note in notes]
     more = [f"... and {len(lines) - NOTES_SHOWN} more like these"] * (len(lines) > NOTES_SHOWN)
     return lines[:NOTES_SHOWN] + more
 
@@ -163,4 +166,4 @@ async def _stopped(stop: asyncio.Event, seconds: float) -> bool:
 
 
 def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)  # noqa: T201 # the display
+    print(printable(line), file=sys.stderr, flush=True)  # noqa: T201 # the display

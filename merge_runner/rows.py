@@ -125,11 +125,15 @@ def _call_row(
 
 
 def _as_json(text: str | None) -> str | None:
-    """A reply that is no JSON, as a proxy's HTML page, becomes a JSON string."""
+    """A reply that is no JSON, as a proxy's HTML page, becomes a JSON string.
+
+    So does one that the database would not take: with half of a surrogate pair, or nested beyond
+    any honest reply.
+    """
     if text is None:
         return None
     try:
-        json.loads(text)
-    except ValueError:
-        return json.dumps(text)
+        json.dumps(json.loads(text), ensure_ascii=False).encode()
+    except (ValueError, RecursionError):
+        return json.dumps(text.encode(errors="replace").decode())
     return text

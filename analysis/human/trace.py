@@ -40,15 +40,21 @@ def parse_csv(content: bytes) -> Trace:
     """Read a trial's CSV file; raises Unreadable."""
     try:
         lines = io.StringIO(content.decode("utf-8-sig"), newline="")
-        header, *rows = [row for row in csv.reader(lines, strict=True) if row] or [[]]
+        # Checked row by row: a small download can unpack to many rows of nothing.
+        reader = filter(None, csv.reader(lines, strict=True))
+        header = next(reader, [])
+        _require(NEEDED, header)
+        rows = [_whole(row, header, number) for number, row in enumerate(reader)]
     except (UnicodeDecodeError, csv.Error) as exc:
         raise Unreadable(f"it is no CSV table: {exc}") from exc
-    _require(NEEDED, header)
-    for number, row in enumerate(rows):
-        if len(row) != len(header):
-            raise Unreadable(f"row {number} has {len(row)} of {len(header)} columns: it is cut off")
     places = {name: header.index(name) for name in NEEDED}
     return _trace({name: [row[place] for row in rows] for name, place in places.items()})
+
+
+def _whole(row: list[str], header: list[str], number: int) -> list[str]:
+    if len(row) != len(header):
+        raise Unreadable(f"row {number} has {len(row)} of {len(header)} columns: it is cut off")
+    return row
 
 
 def parse_mat(content: bytes) -> Trace:

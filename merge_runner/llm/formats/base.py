@@ -10,6 +10,8 @@ from pydantic import JsonValue
 from merge_runner.config import ModelEntry
 from merge_runner.records import Usage
 
+MOST_TOKENS = 2**31 - 1
+
 
 @dataclass(frozen=True, slots=True)
 class WireRequest:
@@ -89,8 +91,8 @@ def as_text(value: object) -> str | None:
 
 
 def as_count(value: object) -> int | None:
-    """A token count, or None where it is absent."""
-    return value if isinstance(value, int) and not isinstance(value, bool) else None
+    """A token count, or None where it is absent or cannot be one."""
+    return value if type(value) is int and 0 <= value <= MOST_TOKENS else None
 
 
 def total(*counts: int | None) -> int | None:

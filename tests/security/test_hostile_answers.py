@@ -1,0 +1,64 @@
+"""What a model or a server writes is stored as it is, and speaks to no terminal."""
+
+from __future__ import annotations
+
+import io
+import json
+
+from aiohttp import web
+from harness import watched
+from rich.console import Console
+
+from merge_runner.llm.meter import Meter, Wait
+from merge_runner.progress import Progress, _table
+
+ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202e"
+ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0")
+
+
+async def test_strange_characters_and_counts_are_stored_and_shown_harmlessly(merge_runner):
+    async def middle(request, handler):
+        body = json.loads((await handler(request)).body)
+        body["usage"] |= {"prompt_tokens": 10**30, "completion_tokens": -5}
+        body["model"] = "scripted-driver"
+        body["choices"][0]["message"]["content"] = f"M {ESCAPE} {chr(0xD800)} no plan"
+        body["choices"][0]["finish_reason"] = f"stop{chr(0xDFFF)}"
+        return web.Response(text=json.dumps(body), content_type="application/json")
+
+    async with watched(middle) as server:
+        run = await merge_runner(*ONE, EMULATOR_BASE_URL=f"{server.url}/v1")
+    assert run.code == 0, run.err
+    told = await merge_runner(
+        "sql",
+        "select count(*) as n, count(input_tokens) as counted, count(reply) as replies, "
+        "any_value(rationale) as words from calls "
+        "join decisions using (trial_id, spec_hash, side, decision)",
+    )
+    assert "\x1b" not in told.out
+    assert "\u202e" not in told.out
+    n, counted, replies = told.out.splitlines()[1].split()[:3]
+    assert (n, counted, replies) == (str(server.requests), "0", str(server.requests))
+
+
+async def test_an_error_in_a_servers_words_speaks_to_no_terminal(merge_runner):
+    def middle(request, handler):
+        error = {"error": {"message": f"no {ESCAPE} [/red] [link=x]", "code": "bad"}}
+
+        async def refuse():
+            return web.json_response(error, status=400)
+
+        return refuse()
+
+    async with watched(middle) as server:
+        run = await merge_runner(*ONE, EMULATOR_BASE_URL=f"{server.url}/v1")
+    assert run.code == 1
+    assert "\x1b" not in run.out + run.err
+    assert "[/red] [link=x]" in run.out
+
+
+def test_a_servers_words_are_no_markup_in_the_display():
+    meter = Meter(waits={"key": Wait("m: L_4_0", f"after HTTP 503: [/nope] {ESCAPE}")})
+    shown = io.StringIO()
+    Console(file=shown, width=200).print(_table(Progress("title", 1, meters=[meter])))
+    assert "[/nope]" in shown.getvalue()
+    assert "\x1b" not in shown.getvalue()
