@@ -21,6 +21,8 @@ PROGRAM = Path(sys.executable).with_name("merge-runner")
 RECORDING = PROJECT / "cache/recordings/emulator-baseline.parquet"
 # Variables that would change what a run does.
 CONFIGURING = ("_API_KEY", "_BASE_URL", "_PROXY", "_proxy")
+# No account's limits, which would make a sweep take minutes.
+FAST = ("--rpm", 10**6, "--tpm", 10**9)
 Middle = Callable[[web.Request, Callable[[web.Request], Awaitable[web.StreamResponse]]], Awaitable]
 
 

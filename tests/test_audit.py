@@ -13,7 +13,7 @@ from pathlib import Path
 import duckdb
 import pytest
 from aiohttp import web
-from harness import PROGRAM, RECORDING, environment, watched
+from harness import FAST, PROGRAM, RECORDING, environment, watched
 from recordings import drive, write_folder
 from typer.testing import CliRunner
 
@@ -538,7 +538,7 @@ async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tm
     numbers = count()
     async with watched(caching({}, id=lambda: f"new-{next(numbers)}")) as server:
         env = {"OPENAI_BASE_URL": f"{server.url}/v1", "OPENAI_API_KEY": "k"}
-        part = ("--model", "o3", "--conditions", "L_4_8", "--reps", 2, "--yes")
+        part = ("--model", "o3", "--conditions", "L_4_8", "--reps", 2, "--yes", *FAST)
         assert (await merge_runner("sweep", "baseline", *part, **env)).code == 0
     found = audit("--db", tmp_path / "results/merge.duckdb")
     assert found.code == 0

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from harness import PROJECT, RECORDING, environment, watched
+from harness import FAST, PROJECT, RECORDING, environment, watched
 
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.recording import read_recording
@@ -164,7 +164,7 @@ async def test_a_recording_that_was_tampered_with_is_refused_whole(
 async def test_a_recording_holds_no_secret(merge_runner, tmp_path):
     async with watched() as server:
         env = {"OPENAI_API_KEY": "sk-very-secret-1", "OPENAI_BASE_URL": f"{server.url}/v1"}
-        part = ("--reps", 1, "--conditions", "N_0_0", "--model", "o3", "--yes")
+        part = ("--reps", 1, "--conditions", "N_0_0", "--model", "o3", "--yes", *FAST)
         assert (await merge_runner("sweep", "baseline", *part, **env)).code == 0
         assert (await merge_runner("recording", "export", "o3.parquet", **env)).code == 0
     for folder, _, names in os.walk(tmp_path):
@@ -183,7 +183,7 @@ async def test_a_named_recording_comes_before_what_the_cache_holds(merge_runner)
         async with watched(faults=faults) as server:
             env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
             places = ("--db", f"{name}.duckdb", "--cache", name)
-            assert (await merge_runner("sweep", *part, "--yes", *places, **env)).code == 0
+            assert (await merge_runner("sweep", *part, "--yes", *FAST, *places, **env)).code == 0
             assert (await merge_runner("recording", "export", f"{name}.parquet", *places)).code == 0
         digests.append((await merge_runner("digest", "--db", f"{name}.duckdb")).out)
     replay = ("replay", *part, "--cache", "bad", "--recording", "good.parquet", "--db", "r.duckdb")

@@ -8,10 +8,10 @@ import signal
 
 import pytest
 from aiohttp import web
-from harness import watched
+from harness import FAST, watched
 
 from merge_runner.database import open_database
-from merge_runner.emulator.faults import FaultPlan
+from merge_runner.emulator.faults import TRANSIENT, FaultPlan
 from merge_runner.records import SLOT_HEADER
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--json")
@@ -64,11 +64,14 @@ async def test_what_is_recorded_is_not_asked_again_and_what_is_new_is(merge_runn
     assert third["trials"]["finished"] + third["trials"]["collided"] == 4
 
 
-async def test_the_digest_depends_on_no_schedule_and_no_transient_fault(merge_runner):
+async def test_the_digest_depends_on_no_schedule_and_no_transient_fault(merge_runner, tmp_path):
+    # Of each transient fault a fiftieth; a hang ends soon, without a reply.
+    rates = "\n".join(f"{fault} = 0.02" for fault in TRANSIENT)
+    (tmp_path / "faults.toml").write_text(f"seed = 5\nhang_s = 0.3\n[rates]\n{rates}\n")
     for name, options in {
         "one": ("--in-flight", 1),
         "many": ("--in-flight", 500),
-        "faults": ("--fault-rate", 0.2, "--seed", 5),
+        "faults": ("--faults", "faults.toml"),
     }.items():
         run = await merge_runner(*SMALL, "--db", f"{name}.duckdb", "--cache", name, *options)
         assert run.code == 0, run.err
@@ -108,8 +111,7 @@ async def test_another_sample_set_and_another_prompt_are_other_samples(merge_run
 async def test_a_real_model_runs_against_any_server_of_its_format_and_replays_without_a_key(
     merge_runner, model, variables, path
 ):
-    fast = ("--rpm", 100_000, "--tpm", 100_000_000)
-    sweep = (*SMALL, "--conditions", "L_4_0", "--model", model, *fast)
+    sweep = (*SMALL, "--conditions", "L_4_0", "--model", model, *FAST)
     without = await merge_runner(*sweep)
     assert without.code == 2
     assert variables[0] in without.err
@@ -139,7 +141,7 @@ async def test_a_stub_never_answers_for_the_real_endpoint(merge_runner):
     async with watched() as one, watched() as other:
         for server in (one, other):
             env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
-            sweep = (*SMALL, "--conditions", "L_4_0", "--model", "o3", "--yes")
+            sweep = (*SMALL, "--conditions", "L_4_0", "--model", "o3", "--yes", *FAST)
             assert (await merge_runner(*sweep, **env)).code == 0
         assert one.requests == other.requests > 0
     ambiguous = await merge_runner("replay", "baseline", "--reps", 1, "--model", "o3")
@@ -289,7 +291,7 @@ async def test_another_served_model_is_said_loudly_and_an_alias_is_none(merge_ru
             env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
             run = await merge_runner(
                 "sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--model", "o3",
-                "--yes", "--db", f"{served}.duckdb", **env,
+                "--yes", *FAST, "--db", f"{served}.duckdb", **env,
             )  # fmt: skip
             assert run.code == 0
             assert run.out.count("another model answered") == expected

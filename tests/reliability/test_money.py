@@ -8,13 +8,12 @@ import json
 
 import pytest
 from aiohttp import web
-from harness import watched
+from harness import FAST, watched
 
 SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
 # o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and no trial
 # can cost more than 3.4 USD (2 x 12 prompts, 16,000 tokens of output each).
 ROOM_FOR_SOME = 3.9
-FAST = ("--rpm", 10**6, "--tpm", 10**9)
 
 
 def account(server):
@@ -85,19 +84,19 @@ async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(m
         number = next(numbers)
         reply = await handler(request)
         body = json.loads(reply.body)
-        # Every answer costs as much as it can, and every other one is cut, at an unknown cost.
+        # Every answer costs as much as it can, and every third one is cut, at an unknown cost.
         body["usage"]["completion_tokens"] = 16_000
-        if number % 2:
+        if number % 3 == 2:
             raise web.HTTPOk(text='{"cut')
         return web.json_response(body)
 
     async with watched(middle) as server:
         sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
         env = account(server)
-        run = await merge_runner(*sweep, "--max-cost", 3.5, **env)
+        run = await merge_runner(*sweep, "--max-cost", 3.35, **env)
         assert run.code == 3, run.err
         assert run.summary["trials"]["suspended"] == 1
-        assert run.summary["sweep_cost_usd"] + run.summary["set_aside_usd"] <= 3.5
+        assert run.summary["sweep_cost_usd"] + run.summary["set_aside_usd"] <= 3.35
         assert run.summary["set_aside_usd"] > 0.1
         first = server.requests
         assert first > 15
@@ -114,7 +113,7 @@ async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(me
         return await handler(request)
 
     arrived = asyncio.Event()
-    sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes")
+    sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
     async with watched(middle) as server:
         env = account(server)
         process = await merge_runner.start(*sweep, **env)
@@ -171,7 +170,7 @@ async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, tmp_path):
     (tmp_path / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 1\n")
     async with watched() as server:
         env = account(server)
-        sweep = ("sweep", "baseline", "--model", "mine", "--conditions", "L_4_0", "--json")
+        sweep = ("sweep", "baseline", "--model", "mine", "--conditions", "L_4_0", "--json", *FAST)
         asked = await merge_runner(*sweep, **env)
         assert asked.code == 2
         assert "an unknown price" in asked.err

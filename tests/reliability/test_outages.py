@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from aiohttp import web
-from harness import watched
+from harness import FAST, watched
 
 from merge_runner.records import SLOT_HEADER
 
@@ -124,7 +124,7 @@ async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
             body["model"] = "o3-mini"
         return web.json_response(body)
 
-    sweep = ("sweep", "baseline", "--reps", 2, "--model", "o3", "--yes", "--json")
+    sweep = ("sweep", "baseline", "--reps", 2, "--model", "o3", "--yes", "--json", *FAST)
     async with watched(middle) as server:
         env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
         run = await merge_runner(*sweep, "--in-flight", 2, "--strict-model", **env)
@@ -135,6 +135,6 @@ async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
         # Its replies are kept: the same command stops at once, and without the option it goes on.
         again = await merge_runner(*sweep, "--strict-model", "--in-flight", 2, **env)
         assert again.code == 1
-        loose = await merge_runner(*sweep, "--conditions", "L_4_0", "--tpm", 10**9, **env)
+        loose = await merge_runner(*sweep, "--conditions", "L_4_0", **env)
         assert loose.code == 0
     assert loose.summary["model_mismatches"]

@@ -9,7 +9,7 @@ from pathlib import Path
 import duckdb
 import pytest
 from aiohttp import web
-from harness import watched
+from harness import FAST, watched
 
 from analysis.report import write_report
 from analysis.study import Study
@@ -31,7 +31,7 @@ ACCOUNT = {
     "x-goog-user-project": "goog-marker-Kw72",
     "set-cookie": "session=cookie-marker-Kw72; Path=/",
 }
-ONE = ("baseline", "--reps", 1, "--conditions", "N_0_0", "--yes")
+ONE = ("baseline", "--reps", 1, "--conditions", "N_0_0", "--yes", *FAST)
 
 
 def keys_in(request):
