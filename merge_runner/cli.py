@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import csv
 import json
+import math
 import sys
 import tempfile
 from enum import StrEnum
@@ -135,6 +136,8 @@ def sweep(
     from merge_runner.plan import Choice, Limits
     from merge_runner.sweep import Options
 
+    if max_cost is not None and not math.isfinite(max_cost):
+        raise UsageError("--max-cost is a number of USD")
     if recording is not None and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
     options = Options(
@@ -391,17 +394,17 @@ def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json:
 
 
 def _dry_run(plan: Plan, options: Options) -> Estimate:
-    """What is not recorded yet; makes neither a database nor a cache."""
+    """What is neither stored nor recorded yet; makes no database or cache that is not there."""
     from dataclasses import replace
 
-    from merge_runner.estimate import estimate, nothing_recorded
+    from merge_runner.estimate import estimate
     from merge_runner.sweep import Sweep
 
-    if not options.cache.is_dir():
-        return estimate(plan, nothing_recorded(plan), options.limits)
     with tempfile.TemporaryDirectory() as folder:
         db = options.db if options.db.is_file() else Path(folder) / "none.duckdb"
-        prepared = Sweep(plan, replace(options, db=db), say=say)
+        recorded = (options.cache / "cache.db").is_file()
+        cache = options.cache if recorded else Path(folder) / "responses"
+        prepared = Sweep(plan, replace(options, db=db, cache=cache), say=say)
         missing = asyncio.run(prepared.rehearse())
         prepared.close()
     return estimate(plan, missing, options.limits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import os
@@ -146,6 +147,8 @@ def unreadable_is_usage() -> Iterator[None]:
     except StoreLocked:
         raise
     except StoreError as exc:
+        if "No space left" in str(exc):
+            raise StoreError(f"{exc}; make room, and run the same command again") from exc
         raise UsageError(f"{exc}; {REBUILD}") from exc
     except duckdb.IOException as exc:
         raise UsageError(f"the database cannot be read: {first_line(exc)}; {REBUILD}") from exc
@@ -178,22 +181,24 @@ def migrate(path: Path) -> None:
     What an older schema lacked is NULL or has its default. The old file stays beside the new one,
     as ``NAME.v1.duckdb``. Raises UsageError where that is not possible.
     """
+    path = path.resolve()
     copy = path.with_name(f"{path.name}.migrating")
     try:
-        copy.unlink(missing_ok=True)
         # Opened for writing, so that nobody else writes into what is being copied.
         with open_database(path, read_only=False, patience_s=PATIENCE_S) as connection:
             version = schema_version(connection, path)
             if version == SCHEMA_VERSION:
                 return  # another process was quicker
+            _discard(copy)  # what a process left that died here
             connection.execute("CHECKPOINT")
             with duckdb.connect(str(copy)) as made:
                 made.execute(SCHEMA.read_text(encoding="utf-8"))
             _copy_rows(connection, copy)
-            kept = path.with_name(f"{path.stem}.v{version}{path.suffix}")
+            kept = _free_name(path, version)
             shutil.copy2(path, kept)
             os.replace(copy, path)
     except (OSError, duckdb.Error, StoreError) as exc:
+        _discard(copy)
         raise UsageError(
             f"{path} has an older schema and cannot be brought to version {SCHEMA_VERSION} where "
             f"it lies: {first_line(exc)}. Copy it to a folder that can be written and name the "
@@ -206,6 +211,23 @@ def migrate(path: Path) -> None:
         SCHEMA_VERSION,
         kept,
     )
+
+
+def _discard(copy: Path) -> None:
+    for name in (copy, copy.with_name(f"{copy.name}.wal")):
+        with contextlib.suppress(OSError):
+            name.unlink()
+
+
+def _free_name(path: Path, version: int) -> Path:
+    """Where the old file is kept: never in the place of another one."""
+    names = (f"{path.stem}.v{version}{number}{path.suffix}" for number in _numbers())
+    return next(kept for kept in map(path.with_name, names) if not kept.exists())
+
+
+def _numbers() -> Iterator[str]:
+    yield ""
+    yield from (f"-{number}" for number in itertools.count(2))
 
 
 def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:

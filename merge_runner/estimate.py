@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from merge_runner.config import ModelEntry
 from merge_runner.llm.cache import ModelFacts
 from merge_runner.llm.prices import pricing
-from merge_runner.plan import PROMPTS_PER_DRIVER, Limits, Plan
+from merge_runner.plan import Limits, Plan
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
 from merge_runner.simulator.conditions import CONDITIONS
@@ -92,20 +92,11 @@ def estimate(plan: Plan, missing: Missing, limits: Limits) -> Estimate:
     )
 
 
-def nothing_recorded(plan: Plan) -> Missing:
-    """All of a plan."""
-    calls = {
-        name: plan.trials * PROMPTS_PER_DRIVER * sum(s == name for s in plan.sides.values())
-        for name in plan.entries
-    }
-    return Missing(plan.trials, calls, dict.fromkeys(plan.entries, ModelFacts()))
-
-
 def worst_trial_usd(plan: Plan) -> float:
-    """What a whole trial may cost: every token of its prompts a byte, every answer at its cap."""
+    """What a whole trial may cost: to the timeout, every byte a token, every answer at its cap."""
     prompt_bytes = len(_typical_prompt(plan).encode()) * PROMPT_MARGIN
     return sum(
-        math.ceil(PROMPTS_PER_DRIVER + 1)
+        math.ceil(plan.scenario.timeout_steps / plan.scenario.executed_actions)
         * (
             pricing(entry).cost_usd(
                 Usage(input_tokens=int(prompt_bytes), output_tokens=entry.max_output_tokens)

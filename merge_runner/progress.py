@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from merge_runner.errors import printable
+from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.meter import Meter, Wait
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class Progress:
     expected_calls: int = 0
     meters: Sequence[Meter] = ()
     cap_usd: float | None = None
+    ledger: Ledger | None = None
     done: Counter[str] = field(default_factory=Counter)
     running: int = 0
     stored_before: int = 0
@@ -55,7 +57,6 @@ class Progress:
         requests, tokens = (sum(rate[i] for rate in rates) for i in (0, 1))
         cost = sum(meter.cost_usd for meter in self.meters)
         window = min(60.0, max(elapsed, 1.0)) / 60
-        cap = "" if self.cap_usd is None else f" of {self.cap_usd:.2f}"
         before = f" (+{self.stored_before} stored before)" if self.stored_before else ""
         others = sum((meter.mismatches for meter in self.meters), Counter[str]())
         warnings = [("WARNING", f"another model answers: {pair}") for pair in sorted(others)]
@@ -65,10 +66,16 @@ class Progress:
             ("failed", str(self.done["failed"])),
             ("calls", f"{live} live, {cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
-            ("cost", f"{cost:.2f}{cap} USD"),
+            ("cost", f"{cost:.2f} USD{self._spent()}"),
             *_waiting(self.meters),
             ("time", f"{elapsed:.0f} s{self._left(elapsed, live + cached)}"),
         ]
+
+    def _spent(self) -> str:
+        """What counts against the cap: all runs of the sweep, and what is set aside."""
+        if self.cap_usd is None or self.ledger is None:
+            return ""
+        return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
 
     def _left(self, elapsed: float, calls: int) -> str:
         if self.ended == self.total or not (self.ended or calls):

@@ -19,11 +19,11 @@ from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.llm_driver import LlmDriver
 from merge_runner.drivers.projected_order import ProjectedOrderDriver
 from merge_runner.errors import (
+    MergeRunnerError,
     ProviderDown,
     RecordingError,
     ReplayMiss,
     StoreError,
-    SweepStopped,
     TrialSuspended,
     UsageError,
 )
@@ -103,6 +103,14 @@ class Outcome:
         self.messages.append(message)
 
 
+@dataclass(slots=True)
+class Outage:
+    """How many trials a model failed since it gave its last of so many answers."""
+
+    answers: int = 0
+    trials: int = 0
+
+
 class Sweep:
     """One run of a plan. Making it opens the cache and the database, and nothing else."""
 
@@ -126,14 +134,14 @@ class Sweep:
         self._sealed = SealedTransport()
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
-        self._answers_before_failures = 0
-        self._failures_in_a_row = 0
+        self._outages: dict[str, Outage] = {}
         self._suspended: list[TrialSuspended] = []
         self._progress = Progress(
             title=f"{plan.name}: {plan.model}" + (" (scripted stand-in)" if plan.scripted else ""),
             total=len(self._todo),
             expected_calls=round(len(self._todo) * plan.llm_sides * PROMPTS_PER_DRIVER),
             cap_usd=options.limits.max_cost_usd,
+            ledger=self._ledger,
             stored_before=len(self._stored),
         )
 
@@ -159,8 +167,11 @@ class Sweep:
             finally:
                 await self._store_rest(flusher, outcome)
             self._explain_misses(outcome)
-            outcome.spending = self._ledger.read()
-            outcome.cache_cost_usd = self._cache.cost_usd()
+            try:
+                outcome.spending = self._ledger.read()
+                outcome.cache_cost_usd = self._cache.cost_usd()
+            except MergeRunnerError as exc:
+                outcome.fail(exc.exit_code, str(exc))
         for meter in meters:
             outcome.damaged += meter.damaged
             outcome.calls_live += meter.calls_live
@@ -290,7 +301,7 @@ class Sweep:
             await asyncio.wait([work])
         if work.cancelled():
             outcome.fail(INTERRUPTED, "Interrupted. Run the same command again to go on.")
-        elif isinstance(error := work.exception(), SweepStopped):
+        elif isinstance(error := work.exception(), MergeRunnerError):
             outcome.fail(error.exit_code, str(error))
         elif error is not None:
             raise error
@@ -317,21 +328,20 @@ class Sweep:
 
     def _end(self, outcome: Outcome) -> None:
         """Note how the sweep ended, read back what the database holds of it, and audit that."""
-        ended_at = datetime.now(UTC).replace(tzinfo=None)
         try:
-            self._store.end_sweep(outcome.sweep_id, ended_at, outcome.exit_code)
             outcome.facts = sweep_facts(self._options.db, outcome.sweep_id)
             outcome.audit = audit_sweep(
                 self._options.db, outcome.sweep_id, finished=outcome.exit_code == 0
             )
-        except StoreError as exc:
+            # Another model's answers are told apart from this, and only --strict-model stops there.
+            findings = [f for f in outcome.audit.findings if f.kind != "served"]
+            if findings:
+                outcome.fail(1, f"the audit found {len(findings)} faults: `merge-runner audit`")
+            outcome.messages += map(str, findings[:SHOWN])
+            ended_at = datetime.now(UTC).replace(tzinfo=None)
+            self._store.end_sweep(outcome.sweep_id, ended_at, outcome.exit_code)
+        except (StoreError, UsageError) as exc:
             outcome.fail(exc.exit_code, str(exc))
-            return
-        # Another model's answers are told apart from this, and are an error where she says so.
-        findings = [f for f in outcome.audit.findings if f.kind != "served"]
-        if findings:
-            outcome.fail(1, f"the audit found {len(findings)} faults, see `merge-runner audit`:")
-        outcome.messages += map(str, findings[:SHOWN])
 
     async def _trial(self, spec: TrialSpec) -> TrialRecord | None:
         """Play a trial; None: there is no money for it to go on."""
@@ -348,17 +358,21 @@ class Sweep:
                 client.leave(spec.order)
 
     def _watch_for_outage(self, record: TrialRecord) -> None:
-        """Stop when one trial after the other fails and no call is answered in between."""
-        answers = sum(client.meter.calls_live for client in self._clients.values())
-        if record.status != "failed" or answers > self._answers_before_failures:
-            self._failures_in_a_row, self._answers_before_failures = 0, answers
-        self._failures_in_a_row += record.status == "failed"
-        if self._failures_in_a_row >= FAILURES_IN_A_ROW and not self._options.replay:
-            raise ProviderDown(
-                f"the last {self._failures_in_a_row} trials failed and no call was answered in "
-                f"between ({record.error}): the rest is not tried. When the service answers "
-                "again, run the same command to go on"
-            )
+        """Stop when trials fail for want of one model, which answers no call in between."""
+        if self._options.replay:
+            return
+        for name in {self._plan.sides[failed.side] for failed in record.failed_calls}:
+            outage = self._outages.setdefault(name, Outage())
+            answers = self._clients[name].meter.calls_live
+            if answers > outage.answers:
+                outage.answers, outage.trials = answers, 0
+            outage.trials += 1
+            if outage.trials >= FAILURES_IN_A_ROW:
+                raise ProviderDown(
+                    f"the last {outage.trials} trials with {name} failed and no call was answered "
+                    f"in between ({record.error}): the rest is not tried. When the service answers "
+                    "again, run the same command to go on"
+                )
 
     def _driver(self, spec: TrialSpec, side: Side) -> Driver:
         name, scenario = self._plan.sides[side], self._plan.scenario

@@ -525,7 +525,7 @@ async def test_a_proxy_that_caches_is_found_in_repetitions_and_in_a_fresh_set_of
         for more in ((2,), (1, "--sample-set", 1)):
             run = await merge_runner(*part, *more, **env)
             assert run.code == 1, "the sweep itself finds it at its end"
-            assert "faults, see `merge-runner audit`" in run.err
+            assert "faults: `merge-runner audit`" in run.err
     found = audit("--db", tmp_path / "results/merge.duckdb")
     assert found.code == 1
     assert found.kinds == {"shared"}

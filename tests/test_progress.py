@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from types import SimpleNamespace
 
+from merge_runner.llm.ledger import Spending
 from merge_runner.llm.meter import Meter
 from merge_runner.progress import Progress
 from merge_runner.records import Attempt, Usage
@@ -21,6 +23,7 @@ def test_every_figure_is_that_of_the_meters():
         expected_calls=184,
         meters=meters,
         cap_usd=20,
+        ledger=SimpleNamespace(spending=Spending(spent_usd=4.0, reserved_usd=0.25)),
         done=Counter(finished=2, failed=1),
         running=5,
         stored_before=7,
@@ -32,7 +35,7 @@ def test_every_figure_is_that_of_the_meters():
     assert fields["WARNING"] == "another model answers: o3 -> gpt-4o"
     assert fields["calls"] == "34 live, 12 from recordings"
     assert fields["rate"] == "2 requests/min, 150 tokens/min"
-    assert fields["cost"] == "1.50 of 20.00 USD"
+    assert fields["cost"] == "1.50 USD, 4.25 of 20 over all runs"
     # 3 of 10 trials have ended but only 46 of 184 calls are made: the larger share tells.
     assert fields["time"] == "60 s, about 140 s left"
 

@@ -9,10 +9,13 @@ order of the sweep, as those before them end.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.ledger import TOLERANCE_USD, Ledger
 from merge_runner.records import Attempt
+
+PATIENCE_S = 90.0
 
 
 class Budget:
@@ -31,6 +34,7 @@ class Budget:
         self._allowances: dict[int, float] = {}
         self._at_the_door: list[int] = []  # once for each side that asks
         self._stuck: set[int] = set()
+        self._left: set[int] = set()
         self._in_flight = 0
         self._queued_usd = 0.0
         self._changed = asyncio.Event()
@@ -39,6 +43,8 @@ class Budget:
         """Wait for a trial's allowance; raises TrialSuspended when no ending trial can free it."""
         if self.cap_usd is None:
             return
+        if trial in self._left:
+            raise TrialSuspended("its trial is suspended")
         self._at_the_door.append(trial)
         try:
             while trial not in self._allowances:
@@ -57,18 +63,22 @@ class Budget:
             self._tell()
 
     def leave(self, trial: int) -> None:
-        """The trial has ended: what is left of its allowance is free."""
+        """The trial has ended or is suspended: what is left of its allowance is free."""
+        self._left.add(trial)
         if self._allowances.pop(trial, None) is not None:
             self._tell()
 
     async def reserve(self, trial: int, worst_usd: float) -> None:
         """Set an attempt's worst case aside; waits for others, else raises TrialSuspended."""
+        waited_s = 0.0
         while not self._taken(trial, worst_usd):
             self._stuck.add(trial)
             try:
-                if not self._in_flight and self._allowances.keys() <= self._stuck:
+                if not self._in_flight and (
+                    self._allowances.keys() <= self._stuck or waited_s >= PATIENCE_S
+                ):
                     raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
-                await self._changed.wait()
+                waited_s += await self._change()
             finally:
                 self._stuck.discard(trial)
         self._in_flight += 1
@@ -92,7 +102,7 @@ class Budget:
 
     @property
     def _committed_usd(self) -> float:
-        return self.ledger.spending.committed_usd + self._queued_usd
+        return self.ledger.read().committed_usd + self._queued_usd
 
     def _taken(self, trial: int, worst_usd: float) -> bool:
         """Take an attempt's worst case, from the trial's allowance as far as that goes."""
@@ -105,6 +115,18 @@ class Budget:
         if own:
             self._allowances[trial] -= own
         return True
+
+    async def _change(self) -> float:
+        """Wait for a change, a while; returns how long in s.
+
+        Another process may hold a claim that a trial of ours waits for, and wait for ours.
+        """
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(PATIENCE_S):
+                await self._changed.wait()
+        return loop.time() - began
 
     def _tell(self) -> None:
         self._changed.set()

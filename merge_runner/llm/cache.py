@@ -22,7 +22,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.batches import BatchWriter, Operation
-from merge_runner.llm.disk import FORMAT, open_disk, set_format
+from merge_runner.llm.disk import FORMAT, format_of, open_disk, set_format
 from merge_runner.records import Attempt, ChatRequest
 
 ENTRY_VERSION = 1
@@ -157,19 +157,30 @@ class ResponseCache:
         """Keep entries in one transaction, in this thread; returns those that are kept."""
         return self.run_now([partial(self._keep, entry) for entry in entries])
 
-    def set_aside(self, key: str) -> None:
-        """Move a damaged entry out of the way, where it can still be looked at."""
-        with self._disk.transact(retry=True):
-            self._disk.set(_DAMAGED + key, self._disk[key])
-            del self._disk[key]
+    def set_damage_aside(self, key: str) -> list[str]:
+        """Move a damaged entry, or list of attempts, to where it can still be looked at.
+
+        Returns the names of those that were.
+        """
+        names = {key: _unsealed, _UNANSWERED + key: _attempts}
+
+        def damaged() -> list[str]:
+            return [name for name, check in names.items() if self._is_damaged(name, check)]
+
+        def operation() -> list[str]:
+            found = damaged()  # another process may have mended it
+            for name in found:
+                self._disk.set(_DAMAGED + name, self._disk[name])
+                self._disk.delete(name)
+            return found
+
+        moved: list[str] = self.run_now([operation])[0] if damaged() else []
+        return moved
 
     def unanswered(self, key: str) -> tuple[Attempt, ...]:
         """The attempts at a call that earlier runs made without an answer."""
         text = self.read(_UNANSWERED + key)
-        try:
-            return () if text is None else ATTEMPTS.validate_json(text)
-        except ValidationError as exc:
-            raise RecordingError(f"the list of earlier attempts at {key} is damaged") from exc
+        return () if text is None else _attempts(text)
 
     def keep_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """An operation: keep the attempts at a call that has no answer yet."""
@@ -223,19 +234,15 @@ class ResponseCache:
 
     def facts(self, model: str) -> ModelFacts:
         """What the folder knows of a model."""
-        text = self.read(_MODEL + model)
-        try:
-            return ModelFacts() if text is None else _FACTS.validate_json(text)
-        except ValidationError as exc:
-            raise RecordingError(f"the cache's facts about {model} are damaged: {exc}") from exc
+        return self._facts(model) or self._counted_anew(model)
 
     def cost_usd(self) -> float:
         """What all entries of the folder cost when they were made."""
-        return sum(
-            self.facts(key.removeprefix(_MODEL)).cost_usd
-            for key in self._disk
-            if key.startswith(_MODEL)
-        )
+        try:
+            models = [key.removeprefix(_MODEL) for key in self._disk if key.startswith(_MODEL)]
+        except sqlite3.Error as exc:
+            raise CacheFailed(f"the cache {self.folder} cannot be read: {exc}") from exc
+        return sum(self.facts(model).cost_usd for model in models)
 
     def close(self) -> None:
         """Close the folder."""
@@ -249,27 +256,56 @@ class ResponseCache:
         self._new.append(entry)
         return entry
 
+    def _is_damaged(self, name: str, check: Callable[[str], object]) -> bool:
+        text = self.read(name)
+        try:
+            if text is not None:
+                check(text)
+        except RecordingError:
+            return True
+        return False
+
     def _keys(self) -> Iterator[str]:
         return (key for key in self._disk if len(key) == KEY_LENGTH and " " not in key)
 
     def _count(self, entries: Iterable[Entry]) -> None:
         """Within a transaction: add entries to the facts about their models."""
-        facts: dict[str, ModelFacts] = {}
+        by_model: dict[str, list[Entry]] = {}
         for entry in entries:
-            model = entry.request.model
-            if model not in facts:
-                facts[model] = self.facts(model)
-            facts[model].add(entry)
-        for model, known in facts.items():
+            by_model.setdefault(entry.request.model, []).append(entry)
+        for model, new in by_model.items():
+            known = self._facts(model)
+            if known is None:
+                known = self._counted_anew(model)  # with the new ones, which lie there already
+            else:
+                for entry in new:
+                    known.add(entry)
             self._disk.set(_MODEL + model, _FACTS.dump_json(known).decode())
 
     def _bring_up_to_date(self) -> None:
         """The first format knew the endpoints of each model and nothing else."""
         with self._disk.transact(retry=True):
-            for key in [key for key in self._disk if key.startswith(_OLD_ENDPOINTS)]:
+            if format_of(self._disk) == FORMAT:
+                return  # another process was quicker
+            for key in [key for key in self._disk if key.startswith((_OLD_ENDPOINTS, _MODEL))]:
                 del self._disk[key]
             self._count(self._undamaged())
             set_format(self._disk)
+
+    def _facts(self, model: str) -> ModelFacts | None:
+        """The facts about a model; None where they are damaged."""
+        text = self.read(_MODEL + model)
+        try:
+            return ModelFacts() if text is None else _FACTS.validate_json(text)
+        except ValidationError:
+            return None
+
+    def _counted_anew(self, model: str) -> ModelFacts:
+        facts = ModelFacts()
+        for entry in self._undamaged():
+            if entry.request.model == model:
+                facts.add(entry)
+        return facts
 
     def _undamaged(self) -> Iterator[Entry]:
         """A damaged entry is reported when it is needed, not before."""
@@ -281,17 +317,25 @@ class ResponseCache:
 def _sealed(entry: Entry) -> str:
     """An entry as it is stored: its JSON behind a checksum."""
     text = entry.to_json()
-    return _checksum(text) + text
+    return checksum(text) + text
 
 
 def _unsealed(text: str) -> Entry:
     """A stored entry; those of the first format have no checksum. Raises RecordingError."""
     if not text.startswith("{"):
         told, text = text[:CHECKSUM_LENGTH], text[CHECKSUM_LENGTH:]
-        if told != _checksum(text):
+        if told != checksum(text):
             raise RecordingError("the recorded reply is damaged: its checksum is wrong")
     return Entry.from_json(text)
 
 
-def _checksum(text: str) -> str:
+def _attempts(text: str) -> tuple[Attempt, ...]:
+    try:
+        return ATTEMPTS.validate_json(text)
+    except ValidationError as exc:
+        raise RecordingError("the list of earlier attempts is damaged") from exc
+
+
+def checksum(text: str) -> str:
+    """What tells a damaged text."""
     return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH]

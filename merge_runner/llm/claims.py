@@ -9,15 +9,27 @@ import fcntl
 import os
 from pathlib import Path
 
+from merge_runner.errors import UsageError
+
 LOCK_FILE = "claims.lock"
+_TRIED = "f" * 64
 
 
 class Claims:
     """The claims of this process on call keys, among all processes that use the same folder."""
 
     def __init__(self, folder: Path) -> None:
-        self._file = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        """Raises UsageError where the folder's file system has no locks."""
         self._closed = False
+        try:
+            self._file = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            if self.take(_TRIED):
+                self.release(_TRIED)
+        except OSError as exc:
+            raise UsageError(
+                f"the cache {folder} cannot be shared safely: {LOCK_FILE} cannot be locked "
+                f"({exc.strerror}). Name a folder on a local disk with --cache"
+            ) from exc
 
     def take(self, key: str) -> bool:
         """Claim a key; False while another process holds it."""

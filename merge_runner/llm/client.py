@@ -36,7 +36,7 @@ from merge_runner.llm.retry import (
     call_with_retries,
 )
 from merge_runner.llm.transport import Transport, TransportFailure
-from merge_runner.llm.verdicts import RawReply, Verdict, judge
+from merge_runner.llm.verdicts import RawReply, Verdict, judge, may_be_charged
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
 
 EMPTY_RETRIES = 2
@@ -126,19 +126,24 @@ class LlmClient:
         return frozenset({self.entry.id, *self.entry.aliases})
 
     def _recorded(self, request: ChatRequest) -> Entry | None:
-        """The recorded call; a damaged one is set aside, unless nothing can be asked anew."""
+        """The recorded call; a damaged one is none, unless nothing can be asked anew."""
         try:
             return self.cache.get(request.key)
         except RecordingError as exc:
             if self.sealed:
                 raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-            self.cache.set_aside(request.key)
-            self.meter.damaged.append(request.key)
-            self.meter.notes.append(
-                f"{self.name}: {_who(request.slot)}: {exc}; it is set aside in the cache as "
-                f"'damaged {request.key}', and asked again"
-            )
             return None
+
+    def _set_aside_if_damaged(self, request: ChatRequest) -> None:
+        """Move damage out of the way, and tell; only who has claimed the call may."""
+        if self.sealed:
+            return
+        for name in self.cache.set_damage_aside(request.key):
+            self.meter.damaged.append(name)
+            self.meter.notes.append(
+                f"{self.name}: {_who(request.slot)}: what is recorded is damaged; it is set aside "
+                f"in the cache as 'damaged {name}', and asked again"
+            )
 
     def _check_served(self, reply: ChatReply) -> None:
         served = reply.attempts[-1].model_served
@@ -176,12 +181,18 @@ class LlmClient:
 
     async def _claimed(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
         """Make a call unless another process does; returns the entry and its earlier attempts."""
+        if self.budget is not None:
+            # Before the claim: nobody waits for money with a call that another process needs.
+            with self._giving_way(request, "for trials before it to end, under --max-cost"):
+                await self.budget.admit(order)
         if self.claims is None:
+            self._set_aside_if_damaged(request)
             return await self._make(request, order)
         while not self.claims.take(request.key):
             with self._giving_way(request, "for another merge-runner that makes the same call"):
                 await asyncio.sleep(CLAIM_POLL_S)
         try:
+            self._set_aside_if_damaged(request)
             made = self._recorded(request)  # maybe just now
             return (made, len(made.attempts)) if made else await self._make(request, order)
         finally:
@@ -242,8 +253,7 @@ class LlmClient:
     async def _take_turn(self, call: _Call) -> Permit:
         """Money first: a permit must be used when it is given, or the limits do not hold."""
         if self.budget is not None:
-            with self._giving_way(call.request, "for trials before it to end, under --max-cost"):
-                await self.budget.admit(call.order)
+            with self._giving_way(call.request, "for calls in flight to be paid, under --max-cost"):
                 await self.budget.reserve(call.order, call.worst_usd)
         permit: Permit | None = None
         try:
@@ -279,13 +289,13 @@ class LlmClient:
             )
             verdict = judge(raw, FORMATS[self.entry.format])
             record = self._record(number, raw, verdict)
-            # A failed request is not charged; an answer without usage may be.
-            spent = record.cost_usd if raw.status == 200 else 0.0
+            spent = record.cost_usd
             self._settle_tokens(permit, record.usage)
         except TransportFailure as exc:
             verdict = None
-            record = Attempt(number, exc.outcome, error=str(exc))
-            spent = None if exc.sent else 0.0
+            free = self.entry.price == "free" or not exc.sent
+            spent = 0.0 if free else None
+            record = Attempt(number, exc.outcome, error=str(exc), cost_usd=spent)
         record = _timed(record, started_at, time.perf_counter() - started)
         call.attempts.append(record)
         self.meter.count_attempt(record)
@@ -319,7 +329,7 @@ class LlmClient:
         attempts = call.attempts[call.earlier :]
         message = verdict.message or verdict.outcome
         delay_s = verdict.delay_s or 0.0
-        if verdict.action == "retry" and delay_s > self.entry.deadline_s:
+        if verdict.pause and delay_s > self.entry.deadline_s:
             raise QuotaExhausted(
                 f"{self.name}: the provider asks to wait {delay_s:.0f} s, longer than a "
                 f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
@@ -366,7 +376,7 @@ class LlmClient:
             usage=usage,
             reply=raw.body,
             error=verdict.message,
-            cost_usd=self.pricing.cost_usd(usage) if raw.status == 200 else 0.0,
+            cost_usd=self.pricing.cost_usd(usage) if may_be_charged(raw) else 0.0,
         )
 
     def _worst_case(self, request: ChatRequest) -> Usage:

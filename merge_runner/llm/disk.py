@@ -12,7 +12,7 @@ from diskcache.core import MODE_PICKLE
 from merge_runner.errors import RecordingError, UsageError
 
 FORMAT = 2
-_FORMAT = "format"
+_FORMAT, _OPENED = "format", "opened"
 
 
 class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
@@ -56,10 +56,11 @@ def open_disk(folder: Path) -> tuple[diskcache.Cache, int]:
             sqlite_synchronous=2,  # FULL: an acknowledged reply survives a power cut
             disk_min_file_size=2**40,  # everything in the one SQLite file
         )
-        # The first version had no mark of its format.
-        version = int(disk.get(_FORMAT, 1 if len(disk) else FORMAT))
+        if not len(disk):
+            disk.add(_FORMAT, str(FORMAT))
+        version = format_of(disk)
         if version <= FORMAT:
-            disk.set(_FORMAT, str(version))
+            disk.set(_OPENED, "")  # it can be written
     except (OSError, sqlite3.Error, diskcache.Timeout, ValueError) as exc:
         raise UsageError(
             f"the cache {folder} cannot be used: {exc}. Mend or move the folder, or name another "
@@ -71,6 +72,11 @@ def open_disk(folder: Path) -> tuple[diskcache.Cache, int]:
             f"reads up to {FORMAT}: update merge-runner, or name another with --cache"
         )
     return disk, version
+
+
+def format_of(disk: diskcache.Cache) -> int:
+    """The format of a folder; the first one had no mark."""
+    return int(disk.get(_FORMAT, 1))
 
 
 def set_format(disk: diskcache.Cache) -> None:

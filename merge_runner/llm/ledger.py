@@ -12,7 +12,8 @@ from datetime import UTC, datetime
 
 from pydantic import TypeAdapter
 
-from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.errors import UsageError
+from merge_runner.llm.cache import CHECKSUM_LENGTH, Entry, ResponseCache, checksum
 from merge_runner.records import Attempt
 
 UNKNOWN_FATE = "unknown"
@@ -103,12 +104,23 @@ class Ledger:
     def read(self) -> Spending:
         """The state of now."""
         text = self._cache.read(self._name)
-        self.spending = Spending() if text is None else _SPENDING.validate_json(text)
+        self.spending = Spending() if text is None else self._unsealed(text)
         return self.spending
 
     def _write(self, spending: Spending) -> None:
         self.spending = spending
-        self._cache.replace(self._name, _SPENDING.dump_json(spending).decode())
+        text = _SPENDING.dump_json(spending).decode()
+        self._cache.replace(self._name, checksum(text) + text)
+
+    def _unsealed(self, text: str) -> Spending:
+        told, text = text[:CHECKSUM_LENGTH], text[CHECKSUM_LENGTH:]
+        if told != checksum(text):
+            raise UsageError(
+                f"the record of what this sweep has spent ({self._name!r} in the cache "
+                f"{self._cache.folder}) is damaged, so that no cap could hold: export what is "
+                "recorded and import it into a new folder, which counts from 0, with --cache"
+            )
+        return _SPENDING.validate_json(text)
 
 
 def _begun(number: int) -> Attempt:

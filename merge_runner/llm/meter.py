@@ -56,7 +56,7 @@ class Meter:
         )
         if attempt.cost_usd is not None:
             self.cost_usd += attempt.cost_usd
-        elif usage.output_tokens:
+        else:
             self.cost_unknown += 1
 
     def count_reply(self, reply: ChatReply, accepted_models: frozenset[str]) -> None:

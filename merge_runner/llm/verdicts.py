@@ -35,6 +35,7 @@ QUOTA_CODES = frozenset(
 )
 # Anthropic reports these as invalid requests.
 SPENT = ("credit balance is too low", "spend limit")
+TOO_LATE = frozenset({408, 504, 524})
 TRANSIENT = {
     408: "request_timeout",
     409: "conflict",
@@ -75,6 +76,17 @@ class Verdict:
     message: str | None = None
     delay_s: float | None = None
     pause: bool = False
+
+
+def may_be_charged(raw: RawReply) -> bool:
+    """Whether a reply may stand for work that is charged.
+
+    A provider's own error is not; that of a gateway, or one for want of time, may follow an answer
+    that was made.
+    """
+    if raw.status == 200 or raw.status in TOO_LATE:
+        return True
+    return raw.status >= 500 and not isinstance(_json(raw.body), (dict, list))
 
 
 def judge(raw: RawReply, wire: WireFormat) -> Verdict:

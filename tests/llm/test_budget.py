@@ -191,3 +191,12 @@ async def test_without_a_cap_everything_passes_and_is_recorded(ledger):
     for trial in range(3):
         await attempt(budget, trial, 10.0**9, 10.0**6)
     assert ledger.read().spent_usd == 3 * 10.0**6
+
+
+async def test_a_call_that_goes_on_after_its_trial_gets_no_money(ledger):
+    budget = Budget(ledger, cap_usd=5.0, trial_usd=4.0)
+    await budget.admit(1)
+    budget.leave(1)
+    with pytest.raises(TrialSuspended):
+        await budget.admit(1)
+    await asyncio.wait_for(budget.admit(2), 1)

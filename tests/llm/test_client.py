@@ -644,10 +644,17 @@ async def test_a_failing_server_makes_only_its_own_call_wait(make):
     assert client.transport.times == [0, 0, 30]
 
 
-@pytest.mark.parametrize("status", [429, 503])
 @on_a_clock
-async def test_a_delay_longer_than_the_deadline_stops_the_sweep(make, status):
-    client = make(error(status, "come back tomorrow", retry_after="86400"), answer())
+async def test_an_outage_longer_than_the_deadline_fails_its_call_alone(make):
+    client = make(error(503, "come back tomorrow", retry_after="86400"), answer())
+    with pytest.raises(CallFailed, match="come back tomorrow"):
+        await client.ask("prompt", slot())
+    assert (len(client.transport.sent), now()) == (1, 0)
+
+
+@on_a_clock
+async def test_a_limit_that_lasts_longer_than_the_deadline_stops_the_sweep(make):
+    client = make(error(429, "come back tomorrow", retry_after="86400"), answer())
     with pytest.raises(QuotaExhausted, match=r"86400 s.*come back tomorrow"):
         await client.ask("prompt", slot())
     assert len(client.transport.sent) == 1

@@ -5,15 +5,26 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import shutil
 
 import pytest
 from aiohttp import web
-from harness import FAST, watched
+from harness import FAST, PROJECT, watched
 
 SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
-# o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and no trial
-# can cost more than 3.4 USD (2 x 12 prompts, 16,000 tokens of output each).
+# o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and none can
+# cost more than 3.4 USD (2 x 12 prompts to the timeout, 16,000 tokens of output each).
+SHORT = "[repetitions]\nbaseline = 10\n[scenario]\ntimeout_s = 12\n"
 ROOM_FOR_SOME = 3.9
+
+
+@pytest.fixture(autouse=True)
+def experiments(tmp_path):
+    """Trials that end after 12 s at the latest."""
+    folder = tmp_path / "experiments"
+    shutil.copytree(PROJECT / "experiments", folder)
+    (folder / "baseline.toml").write_text(SHORT)
+    return folder
 
 
 def account(server):
@@ -161,13 +172,11 @@ async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_r
     assert other.out.split()[-1] == "0.0"
 
 
-async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, tmp_path):
-    (tmp_path / "experiments").mkdir()
-    (tmp_path / "experiments/models.toml").write_text(
+async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, experiments):
+    (experiments / "models.toml").write_text(
         '[mine]\nprovider = "openai"\nformat = "openai-chat"\nid = "nobody-knows"\n'
         "max_output_tokens = 1000\n"
     )
-    (tmp_path / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 1\n")
     async with watched() as server:
         env = account(server)
         sweep = ("sweep", "baseline", "--model", "mine", "--conditions", "L_4_0", "--json", *FAST)
@@ -182,3 +191,46 @@ async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, tmp_path):
         run = await merge_runner(*sweep, "--yes", **env)
     assert run.code == 0, run.err
     assert run.summary["calls_of_unknown_cost"] == server.requests
+
+
+async def test_two_runs_under_one_cap_never_pass_it_and_both_end(merge_runner):
+    bill = Bill()
+    async with watched(bill.middle) as server:
+        env = account(server)
+        sweep = (*SWEEP, "--reps", 3, "--yes", *FAST, "--max-cost", 7)
+        runs = await asyncio.gather(
+            *(merge_runner(*sweep, "--order-seed", seed, **env) for seed in (1, 2))
+        )
+    assert {run.code for run in runs} <= {0, 3}, [run.err for run in runs]
+    assert 0 < bill.usd <= 7
+    (calls,) = await sql(merge_runner, "select count(distinct call_key) as n from calls")
+    assert calls["n"] <= server.requests
+
+
+async def test_a_gateways_error_may_be_charged_and_a_providers_is_not(merge_runner, experiments):
+    async def middle(request, handler):
+        await handler(request)
+        if server.requests % 2:
+            return web.Response(status=502, text="<html>502 Bad Gateway</html>")
+        return web.json_response({"error": {"message": "Overloaded."}}, status=503)
+
+    (experiments / "models.toml").write_text(
+        '[brief]\nprovider = "openai"\nformat = "openai-chat"\nid = "o3"\ndeadline_s = 2\n'
+        "max_output_tokens = 16000\n"
+    )
+    async with watched(middle) as server:
+        run = await merge_runner(
+            "sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--model", "brief",
+            "--yes", "--json", **account(server),
+        )  # fmt: skip
+    assert run.code == 1
+    attempts = run.summary["attempts"]
+    assert attempts["server_error"] > 0 < attempts["overloaded"]
+    assert run.summary["attempts_of_unknown_cost"] == attempts["server_error"]
+    assert run.summary["set_aside_usd"] == pytest.approx(0.137 * attempts["server_error"], rel=0.1)
+
+
+async def test_a_dry_run_makes_no_file(merge_runner, tmp_path):
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    assert (await merge_runner(*SWEEP, "--dry-run")).code == 0
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before

@@ -74,7 +74,9 @@ async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_pat
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         run = await merge_runner(*sweep, "--in-flight", 4, **env)
         assert run.code == 1, run.err
-        assert "the last 10 trials failed and no call was answered in between" in run.err
+        assert (
+            "the last 10 trials with patient failed and no call was answered in between" in run.err
+        )
         assert "run the same command to go on" in run.err
         assert run.summary["trials"]["failed"] <= 14
         # Two sides of at most 14 of 110 trials, with two or three attempts each.
