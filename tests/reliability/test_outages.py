@@ -140,3 +140,41 @@ async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
         loose = await merge_runner(*sweep, "--conditions", "L_4_0", **env)
         assert loose.code == 0
     assert loose.summary["model_mismatches"]
+
+
+async def test_one_dead_model_of_a_pair_stops_the_sweep(merge_runner, tmp_path):
+    async def middle(request, handler):
+        return (
+            down(request) if (await request.json())["model"] == "dead" else await handler(request)
+        )
+
+    configured(tmp_path, deadline_s=0.6)
+    dead = MODELS.format(deadline_s=0.6).replace("[patient]", "[bad]")
+    registry = tmp_path / "experiments/models.toml"
+    registry.write_text(registry.read_text() + dead.replace("scripted-driver", "dead"))
+    async with watched(middle) as server:
+        run = await merge_runner(
+            "sweep", "baseline", "--model", "patient+bad", "--in-flight", 4, "--json",
+            EMULATOR_BASE_URL=f"{server.url}/v1",
+        )  # fmt: skip
+    assert run.code == 1
+    assert "the last 10 trials with bad failed" in run.err
+    assert run.summary["trials"]["failed"] <= 14
+
+
+async def test_recorded_trials_do_not_hide_an_outage(merge_runner, tmp_path):
+    async def middle(request, handler):
+        return await handler(request) if working else down(request)
+
+    working = True
+    sweep = configured(tmp_path, deadline_s=0.6)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        part = ("--reps", 2, "--conditions", "L_4_0,L_4_8,N_0_0")
+        assert (await merge_runner(*sweep, *part, "--in-flight", 3, **env)).code == 0
+        working = False
+        run = await merge_runner(*sweep, "--reps", 4, "--in-flight", 3, "--db", "new", **env)
+    assert run.code == 1
+    assert "no call was answered in between" in run.err
+    assert run.summary["trials"]["failed"] <= 13
+    assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] <= 6
