@@ -10,6 +10,8 @@ from harness import PROGRAM, environment, watched
 from merge_runner.emulator.faults import TRANSIENT, FaultPlan
 from merge_runner.store import results_digest
 
+pytestmark = pytest.mark.slow
+
 # What each fault is to the client.
 OUTCOMES = {
     "rate_limit": "rate_limited",

@@ -121,6 +121,16 @@ async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
         await Budget(ledger, cap_usd=1.0).reserve(1, 0.5)
 
 
+async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, cache):
+    both = [Budget(Ledger(cache, "shared"), cap_usd=1.0) for _ in range(2)]
+    for budget in both:
+        await budget.reserve(1, 0.75)  # neither knows of the other's yet
+    await both[0].begin("a", [], 0.75)
+    with pytest.raises(TrialSuspended, match="another run"):
+        await both[1].begin("b", [], 0.75)
+    assert both[1].ledger.read().committed_usd == 0.75
+
+
 async def test_a_reservation_waits_for_what_is_in_flight(ledger):
     budget = Budget(ledger, cap_usd=1.0)
     await budget.reserve(1, 0.75)

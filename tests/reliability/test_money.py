@@ -11,6 +11,8 @@ import pytest
 from aiohttp import web
 from harness import FAST, PROJECT, watched
 
+pytestmark = pytest.mark.slow
+
 SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
 # o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and none can
 # cost more than 3.4 USD (2 x 12 prompts to the timeout, 16,000 tokens of output each).

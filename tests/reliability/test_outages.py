@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from aiohttp import web
 from harness import FAST, watched
 
 from merge_runner.records import SLOT_HEADER
+
+pytestmark = pytest.mark.slow
 
 MODELS = """
 [patient]

@@ -338,7 +338,7 @@ def test_a_small_file_that_unpacks_to_much_is_refused_in_little_memory(name):
 def test_the_measurement_sees_memory():
     """Or else the test above would show nothing."""
     used = PEAK_MB.replace("summarise(Path(sys.argv[1]))", "bytearray(b'x') * (300 * 2**20)")
-    assert peak_mb(used)[1] >= 300
+    assert peak_mb(used)[1] >= 290  # less what was free before
 
 
 @pytest.mark.parametrize(
