@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.errors import TrialSuspended
+from merge_runner.errors import TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Ledger
@@ -210,3 +210,11 @@ async def test_a_call_that_goes_on_after_its_trial_gets_no_money(ledger):
     with pytest.raises(TrialSuspended):
         await budget.admit(1)
     await asyncio.wait_for(budget.admit(2), 1)
+
+
+async def test_a_damaged_record_of_spending_is_told_and_not_believed(ledger, cache):
+    await attempt(Budget(ledger), 1, 0.5, 0.25)
+    text = cache.read(ledger._name)
+    await cache.write(lambda: cache.replace(ledger._name, text.replace("0.25", "0.15")))
+    with pytest.raises(UsageError, match="so that no cap could hold"):
+        ledger.read()
