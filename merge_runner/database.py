@@ -64,14 +64,15 @@ def open_database(
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open the database, waiting for others to close it; raises StoreError."""
     connection, name = _attached(path, read_only, patience_s, instance)
+    in_order = False
     try:
         yield connection
-    except BaseException:
-        instance.drop()
-        raise
-    else:
-        _detach(connection, name, instance)
+        in_order = True
     finally:
+        if in_order:
+            _detach(connection, name, instance)
+        else:
+            instance.drop()
         connection.close()
 
 
