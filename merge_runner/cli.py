@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from merge_runner.errors import MergeRunnerError, UsageError, printable
+from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.places import DEFAULT_CACHE, DEFAULT_DB
+from merge_runner.texts import printable
 
 if TYPE_CHECKING:
     from merge_runner.emulator.faults import FaultPlan

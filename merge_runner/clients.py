@@ -16,8 +16,8 @@ from merge_runner.llm.claims import Claims
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
-from merge_runner.llm.prices import pricing
-from merge_runner.llm.transport import SealedTransport, Transport
+from merge_runner.llm.prices import Pricing, pricing
+from merge_runner.llm.transport import SealedTransport
 from merge_runner.plan import Limits
 
 SPARE_FILES = 64
@@ -27,12 +27,12 @@ SPARE_FILES = 64
 class Terms:
     """On what terms a sweep asks.
 
-    ``ledger`` names its spending in the cache, over all its runs; ``trial_usd`` is the worst case
-    of a whole trial. ``strict`` stops at an answer of another model.
+    ``ledger`` holds its spending, over all its runs; ``trial_usd`` is the worst case of a whole
+    trial. ``strict`` stops at an answer of another model.
     """
 
     limits: Limits
-    ledger: str
+    ledger: Ledger
     trial_usd: float
     strict: bool = False
 
@@ -45,13 +45,14 @@ def sealed_clients(
 ) -> dict[str, LlmClient]:
     """Clients that answer from recordings alone: no key, no connection."""
     return {
-        name: _client(
-            name,
-            entry,
+        name: LlmClient(
+            name=name,
+            entry=entry,
             endpoint=endpoints[name],
             cache=cache,
             transport=transport,
             limiter=Limiter(),
+            pricing=pricing(entry),
             sealed=True,
         )
         for name, entry in entries.items()
@@ -75,9 +76,7 @@ async def live_clients(
 
     limits = terms.limits
     _allow_open_files(limits.connections + SPARE_FILES)
-    budget = Budget(
-        Ledger(cache, terms.ledger), cap_usd=limits.max_cost_usd, trial_usd=terms.trial_usd
-    )
+    budget = Budget(terms.ledger, cap_usd=limits.max_cost_usd, trial_usd=terms.trial_usd)
     claims = Claims(cache.folder)
     stack.callback(claims.close)
     pauses: dict[str, Pause] = {}
@@ -91,18 +90,18 @@ async def live_clients(
             resolve_endpoint(name, entry, environment), connections=limits.connections
         )
         stack.push_async_callback(transport.close)
-        limiter = Limiter(
-            rpm=limits.rpm or entry.rpm,
-            tpm=limits.tpm or entry.tpm,
-            pause=pauses.setdefault(endpoints[name], Pause()),
-        )
-        clients[name] = _client(
-            name,
-            entry,
+        clients[name] = LlmClient(
+            name=name,
+            entry=entry,
             endpoint=endpoints[name],
             cache=cache,
             transport=transport,
-            limiter=limiter,
+            limiter=Limiter(
+                rpm=limits.rpm or entry.rpm,
+                tpm=limits.tpm or entry.tpm,
+                pause=pauses.setdefault(endpoints[name], Pause()),
+            ),
+            pricing=_pricing(name, entry, capped=limits.max_cost_usd is not None),
             budget=None if entry.price == "free" else budget,
             claims=claims,
             strict=terms.strict,
@@ -110,38 +109,14 @@ async def live_clients(
     return clients
 
 
-def _client(
-    name: str,
-    entry: ModelEntry,
-    *,
-    endpoint: str,
-    cache: ResponseCache,
-    transport: Transport,
-    limiter: Limiter,
-    budget: Budget | None = None,
-    claims: Claims | None = None,
-    sealed: bool = False,
-    strict: bool = False,
-) -> LlmClient:
+def _pricing(name: str, entry: ModelEntry, *, capped: bool) -> Pricing:
     price = pricing(entry)
-    if budget is not None and budget.cap_usd is not None and not price.known:
+    if capped and not price.known:
         raise UsageError(
             f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
             "experiments/models.toml"
         )
-    return LlmClient(
-        name=name,
-        entry=entry,
-        endpoint=endpoint,
-        cache=cache,
-        transport=transport,
-        limiter=limiter,
-        pricing=price,
-        budget=budget,
-        claims=claims,
-        sealed=sealed,
-        strict=strict,
-    )
+    return price
 
 
 def _allow_open_files(wanted: int) -> None:

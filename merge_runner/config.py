@@ -25,6 +25,7 @@ from pydantic import (
 
 from merge_runner.errors import UsageError
 from merge_runner.places import PROJECT
+from merge_runner.texts import one_line
 
 MOST_STEPS = MOST_REPETITIONS = 100_000
 
@@ -319,7 +320,7 @@ def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
         try:
             endpoint_identity(name, entry, {})
         except UsageError as exc:
-            raise UsageError(_one_line(f"{path}: [{name}]: {exc}")) from exc
+            raise UsageError(one_line(f"{path}: [{name}]: {exc}")) from exc
     return entries
 
 
@@ -376,12 +377,7 @@ def _validate(model: type[ModelT], value: object, where: str) -> ModelT:
     try:
         return model.model_validate(value)
     except ValidationError as exc:
-        raise UsageError(_one_line(f"{where}: {'; '.join(_explain(exc, model))}")) from exc
-
-
-def _one_line(text: str) -> str:
-    """The text without control characters: a TOML key may hold any."""
-    return "".join(c if c.isprintable() else "?" for c in text)
+        raise UsageError(one_line(f"{where}: {'; '.join(_explain(exc, model))}")) from exc
 
 
 NESTED: dict[str, type[BaseModel]] = {"scenario": Scenario, "price": Price}

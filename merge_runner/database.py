@@ -15,6 +15,7 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.errors import StoreError, StoreLocked, UsageError
+from merge_runner.texts import first_line, quoted
 
 SCHEMA_VERSION = 3
 SCHEMA = Path(__file__).with_name("schema.sql")
@@ -94,7 +95,7 @@ def _attached(
     told = False
     while True:
         try:
-            connection.execute(f"ATTACH '{quoted(path)}' AS {name} ({mode}); USE {name}")
+            connection.execute(f"ATTACH {quoted(path)} AS {name} ({mode}); USE {name}")
         except duckdb.Error as exc:
             if not any(words in str(exc) for words in _BUSY):
                 instance.drop()
@@ -191,15 +192,16 @@ def migrate(path: Path) -> None:
             if version == SCHEMA_VERSION:
                 return  # another process was quicker
             _discard(copy)  # what a process left that died here
-            connection.execute("CHECKPOINT")
-            with duckdb.connect(str(copy)) as made:
-                made.execute(SCHEMA.read_text(encoding="utf-8"))
-            _copy_rows(connection, copy)
-            kept = _free_name(path, version)
-            shutil.copy2(path, kept)
-            os.replace(copy, path)
+            try:
+                _copy_rows(connection, copy)
+                kept = _free_name(path, version)
+                shutil.copy2(path, kept)
+                os.replace(copy, path)
+            finally:
+                _discard(copy)
+    except StoreLocked:
+        raise
     except (OSError, duckdb.Error, StoreError) as exc:
-        _discard(copy)
         raise UsageError(
             f"{path} has an older schema and cannot be brought to version {SCHEMA_VERSION} where "
             f"it lies: {first_line(exc)}. Copy it to a folder that can be written and name the "
@@ -232,7 +234,11 @@ def _numbers() -> Iterator[str]:
 
 
 def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
-    connection.execute(f"ATTACH '{quoted(copy)}' AS copied")
+    """Make a new file with all rows of the open one."""
+    connection.execute("CHECKPOINT")
+    with duckdb.connect(str(copy)) as made:
+        made.execute(SCHEMA.read_text(encoding="utf-8"))
+    connection.execute(f"ATTACH {quoted(copy)} AS copied")
     old = {
         table
         for (table,) in connection.execute(
@@ -247,13 +253,3 @@ def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
             connection.execute(f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table}")  # noqa: S608 # our tables
     connection.execute("INSERT INTO copied.meta VALUES (?)", [SCHEMA_VERSION])
     connection.execute("DETACH copied")
-
-
-def quoted(path: Path) -> str:
-    """A path as it stands between the quotes of a statement."""
-    return str(path).replace("'", "''")
-
-
-def first_line(exc: Exception) -> str:
-    """The first line: DuckDB adds a stack trace to what it takes for its own fault."""
-    return str(exc).split("\n", maxsplit=1)[0]

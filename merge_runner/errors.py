@@ -105,8 +105,3 @@ class StoreLocked(StoreError):
 
 class RecordingError(MergeRunnerError):
     """A recording is damaged, or is not one of ours."""
-
-
-def printable(text: str) -> str:
-    """A text that cannot speak to a terminal: what a model or a server wrote may hold any code."""
-    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)

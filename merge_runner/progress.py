@@ -11,9 +11,9 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from merge_runner.errors import printable
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.meter import Meter, Wait
+from merge_runner.texts import printable
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -25,9 +25,10 @@ import duckdb
 from pydantic import TypeAdapter
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.cache import ATTEMPTS, Entry, ResponseCache
 from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
 from merge_runner.records import SIDES, Attempt, ChatRequest, Slot
+from merge_runner.texts import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 1"
 COLUMNS = {
@@ -47,7 +48,6 @@ COLUMNS = {
 }
 TEXTS = [name for name, kind in COLUMNS.items() if kind == "VARCHAR"]
 BATCH = 1_000
-ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 HEADERS = TypeAdapter(dict[str, str])
 # Far beyond any sweep; a file that claims more was made to harm.
 MOST_CALLS = 10_000_000
@@ -108,9 +108,9 @@ def export_recording(
         appender = connection.appender("calls")
         appender.append_rows(rows)
         appender.flush()
-        pairs = ", ".join(f"{_quoted(name)}: {_quoted(text)}" for name, text in metadata.items())
+        pairs = ", ".join(f"{quoted(name)}: {quoted(text)}" for name, text in metadata.items())
         connection.execute(
-            f"COPY calls TO {_quoted(str(partial))} "
+            f"COPY calls TO {quoted(str(partial))} "
             f"(FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE 10240, KV_METADATA {{{pairs}}})"
         )
         os.replace(partial, file)
@@ -228,7 +228,7 @@ def _verified(file: Path, number: int, row: dict[str, Any]) -> Entry:
     try:
         entry = _entry(row)
     except DAMAGED as exc:
-        raise RecordingError(f"{file}: row {number} is damaged: {_first_line(exc)}") from exc
+        raise RecordingError(f"{file}: row {number} is damaged: {first_line(exc)}") from exc
     if entry.request.key != row["call_key"]:
         raise RecordingError(f"{file}: the content of row {number} does not belong to its key")
     if not entry.attempts:
@@ -302,7 +302,7 @@ def _opened(file: Path) -> duckdb.DuckDBPyConnection:
         }
     except duckdb.Error as exc:
         raise RecordingError(
-            f"{file} is no Parquet file that can be read: {_first_line(exc)}"
+            f"{file} is no Parquet file that can be read: {first_line(exc)}"
         ) from exc
     found.pop("file_row_number", None)
     if found != COLUMNS:
@@ -361,24 +361,16 @@ def _readable(file: Path) -> Iterator[None]:
     try:
         yield
     except (duckdb.Error, UnicodeDecodeError) as exc:
-        raise RecordingError(f"{file} is damaged: {_first_line(exc)}") from exc
-
-
-def _first_line(exc: Exception) -> str:
-    return str(exc).partition("\n")[0]
+        raise RecordingError(f"{file} is damaged: {first_line(exc)}") from exc
 
 
 def _listed(columns: dict[str, str]) -> str:
     """Columns with their types; in a file of somebody else's they may have any name."""
     named = [f"{name[:40]} {kind[:40]}" for name, kind in columns.items()]
     text = ", ".join(named[: 2 * len(COLUMNS)])
-    return "".join(character if character.isprintable() else "?" for character in text)
+    return one_line(text)
 
 
 def _pattern(file: Path) -> str:
     """The file as a quoted pattern that matches it alone, whatever its name."""
-    return _quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))
-
-
-def _quoted(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"
+    return quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))

@@ -20,7 +20,6 @@ from merge_runner.database import (
     SCHEMA,
     SCHEMA_VERSION,
     Instance,
-    first_line,
     migrate,
     open_database,
     read_database,
@@ -30,6 +29,7 @@ from merge_runner.database import (
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.records import TrialRecord
 from merge_runner.rows import Row, call_rows, decision_rows, state_rows, trial_row
+from merge_runner.texts import first_line
 
 TrialKey = tuple[str, str]
 """(trial_id, spec_hash)"""

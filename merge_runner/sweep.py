@@ -261,7 +261,7 @@ class Sweep:
             self._cache,
             Terms(
                 self._options.limits,
-                self._plan.ledger,
+                self._ledger,
                 worst_trial_usd(self._plan),
                 self._options.strict_model,
             ),

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path, PureWindowsPath
 
 from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner.texts import one_line
 
 MAX_FILE_BYTES = 64 * 2**20
 MAX_TOTAL_BYTES = 4 * 2**30
@@ -67,7 +68,7 @@ def open_files(path: Path) -> Iterator[list[File]]:
         _refuse_paths_outside(path, archive.infolist())
         yield [
             File(
-                _shown(member.filename.replace("\\", "/")),
+                one_line(member.filename.replace("\\", "/")),
                 member.file_size,
                 member.compress_size,
                 _reader(archive, member),
@@ -101,13 +102,8 @@ def _files_below(folder: Path) -> Iterator[File]:
         for name in names:
             path = Path(parent, name)
             size = path.stat().st_size if path.is_file() else 0
-            shown = _shown(str(path.relative_to(folder)))
+            shown = one_line(str(path.relative_to(folder)))
             yield File(shown, size, size, partial(_read_file, path))
-
-
-def _shown(name: str) -> str:
-    """A name as it may be printed: whoever made the download chose its characters."""
-    return "".join(character if character.isprintable() else "?" for character in name)
 
 
 def _read_file(path: Path) -> bytes:

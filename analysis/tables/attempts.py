@@ -6,6 +6,7 @@ from analysis.provenance import ANSWERS, Tally, tally
 from analysis.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
+from merge_runner.texts import quoted
 
 NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
 FALLBACK = (
@@ -90,19 +91,15 @@ def _with(what: str) -> str:
 
 
 def _failed(reason: str) -> str:
-    return _with(f"fate IN ('driven', 'fallback') AND failure = {_quoted(reason)}")
+    return _with(f"fate IN ('driven', 'fallback') AND failure = {quoted(reason)}")
 
 
 def _other_model(study: Study) -> str:
     declared = "".join(
-        f" AND NOT (model_requested = {_quoted(asked)} AND model_served = {_quoted(alias)})"
+        f" AND NOT (model_requested = {quoted(asked)} AND model_served = {quoted(alias)})"
         for asked, alias in sorted(study.calls.aliases)
     )
     return _with(f"fate IN ('driven', 'fallback') AND model_served <> model_requested{declared}")
-
-
-def _quoted(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"
 
 
 def _row(group: Group, found: Tally, reasons: tuple[str, ...]) -> Row:

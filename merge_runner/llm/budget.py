@@ -90,14 +90,19 @@ class Budget:
             raise self._suspended("another run of the sweep spends from the same cap")
         self._queued_usd -= worst_usd
 
-    def give_back(self, worst_usd: float) -> None:
+    def give_back(self, trial: int, worst_usd: float) -> None:
         """The attempt was not begun."""
         self._queued_usd -= worst_usd
-        self.settled()
+        self.settled(trial, worst_usd)
 
-    def settled(self) -> None:
-        """An attempt has ended, and the ledger knows what it cost."""
+    def settled(self, trial: int, freed_usd: float = 0.0) -> None:
+        """An attempt has ended, and the ledger knows what it cost.
+
+        ``freed_usd`` was set aside for one that cost nothing: the trial needs it again.
+        """
         self._in_flight -= 1
+        if trial in self._allowances:
+            self._allowances[trial] = min(self._trial_usd, self._allowances[trial] + freed_usd)
         self._tell()
 
     @property

@@ -242,7 +242,7 @@ class LlmClient:
         try:
             return await self.budget.ledger.keep(entry, call.worst_usd, call.spent_usd)
         finally:
-            self.budget.settled()
+            self.budget.settled(call.order)
 
     async def _keep_unanswered(self, call: _Call) -> None:
         """Keep the attempts for a later run; the ledger of a paid model did so already."""
@@ -261,7 +261,7 @@ class LlmClient:
                 permit = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
         finally:
             if permit is None and self.budget is not None:
-                self.budget.give_back(call.worst_usd)
+                self.budget.give_back(call.order, call.worst_usd)
         return permit
 
     @contextmanager
@@ -315,7 +315,7 @@ class LlmClient:
         try:
             await self.budget.begin(call.request.key, call.attempts, call.worst_usd)
         except MergeRunnerError:
-            self.budget.give_back(call.worst_usd)
+            self.budget.give_back(call.order, call.worst_usd)
             raise
 
     async def _settle_failed(self, call: _Call, spent_usd: float | None) -> None:
@@ -323,7 +323,7 @@ class LlmClient:
             await self.budget.ledger.settle(
                 call.request.key, call.attempts, call.worst_usd, spent_usd
             )
-            self.budget.settled()
+            self.budget.settled(call.order, call.worst_usd if spent_usd == 0 else 0.0)
 
     def _act_on(self, verdict: Verdict, call: _Call) -> None:
         attempts = call.attempts[call.earlier :]

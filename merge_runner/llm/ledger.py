@@ -16,7 +16,6 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.cache import CHECKSUM_LENGTH, Entry, ResponseCache, checksum
 from merge_runner.records import Attempt
 
-UNKNOWN_FATE = "unknown"
 TOLERANCE_USD = 1e-9  # sums of floats
 _SPENT = "spent "
 
@@ -127,7 +126,7 @@ def _begun(number: int) -> Attempt:
     """An attempt as it is noted before it is made; what comes of it takes its place."""
     return Attempt(
         number=number,
-        outcome=UNKNOWN_FATE,
+        outcome="unknown",
         started_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
         error="the run ended before a reply was seen; it may have been charged",
     )

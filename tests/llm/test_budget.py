@@ -47,7 +47,7 @@ async def attempt(budget, trial, worst, actual, turns=0):
     for _ in range(turns):
         await asyncio.sleep(0)
     await budget.ledger.settle("key", [], worst, actual)
-    budget.settled()
+    budget.settled(trial, worst if actual == 0 else 0.0)
 
 
 async def soon(job):
@@ -136,7 +136,7 @@ async def test_a_reservation_waits_for_what_is_in_flight(ledger):
     await budget.reserve(1, 0.75)
     waiting = await soon(budget.reserve(2, 0.5))
     assert not waiting.done()
-    budget.give_back(0.75)
+    budget.give_back(1, 0.75)
     await waiting
 
 
@@ -152,6 +152,18 @@ async def test_a_trial_begins_only_where_it_could_end_within_the_cap(ledger):
     assert not third.done()
     budget.leave(1)
     await third
+
+
+async def test_attempts_that_cost_nothing_do_not_use_up_an_allowance(ledger):
+    budget = Budget(ledger, cap_usd=5.0, trial_usd=4.0)
+    for _ in range(10):
+        await attempt(budget, 1, 1.0, 0.0)
+    other = await soon(budget.admit(2))
+    assert not other.done()
+    await attempt(budget, 1, 4.0, 4.0)
+    budget.leave(1)
+    with pytest.raises(TrialSuspended):
+        await other
 
 
 async def test_trials_begin_in_their_order_and_the_first_is_never_overtaken(ledger):

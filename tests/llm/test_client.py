@@ -1,11 +1,11 @@
 import asyncio
-import functools
 import json
 import sqlite3
 from collections import Counter
 
 import diskcache
 import pytest
+from virtual_time import in_virtual_time, now_s
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import (
@@ -27,53 +27,6 @@ from merge_runner.llm.verdicts import RawReply
 from merge_runner.records import Slot
 
 
-class ClockLoop(asyncio.SelectorEventLoop):
-    """An event loop whose clock jumps to the next timer; work in threads is waited for."""
-
-    def __init__(self):
-        self.now = 0.0
-        self.working = 0
-        super().__init__()
-        self.select, self._selector.select = self._selector.select, self.jump
-
-    def time(self):
-        return self.now
-
-    def run_in_executor(self, *args):
-        work = super().run_in_executor(*args)
-        self.working += 1
-        work.add_done_callback(self.worked)
-        return work
-
-    def worked(self, work):
-        self.working -= 1
-
-    def jump(self, timeout=None):
-        ready = self.select(0 if timeout == 0 or (timeout and not self.working) else None)
-        if not ready:
-            self.now += timeout
-        return ready
-
-
-def on_a_clock(test):
-    """Run a test in time that passes at once; whoever would wait for ever waits for an hour."""
-
-    async def limited(*args, **kwargs):
-        async with asyncio.timeout(3600):
-            await test(*args, **kwargs)
-
-    @functools.wraps(test)
-    def run(*args, **kwargs):
-        with asyncio.Runner(loop_factory=ClockLoop) as runner:
-            runner.run(limited(*args, **kwargs))
-
-    return run
-
-
-def now():
-    return asyncio.get_running_loop().time()
-
-
 class Server:
     """Stands in for the network: gives its replies in order, the last one for ever."""
 
@@ -88,7 +41,7 @@ class Server:
 
     async def send(self, request, *, attempt, timeout_s):
         self.sent.append(request)
-        self.times.append(now())
+        self.times.append(now_s())
         self.timeouts.append(timeout_s)
         reply = self.replies.pop(0) if len(self.replies) > 1 else self.replies[0]
         await self.open.wait()
@@ -175,7 +128,7 @@ def outcomes(attempts):
     return [attempt.outcome for attempt in attempts]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_second_ask_is_answered_from_the_cache(make):
     client = make(answer("first"), answer("second"))
     first = await client.ask("prompt", slot())
@@ -190,7 +143,7 @@ async def test_a_second_ask_is_answered_from_the_cache(make):
     assert later.transport.sent == []
 
 
-@on_a_clock
+@in_virtual_time
 async def test_two_who_ask_the_same_at_once_share_one_call(make):
     client = make(answer("first"), answer("second"))
     replies = await asyncio.gather(*(client.ask("prompt", slot()) for _ in range(2)))
@@ -200,7 +153,7 @@ async def test_two_who_ask_the_same_at_once_share_one_call(make):
     assert (client.meter.calls_live, client.meter.calls_cached) == (1, 1)
 
 
-@on_a_clock
+@in_virtual_time
 async def test_every_slot_is_a_sample_of_its_own(make):
     client = make(*(answer(str(number)) for number in range(20)))
     slots = [slot(repetition, side) for repetition in range(1, 11) for side in ("left", "right")]
@@ -211,7 +164,7 @@ async def test_every_slot_is_a_sample_of_its_own(make):
     assert len({request.body for request in client.transport.sent}) == 1
 
 
-@on_a_clock
+@in_virtual_time
 async def test_what_is_sent_is_what_is_kept(make, cache):
     client = make(answer())
     reply = await client.ask("Où?", slot())
@@ -223,7 +176,7 @@ async def test_what_is_sent_is_what_is_kept(make, cache):
     assert reply.attempts[0].reply == client.transport.replies[0].body
 
 
-@on_a_clock
+@in_virtual_time
 async def test_passing_failures_are_tried_again_and_all_attempts_are_kept(make, cache):
     client = make(
         TransportFailure("timeout", "no reply within 600 s"),
@@ -252,7 +205,7 @@ async def test_passing_failures_are_tried_again_and_all_attempts_are_kept(make, 
     assert reply.text == "M"
 
 
-@on_a_clock
+@in_virtual_time
 async def test_words_that_no_file_can_hold_lose_no_reply(make, cache):
     """JSON can spell half a surrogate pair; a file cannot."""
     odd = json.dumps({"error": {"message": "\ud800"}, "model": "\udfff"})
@@ -263,7 +216,7 @@ async def test_words_that_no_file_can_hold_lose_no_reply(make, cache):
     assert cache.get(reply.request.key).attempts == reply.attempts
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_damaged_reply_fails_its_call_in_a_replay_and_is_not_asked_again(make, cache):
     recorded = await make(answer()).ask("prompt", slot())
     with diskcache.Cache(str(cache.folder)) as stock:
@@ -276,7 +229,7 @@ async def test_a_damaged_reply_fails_its_call_in_a_replay_and_is_not_asked_again
     assert client.transport.sent == []
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
     key = (await make(answer("old")).ask("prompt", slot())).request.key
     with diskcache.Cache(str(cache.folder)) as stock:
@@ -290,7 +243,7 @@ async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
     assert (await make(answer("third")).ask("prompt", slot())).text == "new"
 
 
-@on_a_clock
+@in_virtual_time
 async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, tmp_path):
     caches = [ResponseCache(tmp_path) for _ in range(2)]
     clients = [make(answer(f"from {n}"), cache=caches[n]) for n in range(2)]
@@ -302,7 +255,7 @@ async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, t
         own.close()
 
 
-@on_a_clock
+@in_virtual_time
 async def test_an_exhausted_quota_stops_at_once(make, cache):
     client = make(error(429, "the account is empty", "insufficient_quota"))
     with pytest.raises(QuotaExhausted, match=r"my-model.*the account is empty"):
@@ -311,7 +264,7 @@ async def test_an_exhausted_quota_stops_at_once(make, cache):
     assert list(cache.entries()) == []
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_refused_key_stops_at_once(make):
     client = make(error(401, code="invalid_api_key"))
     with pytest.raises(EndpointRefused, match=r"my-model.*key"):
@@ -320,7 +273,7 @@ async def test_a_refused_key_stops_at_once(make):
 
 
 @pytest.mark.parametrize("shutdown", [None, "2026-12-11"])
-@on_a_clock
+@in_virtual_time
 async def test_an_unknown_model_stops_at_once_and_its_shutdown_is_named(make, shutdown):
     client = make(error(404, code="model_not_found"), shutdown=shutdown)
     with pytest.raises(EndpointRefused) as caught:
@@ -330,7 +283,7 @@ async def test_an_unknown_model_stops_at_once_and_its_shutdown_is_named(make, sh
     assert len(client.transport.sent) == 1
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_rejected_request_fails_this_call_alone(make, cache):
     client = make(error(500), error(400, "bad temperature"), answer())
     with pytest.raises(CallFailed, match="bad temperature") as caught:
@@ -341,7 +294,7 @@ async def test_a_rejected_request_fails_this_call_alone(make, cache):
     assert (await client.ask("prompt", slot(2))).outcome == "ok"
 
 
-@on_a_clock
+@in_virtual_time
 async def test_at_its_deadline_a_call_fails_with_all_that_was_tried(make):
     client = make(error(500, "out of order"), deadline_s=20, timeout_s=9)
     with pytest.raises(CallFailed, match=r"20 s.*out of order") as caught:
@@ -353,7 +306,7 @@ async def test_at_its_deadline_a_call_fails_with_all_that_was_tried(make):
         assert timeout == pytest.approx(min(9, 20 - sent_at))
 
 
-@on_a_clock
+@in_virtual_time
 async def test_the_wait_for_a_turn_does_not_count_against_the_deadline(make):
     client = make(answer(), limiter=Limiter(tpm=150), deadline_s=5)
     client.transport.replies = [answer(usage=None)]
@@ -372,7 +325,7 @@ async def test_the_wait_for_a_turn_does_not_count_against_the_deadline(make):
         (answer(""), "empty", ""),
     ],
 )
-@on_a_clock
+@in_virtual_time
 async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make, reply, outcome, text):
     client = make(reply, answer("a better one"))
     for cached in (False, True):
@@ -393,7 +346,7 @@ async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make, reply, ou
         ([gemini(), error(500), gemini(), gemini("M")], ["empty", "server_error", "empty", "ok"]),
     ],
 )
-@on_a_clock
+@in_virtual_time
 async def test_an_empty_answer_of_gemini_is_asked_at_most_twice_again(
     make, cache, replies, expected
 ):
@@ -406,7 +359,7 @@ async def test_an_empty_answer_of_gemini_is_asked_at_most_twice_again(
 
 
 @pytest.mark.parametrize("wire", ["openai-chat", "openai-responses", "anthropic"])
-@on_a_clock
+@in_virtual_time
 async def test_an_empty_answer_of_others_is_not_asked_again(make, wire):
     client = make(raw({}), format=wire)
     assert (await client.ask("prompt", slot())).outcome == "empty"
@@ -419,7 +372,7 @@ async def ticks(count=20):
         await asyncio.sleep(0)
 
 
-@on_a_clock
+@in_virtual_time
 async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     client = make(answer("paid for"))
     client.transport.open.clear()
@@ -439,7 +392,7 @@ async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     assert outcomes(kept.attempts) == ["ok"]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_one_of_two_who_gives_up_does_not_take_the_answer_from_the_other(make):
     client = make(answer("shared"))
     client.transport.open.clear()
@@ -452,7 +405,7 @@ async def test_one_of_two_who_gives_up_does_not_take_the_answer_from_the_other(m
     assert len(client.transport.sent) == 1
 
 
-@on_a_clock
+@in_virtual_time
 async def test_drain_gives_up_calls_that_wait_for_their_turn(make, cache):
     limiter = Limiter()
     client = make(answer(), limiter=limiter)
@@ -463,12 +416,12 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make, cache):
     results = await asyncio.gather(*asked, return_exceptions=True)
     assert not any(hasattr(result, "text") for result in results)
     assert client.transport.sent == []
-    assert now() == 0
+    assert now_s() == 0
     with pytest.raises(CallFailed, match="stopped"):
         await client.ask("prompt", slot(3))
 
 
-@on_a_clock
+@in_virtual_time
 async def test_drain_gives_up_calls_that_wait_to_try_again(make):
     client = make(error(503, retry_after="300"), answer())
     asked = asyncio.create_task(client.ask("prompt", slot()))
@@ -476,10 +429,10 @@ async def test_drain_gives_up_calls_that_wait_to_try_again(make):
     await client.drain()
     await asyncio.gather(asked, return_exceptions=True)
     assert len(client.transport.sent) == 1
-    assert now() == 0
+    assert now_s() == 0
 
 
-@on_a_clock
+@in_virtual_time
 async def test_drain_does_not_wait_for_another_attempt_of_a_call_in_flight(make):
     client = make(error(503, retry_after="300"), answer())
     client.transport.open.clear()
@@ -491,10 +444,10 @@ async def test_drain_does_not_wait_for_another_attempt_of_a_call_in_flight(make)
     await drained
     await asyncio.gather(asked, return_exceptions=True)
     assert len(client.transport.sent) == 1
-    assert now() == 0
+    assert now_s() == 0
 
 
-@on_a_clock
+@in_virtual_time
 async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, tmp_path):
     own = ResponseCache(tmp_path)
     client = make(answer("paid for"), cache=own)
@@ -516,7 +469,7 @@ async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, tmp_
         (None, {}),
     ],
 )
-@on_a_clock
+@in_virtual_time
 async def test_a_model_that_was_not_asked_for_is_counted(make, served, mismatches):
     client = make(answer(model=served), aliases=("m",))
     reply = await client.ask("prompt", slot())
@@ -527,7 +480,7 @@ async def test_a_model_that_was_not_asked_for_is_counted(make, served, mismatche
 PRICE = Price(input=2.0, output=8.0, source="contract")
 
 
-@on_a_clock
+@in_virtual_time
 async def test_what_an_attempt_costs_comes_from_its_tokens(make):
     client = make(error(500), answer(usage=(1000, 500)), answer(usage=None), price=PRICE)
     reply = await client.ask("prompt", slot())
@@ -537,7 +490,7 @@ async def test_what_an_attempt_costs_comes_from_its_tokens(make):
     assert client.meter.cost_usd == pytest.approx(0.006)
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_price_that_nobody_knows_is_counted_and_not_guessed(make):
     client = make(answer(), id="no-such-model", price="genai-prices")
     assert (await client.ask("prompt", slot())).attempts[0].cost_usd is None
@@ -549,7 +502,7 @@ def worst_case_usd(client):
     return len(client.transport.sent[0].body.encode()) * 2e-6 + 100 * 8e-6
 
 
-@on_a_clock
+@in_virtual_time
 async def test_no_call_is_made_that_could_pass_the_cap(make):
     client = make(answer(usage=(10, 5)), price=PRICE)
     await client.ask("prompt", slot())
@@ -563,7 +516,7 @@ async def test_no_call_is_made_that_could_pass_the_cap(make):
     assert too_little.transport.sent == []
 
 
-@on_a_clock
+@in_virtual_time
 async def test_calls_in_flight_are_waited_for_and_their_actual_cost_counts(make):
     client = make(answer(usage=(10, 5)), price=PRICE, cap=0.0015)
     await asyncio.gather(*(client.ask("prompt", slot(n)) for n in range(1, 6)))
@@ -571,7 +524,7 @@ async def test_calls_in_flight_are_waited_for_and_their_actual_cost_counts(make)
     assert worst_case_usd(client) * 2 > 0.0015
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_call_that_gets_no_turn_gives_its_money_back(make):
     limiter = Limiter()
     client = make(answer(), price=PRICE, cap=0.0015, limiter=limiter)
@@ -584,7 +537,7 @@ async def test_a_call_that_gets_no_turn_gives_its_money_back(make):
     assert client.budget.ledger.read().committed_usd == 0
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_call_above_the_token_limit_gives_its_money_back(make):
     client = make(answer(), price=PRICE, cap=0.0015, limiter=Limiter(tpm=50))
     for repetition in (1, 2):
@@ -592,7 +545,7 @@ async def test_a_call_above_the_token_limit_gives_its_money_back(make):
             await client.ask("prompt", slot(repetition))
 
 
-@on_a_clock
+@in_virtual_time
 async def test_an_attempt_without_a_reply_may_have_been_charged(make):
     failure = TransportFailure("timeout", "no reply")
     client = make(failure, answer(), price=PRICE, cap=0.0015)
@@ -601,7 +554,7 @@ async def test_an_attempt_without_a_reply_may_have_been_charged(make):
     assert len(client.transport.sent) == 1
 
 
-@on_a_clock
+@in_virtual_time
 @pytest.mark.parametrize(
     "failure", [error(500), TransportFailure("no_connection", "refused", sent=False)]
 )
@@ -610,7 +563,7 @@ async def test_an_attempt_that_is_refused_or_never_sent_is_not_charged(make, fai
     assert (await refused.ask("prompt", slot())).outcome == "ok"
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_rate_limit_makes_all_calls_of_the_key_wait(make):
     shared = Pause()
     client = make(error(429, retry_after="30"), answer(), limiter=Limiter(pause=shared))
@@ -623,7 +576,7 @@ async def test_a_rate_limit_makes_all_calls_of_the_key_wait(make):
     assert any("30.0 s" in note for note in client.meter.notes)
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_rate_limit_without_a_delay_makes_all_calls_wait_as_long_as_its_own(make):
     client = make(error(429), error(429), error(429), answer())
     asked = [asyncio.create_task(client.ask("prompt", slot()))]
@@ -635,7 +588,7 @@ async def test_a_rate_limit_without_a_delay_makes_all_calls_wait_as_long_as_its_
     assert client.transport.times[1] >= 0.5
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_failing_server_makes_only_its_own_call_wait(make):
     client = make(error(503, retry_after="30"), answer())
     first = asyncio.create_task(client.ask("prompt", slot()))
@@ -644,24 +597,24 @@ async def test_a_failing_server_makes_only_its_own_call_wait(make):
     assert client.transport.times == [0, 0, 30]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_an_outage_longer_than_the_deadline_fails_its_call_alone(make):
     client = make(error(503, "come back tomorrow", retry_after="86400"), answer())
     with pytest.raises(CallFailed, match="come back tomorrow"):
         await client.ask("prompt", slot())
-    assert (len(client.transport.sent), now()) == (1, 0)
+    assert (len(client.transport.sent), now_s()) == (1, 0)
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_limit_that_lasts_longer_than_the_deadline_stops_the_sweep(make):
     client = make(error(429, "come back tomorrow", retry_after="86400"), answer())
     with pytest.raises(QuotaExhausted, match=r"86400 s.*come back tomorrow"):
         await client.ask("prompt", slot())
     assert len(client.transport.sent) == 1
-    assert now() == 0
+    assert now_s() == 0
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_sealed_replay_misses_what_is_not_recorded_and_notes_it(make):
     await make(answer("recorded")).ask("prompt", slot())
     client = make(transport=SealedTransport())
@@ -672,7 +625,7 @@ async def test_a_sealed_replay_misses_what_is_not_recorded_and_notes_it(make):
     assert caught.value.request.slot == slot(2)
 
 
-@on_a_clock
+@in_virtual_time
 async def test_the_actual_tokens_take_the_place_of_the_estimate(make):
     """The estimate is the whole cap; the tokens that a reply tells free the rest at once."""
     client = make(answer(usage=(10, 5)), limiter=Limiter(tpm=200))
@@ -681,7 +634,7 @@ async def test_the_actual_tokens_take_the_place_of_the_estimate(make):
     assert client.transport.times == [0, 0, 0]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_the_call_with_the_lowest_order_is_sent_first(make):
     limiter = Limiter()
     client = make(answer(), limiter=limiter)

@@ -7,6 +7,7 @@ import pytest
 from asyncio_throttle import throttler
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from virtual_time import in_virtual_time, now_s
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.limiter import Limiter, Pause
@@ -14,46 +15,19 @@ from merge_runner.llm.limiter import Limiter, Pause
 MINUTE = 60.0
 
 
-class ClockLoop(asyncio.SelectorEventLoop):
-    """An event loop whose clock jumps to the next timer where a real one would wait for it."""
-
-    def __init__(self):
-        self.now = 0.0
-        super().__init__()
-        self.select, self._selector.select = self._selector.select, self.jump
-
-    def time(self):
-        return self.now
-
-    def jump(self, timeout=None):
-        ready = self.select(0 if timeout is not None else None)
-        if not ready:
-            self.now += timeout or 0.0
-        return ready
-
-
 def on_a_clock(test):
-    """Run a test in time that passes at once; whoever would wait for ever waits for a day."""
-
-    async def limited(*args, **kwargs):
-        async with asyncio.timeout(86_400):
-            await test(*args, **kwargs)
+    """Run a test in virtual time, which the throttle reads too."""
 
     @functools.wraps(test)
     def run(*args, **kwargs):
         real = throttler.time
-        throttler.time = types.SimpleNamespace(monotonic=now)
+        throttler.time = types.SimpleNamespace(monotonic=now_s)
         try:
-            with asyncio.Runner(loop_factory=ClockLoop) as runner:
-                runner.run(limited(*args, **kwargs))
+            in_virtual_time(test)(*args, **kwargs)
         finally:
             throttler.time = real
 
     return run
-
-
-def now():
-    return asyncio.get_running_loop().time()
 
 
 class Queue:
@@ -74,7 +48,7 @@ class Queue:
     async def _ask(self, name, tokens, order):
         permit = await self.limiter.acquire(tokens, order=order)
         self.names.append(name)
-        self.times.append(now())
+        self.times.append(now_s())
         self.tokens.append(tokens)
         return permit
 
@@ -272,7 +246,7 @@ async def test_settled_tokens_are_what_counts(asked):
         permit = await queue.ask(tokens=estimate)
         used = estimate * share // 100
         permit.settle(used)
-        times.append(now())
+        times.append(now_s())
         actual.append(used)
         await asyncio.sleep(pause)
     assert fullest_window(times, actual) <= 100

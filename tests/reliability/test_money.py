@@ -63,6 +63,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         assert 0 < bill.usd <= ROOM_FOR_SOME
         assert run.summary["cost_usd"] == pytest.approx(bill.usd)
         assert run.summary["trials"]["suspended"] > 0
+        assert f"{bill.usd:.2f} of {ROOM_FOR_SOME} over all runs" in run.err.splitlines()[-2]
         assert "raise --max-cost and run the same command again" in run.err
         # What is finished is balanced: no condition is two repetitions ahead of another one.
         counts = await sql(

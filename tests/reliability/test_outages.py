@@ -32,6 +32,16 @@ def configured(folder, deadline_s):
     return ("sweep", "baseline", "--model", "patient", "--json")
 
 
+class Service:
+    """Answers while it works."""
+
+    def __init__(self, *, working):
+        self.working = working
+
+    async def middle(self, request, handler):
+        return await handler(request) if self.working else down(request)
+
+
 def down(request):
     return web.json_response({"error": {"message": "The engine is down."}}, status=503)
 
@@ -68,12 +78,9 @@ async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tm
 
 
 async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_path):
-    async def middle(request, handler):
-        return await handler(request) if working else down(request)
-
-    working = False
+    service = Service(working=False)
     sweep = configured(tmp_path, deadline_s=0.6)
-    async with watched(middle) as server:
+    async with watched(service.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         run = await merge_runner(*sweep, "--in-flight", 4, **env)
         assert run.code == 1, run.err
@@ -84,7 +91,7 @@ async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_pat
         assert run.summary["trials"]["failed"] <= 14
         # Two sides of at most 14 of 110 trials, with two or three attempts each.
         assert server.requests <= 2 * 14 * 3
-        working = True
+        service.working = True
         configured(tmp_path, deadline_s=60)
         again = await merge_runner(*sweep, "--in-flight", 20, **env)
     assert again.code == 0, again.err
@@ -166,16 +173,13 @@ async def test_one_dead_model_of_a_pair_stops_the_sweep(merge_runner, tmp_path):
 
 
 async def test_recorded_trials_do_not_hide_an_outage(merge_runner, tmp_path):
-    async def middle(request, handler):
-        return await handler(request) if working else down(request)
-
-    working = True
+    service = Service(working=True)
     sweep = configured(tmp_path, deadline_s=0.6)
-    async with watched(middle) as server:
+    async with watched(service.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         part = ("--reps", 2, "--conditions", "L_4_0,L_4_8,N_0_0")
         assert (await merge_runner(*sweep, *part, "--in-flight", 3, **env)).code == 0
-        working = False
+        service.working = False
         run = await merge_runner(*sweep, "--reps", 4, "--in-flight", 3, "--db", "new", **env)
     assert run.code == 1
     assert "no call was answered in between" in run.err

@@ -1,0 +1,23 @@
+"""Texts of others as they may be shown or put into a statement."""
+
+from __future__ import annotations
+
+
+def printable(text: str) -> str:
+    """A text that cannot speak to a terminal: what a model or a server wrote may hold any code."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
+
+
+def one_line(text: str) -> str:
+    """A printable text on one line: a name that somebody else chose may hold any character."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def first_line(exc: Exception) -> str:
+    """What an error says: DuckDB adds a stack trace to what it takes for its own fault."""
+    return str(exc).partition("\n")[0]
+
+
+def quoted(text: object) -> str:
+    """A text as a literal of SQL."""
+    return "'" + str(text).replace("'", "''") + "'"
