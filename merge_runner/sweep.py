@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
@@ -78,6 +79,8 @@ class Outcome:
     ``cache_cost_usd`` what all replies in the cache cost when they were made. ``damaged`` lists
     the keys of recorded replies that could not be read. ``facts`` are those of the database over
     all trials of the sweep, and ``audit`` what was checked there, None where they are not stored.
+    ``playing_s`` is how long the trials took, ``worst_stall_s`` by how much the event loop was late
+    at worst.
     """
 
     sweep_id: str
@@ -96,6 +99,8 @@ class Outcome:
     cache_cost_usd: float = 0.0
     facts: SweepFacts | None = None
     audit: Audit | None = None
+    playing_s: float = 0.0
+    worst_stall_s: float = 0.0
 
     def fail(self, exit_code: int, message: str) -> None:
         """Note a problem; the first one decides the exit code."""
@@ -161,10 +166,13 @@ class Sweep:
             meters = [client.meter for client in self._clients.values()]
             self._progress.meters = meters
             flusher = Flusher(self._store, outcome.sweep_id, self._say)
+            began = time.perf_counter()
             try:
                 async with shown(self._progress):
                     await self._play(flusher, outcome)
             finally:
+                outcome.playing_s = time.perf_counter() - began
+                outcome.worst_stall_s = self._progress.worst_stall_s
                 await self._store_rest(flusher, outcome)
             self._explain_misses(outcome)
             try:
