@@ -21,7 +21,7 @@ from merge_runner.llm.keys import make_request
 from merge_runner.llm.limiter import BURST_S, Limiter
 from merge_runner.plan import Choice, make_plan
 from merge_runner.records import SIDES, Attempt, ChatReply, Side, Slot, TrialRecord, TrialSpec
-from merge_runner.rows import call_rows, decision_rows, state_rows, trial_row
+from merge_runner.rows import rows_of
 from merge_runner.store import Store
 from merge_runner.trial import play_trial
 
@@ -103,11 +103,9 @@ def store(folder: Path) -> dict[str, float]:
             replace(record, spec=replace(record.spec, trial_id=f"{record.spec.trial_id}/{number}"))
             for record in played
         ]
+        made = [rows_of(record) for record in batch]
         tables = {
-            "trials": [trial_row(record) for record in batch],
-            "states": list(chain.from_iterable(map(state_rows, batch))),
-            "decisions": list(chain.from_iterable(map(decision_rows, batch))),
-            "calls": list(chain.from_iterable(map(call_rows, batch))),
+            name: list(chain.from_iterable(trial[name] for trial in made)) for name in made[0]
         }
         rows += sum(map(len, tables.values()))
         began = time.perf_counter()
@@ -115,9 +113,9 @@ def store(folder: Path) -> dict[str, float]:
         ours_s += time.perf_counter() - began
         began = time.perf_counter()
         with duckdb.connect(bare) as connection:
-            for table, made in tables.items():
+            for table, values in tables.items():
                 appender = connection.appender(table)
-                appender.append_rows(made)
+                appender.append_rows(values)
                 appender.flush()
         bare_s += time.perf_counter() - began
     return {

@@ -16,6 +16,16 @@ Row = tuple[Any, ...]
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
 
+def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
+    """All rows of a trial, by table."""
+    return {
+        "trials": [trial_row(record)],
+        "states": list(state_rows(record)),
+        "decisions": list(decision_rows(record)),
+        "calls": list(call_rows(record)),
+    }
+
+
 def trial_row(record: TrialRecord) -> Row:
     """The row of ``trials``."""
     spec = record.spec

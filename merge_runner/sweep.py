@@ -49,6 +49,7 @@ from merge_runner.trial import play_trial
 INTERRUPTED = 130
 SHOWN = 5
 FAILURES_IN_A_ROW = 10
+FROM_RECORDINGS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,8 +291,11 @@ class Sweep:
 
         work = asyncio.create_task(
             run_bounded(
-                (partial(self._trial, spec) for spec in self._todo),
-                in_flight=self._options.in_flight,
+                (partial(self._stored_trial, spec, flusher) for spec in self._todo),
+                # Recorded replies are there at once: more in flight only take more memory.
+                in_flight=min(self._options.in_flight, FROM_RECORDINGS)
+                if self._options.replay
+                else self._options.in_flight,
                 on_done=ended,
             )
         )
@@ -350,6 +354,11 @@ class Sweep:
             self._store.end_sweep(outcome.sweep_id, ended_at, outcome.exit_code)
         except (StoreError, UsageError) as exc:
             outcome.fail(exc.exit_code, str(exc))
+
+    async def _stored_trial(self, spec: TrialSpec, flusher: Flusher) -> TrialRecord | None:
+        """Play a trial when there is room to keep it until it is stored."""
+        await flusher.room()
+        return await self._trial(spec)
 
     async def _trial(self, spec: TrialSpec) -> TrialRecord | None:
         """Play a trial; None: there is no money for it to go on."""
