@@ -19,7 +19,7 @@ from scipy import stats
 from scipy.special import expit
 
 from analysis.indicators import ALPHA, SLOPE_MARGIN_S, TESTED
-from analysis.intervals import proportion
+from analysis.intervals import wilson_low
 from analysis.piecewise import THRESHOLDS
 from analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
 from analysis.regressions import gap_design
@@ -123,15 +123,10 @@ class _Draws:
                 judged += np.isfinite(passes).sum(axis=1)
                 passing += np.nansum(passes, axis=1).astype(int)
         self.piecewise = (
-            np.array([_enough(*counts) for counts in zip(passing, judged, strict=True)])
+            wilson_low(passing, judged) >= THRESHOLDS.min_share
             if humans.piecewise
             else None
         )
-
-
-def _enough(passing: int, judged: int) -> bool:
-    low = proportion(int(passing), int(judged)).low
-    return low is not None and low >= THRESHOLDS.min_share
 
 
 def _wald(draws: _Draws) -> Passes:

@@ -18,7 +18,7 @@ from analysis.forms import TableFormat
 from analysis.provenance import provenance
 from analysis.published import published
 from analysis.study import Study
-from analysis.tables import make_tables
+from analysis.tables import finished_tables
 from analysis.tables.against import PAPER, against, in_paper
 from analysis.tables.formats import notes_of, render, shown_columns, shown_value
 from analysis.tables.model import Column, Row, Table
@@ -52,7 +52,7 @@ class Links:
 
 def write_report(study: Study, out: Path, files: Path | None) -> Iterator[Path]:
     """Write the report, and all tables and figures into ``files``; yields the paths."""
-    tables = make_tables(study)
+    tables = finished_tables(study.db, study.only, study=study)
     if files is not None:
         yield from write_figures(study, files)
         yield from write_tables(tables, files)

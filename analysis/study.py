@@ -76,7 +76,7 @@ class Study:
 
     def __init__(self, db: Path | str = DEFAULT_DB, models: Sequence[str] | None = None) -> None:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
-        self.db = Path(db)
+        self.db, self.only = Path(db), models
         found = load_each({"trials": TRIALS, "specs": SPECS}, self.db)
         trials = found["trials"]
         self.human = _human_group(trials[trials["source"] == HUMAN])
@@ -104,9 +104,9 @@ class Study:
     @cached_property
     def profiles(self) -> pd.DataFrame:
         """One row a vehicle: the piecewise-linear fit of its speeds."""
-        from analysis.piecewise import fit_profiles
+        from analysis.profiles import fitted_profiles
 
-        return fit_profiles(self.speeds)
+        return fitted_profiles(self.db)
 
     @cached_property
     def speeds(self) -> pd.DataFrame:
