@@ -105,7 +105,7 @@ def report(
     """Write tables, figures, provenance and conclusions as one HTML file, and all as files."""
     from analysis.report import write_report
 
-    for path in write_report(_study(db, models), out, files):
+    for path in write_report(db, listed(models), out, files):
         say(f"wrote {path}")
 
 

@@ -1,19 +1,19 @@
 """What is computed from the results and kept beside them in the database, until they change.
 
-Kept are the fits of I5, by vehicle, and whole tables. Where the file cannot be written, as on a
-read-only disk or while another program holds it, nothing is kept, and the next run computes anew.
+Kept are the fits of I5, by vehicle, and whole tables and figures. Where the file cannot be written,
+as on a read-only disk or while another program holds it, nothing is kept, and the next run computes
+anew.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import duckdb
 
@@ -21,6 +21,9 @@ import merge_runner
 from merge_runner.database import open_database, read_database
 from merge_runner.errors import StoreError
 from merge_runner.texts import first_line
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 KEPT = """
 -- The fit of a vehicle's speeds by one program; NULL where it drove too shortly for one. ``speeds``
@@ -35,8 +38,8 @@ CREATE TABLE IF NOT EXISTS i5_fits (
     rmse_mps DOUBLE,
     reversal_rate_hz DOUBLE
 );
--- A finished table of the results in one state, made with these options.
-CREATE TABLE IF NOT EXISTS finished_tables (
+-- A table as JSON, or a figure as SVG in Base64, of the results in one state.
+CREATE TABLE IF NOT EXISTS finished (
     state VARCHAR NOT NULL,
     options VARCHAR NOT NULL,
     name VARCHAR NOT NULL,
@@ -54,9 +57,18 @@ ROWS = {
     "sweep_trials": "sweep_trials",
     "views": "(FROM duckdb_views() SELECT sql WHERE database_name = current_database())",
 }
-LIBRARIES = ("duckdb", "firthmodels", "numpy", "pandas", "scipy", "statsmodels")
+LIBRARIES = (
+    "duckdb",
+    "firthmodels",
+    "jinja2",
+    "matplotlib",
+    "numpy",
+    "pandas",
+    "scipy",
+    "statsmodels",
+)
 PACKAGES = (Path(__file__).parent, Path(merge_runner.__file__).parent)
-PATIENCE_S = 1.0
+PATIENCE_S = 0.5
 LOG = logging.getLogger(__name__)
 
 
@@ -68,7 +80,7 @@ def program() -> str:
         digest.update(f"{name} {version(name)}\n".encode())
     for package in PACKAGES:
         for path in sorted(package.rglob("*")):
-            if path.suffix in {".py", ".sql", ".csv"}:
+            if path.suffix in {".py", ".sql", ".csv", ".html"}:
                 digest.update(f"{path.relative_to(package)}\n".encode())
                 digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -94,33 +106,38 @@ def has(connection: duckdb.DuckDBPyConnection, table: str) -> bool:
     return found.fetchone() is not None
 
 
-def finished(db: Path, options: str) -> tuple[str, dict[str, str]]:
-    """The present state of the results, and the tables that are kept of it, by name."""
+def finished(db: Path, options: str, names: Sequence[str]) -> tuple[str, dict[str, str]]:
+    """The present state of the results, and those that are kept of it, by name."""
     with read_database(db) as connection:
         now = state(connection)
-        if not has(connection, "finished_tables"):
+        if not has(connection, "finished"):
             return now, {}
         rows = connection.execute(
-            "SELECT name, content FROM finished_tables WHERE state = ? AND options = ?",
-            [now, options],
+            "SELECT name, content FROM finished WHERE state = ? AND options = ? "
+            "AND list_contains(?, name)",
+            [now, options, list(names)],
         ).fetchall()
     return now, dict(rows)
 
 
-def keep_finished(db: Path, made_of: str, options: str, tables: dict[str, str]) -> None:
-    """Keep tables, unless the results are no longer in the state that they were ``made_of``."""
-    with _writing(db) as connection:
+def keep_finished(db: Path, made_of: str, options: str, contents: dict[str, str]) -> None:
+    """Keep tables or figures, unless the results have left the state that these are ``made_of``."""
+
+    def keep(connection: duckdb.DuckDBPyConnection) -> None:
         if state(connection) == made_of:
-            connection.execute("DELETE FROM finished_tables WHERE state <> ?", [made_of])
+            connection.execute("DELETE FROM finished WHERE state <> ?", [made_of])
             connection.executemany(
-                "INSERT INTO finished_tables VALUES (?, ?, ?, ?)",
-                [[made_of, options, name, content] for name, content in tables.items()],
+                "INSERT INTO finished VALUES (?, ?, ?, ?)",
+                [[made_of, options, name, content] for name, content in contents.items()],
             )
 
+    _write(db, keep)
 
-def keep_fits(db: Path, fits: Any) -> None:
-    """Keep the rows of a data frame with the columns of ``i5_fits``, and no older ones."""
-    with _writing(db) as connection:
+
+def keep_fits(db: Path, fits: pd.DataFrame) -> None:
+    """Keep these rows of ``i5_fits``, in the place of older ones of their vehicles."""
+
+    def keep(connection: duckdb.DuckDBPyConnection) -> None:
         connection.register("fits", fits)
         connection.execute(
             "DELETE FROM i5_fits WHERE (trial_id, spec_hash, side) IN "
@@ -129,14 +146,15 @@ def keep_fits(db: Path, fits: Any) -> None:
         connection.execute("INSERT INTO i5_fits BY NAME FROM fits")
         connection.unregister("fits")
 
+    _write(db, keep)
 
-@contextmanager
-def _writing(db: Path) -> Iterator[duckdb.DuckDBPyConnection]:
+
+def _write(db: Path, keep: Callable[[duckdb.DuckDBPyConnection], None]) -> None:
     try:
         with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
             connection.begin()
             connection.execute(KEPT)
-            yield connection
+            keep(connection)
             connection.commit()
     except (StoreError, duckdb.Error) as exc:
         LOG.warning("what was computed is not kept for the next time: %s", first_line(exc))

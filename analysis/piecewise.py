@@ -129,10 +129,10 @@ def _knots(v: Array) -> NDArray[np.bool_]:
         open_ways[:, :ways] &= through <= best[:, end, None] + penalty
     knots = np.zeros((rows, n), bool)
     knots[:, 0] = True
-    end = np.full(rows, n)
-    while end.any():
-        knots[np.arange(rows), np.maximum(end, 1) - 1] = True
-        end = last[np.arange(rows), end]
+    ends = np.full(rows, n)
+    while ends.any():
+        knots[np.arange(rows), np.maximum(ends, 1) - 1] = True
+        ends = last[np.arange(rows), ends]
     return knots
 
 
@@ -145,7 +145,7 @@ def _reversals(acceleration_mps2: Array) -> NDArray[np.int_]:
 
 
 def fit_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
-    """Fit all vehicles of ``load.SPEEDS``; NaN where one drove for less than 4 samples.
+    """Fit vehicles, a row each with lists time_s and velocity_mps; NaN below 4 samples.
 
     Columns: trial_id, spec_hash, side, knot_rate_hz, rmse_mps, reversal_rate_hz.
     """

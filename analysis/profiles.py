@@ -44,5 +44,4 @@ def fitted_profiles(db: Path) -> pd.DataFrame:
         new = fit_profiles(speeds).merge(missing, on=KEY)
         keep_fits(db, new.assign(program=program()))
         fits = pd.concat([fits, new]) if len(fits) else new
-    found = fits.drop(columns="speeds").dropna().sort_values(KEY, ignore_index=True)
-    return found
+    return fits.drop(columns="speeds").dropna().sort_values(KEY, ignore_index=True)

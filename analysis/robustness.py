@@ -55,9 +55,7 @@ def outcomes(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
     ended = trials[trials["status"] != "failed"]
     specs = load_each({"specs": SPECS}, db)["specs"]
     scenarios = _scenarios(ended["spec_hash"].unique(), specs)
-    found = load_each(
-        {"plans": PLANS, "close": _close(scenarios.values()), "decided": DECIDED}, db
-    )
+    found = load_each({"plans": PLANS, "close": _close(scenarios.values()), "decided": DECIDED}, db)
     close = {(row.trial_id, row.spec_hash): row.close for row in found["close"].itertuples()}
     decided = set(found["decided"].itertuples(index=False, name=None))
     plans: dict[tuple[str, str], dict[str, Any]] = {}

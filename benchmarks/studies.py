@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import islice
@@ -117,7 +116,7 @@ def _actions(
 def _played(
     rng: np.random.Generator, driver: str, variant: str, condition: Condition, rep: int
 ) -> TrialRecord:
-    """One trial of a model, with its calls; now and then one fails, is retried, or gives no plan."""
+    """One trial of a model; now and then a call fails, is retried, or gives no plan."""
     world = World(SCENARIO, condition)
     actions = _actions(rng, condition, 0.02 * MODELS.index((driver, variant)))
     spec = TrialSpec(

@@ -50,7 +50,7 @@ def finished_tables(
     """
     wanted = _valid(names)
     options = options_text(db, models)
-    state, kept = finished(db, options)
+    state, kept = finished(db, options, wanted)
     found = {name: from_text(text) for name, text in kept.items()}
     missing = [name for name in dict.fromkeys(wanted) if name not in found]
     if missing:

@@ -261,7 +261,7 @@ def test_speeds_at_5_hz_stay_as_they_are(steps):
 
 
 def as_speeds(rows) -> pd.DataFrame:
-    """Trials, sides and speeds at 5 Hz as rows of ``load.SPEEDS``."""
+    """Trials, sides and speeds at 5 Hz as ``fit_profiles`` takes them."""
     return pd.DataFrame(
         [(trial, "h", side, list(np.arange(len(v)) * 0.2), list(v)) for trial, side, v in rows],
         columns=["trial_id", "spec_hash", "side", "time_s", "velocity_mps"],
