@@ -157,4 +157,9 @@ def _write(db: Path, keep: Callable[[duckdb.DuckDBPyConnection], None]) -> None:
             keep(connection)
             connection.commit()
     except (StoreError, duckdb.Error) as exc:
-        LOG.warning("what was computed is not kept for the next time: %s", first_line(exc))
+        _say_once(first_line(exc))
+
+
+@cache
+def _say_once(reason: str) -> None:
+    LOG.warning("what was computed is not kept for the next time: %s", reason)

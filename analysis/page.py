@@ -22,7 +22,7 @@ from merge_runner.provenance import git_state
 
 TEMPLATES = Path(__file__).with_name("templates")
 LISTED = 300
-LIBRARIES = ("statsmodels", "firthmodels", "scipy", "numpy", "pandas", "ruptures", "matplotlib")
+LIBRARIES = ("statsmodels", "firthmodels", "scipy", "numpy", "pandas", "matplotlib")
 
 
 @dataclass
