@@ -36,9 +36,14 @@ from benchmarks.cases import (
     start,
 )
 from benchmarks.goals import judged
-from benchmarks.peers import peer_cached, peer_cold, peer_resume
+from benchmarks.peers import installed, peer_cached, peer_cold, peer_resume
 from benchmarks.processes import served
 
+PEERS = (
+    Case("inspect-ai, 0 ms", 1, peer_cold),
+    Case("inspect-ai, cached", 1, peer_cached),
+    Case("inspect-ai, killed at half, resumed", 1, peer_resume),
+)
 CASES = (
     Case("floor, 0 ms", 3, cold_floor(0)),
     Case("cold, 0 ms", 3, cold(0)),
@@ -70,9 +75,7 @@ CASES = (
         for what in ("tables", "report")
         for heat, rounds in (("cold", 1), ("warm", 2))
     ),
-    Case("inspect-ai, 0 ms", 1, peer_cold),
-    Case("inspect-ai, cached", 1, peer_cached),
-    Case("inspect-ai, killed at half, resumed", 1, peer_resume),
+    *PEERS,
 )
 
 
@@ -88,6 +91,9 @@ def main() -> None:
         for case in CASES
         if fnmatch.fnmatch(case.name, args.only) and not fnmatch.fnmatch(case.name, args.skip)
     ]
+    if not installed():
+        _say("inspect-ai is not compared with: `make bench` installs it")
+        cases = [case for case in cases if case not in PEERS]
     samples: dict[str, list[dict[str, float]]] = {}
     began = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="merge-runner-") as folder, served() as server:

@@ -23,6 +23,7 @@ from merge_runner.store import query
 Figures = dict[str, float]
 # In this condition both vehicles collide early whatever the server answers: 8 calls a trial.
 SHORT, SHORT_CALLS = ("--conditions", "R_-4_8"), 8
+KILLED_DELAY_MS = 1_000
 STUDIES = (110, 1_100, 11_000)
 
 
@@ -254,11 +255,27 @@ def resume(bench: Bench) -> Figures:
     """A sweep that is killed without a word at half, and run again."""
     folder = bench.fresh("killed")
     bench.server.reset()
-    half = TRIALS * CALLS // 2
-    bench.sweep(folder, delay_ms=50, until=lambda: bench.server.stats()["answered"] >= half)
-    ran = bench.sweep(folder, delay_ms=50)
+    bench.sweep(folder, delay_ms=KILLED_DELAY_MS, until=half_is_answered(bench.server))
+    ran = bench.sweep(folder, delay_ms=KILLED_DELAY_MS)
     stats = bench.server.stats()
     return {**figures_of(ran), "asked": stats["asked"], "asked_again": stats["asked_again"]}
+
+
+def half_is_answered(server: Server) -> Callable[[], bool]:
+    """Says when half of the workload is answered and all calls in flight wait for the server.
+
+    An answer that is on its way when its reader dies is lost to whatever reader.
+    """
+    seen, since = 0, time.perf_counter()
+
+    def quiet_at_half() -> bool:
+        nonlocal seen, since
+        answered, now = server.stats()["answered"], time.perf_counter()
+        if answered != seen:
+            seen, since = answered, now
+        return bool(answered >= TRIALS * CALLS // 2 and now - since > KILLED_DELAY_MS / 2000)
+
+    return quiet_at_half
 
 
 def limited(bench: Bench) -> Figures:

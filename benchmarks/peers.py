@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from benchmarks.cases import Bench, Figures, figures_of
+from benchmarks.cases import KILLED_DELAY_MS, Bench, Figures, figures_of, half_is_answered
 from benchmarks.processes import PROJECT, Run, run
 from benchmarks.workload import CALLS, TRIALS
 
@@ -25,15 +25,19 @@ def peer_resume(bench: Bench) -> Figures:
     """Killed without a word at half, and gone on with from its log."""
     name = bench.fresh("peer-killed").name
     bench.server.reset()
-    half = TRIALS * CALLS // 2
-    _peer(bench, name, delay_ms=50, until=lambda: bench.server.stats()["answered"] >= half)
-    ran = _peer(bench, name, "--retry", delay_ms=50)
+    _peer(bench, name, delay_ms=KILLED_DELAY_MS, until=half_is_answered(bench.server))
+    ran = _peer(bench, name, "--retry", delay_ms=KILLED_DELAY_MS)
     stats = bench.server.stats()
     return {**_measured(ran), "asked": stats["asked"], "asked_again": stats["asked_again"]}
 
 
 def _measured(ran: Run) -> Figures:
     return figures_of(ran, calls=TRIALS * CALLS)
+
+
+def installed() -> bool:
+    """Whether it is there; ``make bench`` installs it."""
+    return PEER.exists()
 
 
 def _peer(

@@ -26,6 +26,7 @@ from merge_runner.records import (
     Decision,
     DecisionRow,
     FailedCall,
+    Side,
     Slot,
     StateRow,
     TrialRecord,
@@ -151,7 +152,7 @@ def _played(
                 world.advance({side: actions[side][step] for side in SIDES})
     return TrialRecord(
         spec,
-        "failed" if lost else world.status,
+        world.status or "failed",
         None if lost else world.merged_first(),
         world.time_s,
         "no answer after 2 attempts" if lost else None,
@@ -161,7 +162,7 @@ def _played(
     )
 
 
-def _reply(spec: TrialSpec, side: str, number: int, outcomes: tuple[str, ...]) -> ChatReply:
+def _reply(spec: TrialSpec, side: Side, number: int, outcomes: tuple[str, ...]) -> ChatReply:
     slot = Slot(spec.condition, spec.repetition, side, number, 0)
     key = f"{spec.trial_id}/{side}/{number}"
     body = json.dumps({"model": spec.model_left, "messages": [PROMPT], "key": key})

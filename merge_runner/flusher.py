@@ -11,7 +11,6 @@ from merge_runner.records import TrialRecord
 from merge_runner.store import Store
 
 EVERY_S = 1.0
-ROOM_POLL_S = 0.02
 BATCH = 64
 """Trials in one transaction: few enough that a reader gets its turn soon."""
 MOST_PENDING = 4 * BATCH
@@ -36,7 +35,7 @@ class Flusher:
         self._problem = ""
         self._locked = self._stuck = False
         self._closing = False
-        self._awake = asyncio.Event()
+        self._awake, self._tried = asyncio.Event(), asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
     def add(self, record: TrialRecord) -> None:
@@ -48,7 +47,8 @@ class Flusher:
     async def room(self) -> None:
         """Wait while much is still to be stored, and it can be."""
         while len(self._pending) > MOST_PENDING and not self._stuck:
-            await asyncio.sleep(ROOM_POLL_S)
+            self._tried.clear()
+            await self._tried.wait()
 
     async def close(self) -> None:
         """Store what is left; raises StoreError if that does not work after a while."""
@@ -85,11 +85,14 @@ class Flusher:
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
             )
         except StoreError as exc:
+            self._stuck, self._locked = True, isinstance(exc, StoreLocked)
             self._pending = batch + self._pending
-            self._locked, self._stuck = isinstance(exc, StoreLocked), True
             if str(exc) != self._problem:
                 self._problem = str(exc)
                 self._say(f"waiting to store {len(self._pending)} trials: {exc}")
             return False
-        self._stuck = False
-        return True
+        else:
+            self._stuck = False
+            return True
+        finally:
+            self._tried.set()

@@ -134,7 +134,7 @@ def read_recording(file: Path) -> Iterator[Entry]:
                 seen.add(entry.request.key)
                 content.update(_fingerprint(values[0], values[-1]))
                 yield entry
-    told = _metadata(file)
+        told = _metadata(file, connection)
     if (str(number), content.hexdigest()) != (told.get("calls"), told.get("content_sha256")):
         raise RecordingError(
             f"{file} is not as it was exported: it holds {number} calls of {told.get('calls')}, "
@@ -182,7 +182,7 @@ def summarise(file: Path) -> Summary:
         models_served=dict(served),
         endpoints=dict(endpoints),
         outcomes=dict(outcomes),
-        provenance=_metadata(file),
+        provenance=_provenance(file),
     )
 
 
@@ -310,7 +310,7 @@ def _opened(file: Path) -> duckdb.DuckDBPyConnection:
             f"{file} is no recording of ours: it has the columns {_listed(found)}; "
             f"a recording has {_listed(COLUMNS)}"
         )
-    version = _metadata(file).get("key_version")
+    version = _metadata(file, connection).get("key_version")
     if version != str(KEY_VERSION):
         raise RecordingError(
             f"{file} has keys of version {version!r}, this program reads version {KEY_VERSION}"
@@ -343,8 +343,13 @@ def _number(connection: duckdb.DuckDBPyConnection, sql: str) -> int:
     return int(row[0] or 0) if row else 0
 
 
-def _metadata(file: Path) -> dict[str, str]:
-    with _readable(file), duckdb.connect(config=READING) as connection:
+def _provenance(file: Path) -> dict[str, str]:
+    with _opened(file) as connection:
+        return _metadata(file, connection)
+
+
+def _metadata(file: Path, connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
+    with _readable(file):
         rows = connection.execute(
             f"SELECT key, value FROM parquet_kv_metadata({_pattern(file)})"  # noqa: S608 # quoted
         ).fetchall()

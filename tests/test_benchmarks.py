@@ -1,0 +1,89 @@
+"""The benchmarks measure what they say; how fast anything is, no test asserts."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from benchmarks.__main__ import CASES, tables
+from benchmarks.cases import Bench, figures_of, resume
+from benchmarks.goals import GOALS, judged
+from benchmarks.processes import served, started_on
+from benchmarks.recorder import multiply
+from merge_runner.llm.cache import ResponseCache
+
+
+@pytest.fixture
+def bench(tmp_path):
+    with served() as server:
+        yield Bench(tmp_path, server)
+
+
+class Everything(dict):
+    """Figures of a case, whatever they are called."""
+
+    def __missing__(self, figure):
+        return 1.0
+
+
+def test_every_goal_is_about_cases_that_are_run():
+    samples = {case.name: [Everything()] for case in CASES}
+    assert [goal for goal, _ in judged(samples)] == list(GOALS)
+
+
+def test_a_goal_that_was_not_measured_is_not_judged():
+    assert list(judged({"--help": [{"wall_s": 0.2}]})) == [(GOALS[-1], 0.2)]
+
+
+@pytest.mark.parametrize(("at_most", "verdict"), [(True, "met"), (False, "**missed**")])
+def test_a_missed_goal_is_told(at_most, verdict):
+    goal = {"what": "it", "bound": 2.0, "value": 1.5, "unit": "x", "at_most": at_most}
+    goal["met"] = at_most
+    assert tables({}, [goal]).splitlines()[2].endswith(f"| 1.5 x | {verdict} |")
+
+
+def test_the_floor_asks_once_and_reads_back_the_second_time(bench):
+    for asked in (6, 6):
+        bench.floor(bench.folder, trials=3, calls=2, in_flight=2, delay_ms=1)
+        assert bench.server.stats()["asked"] == asked
+    assert bench.server.stats()["asked_again"] == 0
+
+
+def test_the_server_knows_what_is_asked_again(bench):
+    for name in "ab":
+        bench.floor(bench.fresh(name), trials=1, calls=2)
+    assert bench.server.stats()["asked_again"] == 2
+    bench.server.reset()
+    assert bench.server.stats()["asked"] == 0
+
+
+@pytest.mark.slow
+def test_a_killed_sweep_asks_for_no_answered_call_again(bench):
+    figures = resume(bench)
+    assert figures["asked_again"] == 0
+    assert figures["asked"] >= figures["calls"] > 2000
+
+
+def test_multiplied_recordings_are_those_of_a_sweep(bench):
+    short = ("--conditions", "R_-4_8")
+    folder = bench.fresh("few")
+    bench.sweep(folder, *short, "--reps", "1")
+    multiply(folder / "responses", 3)
+    replayed = bench.sweep(folder, *short, "--replay", "--reps", "3", db="again")
+    assert figures_of(replayed)["calls"] == 24
+    assert replayed.summary["audit"]["findings"] == []
+    cache = ResponseCache(folder / "responses")
+    assert len({entry.attempts[0].reply for entry in cache.entries()}) == 24
+    cache.close()
+
+
+def test_what_is_measured_and_the_server_are_kept_apart():
+    everywhere = os.sched_getaffinity(0)
+    halves = []
+    for half in (0, 1):
+        with started_on(half):
+            halves.append(os.sched_getaffinity(0))
+    assert os.sched_getaffinity(0) == everywhere
+    if len(everywhere) > 1:
+        assert not halves[0] & halves[1]
