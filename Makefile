@@ -57,7 +57,7 @@ PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 .venv/runtime: .venv/python requirements.lock pyproject.toml
 	@echo "installing the pinned packages into .venv (once, a minute or two)" >&2
 	@$(PIP) install --require-hashes -r requirements.lock
-	@$(PIP) install --no-deps --no-build-isolation --editable .
+	@$(PIP) install --no-deps --no-build-isolation --config-settings editable_mode=compat --editable .
 	@touch $@
 
 .venv/dev: .venv/runtime requirements-dev.lock

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import csv
 import gc
 import json
@@ -305,6 +304,8 @@ def emulate(
     until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Run the local stand-in for a language model on 127.0.0.1; prints its base URL."""
+    import asyncio
+
     from merge_runner.emulator.server import run
 
     asyncio.run(
@@ -369,6 +370,8 @@ def recording_info(file: RecordingFile) -> None:
 
 
 def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json: bool) -> None:
+    import asyncio
+
     from merge_runner.plan import make_plan
     from merge_runner.summary import Summary
     from merge_runner.sweep import INTERRUPTED, Sweep
@@ -399,6 +402,7 @@ def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json:
 
 def _dry_run(plan: Plan, options: Options) -> Estimate:
     """What is neither stored nor recorded yet; makes no database or cache that is not there."""
+    import asyncio
     from dataclasses import replace
 
     from merge_runner.estimate import estimate
@@ -416,6 +420,8 @@ def _dry_run(plan: Plan, options: Options) -> Estimate:
 
 def _confirm(plan: Plan, prepared: Sweep, options: Options, *, yes: bool) -> Estimate | None:
     """Check the keys, say what a live run of a paid model will cost, and ask once."""
+    import asyncio
+
     from merge_runner.config import resolve_endpoint
     from merge_runner.estimate import estimate
 
