@@ -26,11 +26,23 @@ from merge_runner.simulator.conditions import CONDITIONS
 PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
 # The environment is the project's own: a make in another folder must not install into it.
-INSTALLED = 'make() { command make -o .venv/python -o .venv/runtime -o .venv/dev "$@"; }\n'
+INSTALLED = (
+    "make() { command make -o .venv/python -o .venv/runtime -o .venv/dev "
+    '-o .venv-peer/installed "$@"; }\n'
+)
 # Of our program these run in the test's own process, where the libraries are loaded already: they
 # ask no question and start no event loop. All else runs in a shell.
 HERE = ("audit", "digest", "explain", "human", "recording", "tables")
-LINKED = (".venv", "Makefile", "pyproject.toml", "requirements.lock", "requirements-dev.lock")
+LINKED = (
+    ".venv",
+    "Makefile",
+    "pyproject.toml",
+    "requirements.lock",
+    "requirements-dev.lock",
+    "requirements-peer.lock",
+    "benchmarks",
+    "tests",
+)
 
 
 def commands(page: Path) -> list[str]:
