@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -59,16 +60,24 @@ async def connected(where: str) -> AsyncIterator[Client]:
 
 @asynccontextmanager
 async def _local_cluster(workers: int) -> AsyncIterator[object]:
+    """Worker processes; Ctrl-C is for us alone, who stop them in order."""
     from distributed import LocalCluster
 
-    async with LocalCluster(
+    cluster = LocalCluster(
         n_workers=workers,
         threads_per_worker=1,
         processes=True,
         dashboard_address=None,
         silence_logs=logging.CRITICAL,  # a lost worker is told in a line of ours
+        preload=["merge_runner.cluster.worker"],  # also for one that takes a lost one's place
         asynchronous=True,
-    ) as cluster:
+    )
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # children inherit it
+    try:
+        await cluster
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    async with cluster:
         yield cluster
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import signal
 import socket
 from contextlib import AsyncExitStack
 from functools import partial
@@ -30,6 +31,11 @@ from merge_runner.players import Players
 from merge_runner.records import TrialRecord, TrialSpec
 
 REPORT_EVERY_S = 0.5
+
+
+def dask_setup(_: object) -> None:
+    """Called by Dask where this is a worker's preload: Ctrl-C is for the coordinator alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def play_batch(address: str, token: str) -> None:
