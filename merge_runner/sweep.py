@@ -263,9 +263,10 @@ class Sweep:
             )
             return Players(plan, clients, options.in_flight)
         from merge_runner.cluster.connect import connected
-        from merge_runner.cluster.coordinator import Coordinator
 
         client = await stack.enter_async_context(connected(options.dask))
+        from merge_runner.cluster.coordinator import Coordinator  # needs what was asked for
+
         return await stack.enter_async_context(
             Coordinator(client, plan, addressed, self._cache, desk, options.in_flight)
         )
