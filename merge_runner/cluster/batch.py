@@ -42,7 +42,7 @@ class Told:
 
     entry: Entry | None
     attempts: tuple[Attempt, ...]
-    damaged: tuple[str, ...]
+    damaged: tuple[str, ...] = ()
 
 
 @cache

@@ -113,9 +113,7 @@ class Link:
         elif number == 0:
             self._handlers[what](*content)
         else:
-            task = asyncio.create_task(self._answer(number, what, content), name=what)
-            self._answering[number] = task
-            task.add_done_callback(lambda done: self._answered(number, done))
+            self._hear_question(number, what, content)
 
     def _hear_answer(self, number: int, what: str, content: tuple[Any, ...]) -> None:
         future = self._asked.get(number)
@@ -126,15 +124,24 @@ class Link:
         else:
             future.set_exception(rebuilt(*content))
 
-    async def _answer(self, number: int, what: str, content: tuple[Any, ...]) -> None:
+    def _hear_question(self, number: int, what: str, content: tuple[Any, ...]) -> None:
         try:
             answer = self._handlers[what](*content)
-            if isinstance(answer, Awaitable):
-                answer = await answer
         except MergeRunnerError as exc:
             self._send(number, ERROR, taken_apart(exc))
-        else:
+            return
+        if not isinstance(answer, Awaitable):
             self._send(number, ANSWER, (answer,))
+            return
+        task = asyncio.create_task(self._answer(number, answer), name=what)
+        self._answering[number] = task
+        task.add_done_callback(lambda done: self._answered(number, done))
+
+    async def _answer(self, number: int, answer: Awaitable[Any]) -> None:
+        try:
+            self._send(number, ANSWER, (await answer,))
+        except MergeRunnerError as exc:
+            self._send(number, ERROR, taken_apart(exc))
 
     def _answered(self, number: int, done: asyncio.Task[None]) -> None:
         del self._answering[number]

@@ -48,8 +48,8 @@ class WorkerCache(ResponseCache):
 
     async def put_paid(self, entry: Entry, worst_usd: float, actual_usd: float | None) -> Entry:
         """Keep an entry on this disk, then in the main cache, with what it cost."""
-        await super().put(entry)
-        kept: Entry = await self._link.ask("keep", entry, (worst_usd, actual_usd))
+        kept = await super().put(entry)
+        await self._link.ask("keep", entry.to_json(), (worst_usd, actual_usd))
         await self._discard(entry.request.key)
         return kept
 
@@ -88,7 +88,7 @@ class WorkerCache(ResponseCache):
         task.add_done_callback(forget)
 
     async def _deliver(self, entry: Entry) -> None:
-        await self._link.ask("keep", entry, None)
+        await self._link.ask("keep", entry.to_json(), None)
         await self._discard(entry.request.key)
 
     async def _discard(self, key: str) -> None:

@@ -9,7 +9,7 @@ from distributed.comm import Comm
 
 from merge_runner.cluster.batch import Batch, Told
 from merge_runner.cluster.link import Link, rebuilt
-from merge_runner.errors import CacheFailed, TrialSuspended
+from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended
 from merge_runner.llm.cache import Entry
 from merge_runner.llm.limiter import Permit
 from merge_runner.llm.meter import Meter
@@ -87,6 +87,7 @@ class Session:
         return await self._run.admit(self, token, fingerprint, host)
 
     def _trial(self, order: int, told: TrialRecord | str) -> None:
+        """A trial has ended, or is suspended for the reason that is told."""
         spec = self.trials.pop(order)
         self._run.ended(spec, TrialSuspended(told) if isinstance(told, str) else told)
 
@@ -113,26 +114,29 @@ class Session:
             return None
         self._run.claimed.add(key)
         self._claimed.add(key)
-        damaged = tuple(self._cache.set_damage_aside(key))
-        return Told(self._cache.get(key), self._cache.unanswered(key), damaged)
+        try:
+            return Told(self._cache.get(key), self._cache.unanswered(key))
+        except RecordingError:
+            damaged = tuple(self._cache.set_damage_aside(key))
+            return Told(self._cache.get(key), self._cache.unanswered(key), damaged)
 
     def _release(self, key: str) -> None:
         self._claimed.remove(key)
         self._run.claimed.remove(key)
         self._desk.claims.release(key)
 
-    async def _keep(self, entry: Entry, cost: tuple[float, float | None] | None) -> Entry:
+    async def _keep(self, text: str, cost: tuple[float, float | None] | None) -> None:
         """Keep a reply in the main cache; ``cost`` is the worst case and the actual one, in USD."""
+        entry = Entry.from_json(text)
         try:
             if cost is None:
-                kept = await self._cache.put(entry)
+                await self._cache.put(entry)
             else:
-                kept = await self._desk.budget.ledger.keep(entry, *cost)
+                await self._desk.budget.ledger.keep(entry, *cost)
         except CacheFailed as exc:
             self._run.fail(exc)
             raise
         self._run.answered[entry.request.model] += 1
-        return kept
 
     async def _turn(self, name: str, tokens: int, order: int) -> int:
         permit = await self._desk.limiters[name].acquire(tokens, order=order)
