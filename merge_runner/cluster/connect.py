@@ -33,6 +33,7 @@ async def connected(where: str) -> AsyncIterator[Client]:
             "--dask needs the package distributed: pip install 'merge-runner[dask]'"
         ) from exc
 
+    _silence()
     kind, _, rest = where.partition(":")
     if kind == "local":
         if not (rest.isascii() and rest.isdigit() and int(rest) > 0):
@@ -44,7 +45,6 @@ async def connected(where: str) -> AsyncIterator[Client]:
             yield client
         return
     to = {"scheduler_file": where} if _is_scheduler_file(where) else {"address": _address(where)}
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what we say in a line
     try:
         client = await distributed.Client(**to, asynchronous=True, timeout=CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as exc:
@@ -68,7 +68,7 @@ async def _local_cluster(workers: int) -> AsyncIterator[object]:
         threads_per_worker=1,
         processes=True,
         dashboard_address=None,
-        silence_logs=logging.CRITICAL,  # a lost worker is told in a line of ours
+        silence_logs=logging.CRITICAL,
         preload=["merge_runner.cluster.worker"],  # also for one that takes a lost one's place
         asynchronous=True,
     )
@@ -79,6 +79,13 @@ async def _local_cluster(workers: int) -> AsyncIterator[object]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     async with cluster:
         yield cluster
+
+
+def _silence() -> None:
+    """Dask logs with tracebacks what we tell in a line: lost workers, a lost scheduler."""
+    for name in logging.root.manager.loggerDict:
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _is_scheduler_file(where: str) -> bool:

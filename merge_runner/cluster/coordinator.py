@@ -195,7 +195,7 @@ class Coordinator:
             await self._freed.wait()
         if self._stopping or not self._waiting:
             return None
-        slots = min(self._slots, self._in_flight)
+        slots = max(1, min(self._slots, self._in_flight))
         share = min(self._free, max(1, self._in_flight // slots))
         idle = max(1, slots - sum(bool(other.trials) for other in self._sessions))
         size = min(
@@ -278,6 +278,10 @@ async def _finished(batch: Future) -> None:
         raise ClusterFailed(
             f"one batch was begun on several Dask workers, and all died: {error}. Look at their "
             "memory and their logs; run the same command again to go on"
+        )
+    if isinstance(error, ImportError):
+        raise UsageError(
+            f"a Dask worker cannot load merge-runner ({error}): install the same one for all"
         )
     if error is not None:
         raise error

@@ -77,6 +77,7 @@ class Budget:
         """
         for trial in trials:
             self._allowances.pop(trial, None)
+            self._left.discard(trial)
         self._in_flight -= in_flight
         self._queued_usd -= queued_usd
         self._tell()

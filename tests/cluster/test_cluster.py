@@ -122,13 +122,14 @@ async def scheduler(tmp_path):
             stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
         )  # fmt: skip
         processes.append(psutil.Process(process.pid))
+        return process
 
-    await start("scheduler", "--port", "0", "--host", "127.0.0.1")
+    start.process = await start("scheduler", "--port", "0", "--host", "127.0.0.1")
     while not file.exists():
         await asyncio.sleep(0.1)
     start.file = file
     yield start
-    for parent in processes:
+    for parent in filter(psutil.Process.is_running, processes):
         for process in (*parent.children(recursive=True), parent):
             process.kill()
 
@@ -158,3 +159,22 @@ async def test_a_worker_with_other_source_is_refused(merge_runner, scheduler, tm
     assert run.code == 2
     assert "install the same one for all" in run.err
     assert "Traceback" not in run.err
+
+
+@pytest.mark.slow
+async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, scheduler):
+    async def middle(request, handler):
+        if server.requests == 10:
+            scheduler.process.kill()
+        return await handler(request)
+
+    await scheduler("worker", "--no-nanny")
+    async with watched(middle, FaultPlan(latency_s=0.2)) as server:
+        url = f"{server.url}/v1"
+        run = await merge_runner(*SMALL, "--dask", scheduler.file, EMULATOR_BASE_URL=url)
+        assert run.code == 1
+        assert "error: the Dask scheduler is gone" in run.err
+        assert "Traceback" not in run.err
+        again = await merge_runner(*SMALL, EMULATOR_BASE_URL=url)
+        assert again.code == 0, again.err
+        assert set(server.asked.values()) == {1}, "what was in flight is saved first"
