@@ -37,7 +37,7 @@ class Gate:
             before = -1
             while before != len(self.asked):
                 before = len(self.asked)
-                await asyncio.sleep(0.7)
+                await asyncio.sleep(0.5)
 
     @property
     def asked_again(self) -> set[str]:

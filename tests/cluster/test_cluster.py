@@ -31,15 +31,12 @@ async def test_three_workers_come_to_the_results_of_one_process(merge_runner):
         assert set(server.asked.values()) == {1}
         assert run.summary["calls"] == {"live": server.requests, "cached": 0}
         again = await merge_runner(
-            "sweep", "baseline", "--json", "--dask", "local:2", "--reps", 1, "--db", "other",
+            "sweep", "baseline", "--json", "--dask", "local:1", "--reps", 1, "--db", "other",
             EMULATOR_BASE_URL=url,
         )  # fmt: skip
         assert again.summary["calls"]["live"] == 0, "all is recorded"
         assert run.summary["calls"]["live"] == server.requests
     assert (await merge_runner("digest")).out == GOLDEN
-    replay = await merge_runner("replay", "baseline", "--db", "replayed.duckdb")
-    assert replay.code == 0, replay.err
-    assert (await merge_runner("digest", "--db", "replayed.duckdb")).out == GOLDEN
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,8 @@ from llm.test_limiter import fullest_window
 
 pytestmark = pytest.mark.slow
 
-SWEEP = ("sweep", "baseline", "--reps", 1, "--json", "--dask", "local:3")
+SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
+ON_THREE = ("--dask", "local:3")
 THREE = ("--conditions", "L_4_0,N_0_0,R_-4_8")
 
 
@@ -40,7 +41,7 @@ async def test_requests_a_minute_hold_over_all_workers(merge_runner):
     clock = Clock()
     async with watched(clock.middle) as server:
         url = f"{server.url}/v1"
-        run = await merge_runner(*SWEEP, *THREE, "--rpm", 600, EMULATOR_BASE_URL=url)
+        run = await merge_runner(*SWEEP, *ON_THREE, *THREE, "--rpm", 600, EMULATOR_BASE_URL=url)
     assert run.code == 0, run.err
     assert len(clock.times) == run.summary["calls"]["live"] > 50
     # Half a second's worth goes at a time, and may come a little late; one limiter for each worker
@@ -56,7 +57,7 @@ async def test_tokens_a_minute_hold_over_all_workers_and_waiting_calls_can_be_gi
     clock = Clock()
     async with watched(clock.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await started(*SWEEP, "--tpm", limit, **env)
+        process = await started(*SWEEP, *ON_THREE, "--tpm", limit, **env)
         while len(clock.times) < 40:
             await asyncio.sleep(0.1)
         await asyncio.sleep(3)
@@ -80,7 +81,7 @@ async def test_where_one_worker_is_asked_to_wait_all_wait(merge_runner):
 
     async with watched(middle) as server:
         url = f"{server.url}/v1"
-        run = await merge_runner(*SWEEP, EMULATOR_BASE_URL=url)
+        run = await merge_runner(*SWEEP, *ON_THREE, EMULATOR_BASE_URL=url)
     assert run.code == 0, run.err
     assert run.summary["attempts"] == {"ok": len(clock.times), "rate_limited": 1}
     assert not [t for t in clock.times if asked[0] + 0.3 < t < asked[0] + 2.9]
@@ -104,7 +105,7 @@ async def test_the_cost_cap_holds_over_all_workers_and_a_higher_one_goes_on(merg
     async with watched(middle) as server:
         env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
         sweep = (*SWEEP, *THREE, "--reps", 3, "--model", "o3", "--yes", *FAST)
-        run = await merge_runner(*sweep, "--max-cost", cap, **env)
+        run = await merge_runner(*sweep, *ON_THREE, "--max-cost", cap, **env)
         assert run.code == 3, run.err
         assert 0 < usd <= cap
         assert run.summary["cost_usd"] == pytest.approx(usd)

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.slow
 
 SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "L_4_0,N_0_0,R_-4_8", "--json")
 ON_THREE = (*SWEEP, "--dask", "local:3")
+ON_TWO = (*SWEEP, "--dask", "local:2")
 
 
 async def ended(process) -> tuple[int, str, str]:
@@ -73,19 +74,19 @@ async def test_a_coordinator_that_is_killed_loses_the_calls_in_flight(merge_runn
     gate = Gate(40)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await started(*ON_THREE, **env)
+        process = await started(*ON_TWO, **env)
         await gate.quiet(held=3)
         workers = workers_of(process.pid)
         lost = set(gate.held)
         process.kill()
         await process.wait()
         gone, alive = psutil.wait_procs(workers, timeout=10)
-        assert (len(gone), alive) == (3, [])
+        assert (len(gone), alive) == (2, [])
         gate.open()
-        code, out, err = await ended(await started(*ON_THREE, **env))
-    assert code == 0, err
+        run = await merge_runner(*SWEEP, **env)
+    assert run.code == 0, run.err
     assert gate.asked_again <= lost
-    assert json.loads(out)["calls"]["live"] <= 114 - 40 + len(lost)
+    assert run.summary["calls"]["live"] <= 114 - 40 + len(lost)
     assert (await merge_runner("digest")).out == await quiet_digest(merge_runner)
 
 
@@ -93,7 +94,7 @@ async def test_ctrl_c_saves_what_the_workers_have_in_flight(merge_runner, starte
     gate = Gate(40)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await started(*ON_THREE, **env)
+        process = await started(*ON_TWO, **env)
         await gate.quiet(held=3)
         process.send_signal(signal.SIGINT)
         for worker in workers_of(process.pid):
@@ -104,7 +105,7 @@ async def test_ctrl_c_saves_what_the_workers_have_in_flight(merge_runner, starte
         assert code == 130, err
         assert f"{len(gate.held)} calls in flight are saved first" in err
         assert "Traceback" not in err
-        code, _, err = await ended(await started(*ON_THREE, **env))
-    assert code == 0, err
+        run = await merge_runner(*SWEEP, **env)
+    assert run.code == 0, run.err
     assert not gate.asked_again
     assert len(set(gate.asked)) == 114
