@@ -50,6 +50,7 @@ class _Worker:
         self._work: asyncio.Task[None] | None = None
         self._stopping = False
         self._turns: dict[str, UnlimitedTurns] = {}
+        self._early_pauses: dict[str, float] = {}
 
     async def play(self, address: str, token: str) -> None:
         dask = get_worker()
@@ -84,7 +85,7 @@ class _Worker:
             cache = WorkerCache(folder, link)
             stack.callback(cache.close)
             self._turns = {name: UnlimitedTurns(link, name) for name in batch.pauses_s}
-            for name, seconds in batch.pauses_s.items():
+            for name, seconds in {**batch.pauses_s, **self._early_pauses}.items():
                 self._pause(name, seconds)
             limited = {name: RemoteTurns(link, name) for name in batch.limited}
             desk = RemoteDesk(
@@ -120,7 +121,10 @@ class _Worker:
             self._work.cancel()
 
     def _pause(self, name: str, seconds: float) -> None:
-        self._turns[name].hold(seconds)
+        if name in self._turns:
+            self._turns[name].hold(seconds)
+        else:
+            self._early_pauses[name] = seconds
 
 
 def _tell(link: Link, spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
