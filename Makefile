@@ -9,7 +9,7 @@ PYTHON ?= python3
 RUN := .venv/bin/merge-runner
 export Q
 
-.PHONY: help sweep replay report sql test lint check lock
+.PHONY: help sweep replay report sql test lint check bench lock
 
 help:
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -37,9 +37,13 @@ lint: .venv/dev ## formatting, lint, types, import contract
 
 check: lint test ## formatting, lint, types, import contract and tests
 
+bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/performance.md
+	@.venv/bin/python -m benchmarks $(ARGS)
+
 lock: ## renew the lock files (needs uv)
 	uv pip compile $(LOCK) --group dev -o requirements-dev.lock pyproject.toml
 	uv pip compile $(LOCK) --group build -c requirements-dev.lock -o requirements.lock pyproject.toml
+	uv pip compile $(LOCK) --group pyproject.toml:peer -o requirements-peer.lock
 
 LOCK := --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock"
@@ -59,4 +63,10 @@ PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 .venv/dev: .venv/runtime requirements-dev.lock
 	@echo "installing the pinned development packages into .venv" >&2
 	@$(PIP) install --require-hashes -r requirements-dev.lock
+	@touch $@
+
+.venv-peer/installed: requirements-peer.lock
+	@echo "installing inspect-ai, to compare with, into .venv-peer" >&2
+	@$(PYTHON) -m venv .venv-peer
+	@.venv-peer/bin/python -m pip --disable-pip-version-check --quiet install --require-hashes -r $<
 	@touch $@

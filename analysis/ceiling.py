@@ -19,7 +19,7 @@ from scipy import stats
 from scipy.special import expit
 
 from analysis.indicators import ALPHA, SLOPE_MARGIN_S, TESTED
-from analysis.intervals import proportion
+from analysis.intervals import wilson_low
 from analysis.piecewise import THRESHOLDS
 from analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
 from analysis.regressions import gap_design
@@ -123,30 +123,28 @@ class _Draws:
                 judged += np.isfinite(passes).sum(axis=1)
                 passing += np.nansum(passes, axis=1).astype(int)
         self.piecewise = (
-            np.array([_enough(*counts) for counts in zip(passing, judged, strict=True)])
-            if humans.piecewise
-            else None
+            wilson_low(passing, judged) >= THRESHOLDS.min_share if humans.piecewise else None
         )
-
-
-def _enough(passing: int, judged: int) -> bool:
-    low = proportion(int(passing), int(judged)).low
-    return low is not None and low >= THRESHOLDS.min_share
 
 
 def _wald(draws: _Draws) -> Passes:
     """I1 and I2 by Wald tests of the maximum likelihood fit; a fit without an end fails."""
-    b = np.zeros((DATA_SETS, 3))
+    b, se = np.zeros((DATA_SETS, 3)), np.zeros((DATA_SETS, 3))
     alive = _rank(LOGIT_DESIGN, draws.n)
-    last = np.full(DATA_SETS, np.inf)
+    sound = np.zeros(DATA_SETS, bool)
+    rows = np.flatnonzero(alive)  # a data set that has converged is left as it is
     for _ in range(WALD_STEPS):
-        p = expit(b @ LOGIT_DESIGN.T)
-        covariance, sound = _inverse(LOGIT_DESIGN, draws.n * p * (1 - p), alive)
-        step = np.einsum("bjk,bk->bj", covariance, (draws.left - draws.n * p) @ LOGIT_DESIGN)
-        b = np.where(sound[:, None], b + np.clip(step, -10, 10), b)
-        last = np.abs(step).max(axis=1)
-    se = np.sqrt(np.abs(np.einsum("bjj->bj", covariance)))
-    sound &= last < 1e-6
+        n = draws.n[rows]
+        p = expit(b[rows] @ LOGIT_DESIGN.T)
+        covariance, regular = _inverse(LOGIT_DESIGN, n * p * (1 - p), alive[rows])
+        step = np.einsum("bjk,bk->bj", covariance, (draws.left[rows] - n * p) @ LOGIT_DESIGN)
+        b[rows] += np.where(regular[:, None], np.clip(step, -10, 10), 0)
+        se[rows] = np.sqrt(np.abs(np.einsum("bjj->bj", covariance)))
+        size = np.abs(step).max(axis=1)
+        sound[rows] = regular & (size < 1e-6)
+        rows = rows[regular & (size >= 1e-10)]
+        if not len(rows):
+            break
     with np.errstate(divide="ignore", invalid="ignore"):
         significant = 2 * stats.norm.sf(np.abs(b / se)) < ALPHA
     return {

@@ -46,12 +46,13 @@ def tables(
     ] = None,
 ) -> None:
     """Print the paper's tables III to VII, and those that say what these cannot."""
-    from analysis.tables import make_tables
-    from analysis.tables.against import against as beside
+    from analysis.tables import finished_tables
     from analysis.tables.formats import render
 
-    made = make_tables(_study(db, models), names or ())
+    made = finished_tables(db, listed(models), names or ())
     if against is not None:
+        from analysis.tables.against import against as beside
+
         made = [beside(table, against) for table in made]
     print_out(render(made, output))
 
@@ -65,10 +66,10 @@ def explain(
 ) -> None:
     """Say where a cell of a table comes from: its meaning, the query, and the trials."""
     from analysis.explain import explain as explain_cell
-    from analysis.tables import make_tables
+    from analysis.tables import finished_tables
 
     study = _study(db, None)
-    found = explain_cell(study, make_tables(study, [table])[0], cell)
+    found = explain_cell(study, finished_tables(db, None, [table], study)[0], cell)
     if as_json:
         print_out(json.dumps(asdict(found), indent=2, ensure_ascii=False))
     else:
@@ -104,7 +105,7 @@ def report(
     """Write tables, figures, provenance and conclusions as one HTML file, and all as files."""
     from analysis.report import write_report
 
-    for path in write_report(_study(db, models), out, files):
+    for path in write_report(db, listed(models), out, files):
         say(f"wrote {path}")
 
 

@@ -130,7 +130,8 @@ def _tables(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
         ("attempts", of_group(study.calls.attempts, group, group.trials)),
         ("decisions", of_group(study.calls.decisions, group, group.trials)),
     ):
-        connection.register(name, frame)
+        connection.register("frame", frame)
+        connection.execute(f"CREATE TEMP TABLE {name} AS FROM frame")
     return connection
 
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
@@ -205,8 +206,10 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
             found = left_traces(study, group, first)
             colour, _ = _style(study, group)
             alpha = min(0.4, max(0.06, 25 / max(len(found), 1)))  # many lines must not be one blot
-            for time_s, velocity_mps in found:
-                axis.plot(time_s, velocity_mps, color=colour, lw=0.4, alpha=alpha, rasterized=True)
+            lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
+            lines.set(capstyle="projecting", joinstyle="round")
+            axis.add_collection(lines)
+            axis.autoscale_view()
             if not group.measured:
                 _say(axis, MISSING)
             elif not found:

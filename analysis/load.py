@@ -16,11 +16,12 @@ TRIALS = (
     "SELECT trials.*, trial_metrics.* EXCLUDE (trial_id, spec_hash) "
     "FROM trials JOIN trial_metrics USING (trial_id, spec_hash) ORDER BY trial_id, spec_hash"
 )
-# One row a vehicle; the speeds from the start of control on.
-SPEEDS = (
-    "SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s, "
-    "list(velocity_mps ORDER BY step) AS velocity_mps FROM states WHERE time_s >= 0 "
-    "GROUP BY ALL ORDER BY ALL"
+# One row a finished trial of humans or with the baseline prompt: the left vehicle's speeds.
+LEFT_SPEEDS = (
+    "SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s, "
+    "list(velocity_mps ORDER BY step) AS velocity_mps FROM states SEMI JOIN ("
+    "FROM trials WHERE status = 'finished' AND coalesce(variant, 'baseline') = 'baseline') "
+    "USING (trial_id, spec_hash) WHERE time_s >= 0 AND side = 'left' GROUP BY ALL ORDER BY ALL"
 )
 # A plan's revision: |the new plan's first actions - the old plan's for the same instants|. Both
 # plans cover the horizon; the older one is `executed` actions ahead of the new one.

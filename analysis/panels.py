@@ -65,13 +65,15 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
     return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
 
 
-def left_traces(study: Study, group: Group, first: str) -> list[tuple[Array, Array]]:
-    """Panels A and B: times in s and left speeds in m/s where ``first`` merged first."""
+def left_traces(study: Study, group: Group, first: str) -> list[Array]:
+    """Panels A and B: times in s and left speeds in m/s, (n, 2), where ``first`` merged first."""
     if not group.measured:
         return []
     chosen = group.finished[group.finished["merged_first"] == first]
-    rows = of_group(study.speeds[study.speeds["side"] == "left"], group, chosen)
-    return [(np.asarray(row.time_s), np.asarray(row.velocity_mps)) for row in rows.itertuples()]
+    rows = of_group(study.left_speeds, group, chosen)
+    return [
+        np.column_stack(trace) for trace in zip(rows["time_s"], rows["velocity_mps"], strict=True)
+    ]
 
 
 def _conditions(group: Group, velocity_mps: float) -> Iterator[tuple[float, pd.DataFrame]]:

@@ -9,13 +9,11 @@ counts is how few knots suffice and how well.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from ruptures import Pelt
-from ruptures.base import BaseCost
 
 Array = NDArray[np.float64]
 
@@ -23,6 +21,7 @@ SAMPLE_S = 0.2
 TOLERANCE_MPS = 0.03
 MIN_SEGMENT_SAMPLES = 3  # 0.6 s
 STEADY_MPS2 = 0.05  # a smaller acceleration has no sign
+SEGMENTS_AT_ONCE = 2**18  # 2 MB an array
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,85 +50,121 @@ class Profile:
     reversal_rate_hz: float
 
 
-class ContinuousPolyline(BaseCost):  # type: ignore[misc] # ruptures ships no types
-    """Residual sums of squares of straight lines from sample to sample, all computed at once.
+FIELDS = tuple(field.name for field in fields(Profile))
 
-    Segments share their end samples, as with ruptures' own ``clinear``, which computes one segment
-    at a time.
+
+def segment_costs(y: Array) -> Array:
+    """Residual sums of squares of straight lines from sample to sample, shape (..., n, n).
+
+    Of signals of shape (..., n): the line from sample i to sample j, over the samples after i up to
+    j. Segments share their end samples (the cost ``clinear`` of ruptures, Truong et al. 2020).
     """
-
-    model = "continuous-polyline"
-    min_size = MIN_SEGMENT_SAMPLES
-
-    def fit(self, signal: Array) -> ContinuousPolyline:
-        """Tabulate the cost of every segment of a signal of shape (n,)."""
-        y = np.asarray(signal, dtype=float).ravel()
-        self.signal = y.reshape(-1, 1)
-        n = len(y)
-        start, end = np.arange(n)[:, None], np.arange(n)[None, :]
-        length = end - start
-        slope = (y[None, :] - y[:, None]) / np.maximum(length, 1)
-        sums = [np.concatenate([[0.0], np.cumsum(z)]) for z in (y, y * y, np.arange(n) * y)]
-        # Sums over the samples after `start` up to `end`: of y, y^2 and (i - start) y.
-        total, squares, moment = (s[None, 1:] - s[1:, None] for s in sums)
-        moment = moment - start * total
-        steps = length * (length + 1) / 2
-        squared_steps = steps * (2 * length + 1) / 3
-        first = y[:, None]
-        self._table = (
-            squares
-            - 2 * first * total
-            + length * first**2
-            - 2 * slope * (moment - first * steps)
-            + slope**2 * squared_steps
-        )
-        return self
-
-    def error(self, start: int, end: int) -> float:
-        """The cost of the segment that ends with sample ``end`` - 1."""
-        return float(self._table[max(start, 1) - 1, end - 1])
+    n = y.shape[-1]
+    start, end = np.arange(n)[:, None], np.arange(n)[None, :]
+    length = end - start
+    first = y[..., :, None]
+    slope = (y[..., None, :] - first) / np.maximum(length, 1)
+    nothing = np.zeros((*y.shape[:-1], 1))
+    sums = [
+        np.concatenate([nothing, np.cumsum(z, axis=-1)], axis=-1)
+        for z in (y, y * y, np.arange(n) * y)
+    ]
+    # Sums over the samples after `start` up to `end`: of y, y^2 and (i - start) y.
+    total, squares, moment = (s[..., None, 1:] - s[..., 1:, None] for s in sums)
+    moment = moment - start * total
+    steps = length * (length + 1) / 2
+    squared_steps = steps * (2 * length + 1) / 3
+    costs = squares - 2 * first * total + length * first**2
+    costs -= 2 * slope * (moment - first * steps)
+    costs += slope**2 * squared_steps
+    return np.asarray(costs)
 
 
 def fit_profile(velocity_mps: Array) -> Profile:
     """Fit the speeds of one vehicle at 5 Hz, shape (n,) with n >= 4."""
-    v = np.asarray(velocity_mps, dtype=float) - velocity_mps[0]
-    penalty = 2 * np.log(len(v)) * TOLERANCE_MPS**2
-    search = Pelt(custom_cost=ContinuousPolyline(), min_size=MIN_SEGMENT_SAMPLES, jump=1)
-    ends = search.fit(v).predict(penalty)
-    knots = np.array([0, *(end - 1 for end in ends)])
-    fitted = np.interp(np.arange(len(v)), knots, v[knots])
-    seconds = (len(v) - 1) * SAMPLE_S
-    acceleration = np.diff(v) / SAMPLE_S
-    signs = np.sign(acceleration[np.abs(acceleration) > STEADY_MPS2])
-    return Profile(
-        knot_rate_hz=(len(knots) - 2) / seconds,
-        rmse_mps=float(np.sqrt(np.mean((v - fitted) ** 2))),
-        reversal_rate_hz=float((signs[1:] != signs[:-1]).sum()) / seconds,
+    (values,) = fit_each(np.asarray(velocity_mps, dtype=float)[None])
+    return Profile(*map(float, values))
+
+
+def fit_each(velocity_mps: Array) -> Array:
+    """Fit vehicles of equally many samples, (vehicles, n): rows with the fields of Profile."""
+    v = velocity_mps - velocity_mps[:, :1]
+    n = v.shape[1]
+    knots = _knots(v)
+    at = np.arange(n)
+    before = np.maximum.accumulate(np.where(knots, at, 0), axis=1)
+    after = np.minimum.accumulate(np.where(knots, at, n - 1)[:, ::-1], axis=1)[:, ::-1]
+    low, high = (np.take_along_axis(v, place, axis=1) for place in (before, after))
+    fitted = low + (high - low) / np.maximum(after - before, 1) * (at - before)
+    seconds = (n - 1) * SAMPLE_S
+    return np.column_stack(
+        [
+            (knots.sum(axis=1) - 2) / seconds,
+            np.sqrt(np.mean((v - fitted) ** 2, axis=1)),
+            _reversals(np.diff(v) / SAMPLE_S) / seconds,
+        ]
     )
 
 
+def _knots(v: Array) -> NDArray[np.bool_]:
+    """Which samples are knots of the best polyline of each row, both ends among them.
+
+    PELT (Killick et al. 2012) as ruptures has it, for all rows at once: the best way to each sample
+    is one to an earlier sample and a line from there, which falls out once it costs a knot more.
+    """
+    rows, n = v.shape
+    penalty = 2 * np.log(n) * TOLERANCE_MPS**2
+    costs = segment_costs(v) + penalty
+    # Of the first `end` samples: the lowest cost, and how many lie before the last segment.
+    best, last = np.zeros((rows, n + 1)), np.zeros((rows, n + 1), int)
+    open_ways = np.ones((rows, n + 1), bool)
+    open_ways[:, 1:MIN_SEGMENT_SAMPLES] = False
+    for end in range(MIN_SEGMENT_SAMPLES, n + 1):
+        ways = end - MIN_SEGMENT_SAMPLES + 1
+        starts = np.maximum(np.arange(ways), 1) - 1
+        through = best[:, :ways] + costs[:, starts, end - 1]
+        through[~open_ways[:, :ways]] = np.inf
+        last[:, end] = through.argmin(axis=1)
+        best[:, end] = through.min(axis=1)
+        open_ways[:, :ways] &= through <= best[:, end, None] + penalty
+    knots = np.zeros((rows, n), bool)
+    knots[:, 0] = True
+    ends = np.full(rows, n)
+    while ends.any():
+        knots[np.arange(rows), np.maximum(ends, 1) - 1] = True
+        ends = last[np.arange(rows), ends]
+    return knots
+
+
+def _reversals(acceleration_mps2: Array) -> NDArray[np.int_]:
+    """How often the sign changes in each row, samples without a sign left out."""
+    sign = np.where(np.abs(acceleration_mps2) > STEADY_MPS2, np.sign(acceleration_mps2), 0)
+    latest = np.maximum.accumulate(np.where(sign != 0, np.arange(sign.shape[1]), 0), axis=1)
+    known = np.take_along_axis(sign, latest, axis=1)
+    return np.asarray((known[:, 1:] * known[:, :-1] < 0).sum(axis=1))
+
+
 def fit_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
-    """Fit all vehicles of ``load.SPEEDS`` that drove for at least 4 samples.
+    """Fit vehicles, a row each with lists time_s and velocity_mps; NaN below 4 samples.
 
     Columns: trial_id, spec_hash, side, knot_rate_hz, rmse_mps, reversal_rate_hz.
     """
-    names = ["trial_id", "spec_hash", "side", "knot_rate_hz", "rmse_mps", "reversal_rate_hz"]
-    rows = []
-    for row in speeds.itertuples():
-        v = at_5_hz(np.asarray(row.time_s), np.asarray(row.velocity_mps))
+    sampled = [
+        at_5_hz(np.asarray(time_s), np.asarray(velocity_mps))
+        for time_s, velocity_mps in zip(speeds["time_s"], speeds["velocity_mps"], strict=True)
+    ]
+    values = np.full((len(sampled), len(FIELDS)), np.nan)
+    places: dict[int, list[int]] = {}
+    for place, v in enumerate(sampled):
         if len(v) > MIN_SEGMENT_SAMPLES:
-            profile = fit_profile(v)
-            rows.append(
-                (
-                    row.trial_id,
-                    row.spec_hash,
-                    row.side,
-                    profile.knot_rate_hz,
-                    profile.rmse_mps,
-                    profile.reversal_rate_hz,
-                )
-            )
-    return pd.DataFrame(rows, columns=names)
+            places.setdefault(len(v), []).append(place)
+    for n, alike in places.items():
+        step = max(1, SEGMENTS_AT_ONCE // n**2)
+        for start in range(0, len(alike), step):
+            chosen = alike[start : start + step]
+            values[chosen] = fit_each(np.stack([sampled[place] for place in chosen]))
+    keys = speeds[["trial_id", "spec_hash", "side"]].reset_index(drop=True)
+    return keys.join(pd.DataFrame(values, columns=list(FIELDS)))
 
 
 def passing(profiles: pd.DataFrame, limits: Thresholds) -> pd.Series:

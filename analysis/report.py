@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from importlib.metadata import version
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import jinja2
-import pandas as pd
-
-from analysis.conclusions import alarms, not_shown, shown
-from analysis.explain import Source, sources_of, sql_command
 from analysis.figures import FIGURES, rendered, write_figures
 from analysis.forms import TableFormat
-from analysis.provenance import provenance
-from analysis.published import published
+from analysis.kept import finished, keep_finished
+from analysis.page import report_html
 from analysis.study import Study
-from analysis.tables import make_tables
-from analysis.tables.against import PAPER, against, in_paper
-from analysis.tables.formats import notes_of, render, shown_columns, shown_value
-from analysis.tables.model import Column, Row, Table
+from analysis.tables import finished_tables
+from analysis.tables.formats import render
+from analysis.tables.model import Table, options_text
 from merge_runner.errors import UsageError
-from merge_runner.provenance import git_state
 
-TEMPLATES = Path(__file__).with_name("templates")
-LISTED = 300
-LIBRARIES = ("statsmodels", "firthmodels", "scipy", "numpy", "pandas", "ruptures", "matplotlib")
 SUFFIXES = {
     TableFormat.TEXT: "txt",
     TableFormat.CSV: "csv",
@@ -37,26 +25,19 @@ SUFFIXES = {
 }
 
 
-@dataclass
-class Links:
-    """The sources of all cells; equal ones are listed once, under one number."""
+def write_report(
+    db: Path, models: Sequence[str] | None, out: Path, files: Path | None
+) -> Iterator[Path]:
+    """Write the report, and all tables and figures into ``files``; yields the paths.
 
-    study: Study
-    found: dict[tuple[Source, ...], int] = field(default_factory=dict)
-
-    def to(self, table: Table, row: Row, column: Column) -> int:
-        """The number of a cell's sources."""
-        sources = sources_of(self.study, table, row, column)
-        return self.found.setdefault(sources, len(self.found) + 1)
-
-
-def write_report(study: Study, out: Path, files: Path | None) -> Iterator[Path]:
-    """Write the report, and all tables and figures into ``files``; yields the paths."""
-    tables = make_tables(study)
+    ``models`` keeps these drivers alone. Raises UsageError.
+    """
+    study = Study(db, models)
+    tables = finished_tables(db, models, study=study)
     if files is not None:
         yield from write_figures(study, files)
         yield from write_tables(tables, files)
-    text = report_html(study, tables)
+    text = report_html(study, tables, finished_figures(study, options_text(db, models)))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
@@ -75,84 +56,14 @@ def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
             yield path
 
 
-def report_html(study: Study, tables: list[Table]) -> str:
-    """The report as one HTML text."""
-    links = Links(study)
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    origin = provenance(study.db)
-    return environment.get_template("report.html").render(
-        study=study,
-        alarms=alarms(study, origin),
-        shown=shown(study),
-        not_shown=not_shown(study, origin),
-        figures=[
-            {
-                "name": name,
-                "caption": caption,
-                "data": base64.b64encode(rendered(study, name, "svg")).decode(),
-            }
-            for name, (_, caption) in FIGURES.items()
-        ],
-        tables=[_view(table, links) for table in tables],
-        beside=[_view(against(table, PAPER), links) for table in tables if in_paper(table)],
-        sources=[(number, sources) for sources, number in links.found.items()],
-        listed=LISTED,
-        command=sql_command(study),
-        libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
-        origin=origin,
-        records=_records,
-        readings=_records(published("readings")),
-        sources_cited=_records(published("sources")),
-        program=git_state(),
-    )
-
-
-def _view(table: Table, links: Links) -> dict[str, object]:
-    """A table as its template needs it: headings, cells with links, notes."""
-    columns = shown_columns(table)
-    return {
-        "name": table.name,
-        "heading": table.heading,
-        "columns": [
-            {"heading": c.heading, "meaning": c.meaning, "text": c.kind == "text"} for c in columns
-        ],
-        "rows": [
-            {
-                "id": row.id,
-                "cells": [
-                    {
-                        "text": shown_value(column, row.values.get(column.name)),
-                        "left": column.kind == "text",
-                        "link": None
-                        if column.kind == "text" or row.values.get(column.name) is None
-                        else links.to(table, row, column),
-                    }
-                    for column in columns
-                ],
-            }
-            for row in table.rows
-        ],
-        "notes": notes_of(table),
+def finished_figures(study: Study, options: str) -> dict[str, str]:
+    """Every figure by name as SVG in Base64, as it is kept in the database or drawn now."""
+    state, found = finished(study.db, options, list(FIGURES))
+    drawn = {
+        name: base64.b64encode(rendered(study, name, "svg")).decode()
+        for name in FIGURES
+        if name not in found
     }
-
-
-def _records(frame: pd.DataFrame) -> list[dict[str, object]]:
-    """Rows for a template: what is missing is an empty text, whole numbers are whole."""
-    return [
-        {str(name): _plain(value) for name, value in row.items()}
-        for row in frame.to_dict(orient="records")
-    ]
-
-
-def _plain(value: object) -> object:
-    if value is None or value is pd.NaT or (isinstance(value, float) and pd.isna(value)):
-        return ""
-    if isinstance(value, float):
-        return int(value) if value.is_integer() else round(value, 6)
-    return value
+    if drawn:
+        keep_finished(study.db, state, options, drawn)
+    return found | drawn

@@ -1,14 +1,15 @@
 """What the trials would have come to under the other readings of "collision".
 
-The stored plans are driven again. Where a trial ended in a collision that another rule does not
-see, the drivers' last plans go on as far as they reach; what is open then stays ``undecided``.
-Human traces are judged as they are.
+Up to a trial's end the rule changes nothing but the end, so the stored traces are judged again.
+Where a trial of drivers ended in a collision that another rule does not see, its stored plans are
+driven again, and the last ones go on as far as they reach; what is open then stays ``undecided``.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from math import hypot
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,22 +19,32 @@ from analysis.load import SPECS, load_each
 from merge_runner.config import CollisionRule, Scenario
 from merge_runner.simulator.collision import collided
 from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.simulator.track import FORWARD, LATERAL, MERGE_POINT_M
 from merge_runner.simulator.world import World
 
 RULES: tuple[CollisionRule, ...] = get_args(CollisionRule)
 UNDECIDED = "undecided"
+# Samples with centres closer in the plane than a distance, from which on no rule sees a collision.
+CLOSE = """
+SELECT trial_id, spec_hash, list((left_m, right_m) ORDER BY step) AS close FROM (
+    SELECT *, left_m - {merge} AS left_past_m, right_m - {merge} AS right_past_m,
+        {lateral} * (least(left_past_m, 0) + least(right_past_m, 0)) AS across_m,
+        if(left_past_m < 0, {forward} * left_past_m, left_past_m)
+            - if(right_past_m < 0, {forward} * right_past_m, right_past_m) AS along_m
+    FROM vehicle_pairs
+) WHERE across_m ** 2 + along_m ** 2 < {reach_m} ** 2 GROUP BY ALL
+"""
+# Trials in which both drivers decided something; the others ended before that.
+DECIDED = """
+SELECT trial_id, spec_hash FROM decisions GROUP BY ALL HAVING count(DISTINCT side) = 2
+"""
 PLANS = (
     "SELECT trial_id, spec_hash, side, list(applied ORDER BY decision) AS applied, "
     "arg_max(coalesce(plan, []), decision) AS last_plan FROM decisions "
+    "SEMI JOIN (FROM trials WHERE status = 'collided') USING (trial_id, spec_hash) "
     "GROUP BY ALL ORDER BY ALL"
 )
-# No rule sees a collision where the vehicles are 5 m apart along the track.
-HUMAN_TRACES = """
-SELECT trial_id, spec_hash,
-    coalesce(list((left_m, right_m) ORDER BY step) FILTER (abs(left_m - right_m) < 5), []) AS close
-FROM vehicle_pairs JOIN trials USING (trial_id, spec_hash) WHERE source = 'human'
-GROUP BY ALL ORDER BY ALL
-"""
+Outcome = tuple[str, str | None]
 
 
 def outcomes(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
@@ -42,15 +53,67 @@ def outcomes(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
     ``status`` is finished, collided, timeout or undecided.
     """
     ended = trials[trials["status"] != "failed"]
-    humans = bool((ended["source"] == "human").any())
-    found = load_each(
-        {"specs": SPECS, "plans": PLANS} | ({"traces": HUMAN_TRACES} if humans else {}), db
+    specs = load_each({"specs": SPECS}, db)["specs"]
+    scenarios = _scenarios(ended["spec_hash"].unique(), specs)
+    found = load_each({"plans": PLANS, "close": _close(scenarios.values()), "decided": DECIDED}, db)
+    close = {(row.trial_id, row.spec_hash): row.close for row in found["close"].itertuples()}
+    decided = set(found["decided"].itertuples(index=False, name=None))
+    plans: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in found["plans"].itertuples():
+        plans.setdefault((row.trial_id, row.spec_hash), {})[row.side] = row
+    rows = []
+    columns = ["trial_id", "spec_hash", "source", "condition", "status", "merged_first"]
+    for trial in ended[columns].itertuples(index=False):
+        key = (trial.trial_id, trial.spec_hash)
+        pairs = close.get(key, ())
+        known = trial.source == "human" or key in decided
+        for rule in RULES:
+            scenario = scenarios[trial.spec_hash, rule]
+            outcome: Outcome
+            if not known:
+                outcome = UNDECIDED, None
+            elif any(collided(scenario, left, right) for left, right in pairs):
+                outcome = "collided", None
+            elif trial.status != "collided":
+                outcome = trial.status, trial.merged_first
+            elif trial.source == "human":
+                outcome = UNDECIDED, None
+            else:
+                sides = [plans[key][side] for side in ("left", "right")]
+                outcome = redrive(
+                    scenario,
+                    trial.condition,
+                    [side.applied for side in sides],
+                    [side.last_plan for side in sides],
+                )
+            rows.append((*key, rule, *outcome))
+    return pd.DataFrame(rows, columns=["trial_id", "spec_hash", "rule", "status", "merged_first"])
+
+
+def _close(scenarios: Iterable[Scenario]) -> str:
+    """The samples at which boxes can touch, with a margin for rounding."""
+    reach_m = max(
+        (hypot(one.vehicle_length_m, one.vehicle_width_m) for one in scenarios), default=0.0
     )
-    specs = found["specs"].set_index("spec_hash")["spec"]
-    frames = [_driven(ended[ended["source"] != "human"], found["plans"], specs)]
-    if humans:
-        frames.append(_judged(ended, found["traces"]))
-    return pd.concat(frames, ignore_index=True)
+    return CLOSE.format(
+        merge=MERGE_POINT_M, lateral=LATERAL, forward=FORWARD, reach_m=reach_m + 0.01
+    )
+
+
+def _scenarios(
+    spec_hashes: Iterable[str], specs: pd.DataFrame
+) -> dict[tuple[str, CollisionRule], Scenario]:
+    """The scenario of each spec under each rule; that of humans is the default one."""
+    texts = dict(zip(specs["spec_hash"], specs["spec"], strict=True))
+    found = {
+        spec_hash: json.loads(texts.get(spec_hash, "{}")).get("scenario", {})
+        for spec_hash in spec_hashes
+    }
+    return {
+        (spec_hash, rule): Scenario.model_validate(scenario | {"collision_rule": rule})
+        for spec_hash, scenario in found.items()
+        for rule in RULES
+    }
 
 
 def redrive(
@@ -58,7 +121,7 @@ def redrive(
     condition: str,
     applied: Sequence[Sequence[Sequence[float]]],
     last_plans: Sequence[Sequence[float]],
-) -> tuple[str, str | None]:
+) -> Outcome:
     """Drive a trial's plans again: (status, merged_first).
 
     ``applied`` holds, for left and right, the normalised actions of each decision; a vehicle that
@@ -76,56 +139,3 @@ def redrive(
             break
         world.advance({"left": left, "right": right})
     return world.status or UNDECIDED, world.merged_first() if world.status else None
-
-
-def _driven(trials: pd.DataFrame, plans: pd.DataFrame, specs: pd.Series) -> pd.DataFrame:
-    by_trial: dict[tuple[str, str], dict[str, Any]] = {}
-    for row in plans.itertuples():
-        by_trial.setdefault((row.trial_id, row.spec_hash), {})[row.side] = row
-    scenarios = {
-        (spec_hash, rule): Scenario.model_validate(
-            json.loads(specs[spec_hash])["scenario"] | {"collision_rule": rule}
-        )
-        for spec_hash in trials["spec_hash"].unique()
-        for rule in RULES
-    }
-    rows = []
-    for trial in trials.itertuples():
-        sides = by_trial.get((trial.trial_id, trial.spec_hash), {})
-        drivers = [sides[side] for side in ("left", "right") if side in sides]
-        for rule in RULES:
-            scenario = scenarios[trial.spec_hash, rule]
-            if len(drivers) == 2:
-                outcome = redrive(
-                    scenario,
-                    trial.condition,
-                    [driver.applied for driver in drivers],
-                    [driver.last_plan for driver in drivers],
-                )
-            else:  # it ended before both drivers had decided anything
-                outcome = UNDECIDED, None
-            rows.append((trial.trial_id, trial.spec_hash, rule, *outcome))
-    return _frame(rows)
-
-
-def _judged(trials: pd.DataFrame, traces: pd.DataFrame) -> pd.DataFrame:
-    scenarios = {rule: Scenario(collision_rule=rule) for rule in RULES}
-    stored = trials.set_index(["trial_id", "spec_hash"])
-    rows = []
-    for trace in traces.itertuples():
-        if (trace.trial_id, trace.spec_hash) not in stored.index:
-            continue
-        trial = stored.loc[(trace.trial_id, trace.spec_hash)]
-        for rule, scenario in scenarios.items():
-            if any(collided(scenario, left, right) for left, right in trace.close):
-                outcome = "collided", None
-            elif trial["status"] == "collided":
-                outcome = UNDECIDED, None
-            else:
-                outcome = trial["status"], trial["merged_first"]
-            rows.append((trace.trial_id, trace.spec_hash, rule, *outcome))
-    return _frame(rows)
-
-
-def _frame(rows: Sequence[tuple[str, str, str, str, str | None]]) -> pd.DataFrame:
-    return pd.DataFrame(rows, columns=["trial_id", "spec_hash", "rule", "status", "merged_first"])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from analysis.load import PLANS, SHARED, SPECS, SPEEDS, TRIALS, Calls, load_calls, load_each
+from analysis.load import LEFT_SPEEDS, PLANS, SHARED, SPECS, TRIALS, Calls, load_calls, load_each
 from analysis.published import human_outcomes
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
@@ -59,7 +59,7 @@ class Group:
         counts = self.ended["condition"].value_counts()
         return tuple(int(counts.get(name, 0)) for name in CONDITIONS)
 
-    @property
+    @cached_property
     def left_out(self) -> str:
         """Which trials are not among the finished ones, in words."""
         counts = self.trials["status"].value_counts()
@@ -104,14 +104,14 @@ class Study:
     @cached_property
     def profiles(self) -> pd.DataFrame:
         """One row a vehicle: the piecewise-linear fit of its speeds."""
-        from analysis.piecewise import fit_profiles
+        from analysis.profiles import fitted_profiles
 
-        return fit_profiles(self.speeds)
+        return fitted_profiles(self.db)
 
     @cached_property
-    def speeds(self) -> pd.DataFrame:
-        """One row a vehicle: its speeds from the start of control on."""
-        return self._read(SPEEDS)
+    def left_speeds(self) -> pd.DataFrame:
+        """One row a finished baseline trial: the left vehicle's speeds under control."""
+        return self._read(LEFT_SPEEDS)
 
     @cached_property
     def deviations(self) -> pd.DataFrame:
@@ -140,7 +140,9 @@ class Study:
 def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.DataFrame:
     """The rows of a per-trial frame that belong to these trials of a group."""
     keys = trials[["trial_id", "spec_hash"]]
-    return frame.merge(keys, on=["trial_id", "spec_hash"])
+    # To join all rows takes longer than to leave out those of other groups first.
+    near = frame["spec_hash"].isin(keys["spec_hash"].unique())
+    return frame[near].merge(keys, on=["trial_id", "spec_hash"])
 
 
 def _human_group(trials: pd.DataFrame) -> Group:

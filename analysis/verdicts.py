@@ -44,11 +44,20 @@ def fits(group: Group) -> Fits:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """A group's verdicts by both rules, with I5 in both, and the human ceiling for its size."""
+    """A group's verdicts by both rules, with I5 in both, and what to draw its ceiling from.
+
+    ``sizes`` are its trials per condition.
+    """
 
     paper: dict[str, Verdict]
     robust: dict[str, Verdict]
-    ceiling: Ceiling
+    humans: Population
+    sizes: tuple[int, ...]
+
+    @property
+    def ceiling(self) -> Ceiling:
+        """The human ceiling for the group's size."""
+        return ceiling(self.humans, self.sizes)
 
     @staticmethod
     def total(verdicts: dict[str, Verdict]) -> int | None:
@@ -71,7 +80,8 @@ def score(study: Study, group: Group) -> Score:
     return Score(
         paper | {"I5": piecewise},
         robust | {"I5": piecewise},
-        ceiling(population(study), group.sizes),
+        population(study),
+        group.sizes,
     )
 
 

@@ -7,6 +7,7 @@ import itertools
 import logging
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,10 @@ SCHEMA = Path(__file__).with_name("schema.sql")
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
 LOG = logging.getLogger(__name__)
+SETTINGS: dict[str, str | bool | int | float | list[str]] = {
+    "memory_limit": "200MB",  # of the machine's by default; it is a cache of the file most of all
+    "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
+}
 REBUILD = (
     "move it away, or name another with --db, and run the same sweep again: it is rebuilt from the "
     "cache without a call"
@@ -42,7 +47,7 @@ class Instance:
     def cursor(self) -> duckdb.DuckDBPyConnection:
         """A connection of its own."""
         if self._connection is None:
-            self._connection = duckdb.connect()
+            self._connection = duckdb.connect(config=SETTINGS)
         return self._connection.cursor()
 
     def name(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 
 from merge_runner.errors import StoreError, StoreLocked
@@ -10,6 +11,10 @@ from merge_runner.records import TrialRecord
 from merge_runner.store import Store
 
 EVERY_S = 1.0
+ROOM_POLL_S = 0.02
+BATCH = 64
+"""Trials in one transaction: few enough that a reader gets its turn soon."""
+MOST_PENDING = 4 * BATCH
 LOCK_PATIENCE_S = 2.0
 # At the end: with a lock, which somebody will release, and with anything else, as a full disk.
 LAST_LOCK_PATIENCE_S, LAST_PATIENCE_S = 60.0, 3.0
@@ -18,8 +23,8 @@ LAST_LOCK_PATIENCE_S, LAST_PATIENCE_S = 60.0, 3.0
 class Flusher:
     """Collects ended trials and stores them about once a second.
 
-    What cannot be stored waits in memory while the trials go on. ``differing`` lists the trials
-    that are stored already, with another result.
+    What cannot be stored waits in memory while the trials go on; where it is only slow, they wait
+    for it. ``differing`` lists the trials that are stored already, with another result.
     """
 
     def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
@@ -29,20 +34,31 @@ class Flusher:
         self._say = say
         self._pending: list[TrialRecord] = []
         self._problem = ""
-        self._locked = False
-        self._closing = asyncio.Event()
+        self._locked = self._stuck = False
+        self._closing = False
+        self._awake = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
     def add(self, record: TrialRecord) -> None:
         """Store this trial with the next batch."""
         self._pending.append(record)
+        if len(self._pending) >= BATCH:
+            self._awake.set()
+
+    async def room(self) -> None:
+        """Wait while much is still to be stored, and it can be."""
+        while len(self._pending) > MOST_PENDING and not self._stuck:
+            await asyncio.sleep(ROOM_POLL_S)
 
     async def close(self) -> None:
         """Store what is left; raises StoreError if that does not work after a while."""
-        self._closing.set()
+        self._closing = True
+        self._awake.set()
         await self._task
         began = asyncio.get_running_loop().time()
-        while self._pending and not await self._flush():
+        while self._pending:
+            if await self._flush():
+                continue
             patience_s = LAST_LOCK_PATIENCE_S if self._locked else LAST_PATIENCE_S
             if asyncio.get_running_loop().time() - began >= patience_s:
                 raise StoreError(
@@ -53,27 +69,27 @@ class Flusher:
             await asyncio.sleep(min(EVERY_S, patience_s))
 
     async def _run(self) -> None:
-        while not self._closing.is_set():
-            try:
+        while not self._closing:
+            with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(EVERY_S):
-                    await self._closing.wait()
-            except TimeoutError:
-                await self._flush()
+                    await self._awake.wait()
+            self._awake.clear()
+            while self._pending and not self._closing and await self._flush():
+                continue
 
     async def _flush(self) -> bool:
         """Write one batch; False if that did not work."""
-        batch, self._pending = self._pending, []
-        if not batch:
-            return True
+        batch, self._pending = self._pending[:BATCH], self._pending[BATCH:]
         try:
             self.differing += await asyncio.to_thread(
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
             )
         except StoreError as exc:
             self._pending = batch + self._pending
-            self._locked = isinstance(exc, StoreLocked)
+            self._locked, self._stuck = isinstance(exc, StoreLocked), True
             if str(exc) != self._problem:
                 self._problem = str(exc)
                 self._say(f"waiting to store {len(self._pending)} trials: {exc}")
             return False
+        self._stuck = False
         return True

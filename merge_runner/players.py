@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -22,6 +22,12 @@ from merge_runner.trial import play_trial
 
 # Told of each trial that ends; a suspended one has no money to go on.
 Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]
+# Awaited before a trial begins: is there room to keep it until it is stored?
+Room = Callable[[], Awaitable[None]]
+
+
+async def no_wait() -> None:
+    """Room without end."""
 
 
 class Crew(Protocol):
@@ -51,7 +57,7 @@ class Crew(Protocol):
         """How many calls of this run a model has answered."""
         ...
 
-    async def play(self, specs: Iterable[TrialSpec], ended: Ended) -> None:
+    async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
         """Play trials in order; what ``ended`` raises, and any error but a trial's own, ends it."""
         ...
 
@@ -84,10 +90,10 @@ class Players:
         """How many live replies a model's trials have used."""
         return self.clients[name].meter.calls_live
 
-    async def play(self, specs: Iterable[TrialSpec], ended: Ended) -> None:
+    async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
         """See Crew."""
         await run_bounded(
-            (partial(self._trial, spec) for spec in specs),
+            (partial(self._trial, spec, room) for spec in specs),
             in_flight=self.in_flight,
             on_done=lambda done: ended(*done),
         )
@@ -96,7 +102,10 @@ class Players:
         """See Crew."""
         await asyncio.gather(*(client.drain() for client in self.clients.values()))
 
-    async def _trial(self, spec: TrialSpec) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
+    async def _trial(
+        self, spec: TrialSpec, room: Room
+    ) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
+        await room()
         drivers = {side: self._driver(spec, side) for side in SIDES}
         self.running += 1
         try:

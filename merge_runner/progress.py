@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
+PULSE_S = 0.05
 NOTES_SHOWN = 10
 REASONS_SHOWN = 3
 
@@ -31,7 +32,8 @@ class Progress:
     """Where a sweep stands; ``crew`` plays its trials.
 
     ``expected_calls`` is about how many calls all trials take: trials that run in step all end
-    late, so the calls tell the time left better than the trials do.
+    late, so the calls tell the time left better than the trials do. ``worst_stall_s`` is by how
+    much the event loop was late at worst.
     """
 
     title: str
@@ -43,6 +45,7 @@ class Progress:
     done: Counter[str] = field(default_factory=Counter)
     stored_before: int = 0
     started: float = field(default_factory=time.monotonic)
+    worst_stall_s: float = 0.0
 
     @property
     def ended(self) -> int:
@@ -103,11 +106,22 @@ async def shown(progress: Progress) -> AsyncIterator[None]:
     show = _show_live if sys.stderr.isatty() else _show_plain
     stop = asyncio.Event()
     display = asyncio.create_task(show(progress, stop))
+    pulse = asyncio.create_task(_feel_pulse(progress))
     try:
         yield
     finally:
+        pulse.cancel()
         stop.set()
         await display
+
+
+async def _feel_pulse(progress: Progress) -> None:
+    """Measure how late the event loop comes back to who waits for it."""
+    loop = asyncio.get_running_loop()
+    while True:
+        due = loop.time() + PULSE_S
+        await asyncio.sleep(PULSE_S)
+        progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
 
 
 async def _show_live(progress: Progress, stop: asyncio.Event) -> None:

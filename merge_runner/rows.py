@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator
 from datetime import datetime
 from typing import Any
@@ -12,6 +13,17 @@ from merge_runner.records import Attempt, ChatRequest, DecisionRow, FailedCall, 
 from merge_runner.simulator.conditions import CONDITIONS
 
 Row = tuple[Any, ...]
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
+
+
+def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
+    """All rows of a trial, by table."""
+    return {
+        "trials": [trial_row(record)],
+        "states": list(state_rows(record)),
+        "decisions": list(decision_rows(record)),
+        "calls": list(call_rows(record)),
+    }
 
 
 def trial_row(record: TrialRecord) -> Row:
@@ -133,7 +145,9 @@ def _as_json(text: str | None) -> str | None:
     if text is None:
         return None
     try:
-        json.dumps(json.loads(text), ensure_ascii=False).encode()
+        value = json.loads(text)
+        if _SURROGATE.search(text):
+            json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError):
         return json.dumps(text.encode(errors="replace").decode())
     return text

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from typing import TypeVar
 
 ResultT = TypeVar("ResultT")
+AT_ONCE = 50
 
 
 async def run_bounded(
@@ -17,6 +18,7 @@ async def run_bounded(
 ) -> None:
     """Run jobs in order, at most ``in_flight`` at once; each result goes to ``on_done``.
 
+    They start a few at a time, so that whatever else the event loop does goes on in between.
     The first exception of a job cancels all others and is raised.
     """
     waiting = iter(jobs)
@@ -27,7 +29,9 @@ async def run_bounded(
 
     try:
         async with asyncio.TaskGroup() as group:
-            for _ in range(in_flight):
+            for number in range(in_flight):
+                if number % AT_ONCE == 0:
+                    await asyncio.sleep(0)
                 group.create_task(work())
     except BaseExceptionGroup as errors:
         raise errors.exceptions[0] from None

@@ -28,7 +28,7 @@ from merge_runner.database import (
 )
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.records import TrialRecord
-from merge_runner.rows import Row, call_rows, decision_rows, state_rows, trial_row
+from merge_runner.rows import Row, rows_of, state_rows, trial_row
 from merge_runner.texts import first_line
 
 TrialKey = tuple[str, str]
@@ -112,13 +112,15 @@ class Store:
 
         Returns the ids of those that were played to another end than the stored one.
         """
+        # Made before anybody is kept waiting, though a trial that is stored already needs none.
+        rows = [rows_of(record) for record in records]
         with self._writing(patience_s) as connection:
             keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
             stored = _statuses(connection, keys)
             _delete(connection, [key for key, status in stored.items() if status == "failed"])
             new = [
-                record
-                for record, key in zip(records, keys, strict=True)
+                made
+                for made, key in zip(rows, keys, strict=True)
                 if stored.get(key, "failed") == "failed"
             ]
             differing = [
@@ -129,10 +131,8 @@ class Store:
                 and not _same(connection, record)
             ]
             _append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
-            _append(connection, "trials", map(trial_row, new))
-            _append(connection, "states", chain.from_iterable(map(state_rows, new)))
-            _append(connection, "decisions", chain.from_iterable(map(decision_rows, new)))
-            _append(connection, "calls", chain.from_iterable(map(call_rows, new)))
+            for table in ("trials", "states", "decisions", "calls"):
+                _append(connection, table, chain.from_iterable(made[table] for made in new))
             return differing
 
     def add_recorded(

@@ -54,6 +54,8 @@ class Summary:
             "attempts_of_unknown_cost": outcome.spending.open_attempts,
             "cache_cost_usd": round(outcome.cache_cost_usd, 6),
             "damaged_entries": outcome.damaged,
+            "playing_s": round(outcome.playing_s, 3),
+            "worst_stall_s": round(outcome.worst_stall_s, 3),
             "decisions": facts.decisions if facts else None,
             "invalid_decisions": facts.invalid if facts else None,
             "fallbacks": facts.fallbacks if facts else None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
@@ -42,6 +43,7 @@ from merge_runner.store import Store, SweepFacts, SweepRow, sweep_facts
 INTERRUPTED = 130
 SHOWN = 5
 FAILURES_IN_A_ROW = 10
+FROM_RECORDINGS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +75,8 @@ class Outcome:
     ``cache_cost_usd`` what all replies in the cache cost when they were made. ``damaged`` lists
     the keys of recorded replies that could not be read. ``facts`` are those of the database over
     all trials of the sweep, and ``audit`` what was checked there, None where they are not stored.
+    ``playing_s`` is how long the trials took, ``worst_stall_s`` by how much the event loop was late
+    at worst.
     """
 
     sweep_id: str
@@ -91,6 +95,8 @@ class Outcome:
     cache_cost_usd: float = 0.0
     facts: SweepFacts | None = None
     audit: Audit | None = None
+    playing_s: float = 0.0
+    worst_stall_s: float = 0.0
 
     def fail(self, exit_code: int, message: str) -> None:
         """Note a problem; the first one decides the exit code."""
@@ -154,10 +160,13 @@ class Sweep:
             crew = await self._crew(stack)
             self._progress.crew = crew
             flusher = Flusher(self._store, outcome.sweep_id, self._say)
+            began = time.perf_counter()
             try:
                 async with shown(self._progress):
                     await self._play(crew, flusher, outcome)
             finally:
+                outcome.playing_s = time.perf_counter() - began
+                outcome.worst_stall_s = self._progress.worst_stall_s
                 await self._store_rest(flusher, outcome)
             self._explain_misses(outcome)
             try:
@@ -247,7 +256,8 @@ class Sweep:
         plan, options = self._plan, self._options
         if options.replay or not self._todo or not plan.entries:
             clients = sealed_clients(plan.entries, self._endpoints, self._cache, self._sealed)
-            return Players(plan, clients, options.in_flight)
+            # Recorded replies are there at once: more in flight only take more memory.
+            return Players(plan, clients, min(options.in_flight, FROM_RECORDINGS))
         terms = Terms(options.limits, self._ledger, worst_trial_usd(plan))
         desk = open_desk(plan.entries, self._endpoints, self._cache, terms, stack)
         urls = await reached(plan.entries, options.emulator_options, stack)
@@ -283,7 +293,7 @@ class Sweep:
             flusher.add(record)
             self._watch_for_outage(record, crew)
 
-        work = asyncio.create_task(crew.play(self._todo, ended))
+        work = asyncio.create_task(crew.play(self._todo, ended, room=flusher.room))
         drain = asyncio.create_task(_drained(crew, work))
 
         def interrupted() -> None:

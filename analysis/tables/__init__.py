@@ -3,50 +3,81 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pandas as pd
-
-from analysis.study import Study
-from analysis.tables.ablations import ablation_qualitative, ablation_quantitative
-from analysis.tables.attempts import attempts
-from analysis.tables.conflicts import conflict_resolution, criticality
-from analysis.tables.contrasts import contrasts
-from analysis.tables.fallbacks import fallbacks
+from analysis.kept import finished, keep_finished
 from analysis.tables.formats import value_rows
-from analysis.tables.indicators import indicators
-from analysis.tables.model import Table
-from analysis.tables.profiles import velocity_profiles
-from analysis.tables.regressions import gap, who_first
-from analysis.tables.robustness import robustness
-from analysis.tables.windows import speed_windows
+from analysis.tables.model import Table, from_text, options_text, to_text
 from merge_runner.errors import UsageError
 
-TABLES: dict[str, Callable[[Study], Table]] = {
-    "who-first": who_first,
-    "gap": gap,
-    "indicators": indicators,
-    "ablation-qualitative": ablation_qualitative,
-    "ablation-quantitative": ablation_quantitative,
-    "contrasts": contrasts,
-    "velocity-profiles": velocity_profiles,
-    "conflict-resolution": conflict_resolution,
-    "criticality": criticality,
-    "speed-windows": speed_windows,
-    "robustness": robustness,
-    "attempts": attempts,
-    "fallbacks": fallbacks,
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from analysis.study import Study
+
+# Name to module. They are loaded when a table is made: one that is kept must not wait for pandas.
+TABLES = {
+    "who-first": "regressions",
+    "gap": "regressions",
+    "indicators": "indicators",
+    "ablation-qualitative": "ablations",
+    "ablation-quantitative": "ablations",
+    "contrasts": "contrasts",
+    "velocity-profiles": "profiles",
+    "conflict-resolution": "conflicts",
+    "criticality": "conflicts",
+    "speed-windows": "windows",
+    "robustness": "robustness",
+    "attempts": "attempts",
+    "fallbacks": "fallbacks",
 }
 
 
 def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
     """The named tables, or all; raises UsageError."""
-    for name in names:
-        if name not in TABLES:
-            raise UsageError(f"there is no table {name!r}; valid: {', '.join(TABLES)}")
-    return [TABLES[name](study) for name in names or TABLES]
+    return [_maker(name)(study) for name in _valid(names)]
+
+
+def finished_tables(
+    db: Path, models: Sequence[str] | None, names: Sequence[str] = (), study: Study | None = None
+) -> list[Table]:
+    """The named tables of a database, or all, as they are kept there; what is not is made.
+
+    ``models`` keeps these drivers alone; ``study`` is the study of them, where there is one.
+    Raises UsageError.
+    """
+    wanted = _valid(names)
+    options = options_text(db, models)
+    state, kept = finished(db, options, wanted)
+    found = {name: from_text(text) for name, text in kept.items()}
+    missing = [name for name in dict.fromkeys(wanted) if name not in found]
+    if missing:
+        from analysis.study import Study
+
+        made = dict(zip(missing, make_tables(study or Study(db, models), missing), strict=True))
+        keep_finished(db, state, options, {name: to_text(made[name]) for name in missing})
+        found |= made
+    return [found[name] for name in wanted]
 
 
 def table(study: Study, name: str) -> pd.DataFrame:
     """A table as a data frame, at full precision, one row as in its CSV; raises UsageError."""
+    import pandas as pd
+
     (made,) = make_tables(study, [name])
     return pd.DataFrame(value_rows(made)).set_index("row")
+
+
+def _valid(names: Sequence[str]) -> Sequence[str]:
+    for name in names:
+        if name not in TABLES:
+            raise UsageError(f"there is no table {name!r}; valid: {', '.join(TABLES)}")
+    return names or tuple(TABLES)
+
+
+def _maker(name: str) -> Callable[[Study], Table]:
+    module = import_module(f"analysis.tables.{TABLES[name]}")
+    maker: Callable[[Study], Table] = getattr(module, name.replace("-", "_"))
+    return maker

@@ -44,22 +44,23 @@ def render(tables: Sequence[Table], form: TableFormat) -> str:
 
 def as_text(table: Table) -> str:
     """A table for the terminal, never cut: lines are as long as they need to be."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table as RichTable
+    from rich.cells import cell_len
 
-    shown = shown_columns(table)
-    grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for column in shown:
-        grid.add_column(column.heading, justify="left" if column.kind == "text" else "right")
-    for row in table.rows:
-        grid.add_row(*(_text(column, row.values.get(column.name)) for column in shown))
-    out = io.StringIO()
-    console = Console(file=out, width=1000, color_system=None, highlight=False, markup=False)
-    console.print(table.heading)
-    console.print(grid)
-    lines = [line.rstrip() for line in out.getvalue().rstrip().splitlines()]
-    return "\n".join([*lines, *(f"  {note}" for note in notes_of(table))])
+    columns = []
+    for column in shown_columns(table):
+        cells = [_text(column, row.values.get(column.name)) for row in table.rows]
+        width = max(cell_len(cell) for cell in (column.heading, *cells))
+        blanks = [" " * (width - cell_len(cell)) for cell in (column.heading, *cells)]
+        columns.append(
+            [
+                cell + blank if column.kind == "text" else blank + cell
+                for cell, blank in zip((column.heading, *cells), blanks, strict=True)
+            ]
+        )
+    lines = ["   ".join(cells) for cells in zip(*columns, strict=True)]
+    lines[1:1] = ["─" * max(map(cell_len, lines))] if lines else []
+    notes = (f"  {note}" for note in notes_of(table))
+    return "\n".join([table.heading, *(line.rstrip() for line in lines), *notes])
 
 
 def as_csv(table: Table) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from math import isnan
+from pathlib import Path
 from typing import Literal
 
 Kind = Literal["text", "count", "number", "percent", "p", "verdict", "interval"]
@@ -70,3 +72,27 @@ class Table:
     def heading(self) -> str:
         """Number and title."""
         return f"{self.number}. {self.title}" if self.number else self.title
+
+
+def to_text(table: Table) -> str:
+    """A table as JSON, from which ``from_text`` makes an equal one."""
+    return json.dumps(asdict(table), ensure_ascii=False)
+
+
+def from_text(text: str) -> Table:
+    """The table that was made a text."""
+    content = json.loads(text)
+    columns = tuple(Column(**column) for column in content["columns"])
+    intervals = {column.name for column in columns if column.kind == "interval"}
+    for row in content["rows"]:
+        for name in intervals & row["values"].keys():
+            if row["values"][name] is not None:
+                row["values"][name] = tuple(row["values"][name])
+        row["groups"], row["printed"] = tuple(row["groups"]), tuple(row["printed"])
+    rows = [Row(**row) for row in content["rows"]]
+    return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})
+
+
+def options_text(db: Path, models: Sequence[str] | None) -> str:
+    """What else a table depends on than the results: notes name the database."""
+    return json.dumps([str(db), models])

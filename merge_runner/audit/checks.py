@@ -126,14 +126,6 @@ WITH numbered AS (
 SELECT trial_id, side, decision, text FROM judged WHERE text IS NOT NULL
 """
 
-PROMPTS = """
-SELECT trial_id, side, decision, if(prompt IS NULL, 'a model was asked without a prompt',
-    'its prompt does not have the hash prompt_hash')
-FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)
-JOIN drivers USING (spec_hash, side)
-WHERE body IS NOT NULL AND (prompt IS NULL OR prompt_hash IS DISTINCT FROM sha256(prompt))
-"""
-
 CALLS = """
 WITH called AS (
     SELECT trial_id, spec_hash, side, decision, call_key, max_by(outcome, attempt) AS outcome
@@ -232,7 +224,6 @@ CHECKS = (
     Check("outcome", OUTCOMES),
     Check("numbering", NUMBERS),
     Check("plan", PLANS),
-    Check("prompt", PROMPTS),
     Check("call", CALLS),
     Check("attempt", ATTEMPTS),
     Check("model", MODELS),

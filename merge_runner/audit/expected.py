@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
 from merge_runner.config import Scenario
+from merge_runner.llm.keys import between_body_and_slot
 from merge_runner.records import SIDES
 
 
@@ -113,6 +114,14 @@ class Spec:
     def asks(self, side: str) -> bool:
         """Whether a language model drives on a side."""
         return "endpoint" in self.driver(side)
+
+    def between_body_and_slot(self, side: str) -> str | None:
+        """That part of the text of its keys; None where it is not known."""
+        driver = self.driver(side)
+        endpoint, path, headers = (driver.get(name) for name in ("endpoint", "path", "headers"))
+        if endpoint is None or path is None or headers is None:
+            return None
+        return between_body_and_slot(endpoint, path, tuple(headers.items()))
 
     def disagreements(self, config: SweepConfig, variant: str) -> Iterator[str]:
         """In what the spec of a variant is another than the sweep's configuration says."""

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+import hashlib
+from collections.abc import Iterator
+from functools import partial
 
 import duckdb
 
-from merge_runner.audit.expected import Spec
 from merge_runner.audit.findings import Finding, Sharing
-from merge_runner.llm.keys import call_key
-from merge_runner.records import Slot
 
-BATCH = 1_000
 SHOWN = 3
 
-REQUESTS = """
-SELECT trial_id, side, decision, call_key, spec_hash, request::VARCHAR, condition, rep, sample_set
-FROM calls JOIN audited USING (trial_id, spec_hash)
+BATCH = 1_000
+
+# A place, a hash, and the parts of the text that has it; that of a key is in llm/keys.py.
+KEYS = """
+SELECT trial_id, side, decision, call_key, '{"body":', request::VARCHAR,
+    ',' || between_body_and_slot || '{"condition":' || to_json(condition)::VARCHAR
+    || ',"decision":' || decision || ',"repetition":' || rep || ',"sample_set":' || sample_set
+    || ',"side":"' || side || '"}}'
+FROM calls JOIN audited USING (trial_id, spec_hash) LEFT JOIN drivers USING (spec_hash, side)
 WHERE attempt = 1
+"""
+PROMPTS = """
+SELECT trial_id, side, decision, prompt_hash, prompt
+FROM decisions SEMI JOIN audited USING (trial_id, spec_hash) JOIN drivers USING (spec_hash, side)
+WHERE body IS NOT NULL
 """
 
 # Earlier emulators gave every reply the same id: those of a stand-in tell nothing. The present
@@ -87,21 +95,36 @@ FROM repeated
 """
 
 
-def check_keys(
-    connection: duckdb.DuckDBPyConnection, specs: Mapping[str, Spec]
-) -> Iterator[Finding]:
-    """Hash every request anew."""
-    rows = connection.execute(REQUESTS)
-    while batch := rows.fetchmany(BATCH):
-        for trial_id, side, decision, key, spec_hash, *request in batch:
-            if _key(specs.get(spec_hash), side, decision, *request) != key:
-                yield Finding(
-                    "key",
-                    "its request and slot do not have the key under which its reply is kept",
-                    trial=trial_id,
-                    side=side,
-                    decision=decision,
-                )
+def check_hashes(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
+    """Hash every prompt and every request anew."""
+    for kind, sql, text in (
+        ("prompt", PROMPTS, "its prompt does not have the hash prompt_hash"),
+        ("key", KEYS, "its request and slot do not have the key under which its reply is kept"),
+    ):
+        for trial_id, side, decision, whole in _hashed_otherwise(connection, sql):
+            yield Finding(
+                kind,
+                text if whole or kind == "key" else "a model was asked without a prompt",
+                trial=trial_id,
+                side=side,
+                decision=decision,
+            )
+
+
+def _hashed_otherwise(
+    connection: duckdb.DuckDBPyConnection, sql: str
+) -> list[tuple[str, str, int, bool]]:
+    """The places where a text has not its hash, and whether all of the text is there.
+
+    Python hashes several times as fast as the database.
+    """
+    rows = connection.execute(sql)
+    return sorted(
+        (trial_id, side, decision, None not in parts)
+        for batch in iter(partial(rows.fetchmany, BATCH), [])
+        for trial_id, side, decision, told, *parts in batch
+        if None in parts or hashlib.sha256("".join(parts).encode()).hexdigest() != told
+    )
 
 
 def check_sharing(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
@@ -133,30 +156,6 @@ def answers_alike(connection: duckdb.DuckDBPyConnection) -> tuple[int, int]:
     row = connection.execute(ALIKE).fetchone()
     assert row is not None
     return row[0], row[1]
-
-
-def _key(
-    spec: Spec | None,
-    side: str,
-    decision: int,
-    request: str | None,
-    condition: str,
-    repetition: int,
-    sample_set: int,
-) -> str | None:
-    """The key of a request; None where its spec or the request itself is not stored."""
-    driver: dict[str, Any] = spec.driver(side) if spec else {}
-    if request is None or not {"endpoint", "path", "headers"} <= driver.keys():
-        return None
-    return call_key(
-        endpoint=driver["endpoint"],
-        path=driver["path"],
-        headers=driver["headers"],
-        body=request,
-        slot=Slot(
-            condition, repetition, "left" if side == "left" else "right", decision, sample_set
-        ),
-    )
 
 
 def _place(slot: tuple[str, str, int]) -> str:

@@ -19,7 +19,7 @@ from merge_runner.audit.replies import (
     USED,
     answers_alike,
     calls_in_common,
-    check_keys,
+    check_hashes,
     check_sharing,
 )
 from merge_runner.audit.slots import Slots, check_slots
@@ -32,7 +32,7 @@ TABLES = """
 CREATE OR REPLACE TEMP TABLE rules (spec_hash VARCHAR, executed INTEGER, plan_actions INTEGER,
     timeout_steps INTEGER, restarts BOOLEAN);
 CREATE OR REPLACE TEMP TABLE drivers (spec_hash VARCHAR, side VARCHAR, endpoint VARCHAR,
-    body VARCHAR);
+    body VARCHAR, between_body_and_slot VARCHAR);
 CREATE OR REPLACE TEMP TABLE done AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
 CREATE OR REPLACE TEMP TABLE entries (name VARCHAR, id VARCHAR, provider VARCHAR,
     accepted VARCHAR[]);
@@ -44,16 +44,15 @@ SELECT trial_id, spec_hash, model_left, model_right, condition, rep, sample_set,
 FROM trials SEMI JOIN (SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?)
 USING (trial_id, spec_hash) ANTI JOIN done USING (trial_id, spec_hash)
 """
-COUNTS = {
-    "decisions": "SELECT count(*) FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)",
-    "invalid": "SELECT count(*) FROM decisions SEMI JOIN audited USING (trial_id, spec_hash) "
-    "WHERE NOT valid",
-    "calls": "SELECT count(DISTINCT call_key) FROM calls "
-    "SEMI JOIN audited USING (trial_id, spec_hash)",
-    "attempts": "SELECT count(*) FROM calls SEMI JOIN audited USING (trial_id, spec_hash)",
-    "reply ids": "SELECT count(DISTINCT reply_id) FROM reply_ids "
-    "SEMI JOIN audited USING (trial_id, spec_hash)",
-}
+COUNTS = """
+SELECT * FROM
+    (SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid
+    FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)),
+    (SELECT count(DISTINCT call_key) AS calls, count(*) AS attempts
+    FROM calls SEMI JOIN audited USING (trial_id, spec_hash)),
+    (SELECT count(DISTINCT reply_id) AS "reply ids"
+    FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash))
+"""
 # What a sweep did not play, since earlier ones had.
 TAKEN_OVER = """
 SELECT b.sweep_id, count(*)
@@ -158,12 +157,12 @@ def _audit(
     findings = [
         *slots.findings,
         *_rule_findings(connection),
-        *check_keys(connection, specs),
+        *check_hashes(connection),
         *check_sharing(connection),
     ]
     return Audit(
         subject=sweep.sweep_id,
-        counts=slots.counts | {name: _count(connection, sql) for name, sql in COUNTS.items()},
+        counts=slots.counts | _counts(connection, COUNTS),
         findings=tuple(replace(finding, sweep=sweep.sweep_id) for finding in findings),
         sharings=tuple(_taken_over(connection, sweep.sweep_id)),
         notes=(*slots.notes, *_alike_notes(connection)),
@@ -173,14 +172,14 @@ def _audit(
 def _whole(connection: duckdb.DuckDBPyConnection, path: Path, sweeps: bool) -> Audit:
     """What a database holds beside and between its sweeps."""
     loose = connection.execute(LOOSE).fetchall()
-    human = _count(connection, "SELECT count(*) FROM trials WHERE source = 'human'")
+    counts = """
+        SELECT * FROM (SELECT count(*) AS sweeps FROM sweeps),
+            (SELECT count(*) AS trials, count(*) FILTER (source = 'human') AS "human trials"
+            FROM trials)
+    """
     return Audit(
         subject=str(path),
-        counts={
-            "sweeps": _count(connection, "SELECT count(*) FROM sweeps"),
-            "trials": _count(connection, "SELECT count(*) FROM trials"),
-            "human trials": human,
-        },
+        counts=_counts(connection, counts),
         findings=tuple(
             Finding(
                 "loose",
@@ -234,6 +233,7 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
                 side,
                 spec.driver(side).get("endpoint"),
                 canonical_json(spec.driver(side).get("body")) if spec.asks(side) else None,
+                spec.between_body_and_slot(side),
             )
             for spec in specs.values()
             for side in SIDES
@@ -263,8 +263,8 @@ def _alike_notes(connection: duckdb.DuckDBPyConnection) -> Iterable[str]:
     in both cases the repetitions are no samples. The emulator has a few phrases.
     """
     repeated, alike = answers_alike(connection)
-    scripted = _count(connection, "SELECT count(*) FROM audited WHERE scripted")
-    if alike == repeated >= MANY_REPEATED and not scripted:
+    scripted = _counts(connection, "SELECT count(*) AS trials FROM audited WHERE scripted")
+    if alike == repeated >= MANY_REPEATED and not scripted["trials"]:
         yield (
             f"all {repeated} answers to prompts that were asked before are word for word as "
             "before: are they samples?"
@@ -279,11 +279,11 @@ def _fill(
     appender.flush()
 
 
-def _count(connection: duckdb.DuckDBPyConnection, sql: str) -> int:
-    row = connection.execute(sql).fetchone()
-    assert row is not None
-    number: int = row[0]
-    return number
+def _counts(connection: duckdb.DuckDBPyConnection, sql: str) -> dict[str, int]:
+    """A query's only row, numbers by name."""
+    result = connection.execute(sql)
+    names = [column[0] for column in result.description or ()]
+    return dict(zip(names, result.fetchall()[0], strict=True))
 
 
 def _first(exc: ValidationError) -> str:

@@ -26,6 +26,7 @@ from merge_runner.cluster.session import Session
 from merge_runner.cluster.worker import play_batch
 from merge_runner.errors import ClusterFailed, MergeRunnerError, TrialSuspended, UsageError
 from merge_runner.llm.meter import Meter
+from merge_runner.players import no_wait
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from merge_runner.clients import Addressed, OwnDesk
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.plan import Plan
-    from merge_runner.players import Ended
+    from merge_runner.players import Ended, Room
     from merge_runner.records import TrialRecord, TrialSpec
 
 LOOK_EVERY_S = 1.0
@@ -78,6 +79,7 @@ class Coordinator:
         self._waiting: deque[TrialSpec] = deque()
         self._unfinished: set[int] = set()
         self._ended: Ended | None = None
+        self._room: Room = no_wait
         self._slots = 1
         self._sessions: dict[Session, asyncio.Task[None]] = {}
         self._free = in_flight
@@ -126,9 +128,10 @@ class Coordinator:
         """How many calls of this run a model has answered."""
         return self.answered[self._plan.entries[name].id]
 
-    async def play(self, specs: Iterable[TrialSpec], ended: Ended) -> None:
+    async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
         """See Crew."""
         self._ended = ended
+        self._room = room
         self._waiting.extend(specs)
         self._unfinished = {spec.order for spec in self._waiting}
         while self._unfinished:
@@ -190,6 +193,7 @@ class Coordinator:
                 "install the same one for all"
             )
         self._refuse_unreachable_emulator(host)
+        await self._room()
         while not self._free and self._waiting:
             self._freed.clear()
             await self._freed.wait()

@@ -55,6 +55,7 @@ def open_disk(folder: Path) -> tuple[diskcache.Cache, int]:
             size_limit=2**62,
             sqlite_synchronous=2,  # FULL: an acknowledged reply survives a power cut
             disk_min_file_size=2**40,  # everything in the one SQLite file
+            sqlite_mmap_size=0,  # what is mapped counts as this process's memory
         )
         if not len(disk):
             disk.add(_FORMAT, str(FORMAT))

@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+from functools import cache
 
 from pydantic import JsonValue
 
 from merge_runner.records import ChatRequest, Slot
 
 KEY_VERSION = 1
+_CANONICAL = json.JSONEncoder(
+    sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+)
 
 
 def canonical_json(value: object) -> str:
     """The one spelling of a JSON value: sorted keys, no spaces; NaN raises ValueError."""
-    return json.dumps(
-        value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
-    )
+    return _CANONICAL.encode(value)
 
 
 def make_request(
@@ -50,14 +52,16 @@ def make_request(
 
 def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, slot: Slot) -> str:
     """SHA-256 over the canonical JSON of all parts; ``body`` is canonical JSON already."""
-    rest = canonical_json(
-        {
-            "endpoint": endpoint,
-            "headers": headers,
-            "key_version": KEY_VERSION,
-            "path": path,
-            "slot": slot.as_dict(),
-        }
-    )
-    # "body" sorts before the other names, so this is the canonical JSON of the whole.
-    return hashlib.sha256(f'{{"body":{body},{rest[1:]}'.encode()).hexdigest()
+    middle = between_body_and_slot(endpoint, path, tuple(headers.items()))
+    text = f'{{"body":{body},{middle}{canonical_json(slot.as_dict())}}}'
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@cache
+def between_body_and_slot(endpoint: str, path: str, headers: tuple[tuple[str, str], ...]) -> str:
+    """What stands there in the text of a key: it is the same for all calls of a model.
+
+    "body" sorts before the other names and "slot" after them, so that the whole is canonical.
+    """
+    parts = {"endpoint": endpoint, "headers": dict(headers), "key_version": KEY_VERSION}
+    return canonical_json({**parts, "path": path})[1:-1] + ',"slot":'

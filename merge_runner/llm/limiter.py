@@ -1,8 +1,8 @@
 """Requests and tokens a minute, behind one dispatcher that serves the oldest trial first.
 
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
-only the dispatcher ever waits on it: whatever the queue, one poller. Tokens are counted in a
-sliding window of a minute: an estimate at dispatch, settled to the actual usage afterwards.
+only the dispatcher ever asks it, and not before it has room. Tokens are counted in a sliding window
+of a minute: an estimate at dispatch, settled to the actual usage afterwards.
 """
 
 from __future__ import annotations
@@ -12,14 +12,12 @@ import contextlib
 import heapq
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from merge_runner.errors import UsageError
 
-if TYPE_CHECKING:
-    from asyncio_throttle.throttler import Throttler
-
 WINDOW_S = 60.0
+BURST_S = 0.5
+CLOCK_STEP_S = 1e-6
 
 
 @dataclass(slots=True, eq=False)
@@ -116,24 +114,19 @@ class Limiter:
     async def _dispatch(self) -> None:
         """Serve the queue until it is empty."""
         loop = asyncio.get_running_loop()
-        has_turn = False
         while waiter := self._head():
             wait = self._blocked_for(waiter, loop.time())
             if wait > 0:
                 await self._wait(wait)
-                has_turn = False  # a turn is counted when it is taken, so it does not keep
-            elif not has_turn:
-                for throttle in self._throttles:
-                    await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
-                has_turn = True
-            else:
-                heapq.heappop(self._waiters)
-                permit = Permit(loop.time(), waiter.tokens, self, counts=self._tpm is not None)
-                if permit.counts:
-                    self._window.append(permit)
-                    self._tokens_in_window += permit.tokens
-                waiter.turn.set_result(permit)
-                has_turn = False
+                continue
+            for throttle in self._throttles:
+                await throttle.take()  # at once: it has room
+            heapq.heappop(self._waiters)
+            permit = Permit(loop.time(), waiter.tokens, self, counts=self._tpm is not None)
+            if permit.counts:
+                self._window.append(permit)
+                self._tokens_in_window += permit.tokens
+            waiter.turn.set_result(permit)
 
     def _head(self) -> _Waiter | None:
         while self._waiters and self._waiters[0].turn.done():
@@ -146,10 +139,10 @@ class Limiter:
             expired = self._window.popleft()
             expired.counts = False
             self._tokens_in_window -= expired.tokens
-        paused = self._pause.until - now
-        if self._tpm is None or self._tokens_in_window + waiter.tokens <= self._tpm:
-            return paused
-        return max(paused, self._window[0].dispatched_at + self._window_s - now)
+        free_at = max(self._pause.until, *(throttle.free_at for throttle in self._throttles), 0.0)
+        if self._tpm is not None and self._tokens_in_window + waiter.tokens > self._tpm:
+            free_at = max(free_at, self._window[0].dispatched_at + self._window_s)
+        return free_at - now
 
     async def _wait(self, seconds: float) -> None:
         """Wait, or until a new waiter or a settlement changes what can be done."""
@@ -159,17 +152,32 @@ class Limiter:
                 await self._changed.wait()
 
 
-def _throttles(rpm: int, window_s: float) -> list[Throttler]:
+class _Throttle:
+    """asyncio-throttle, and when it has room again, which it does not tell."""
+
+    def __init__(self, limit: int, period_s: float) -> None:
+        from asyncio_throttle.throttler import Throttler
+
+        self._period_s = period_s
+        self._throttler = Throttler(limit, period_s, retry_interval=0.001)
+        self._taken: deque[float] = deque(maxlen=limit)
+
+    @property
+    def free_at(self) -> float:
+        """The earliest next turn, on the event loop's clock."""
+        full = len(self._taken) == self._taken.maxlen
+        return self._taken[0] + self._period_s + CLOCK_STEP_S if full else 0.0
+
+    async def take(self) -> None:
+        """Take a turn; at once where there is room."""
+        await self._throttler.acquire()  # type: ignore[no-untyped-call] # ships no types
+        self._taken.append(asyncio.get_running_loop().time())
+
+
+def _throttles(rpm: int, window_s: float) -> list[_Throttle]:
     """Two that hold together: an even flow, and at most ``rpm`` in a window wherever it begins.
 
     Half a second's worth goes at a time: a whole window at once would trip finer limits.
     """
-    from asyncio_throttle.throttler import Throttler
-
-    burst = max(1, rpm // 120)
-    period = burst * window_s / rpm
-    poll = min(0.05, period / 200)
-    return [
-        Throttler(burst, period, retry_interval=poll),
-        Throttler(rpm, window_s, retry_interval=poll),
-    ]
+    burst = max(1, int(rpm * BURST_S / window_s))
+    return [_Throttle(burst, burst * window_s / rpm), _Throttle(rpm, window_s)]

@@ -6,6 +6,7 @@ The reasons: ``no_array``, ``several_arrays`` (different ones), ``wrong_length``
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 
@@ -13,8 +14,15 @@ from merge_runner.records import Tactical
 
 _ARRAY = re.compile(r"\[([^\[\]]*)\]")
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
-_NOT_FINITE = re.compile(r"[+-]?(?:(?:np|numpy|math)\.)?(?:nan|inf|infinity)", re.IGNORECASE)
-_NOT_FINITE_CALL = re.compile(r"float\((['\"])[+-]?(?:nan|inf|infinity)\1\)", re.IGNORECASE)
+# Possessive, so that the time stays linear however much space there is.
+_NUMBERS = re.compile(
+    rf"(?:\s*+{_NUMBER.pattern}\s*+,)*+\s*+{_NUMBER.pattern}\s*+(?:,\s*+)?", _NUMBER.flags
+)
+_NOT_FINITE = re.compile(
+    r"[+-]?(?:(?:np|numpy|math)\.)?(?:nan|inf|infinity)"
+    r"|float\((['\"])[+-]?(?:nan|inf|infinity)\1\)",
+    re.IGNORECASE,
+)
 _SIGN_APART = re.compile(r"^([+-])\s+")
 _COMMENT = re.compile(r"#[^\n]*")
 _TOKEN_LINE = re.compile(
@@ -56,32 +64,35 @@ def _split(text: str) -> tuple[str, str]:
 
 
 def _plan(code: str, plan_actions: int) -> tuple[tuple[float, ...] | None, str | None]:
-    arrays = {_entries(match) for match in set(_ARRAY.findall(_COMMENT.sub("", code)))}
+    arrays = {_entries(inside) for inside in dict.fromkeys(_ARRAY.findall(_COMMENT.sub("", code)))}
     if not arrays:
         return None, "no_array"
     if len(arrays) > 1:
         return None, "several_arrays"
     entries = arrays.pop()
-    if any(_NOT_FINITE.fullmatch(e) or _NOT_FINITE_CALL.fullmatch(e) for e in entries):
-        return None, "not_finite"  # also a literal too large for a float, spelled inf by now
-    if not all(_NUMBER.fullmatch(entry) for entry in entries):
+    numbers = tuple(entry for entry in entries if isinstance(entry, float))
+    words = [entry for entry in entries if isinstance(entry, str)]
+    # A literal can be too large for a float.
+    if any(_NOT_FINITE.fullmatch(word) for word in words) or not all(map(math.isfinite, numbers)):
+        return None, "not_finite"
+    if words:
         return None, "not_a_number"
-    if len(entries) != plan_actions:
+    if len(numbers) != plan_actions:
         return None, "wrong_length"
-    numbers = tuple(float(entry) for entry in entries)
     if not all(-1 <= number <= 1 for number in numbers):
         return None, "out_of_range"
     return numbers, None
 
 
-def _entries(inside: str) -> tuple[str, ...]:
-    """The entries of an array, numbers in one spelling so that equal arrays compare equal."""
-    entries = [
-        _SIGN_APART.sub(r"\1", entry.strip()) for entry in inside.translate(_MINUSES).split(",")
-    ]
+def _entries(inside: str) -> tuple[float | str, ...]:
+    """The entries of an array: numbers, and what is none as it is spelled."""
+    inside = inside.translate(_MINUSES)
+    if _NUMBERS.fullmatch(inside):
+        return tuple(map(float, inside.rstrip().removesuffix(",").split(",")))
+    entries = [_SIGN_APART.sub(r"\1", entry.strip()) for entry in inside.split(",")]
     if entries[-1] == "":
         entries.pop()
-    return tuple(repr(float(e)) if _NUMBER.fullmatch(e) else e for e in entries)
+    return tuple(float(e) if _NUMBER.fullmatch(e) else e for e in entries)
 
 
 def _tactical(prose: str) -> tuple[Tactical | None, str]:

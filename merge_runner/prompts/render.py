@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 
 from merge_runner.config import Scenario
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS
-from merge_runner.records import Observation
+from merge_runner.records import Observation, Road
 
 
 def render_prompt(
@@ -21,14 +22,16 @@ def render_prompt(
     ``remaining_plan`` is the unexecuted rest of the last valid plan (normalised accelerations),
     None before the first.
     """
-    removed = VARIANTS[variant]
     fields = _fields(observation, remaining_plan, scenario)
-    paragraphs = (
-        template.format_map(fields)
-        for block in BLOCKS
-        if block.name not in removed and (template := block.template(observation.road)) is not None
-    )
-    return "\n\n".join(paragraphs) + "\n"
+    return _template(variant, observation.road).format_map(fields)
+
+
+@cache
+def _template(variant: str, road: Road) -> str:
+    """The blocks of a variant that a road has, one below the other."""
+    removed = VARIANTS[variant]
+    templates = (block.template(road) for block in BLOCKS if block.name not in removed)
+    return "\n\n".join(template for template in templates if template is not None) + "\n"
 
 
 def _fields(
@@ -59,10 +62,9 @@ def _fields(
 
 def decimal(value: float) -> str:
     """Two decimals, and never a negative zero."""
-    text = f"{value:.2f}"
-    return "0.00" if text == "-0.00" else text
+    return f"{value:.2f}".replace("-0.00", "0.00")
 
 
 def listing(values: Iterable[float]) -> str:
     """Values as a Python list of two decimals."""
-    return f"[{', '.join(decimal(value) for value in values)}]"
+    return f"[{', '.join([f'{value:.2f}' for value in values])}]".replace("-0.00", "0.00")

@@ -8,9 +8,17 @@ from math import comb, sqrt
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 
-from analysis.contrasts import PERMUTATIONS, contrast_means, contrast_rates, corrected
+from analysis.contrasts import (
+    PERMUTATIONS,
+    contrast_means,
+    contrast_rates,
+    corrected,
+    shuffled_sums,
+)
 
 
 def fisher(first, second) -> float:
@@ -195,3 +203,16 @@ def test_corrected_p_values_stay_at_most_1():
     holm, false_discovery = corrected([0.6, 0.9, 0.2])
     assert list(holm) == pytest.approx([1.0, 1.0, 0.6])
     assert list(false_discovery) == pytest.approx([0.9, 0.9, 0.6])
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 40), st.data())
+def test_the_sums_of_shuffles_are_those_of_the_first_in_each_order(n, data):
+    """Drawn in parts, from the same stream of numbers, and leaving it where a whole draw does."""
+    count, seed = data.draw(st.integers(0, n)), data.draw(st.integers(0, 2**32))
+    value = np.random.default_rng(seed).normal(size=n)
+    plain, parts = np.random.default_rng(seed), np.random.default_rng(seed)
+    order = np.argsort(plain.random((PERMUTATIONS, n)), axis=1)
+    expected = value[order[:, :count]].sum(axis=1)
+    assert np.allclose(shuffled_sums(parts, value, count), expected, atol=1e-12)
+    assert plain.random() == parts.random()

@@ -89,8 +89,8 @@ def test_traces_are_those_of_the_left_vehicle_that_merges_first_or_second(study)
             study.db,
         )
         found = left_traces(study, group, first)
-        assert sorted(tuple(v) for _, v in found) == sorted(tuple(v) for v in rows["v"])
-        assert all(times[0] == 0 for times, _ in found)
+        assert sorted(tuple(trace[:, 1]) for trace in found) == sorted(tuple(v) for v in rows["v"])
+        assert all(trace[0, 0] == 0 for trace in found)
 
 
 def test_before_an_import_the_figure_says_what_is_missing_and_draws_the_published_line(study):

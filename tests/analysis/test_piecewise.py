@@ -9,18 +9,24 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ruptures import Pelt
+from ruptures.base import BaseCost
 from ruptures.costs import CostCLinear
 
 from analysis.intervals import proportion
 from analysis.piecewise import (
+    FIELDS,
+    MIN_SEGMENT_SAMPLES,
     SAMPLE_S,
     THRESHOLDS,
-    ContinuousPolyline,
+    TOLERANCE_MPS,
     Profile,
     at_5_hz,
+    fit_each,
     fit_profile,
     fit_profiles,
     passing,
+    segment_costs,
 )
 
 SAMPLES = 48  # 9.4 s, as long as a trial at 10 m/s
@@ -94,10 +100,60 @@ def test_continuous_control_fails_as_a_group(controller):
 @pytest.mark.parametrize("n", [4, 9, 30])
 def test_the_cost_of_every_segment_is_that_of_ruptures(n):
     signal = np.random.default_rng(n).normal(10, 1, n)
-    mine, reference = ContinuousPolyline().fit(signal), CostCLinear().fit(signal)
+    mine, reference = segment_costs(signal), CostCLinear().fit(signal)
     for start in range(n - 2):
         for end in range(start + 3, n + 1):
-            assert mine.error(start, end) == pytest.approx(reference.error(start, end), abs=1e-9)
+            found = mine[max(start, 1) - 1, end - 1]
+            assert found == pytest.approx(reference.error(start, end), abs=1e-9)
+
+
+class Tabulated(BaseCost):
+    """Our costs, for ruptures' own search."""
+
+    model = "tabulated"
+    min_size = MIN_SEGMENT_SAMPLES
+
+    def fit(self, signal):
+        self.signal = signal.reshape(-1, 1)
+        self.costs = segment_costs(signal)
+        return self
+
+    def error(self, start, end):
+        return float(self.costs[max(start, 1) - 1, end - 1])
+
+
+def plainly(velocity_mps) -> Profile:
+    """The fit by ruptures' search, one vehicle at a time."""
+    v = velocity_mps - velocity_mps[0]
+    search = Pelt(custom_cost=Tabulated(), min_size=MIN_SEGMENT_SAMPLES, jump=1).fit(v)
+    ends = search.predict(2 * np.log(len(v)) * TOLERANCE_MPS**2)
+    knots = np.array([0, *(end - 1 for end in ends)])
+    fitted = np.interp(np.arange(len(v)), knots, v[knots])
+    seconds = (len(v) - 1) * SAMPLE_S
+    acceleration = np.diff(v) / SAMPLE_S
+    signs = np.sign(acceleration[np.abs(acceleration) > 0.05])
+    return Profile(
+        (len(knots) - 2) / seconds,
+        float(np.sqrt(np.mean((v - fitted) ** 2))),
+        float((signs[1:] != signs[:-1]).sum()) / seconds,
+    )
+
+
+@given(st.integers(4, 80), st.sampled_from((0.003, 0.01, 0.05, 0.2)), st.integers(0, 2**32))
+def test_many_vehicles_at_once_are_fitted_as_ruptures_fits_each(n, roughness, seed):
+    """Also to the last digit, as the same numbers are added in the same order."""
+    v = 10 + np.cumsum(np.random.default_rng(seed).normal(0, roughness, (5, n)), axis=1)
+    assert [Profile(*row) for row in fit_each(v).tolist()] == [plainly(row) for row in v]
+
+
+@given(st.lists(SPEEDS, max_size=12))
+def test_vehicles_of_any_length_are_fitted_in_their_order(speeds):
+    frame = as_speeds((f"t{i}", "left", v) for i, v in enumerate(speeds))
+    found = fit_profiles(frame)
+    assert list(found["trial_id"]) == list(frame["trial_id"])
+    assert [Profile(*row) for row in found[list(FIELDS)].to_numpy().tolist()] == [
+        fit_profile(v) for v in speeds
+    ]
 
 
 def test_knots_are_where_the_acceleration_changes():
@@ -204,22 +260,21 @@ def test_speeds_at_5_hz_stay_as_they_are(steps):
     assert list(at_5_hz(time, v)) == pytest.approx(list(v))
 
 
-def test_every_vehicle_that_drove_for_four_samples_has_a_row():
-    v = driven([1.0] * 12 + [-0.8] * 15)
-    rows = [("t1", "left", v), ("t1", "right", v[:4]), ("t2", "left", v[:3])]
-    speeds = pd.DataFrame(
-        [(trial, "h", side, list(np.arange(len(x)) * 0.2), list(x)) for trial, side, x in rows],
+def as_speeds(rows) -> pd.DataFrame:
+    """Trials, sides and speeds at 5 Hz as ``fit_profiles`` takes them."""
+    return pd.DataFrame(
+        [(trial, "h", side, list(np.arange(len(v)) * 0.2), list(v)) for trial, side, v in rows],
         columns=["trial_id", "spec_hash", "side", "time_s", "velocity_mps"],
     )
+
+
+def test_a_vehicle_that_drove_for_less_than_four_samples_has_no_fit():
+    v = driven([1.0] * 12 + [-0.8] * 15)
+    speeds = as_speeds([("t1", "left", v), ("t1", "right", v[:4]), ("t2", "left", v[:3])])
     found = fit_profiles(speeds)
-    assert [tuple(row) for row in found[["trial_id", "spec_hash", "side"]].to_numpy()] == [
-        ("t1", "h", "left"),
-        ("t1", "h", "right"),
-    ]
-    whole = fit_profile(v)
-    assert found.loc[0, ["knot_rate_hz", "rmse_mps", "reversal_rate_hz"]].to_list() == [
-        whole.knot_rate_hz,
-        whole.rmse_mps,
-        whole.reversal_rate_hz,
-    ]
+    assert found[["trial_id", "side"]].to_numpy().tolist() == [
+        ["t1", "left"], ["t1", "right"], ["t2", "left"]
+    ]  # fmt: skip
+    assert Profile(*found.loc[0, list(FIELDS)]) == fit_profile(v)
+    assert found[list(FIELDS)].isna().all(axis=1).tolist() == [False, False, True]
     assert list(fit_profiles(speeds[:0])) == list(found)

@@ -6,16 +6,18 @@ import json
 import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import duckdb
 import pytest
 from studies import Said, write_study, yielding
 
 from analysis.conclusions import alarms, not_shown, shown
-from analysis.figures import FIGURES
+from analysis.figures import FIGURES, rendered
+from analysis.page import report_html
 from analysis.provenance import provenance, tally
 from analysis.published import published
-from analysis.report import report_html, write_report
+from analysis.report import finished_figures, write_report
 from analysis.study import Study
 from analysis.tables import TABLES, make_tables
 from merge_runner.errors import UsageError
@@ -49,14 +51,14 @@ def one_figure():
     """Drawing takes most of a report's time, and other tests look at the figures."""
     name = "ablation-matrix"
     with pytest.MonkeyPatch.context() as patch:
-        for place in ("analysis.report.FIGURES", "analysis.figures.FIGURES"):
-            patch.setattr(place, {name: FIGURES[name]})
+        for place in ("report", "figures"):
+            patch.setattr(f"analysis.{place}.FIGURES", {name: FIGURES[name]})
         yield
 
 
 @pytest.fixture(scope="module")
 def page(study, tables):
-    return Page(report_html(study, list(tables.values())))
+    return Page(report_html(study, list(tables.values()), finished_figures(study, "")))
 
 
 def test_the_page_needs_no_network_and_runs_nothing(page):
@@ -85,8 +87,9 @@ def test_numbers_lead_to_the_trials_behind_them(page):
 @pytest.mark.usefixtures("few_draws")
 def test_equal_results_give_equal_reports(small):
     again = Study(small.db)
-    texts = {report_html(study, make_tables(study, ["gap"])) for study in (small, again)}
+    texts = {report_html(study, make_tables(study, ["gap"]), {}) for study in (small, again)}
     assert len(texts) == 1
+    assert len({rendered(study, "ablation-matrix", "svg") for study in (small, again)}) == 1
 
 
 def test_conclusions_name_power_and_missing_traces(study):
@@ -105,7 +108,7 @@ def test_an_empty_database_concludes_nothing(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", []))
     assert shown(study) == []
     assert "nothing can be concluded" in " ".join(not_shown(study, provenance(study.db)))
-    assert "Nothing yet" in Page(report_html(study, [])).text
+    assert "Nothing yet" in Page(report_html(study, [], {})).text
 
 
 def asking(folder, said, *, variant="baseline"):
@@ -132,13 +135,13 @@ def test_what_went_wrong_stands_at_the_top_before_any_number(page):
 def test_a_study_in_which_nothing_went_wrong_has_no_warning(tmp_path):
     study = asking(tmp_path, Said(), variant="A1")
     assert alarms(study, provenance(study.db)) == []
-    assert "Read this first" not in Page(report_html(study, [])).text
+    assert "Read this first" not in Page(report_html(study, [], {})).text
 
 
 @pytest.mark.usefixtures("few_draws")
 def test_another_served_model_is_loud_and_its_name_is_shown_as_text(tmp_path):
     study = asking(tmp_path, Said(served="<script>alert(1)</script>"), variant="A1")
-    page = Page(report_html(study, []))
+    page = Page(report_html(study, [], {}))
     assert "script" not in page.tags
     assert "Another model answered" in page.text
     assert "o3 was asked for, <script>alert(1)</script> answered: 6 answers" in page.text
@@ -209,10 +212,11 @@ def test_a_call_that_several_trials_used_was_made_and_paid_once(tmp_path):
 
 @pytest.mark.usefixtures("few_draws")
 def test_the_report_can_write_all_its_parts_as_files(small, tmp_path):
-    paths = list(write_report(small, tmp_path / "r/report.html", tmp_path / "r/files"))
+    db = Path(shutil.copy(small.db, tmp_path / "t.duckdb"))
+    paths = list(write_report(db, None, tmp_path / "r/report.html", tmp_path / "r/files"))
     assert (tmp_path / "r/report.html") in paths
     for name in TABLES:
         for suffix in ("txt", "csv", "json", "md", "tex"):
             assert (tmp_path / "r/files" / f"{name}.{suffix}").stat().st_size > 50
     with pytest.raises(UsageError, match="cannot be written"):
-        list(write_report(small, tmp_path, None))
+        list(write_report(db, None, tmp_path, None))

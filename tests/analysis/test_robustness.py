@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import duckdb
+import numpy as np
 import pandas as pd
 import pytest
 from harness import RECORDING
@@ -12,6 +13,7 @@ from analysis.load import load, load_trials
 from analysis.robustness import RULES, UNDECIDED, outcomes, redrive
 from merge_runner.config import Scenario
 from merge_runner.records import StateRow, TrialRecord, TrialSpec
+from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.store import Store
 
 KEY = ["trial_id", "spec_hash"]
@@ -205,6 +207,36 @@ def test_stored_plans_are_driven_again_under_each_rule(tmp_path):
     firsts = found.dropna(subset=["merged_first"])
     assert set(firsts["rule"]) == {"euclid2d", "shared_lane"}
     assert set(firsts["merged_first"]) == {"left"}
+
+
+@pytest.mark.parametrize("length_m", [4.5, 7.0])
+def test_stored_traces_are_judged_as_their_plans_driven_again(tmp_path, length_m):
+    """Trials of any plans, of which many collide; also of longer vehicles."""
+    rng = np.random.default_rng(7)
+    scenario = Scenario(vehicle_length_m=length_m)
+    drives = [
+        Drive("o3", "baseline", str(rng.choice(list(CONDITIONS))), rep,
+              *(tuple(rng.uniform(-0.3, 0.3, 12).tolist()) for _ in "lr"))
+        for rep in range(100)
+    ]  # fmt: skip
+    db = write_study(tmp_path / "study.duckdb", drives, scenario)
+    trials = load_trials(db)
+    assert 20 < (trials["status"] == "collided").sum() < 95
+    decided = load(
+        "SELECT trial_id, list(applied ORDER BY decision) AS applied, arg_max(plan, decision) "
+        "AS last FROM decisions GROUP BY trial_id, side ORDER BY trial_id, side",
+        db,
+    ).groupby("trial_id")
+    found = by_rule(outcomes(db, trials))
+    for rule in RULES:
+        expected = [
+            redrive(scenario.model_copy(update={"collision_rule": rule}), trial.condition,
+                    *(decided.get_group(trial.trial_id)[name].tolist()
+                      for name in ("applied", "last")))
+            for trial in trials.itertuples()
+        ]  # fmt: skip
+        statuses, firsts = zip(*expected, strict=True)
+        assert same(found[rule], trials.assign(status=statuses, merged_first=firsts))
 
 
 @pytest.fixture

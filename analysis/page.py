@@ -1,0 +1,117 @@
+"""The HTML of the report: conclusions, figures, tables, provenance, the trials behind it all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+import jinja2
+import pandas as pd
+
+from analysis.conclusions import alarms, not_shown, shown
+from analysis.explain import Source, sources_of, sql_command
+from analysis.figures import FIGURES
+from analysis.provenance import provenance
+from analysis.published import published
+from analysis.study import Study
+from analysis.tables.against import PAPER, against, in_paper
+from analysis.tables.formats import notes_of, shown_columns, shown_value
+from analysis.tables.model import Column, Row, Table
+from merge_runner.provenance import git_state
+
+TEMPLATES = Path(__file__).with_name("templates")
+LISTED = 300
+LIBRARIES = ("statsmodels", "firthmodels", "scipy", "numpy", "pandas", "matplotlib")
+
+
+@dataclass
+class Links:
+    """The sources of all cells; equal ones are listed once, under one number."""
+
+    study: Study
+    found: dict[tuple[Source, ...], int] = field(default_factory=dict)
+
+    def to(self, table: Table, row: Row, column: Column) -> int:
+        """The number of a cell's sources."""
+        sources = sources_of(self.study, table, row, column)
+        return self.found.setdefault(sources, len(self.found) + 1)
+
+
+def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
+    """The report as one HTML text; ``figures`` are SVG in Base64, by name."""
+    links = Links(study)
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    origin = provenance(study.db)
+    return environment.get_template("report.html").render(
+        study=study,
+        alarms=alarms(study, origin),
+        shown=shown(study),
+        not_shown=not_shown(study, origin),
+        figures=[
+            {"name": name, "caption": FIGURES[name][1], "data": data}
+            for name, data in figures.items()
+        ],
+        tables=[_view(table, links) for table in tables],
+        beside=[_view(against(table, PAPER), links) for table in tables if in_paper(table)],
+        sources=[(number, sources) for sources, number in links.found.items()],
+        listed=LISTED,
+        command=sql_command(study),
+        libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
+        origin=origin,
+        records=_records,
+        readings=_records(published("readings")),
+        sources_cited=_records(published("sources")),
+        program=git_state(),
+    )
+
+
+def _view(table: Table, links: Links) -> dict[str, object]:
+    """A table as its template needs it: headings, cells with links, notes."""
+    columns = shown_columns(table)
+    return {
+        "name": table.name,
+        "heading": table.heading,
+        "columns": [
+            {"heading": c.heading, "meaning": c.meaning, "text": c.kind == "text"} for c in columns
+        ],
+        "rows": [
+            {
+                "id": row.id,
+                "cells": [
+                    {
+                        "text": shown_value(column, row.values.get(column.name)),
+                        "left": column.kind == "text",
+                        "link": None
+                        if column.kind == "text" or row.values.get(column.name) is None
+                        else links.to(table, row, column),
+                    }
+                    for column in columns
+                ],
+            }
+            for row in table.rows
+        ],
+        "notes": notes_of(table),
+    }
+
+
+def _records(frame: pd.DataFrame) -> list[dict[str, object]]:
+    """Rows for a template: what is missing is an empty text, whole numbers are whole."""
+    return [
+        {str(name): _plain(value) for name, value in row.items()}
+        for row in frame.to_dict(orient="records")
+    ]
+
+
+def _plain(value: object) -> object:
+    if value is None or value is pd.NaT or (isinstance(value, float) and pd.isna(value)):
+        return ""
+    if isinstance(value, float):
+        return int(value) if value.is_integer() else round(value, 6)
+    return value

@@ -1,0 +1,313 @@
+"""What is measured: every case runs whole programs and returns its figures.
+
+``wall_s``, ``cpu_s`` and ``peak_mb`` are those of the process that is measured, ``calls`` how many
+calls it made or read; ``stall_s`` is by how much its event loop was late at worst and ``playing_s``
+how long its trials took.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.processes import PROGRAM, PYTHON, RUNNER, Run, Server, run
+from benchmarks.recorder import multiply
+from benchmarks.workload import CALLS, TRIALS
+from merge_runner.store import query
+
+Figures = dict[str, float]
+# In this condition both vehicles collide early whatever the server answers: 8 calls a trial.
+SHORT, SHORT_CALLS = ("--conditions", "R_-4_8"), 8
+STUDIES = (110, 1_100, 11_000)
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Where the cases run."""
+
+    folder: Path
+    server: Server
+
+    def fresh(self, name: str) -> Path:
+        """An empty folder."""
+        folder = self.folder / name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        return folder
+
+    def sweep(
+        self,
+        folder: Path,
+        *options: str,
+        db: str = "sweep",
+        delay_ms: int = 0,
+        until: Callable[[], bool] | None = None,
+    ) -> Run:
+        """Our runner, off the server's CPUs."""
+        return run(
+            [
+                *RUNNER,
+                "sweep",
+                "baseline",
+                "--json",
+                "--db",
+                str(folder / f"{db}.duckdb"),
+                "--cache",
+                str(folder / "responses"),
+                *options,
+            ],
+            environment={"EMULATOR_BASE_URL": self.server.url(delay_ms)},
+            until=until,
+            pinned=True,
+        )
+
+    def floor(
+        self,
+        folder: Path,
+        *,
+        trials: int = TRIALS,
+        calls: int = CALLS,
+        in_flight: int = 200,
+        delay_ms: int = 0,
+    ) -> Run:
+        """The bare client with as many calls."""
+        return run(
+            [
+                PYTHON,
+                "-m",
+                "benchmarks.floor",
+                "--url",
+                self.server.url(delay_ms),
+                "--cache",
+                str(folder / "floor"),
+                "--trials",
+                str(trials),
+                "--calls-per-trial",
+                str(calls),
+                "--in-flight",
+                str(in_flight),
+            ],
+            pinned=True,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A case, and how often it is run."""
+
+    name: str
+    rounds: int
+    measure: Callable[[Bench], Figures]
+
+
+def figures_of(ran: Run, *, calls: int | None = None) -> Figures:
+    """The figures of a run; those of a sweep are in its summary."""
+    figures = {"wall_s": ran.wall_s, "cpu_s": ran.cpu_s, "peak_mb": ran.peak_mb}
+    if calls is not None:
+        return {**figures, "calls": calls}
+    told = ran.summary
+    return {
+        **figures,
+        "calls": told["calls"]["live"] + told["calls"]["cached"],
+        "trials": told["trials"]["planned"],
+        "stall_s": told["worst_stall_s"],
+        "playing_s": told["playing_s"],
+    }
+
+
+def cold(delay_ms: int) -> Callable[[Bench], Figures]:
+    """A sweep with an empty cache."""
+    return lambda bench: figures_of(bench.sweep(bench.fresh("cold"), delay_ms=delay_ms))
+
+
+def cold_floor(delay_ms: int) -> Callable[[Bench], Figures]:
+    """The same calls, bare."""
+    return lambda bench: figures_of(
+        bench.floor(bench.fresh("floor"), delay_ms=delay_ms), calls=TRIALS * CALLS
+    )
+
+
+def cached_floor(bench: Bench) -> Figures:
+    """The calls of the last ``cold_floor`` again."""
+    return figures_of(bench.floor(bench.folder / "floor"), calls=TRIALS * CALLS)
+
+
+def replay(bench: Bench) -> Figures:
+    """The sweep of the last ``cold`` again, into a fresh database."""
+    fresh = f"replay-{time.monotonic_ns()}"
+    return figures_of(bench.sweep(bench.folder / "cold", "--replay", db=fresh))
+
+
+def committed_recording(bench: Bench) -> Figures:
+    """The recording that comes with the program, as ``make replay`` does it."""
+    recording = "cache/recordings/emulator-baseline.parquet"
+    return figures_of(bench.sweep(bench.fresh("file"), "--replay", "--recording", recording))
+
+
+def paid(bench: Bench) -> Figures:
+    """A model that costs money: its spending is durable before each attempt."""
+    folder = bench.fresh("paid")
+    return figures_of(
+        run(
+            [
+                *RUNNER,
+                "sweep",
+                "baseline",
+                "--json",
+                "--model",
+                "o3",
+                "--yes",
+                "--rpm",
+                "10000000",
+                "--tpm",
+                "100000000000",
+                "--db",
+                str(folder / "sweep.duckdb"),
+                "--cache",
+                str(folder / "responses"),
+            ],
+            environment={"OPENAI_BASE_URL": bench.server.url(), "OPENAI_API_KEY": "benchmark-key"},
+            pinned=True,
+        )
+    )
+
+
+def in_flight(trials: int, limit: int, delay_ms: int = 0) -> Callable[[Bench], Figures]:
+    """Short trials, many at once, while somebody reads the database."""
+
+    def measure(bench: Bench) -> Figures:
+        folder = bench.fresh("many")
+        options = (*SHORT, "--reps", str(trials), "--in-flight", str(limit))
+        with reader(folder / "sweep.duckdb") as waits:
+            ran = bench.sweep(folder, *options, delay_ms=delay_ms)
+        return {**figures_of(ran), "reader_wait_s": max(waits)}
+
+    return measure
+
+
+def in_flight_floor(trials: int, limit: int, delay_ms: int) -> Callable[[Bench], Figures]:
+    """As many short trials, bare."""
+    return lambda bench: figures_of(
+        bench.floor(
+            bench.fresh("many-floor"),
+            trials=trials,
+            calls=SHORT_CALLS,
+            in_flight=limit,
+            delay_ms=delay_ms,
+        ),
+        calls=trials * SHORT_CALLS,
+    )
+
+
+@contextmanager
+def reader(db: Path) -> Iterator[list[float]]:
+    """Reads a database ten times a second; how long each reading took, in s."""
+    waits = [0.0]
+    done = threading.Event()
+
+    def read() -> None:
+        while not done.wait(0.1):
+            if db.exists():
+                began = time.perf_counter()
+                query(db, "SELECT status, count(*) FROM trials GROUP BY ALL")
+                waits.append(time.perf_counter() - began)
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    try:
+        yield waits
+    finally:
+        done.set()
+        thread.join()
+
+
+def record_many(trials: int) -> Callable[[Bench], Figures]:
+    """Not measured: make the recorded replies of this many short trials."""
+
+    def measure(bench: Bench) -> Figures:
+        folder = bench.fresh(f"recorded-{trials}")
+        bench.sweep(folder, *SHORT, "--reps", "1", db="one")
+        multiply(folder / "responses", trials)
+        return {}
+
+    return measure
+
+
+def replay_many(trials: int) -> Callable[[Bench], Figures]:
+    """Replay them into a fresh database."""
+    return lambda bench: figures_of(
+        bench.sweep(
+            bench.folder / f"recorded-{trials}",
+            *SHORT,
+            *("--replay", "--reps", str(trials)),
+            db=f"replay-{time.monotonic_ns()}",
+        )
+    )
+
+
+def resume(bench: Bench) -> Figures:
+    """A sweep that is killed without a word at half, and run again."""
+    folder = bench.fresh("killed")
+    bench.server.reset()
+    half = TRIALS * CALLS // 2
+    bench.sweep(folder, delay_ms=50, until=lambda: bench.server.stats()["answered"] >= half)
+    ran = bench.sweep(folder, delay_ms=50)
+    stats = bench.server.stats()
+    return {**figures_of(ran), "asked": stats["asked"], "asked_again": stats["asked_again"]}
+
+
+def limited(bench: Bench) -> Figures:
+    """A sweep of 6,000 requests a minute: what the server saw of it."""
+    bench.server.reset()
+    ran = bench.sweep(bench.fresh("limited"), *SHORT, "--reps", "110", "--rpm", "6000")
+    arrivals = bench.server.stats()["arrivals"]
+    span_s = arrivals[-1] - arrivals[0]
+    return {**figures_of(ran), "achieved_per_s": (len(arrivals) - 1) / span_s, "limit_per_s": 100}
+
+
+def start(*argv: str) -> Callable[[Bench], Figures]:
+    """How long the program takes to say something."""
+
+    def measure(bench: Bench) -> Figures:
+        folder = bench.fresh("start")
+        places = ["--db", str(folder / "none.duckdb"), "--cache", str(folder / "none")]
+        ran = run([*PROGRAM, *argv, *(places if "--dry-run" in argv else [])])
+        return figures_of(ran, calls=0)
+
+    return measure
+
+
+def parts(bench: Bench) -> Figures:
+    """The limiter and the store by themselves; see parts.py."""
+    ran = run([PYTHON, "-m", "benchmarks.parts", str(bench.fresh("parts"))])
+    return {**ran.summary, "peak_mb": ran.peak_mb}
+
+
+def import_humans(bench: Bench) -> Figures:
+    """990 recorded human trials, each in a file of its own, as in the experiment's archive."""
+    archive = bench.folder / "humans.zip"
+    if not archive.exists():
+        run([PYTHON, "-m", "benchmarks.humans", str(archive)])
+    db = bench.fresh("imported") / "humans.duckdb"
+    return figures_of(run([*PROGRAM, "human", "import", str(archive), "--db", str(db)]), calls=0)
+
+
+def analysis(trials: int, *argv: str, warm: bool) -> Callable[[Bench], Figures]:
+    """Tables or a report of a study; cold: nothing is stored of an earlier one."""
+
+    def measure(bench: Bench) -> Figures:
+        made = bench.folder / f"study-{trials}.duckdb"
+        if not made.exists():
+            run([PYTHON, "benchmarks/studies.py", str(made), "--trials", str(trials)])
+        db = bench.folder / f"warm-{trials}.duckdb"
+        if not warm or not db.exists():
+            shutil.copy(made, db)
+        out = ["--out", str(bench.fresh("report") / "report.html")] if "report" in argv else []
+        return figures_of(run([*PROGRAM, *argv, "--db", str(db), *out]), calls=0)
+
+    return measure

@@ -1,0 +1,196 @@
+"""What the figures should be: ratios of cases that were measured in one run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from statistics import median
+
+Samples = Mapping[str, list[dict[str, float]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """A figure with its bound; ``of`` computes it from the medians, None: it was not measured."""
+
+    what: str
+    bound: float
+    of: Callable[[Medians], float]
+    at_most: bool = True
+    unit: str = ""
+
+    def met(self, value: float) -> bool:
+        """Whether the figure keeps its bound."""
+        return value <= self.bound if self.at_most else value >= self.bound
+
+
+@dataclass(frozen=True, slots=True)
+class Medians:
+    """The medians over the rounds of every figure of every case."""
+
+    samples: Samples
+
+    def __call__(self, case: str, figure: str) -> float:
+        """A median; raises KeyError for what was not measured."""
+        return median(sample[figure] for sample in self.samples[case])
+
+    def cpu_per_call(self, case: str) -> float:
+        """CPU time in s for each call of the case, its start included."""
+        return self(case, "cpu_s") / self(case, "calls")
+
+    def ratio(self, figure: str, case: str, floor: str) -> float:
+        """The median over the rounds of a figure's ratio: what disturbs both is left out."""
+        return median(
+            ours[figure] / theirs[figure]
+            for ours, theirs in zip(self.samples[case], self.samples[floor], strict=True)
+        )
+
+
+def judged(samples: Samples) -> Iterator[tuple[Goal, float]]:
+    """Every goal that was measured, with its figure."""
+    medians = Medians(samples)
+    for goal in GOALS:
+        try:
+            yield goal, goal.of(medians)
+        except KeyError:
+            continue
+
+
+# The slowest call of a trial of 10 decisions waits 10 times for the server.
+IDEAL_S = 11 * 0.2
+
+GOALS = (
+    Goal(
+        "cold sweep: CPU per call, of the floor's",
+        2.0,
+        lambda m: m.cpu_per_call("cold, 0 ms") / m.cpu_per_call("floor, 0 ms"),
+        unit="x",
+    ),
+    Goal(
+        "1,000 in flight: CPU per call, of that with 50",
+        1.3,
+        lambda m: m.cpu_per_call("1,000 in flight") / m.cpu_per_call("50 in flight"),
+        unit="x",
+    ),
+    Goal(
+        "cold sweep at 200 ms: wall, of latency alone and the start",
+        1.25,
+        lambda m: m("cold, 200 ms", "wall_s") / (IDEAL_S + m("--help", "wall_s")),
+        unit="x",
+    ),
+    Goal(
+        "1,000 in flight at 1 s: throughput, of the bare client's",
+        0.9,
+        lambda m: (
+            (m("1,000 in flight, 1 s", "calls") / m("1,000 in flight, 1 s", "wall_s"))
+            / (
+                m("floor, 1,000 in flight, 1 s", "calls")
+                / m("floor, 1,000 in flight, 1 s", "wall_s")
+            )
+        ),
+        at_most=False,
+        unit="x",
+    ),
+    Goal("replay of 110 trials: wall", 1.2, lambda m: m("replay", "wall_s"), unit="s"),
+    Goal(
+        "replay of 110 trials: wall, of the floor's",
+        2.5,
+        lambda m: m.ratio("wall_s", "replay", "floor, cached"),
+        unit="x",
+    ),
+    Goal(
+        "replay: decisions a second in the loop",
+        5000,
+        lambda m: m("replay", "calls") / m("replay", "playing_s"),
+        at_most=False,
+        unit="/s",
+    ),
+    Goal(
+        "inspect-ai: its CPU cold, of ours",
+        8.0,
+        lambda m: m("inspect-ai, 0 ms", "cpu_s") / m("cold, 0 ms", "cpu_s"),
+        at_most=False,
+        unit="x",
+    ),
+    Goal(
+        "inspect-ai: its cached run, of our replay",
+        10.0,
+        lambda m: m("inspect-ai, cached", "wall_s") / m("replay", "wall_s"),
+        at_most=False,
+        unit="x",
+    ),
+    Goal(
+        "answered calls asked again after kill -9",
+        0,
+        lambda m: m("killed at half, resumed", "asked_again"),
+    ),
+    Goal(
+        "11,000 trials replayed: time per trial, of that with 110",
+        1.15,
+        lambda m: (
+            (m("replay of 11,000", "wall_s") / 11_000) / (m("replay of 110 short", "wall_s") / 110)
+        ),
+        unit="x",
+    ),
+    Goal(
+        "11,000 trials replayed: peak memory",
+        400,
+        lambda m: m("replay of 11,000", "peak_mb"),
+        unit="MB",
+    ),
+    Goal(
+        "2,000 in flight: worst stall of the event loop",
+        0.3,
+        lambda m: m("2,000 in flight", "stall_s"),
+        unit="s",
+    ),
+    Goal(
+        "limiter: achieved, of the limit",
+        0.98,
+        lambda m: m("limiter and store", "limiter_achieved"),
+        at_most=False,
+        unit="x",
+    ),
+    Goal(
+        "limiter: worst sliding window, of the limit",
+        1.02,
+        lambda m: m("limiter and store", "limiter_worst_window"),
+        unit="x",
+    ),
+    Goal(
+        "limiter: waiters served out of order",
+        0,
+        lambda m: m("limiter and store", "limiter_displaced"),
+    ),
+    Goal(
+        "limiter: share of a core with 2,000 waiters",
+        0.06,
+        lambda m: m("limiter and store", "limiter_cpu_share"),
+        unit="x",
+    ),
+    Goal(
+        "store: time per row, of the Appender's",
+        3.0,
+        lambda m: m("limiter and store", "store_ratio"),
+        unit="x",
+    ),
+    Goal(
+        "longest wait of a reader while a sweep writes",
+        0.5,
+        lambda m: m("2,000 in flight", "reader_wait_s"),
+        unit="s",
+    ),
+    Goal(
+        "tables of 11,000 trials, warm",
+        1.0,
+        lambda m: m("tables of 11,000, warm", "wall_s"),
+        unit="s",
+    ),
+    Goal(
+        "report of 11,000 trials, warm",
+        10.0,
+        lambda m: m("report of 11,000, warm", "wall_s"),
+        unit="s",
+    ),
+    Goal("--help", 0.15, lambda m: m("--help", "wall_s"), unit="s"),
+)

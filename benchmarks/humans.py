@@ -1,0 +1,34 @@
+"""Writes an archive of human recordings as large as the published one, from the tests' driver."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "analysis"))
+
+from recordings import drive, write_zip
+
+from merge_runner.records import SIDES
+from merge_runner.simulator.conditions import CONDITIONS
+
+PAIRS, RUNS = 9, 10
+
+
+def write_archive(path: Path) -> None:
+    """9 pairs of humans, 10 runs of 11 conditions each."""
+    recorded = [
+        drive(condition, yields=yields).csv() for condition in CONDITIONS for yields in SIDES
+    ]
+    write_zip(
+        path,
+        {
+            f"data/experiment_{pair}_iter_{number}.csv": recorded[number % len(recorded)]
+            for pair in range(1, PAIRS + 1)
+            for number in range(RUNS * len(CONDITIONS))
+        },
+    )
+
+
+if __name__ == "__main__":
+    write_archive(Path(sys.argv[1]))

@@ -1,0 +1,59 @@
+"""The cases of inspect-ai, in an environment of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from benchmarks.cases import Bench, Figures, figures_of
+from benchmarks.processes import PROJECT, Run, run
+from benchmarks.workload import CALLS, TRIALS
+
+PEER = PROJECT / ".venv-peer" / "bin" / "python"
+
+
+def peer_cold(bench: Bench) -> Figures:
+    """All calls, and its cache filled."""
+    return _measured(_peer(bench, bench.fresh("peer").name, "--cache"))
+
+
+def peer_cached(bench: Bench) -> Figures:
+    """The same again, answered by its cache."""
+    return _measured(_peer(bench, "peer", "--cache"))
+
+
+def peer_resume(bench: Bench) -> Figures:
+    """Killed without a word at half, and gone on with from its log."""
+    name = bench.fresh("peer-killed").name
+    bench.server.reset()
+    half = TRIALS * CALLS // 2
+    _peer(bench, name, delay_ms=50, until=lambda: bench.server.stats()["answered"] >= half)
+    ran = _peer(bench, name, "--retry", delay_ms=50)
+    stats = bench.server.stats()
+    return {**_measured(ran), "asked": stats["asked"], "asked_again": stats["asked_again"]}
+
+
+def _measured(ran: Run) -> Figures:
+    return figures_of(ran, calls=TRIALS * CALLS)
+
+
+def _peer(
+    bench: Bench,
+    name: str,
+    *options: str,
+    delay_ms: int = 0,
+    until: Callable[[], bool] | None = None,
+) -> Run:
+    return run(
+        [
+            str(PEER),
+            "-m",
+            "benchmarks.peer",
+            "--url",
+            bench.server.url(delay_ms),
+            "--folder",
+            str(bench.folder / name),
+            *options,
+        ],
+        until=until,
+        pinned=True,
+    )

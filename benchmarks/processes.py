@@ -1,0 +1,134 @@
+"""Runs whole programs and measures what they take."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.request import Request, urlopen
+
+PROJECT = Path(__file__).resolve().parents[1]
+PYTHON = sys.executable
+RUNNER = (PYTHON, "-m", "merge_runner")
+PROGRAM = (PYTHON, "-c", "from analysis.commands import main; main()")
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What one process took: wall and CPU time in s, peak memory in MB; and what it printed."""
+
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
+    output: str
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The JSON object in its last line."""
+        found: dict[str, Any] = json.loads(self.output.strip().splitlines()[-1])
+        return found
+
+
+def run(
+    argv: Sequence[str],
+    *,
+    environment: Mapping[str, str] | None = None,
+    until: Callable[[], bool] | None = None,
+    pinned: bool = False,
+) -> Run:
+    """Run a program to its end, or kill it without a word when ``until`` says so.
+
+    ``pinned`` keeps it off the server's CPUs. Raises RuntimeError where it fails by itself.
+    """
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
+        began = time.perf_counter()
+        with started_on(0 if pinned else None):
+            process = subprocess.Popen(
+                argv,
+                cwd=PROJECT,
+                env={**os.environ, **(environment or {})},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=errors,
+            )
+        while until is not None and not until():
+            time.sleep(0.01)
+        if until is not None:
+            process.send_signal(signal.SIGKILL)
+        _, status, usage = os.wait4(process.pid, 0)
+        wall_s = time.perf_counter() - began
+        process.returncode = os.waitstatus_to_exitcode(status)
+        texts = []
+        for file in (output, errors):
+            file.seek(0)
+            texts.append(file.read().decode())
+    if process.returncode and until is None:
+        raise RuntimeError(f"{' '.join(argv)} ended with {process.returncode}\n{''.join(texts)}")
+    cpu_s = usage.ru_utime + usage.ru_stime
+    return Run(wall_s, cpu_s, usage.ru_maxrss / 1024, texts[0])
+
+
+@contextmanager
+def started_on(half: int | None) -> Iterator[None]:
+    """Processes that are started within this stay on one half of the CPUs, 0 or 1.
+
+    Where there is but one CPU, or the system cannot, they run anywhere.
+    """
+    cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    if half is None or len(cpus) < 2:
+        yield
+        return
+    middle = len(cpus) // 2
+    os.sched_setaffinity(0, cpus[middle:] if half else cpus[:middle])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cpus)
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """The loopback server of a benchmark."""
+
+    port: int
+
+    def url(self, delay_ms: int = 0) -> str:
+        """A base URL whose answers take a while."""
+        return f"http://127.0.0.1:{self.port}/delay/{delay_ms}/v1"
+
+    def reset(self) -> None:
+        """Forget what was asked."""
+        self._ask(Request(f"http://127.0.0.1:{self.port}/reset", data=b"", method="POST"))
+
+    def stats(self) -> dict[str, Any]:
+        """What was asked since the last reset."""
+        return self._ask(Request(f"http://127.0.0.1:{self.port}/stats"))
+
+    def _ask(self, request: Request) -> dict[str, Any]:
+        with urlopen(request) as reply:  # noqa: S310 # our own server
+            found: dict[str, Any] = json.load(reply)
+        return found
+
+
+@contextmanager
+def served() -> Iterator[Server]:
+    """The server as a process of its own, on the other CPUs than what is measured."""
+    with started_on(1):
+        process = subprocess.Popen(
+            [PYTHON, "-m", "benchmarks.server"], cwd=PROJECT, stdout=subprocess.PIPE, text=True
+        )
+    with process:
+        assert process.stdout is not None
+        try:
+            yield Server(int(process.stdout.readline()))
+        finally:
+            process.terminate()
