@@ -10,7 +10,7 @@ from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
 
-from distributed import get_worker
+from distributed import Worker, get_worker
 from distributed.comm import connect
 
 from merge_runner.clients import live_clients
@@ -54,6 +54,7 @@ class _Worker:
 
     async def play(self, address: str, token: str) -> None:
         dask = get_worker()
+        _stop_profiler(dask)
         try:
             comm = await connect(address, **dask.security.get_connection_args("worker"))
         except OSError:
@@ -125,6 +126,15 @@ class _Worker:
             self._turns[name].hold(seconds)
         else:
             self._early_pauses[name] = seconds
+
+
+def _stop_profiler(dask: Worker) -> None:
+    """Stop Dask's look at all threads a hundred times a second.
+
+    Python 3.11 can deadlock there when it collects a threading.local, as those of the cache are.
+    """
+    if (profiler := dask.periodic_callbacks.get("profile")) is not None:
+        dask.loop.add_callback(profiler.stop)
 
 
 def _tell(link: Link, spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
