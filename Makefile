@@ -14,7 +14,7 @@ export Q
 help:
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
 
-sweep: .venv/runtime ## the main job: MODEL=, SWEEP=, ARGS=
+sweep: .venv/runtime $(if $(findstring --dask,$(ARGS)),.venv/dev) ## the main job: MODEL=, SWEEP=, ARGS=
 	@$(RUN) sweep $(SWEEP) --model $(MODEL) $(ARGS)
 
 replay: .venv/runtime ## the same from recorded replies alone: MODEL=, SWEEP=, RECORDING=, ARGS=

@@ -65,7 +65,9 @@ VariantsOption = Annotated[
 SampleSetOption = Annotated[
     int, typer.Option("--sample-set", help="Another number draws a fresh set of samples.")
 ]
-InFlightOption = Annotated[int, typer.Option("--in-flight", help="Trials at once.", min=1)]
+InFlightOption = Annotated[
+    int, typer.Option("--in-flight", help="Trials at once, over all workers.", min=1)
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object.")]
 NameArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="experiments/NAME.toml, or a path.")
@@ -121,6 +123,14 @@ def sweep(
         float | None,
         typer.Option(help="Never spend more USD on this sweep, over all its runs.", min=0),
     ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(
+            "--dask",
+            metavar="CLUSTER",
+            help="Play on a Dask cluster: local:N, a scheduler's address, or its file.",
+        ),
+    ] = None,
     strict_model: Annotated[
         bool, typer.Option("--strict-model", help="Stop when another model answers.")
     ] = False,
@@ -143,6 +153,8 @@ def sweep(
         raise UsageError("--max-cost is a number of USD")
     if recording is not None and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
+    if dask is not None and replay:
+        raise UsageError("a replay needs no cluster: leave --dask out")
     options = Options(
         db=db,
         cache=cache,
@@ -153,6 +165,7 @@ def sweep(
         emulator_options=_emulator_options(fault_rate, faults, seed),
         faults_identity=_faults(fault_rate, faults, seed).identity,
         strict_model=strict_model,
+        dask=dask,
     )
     choice = Choice(
         sweep=name,

@@ -7,7 +7,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 
-from merge_runner.config import ModelEntry, resolve_endpoint, running_emulator_url
+from merge_runner.config import (
+    ModelEntry,
+    base_urls,
+    resolve_endpoint,
+    running_emulator_url,
+    with_base_urls,
+)
 from merge_runner.emulator.process import emulator_process
 from merge_runner.errors import UsageError
 from merge_runner.llm.budget import Budget
@@ -16,7 +22,8 @@ from merge_runner.llm.claims import Claims
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
-from merge_runner.llm.prices import Pricing, pricing
+from merge_runner.llm.prices import pricing
+from merge_runner.llm.sharing import Desk
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.plan import Limits
 
@@ -28,13 +35,33 @@ class Terms:
     """On what terms a sweep asks.
 
     ``ledger`` holds its spending, over all its runs; ``trial_usd`` is the worst case of a whole
-    trial. ``strict`` stops at an answer of another model.
+    trial.
     """
 
     limits: Limits
     ledger: Ledger
     trial_usd: float
+
+
+@dataclass(frozen=True, slots=True)
+class Addressed:
+    """Whom a sweep asks: the identities of its endpoints, and the variables of their base URLs.
+
+    ``strict`` stops at an answer of another model.
+    """
+
+    endpoints: Mapping[str, str]
+    urls: Mapping[str, str]
     strict: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class OwnDesk:
+    """The desk of this process; see Desk."""
+
+    limiters: Mapping[str, Limiter]
+    budget: Budget
+    claims: Claims
 
 
 def sealed_clients(
@@ -59,64 +86,87 @@ def sealed_clients(
     }
 
 
-async def live_clients(
+def open_desk(
     entries: Mapping[str, ModelEntry],
     endpoints: Mapping[str, str],
     cache: ResponseCache,
     terms: Terms,
-    *,
-    emulator_options: Sequence[str],
     stack: AsyncExitStack,
-) -> dict[str, LlmClient]:
-    """Clients with connections, closed with ``stack``; starts the emulator where it is asked.
+) -> OwnDesk:
+    """The desk of a run; its claims are given up with ``stack``.
 
-    Raises UsageError where a key is missing.
+    Raises UsageError where a cap could not hold.
     """
-    from merge_runner.llm.http import HttpTransport
-
     limits = terms.limits
-    _allow_open_files(limits.connections + SPARE_FILES)
-    budget = Budget(terms.ledger, cap_usd=limits.max_cost_usd, trial_usd=terms.trial_usd)
+    for name, entry in entries.items():
+        if limits.max_cost_usd is not None and not pricing(entry).known:
+            raise UsageError(
+                f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
+                "experiments/models.toml"
+            )
     claims = Claims(cache.folder)
     stack.callback(claims.close)
     pauses: dict[str, Pause] = {}
+    return OwnDesk(
+        limiters={
+            name: Limiter(
+                rpm=limits.rpm or entry.rpm,
+                tpm=limits.tpm or entry.tpm,
+                pause=pauses.setdefault(endpoints[name], Pause()),
+            )
+            for name, entry in entries.items()
+        },
+        budget=Budget(terms.ledger, cap_usd=limits.max_cost_usd, trial_usd=terms.trial_usd),
+        claims=claims,
+    )
+
+
+async def reached(
+    entries: Mapping[str, ModelEntry], emulator_options: Sequence[str], stack: AsyncExitStack
+) -> dict[str, str]:
+    """The variables of base URLs that lead to the entries' endpoints.
+
+    Starts the emulator where it is asked, to be stopped with ``stack``.
+    """
+    urls = base_urls(entries)
+    emulated = any(entry.provider == "emulator" for entry in entries.values())
+    if emulated and running_emulator_url() is None:
+        url = await stack.enter_async_context(emulator_process(emulator_options))
+        urls |= {"EMULATOR_BASE_URL": f"{url}/v1"}
+    return urls
+
+
+def live_clients(
+    entries: Mapping[str, ModelEntry],
+    addressed: Addressed,
+    cache: ResponseCache,
+    desk: Desk,
+    *,
+    connections: int,
+    stack: AsyncExitStack,
+) -> dict[str, LlmClient]:
+    """Clients with connections, closed with ``stack``. Raises UsageError where a key is missing."""
+    from merge_runner.llm.http import HttpTransport
+
+    _allow_open_files(connections + SPARE_FILES)
     clients = {}
     for name, entry in entries.items():
-        environment = None
-        if entry.provider == "emulator" and running_emulator_url() is None:
-            url = await stack.enter_async_context(emulator_process(emulator_options))
-            environment = {"EMULATOR_BASE_URL": f"{url}/v1"}
-        transport = HttpTransport(
-            resolve_endpoint(name, entry, environment), connections=limits.connections
-        )
+        endpoint = resolve_endpoint(name, entry, with_base_urls(addressed.urls))
+        transport = HttpTransport(endpoint, connections=connections)
         stack.push_async_callback(transport.close)
         clients[name] = LlmClient(
             name=name,
             entry=entry,
-            endpoint=endpoints[name],
+            endpoint=addressed.endpoints[name],
             cache=cache,
             transport=transport,
-            limiter=Limiter(
-                rpm=limits.rpm or entry.rpm,
-                tpm=limits.tpm or entry.tpm,
-                pause=pauses.setdefault(endpoints[name], Pause()),
-            ),
-            pricing=_pricing(name, entry, capped=limits.max_cost_usd is not None),
-            budget=None if entry.price == "free" else budget,
-            claims=claims,
-            strict=terms.strict,
+            limiter=desk.limiters[name],
+            pricing=pricing(entry),
+            budget=None if entry.price == "free" else desk.budget,
+            claims=desk.claims,
+            strict=addressed.strict,
         )
     return clients
-
-
-def _pricing(name: str, entry: ModelEntry, *, capped: bool) -> Pricing:
-    price = pricing(entry)
-    if capped and not price.known:
-        raise UsageError(
-            f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
-            "experiments/models.toml"
-        )
-    return price
 
 
 def _allow_open_files(wanted: int) -> None:

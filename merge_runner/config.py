@@ -309,6 +309,17 @@ def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | 
     return env.get("EMULATOR_BASE_URL") or None
 
 
+def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
+    """The variables of this environment that say where the entries' providers are reached."""
+    variables = {_provider(name, entry).base_url_env for name, entry in entries.items()}
+    return {v: os.environ[v] for v in variables if v is not None and os.environ.get(v)}
+
+
+def with_base_urls(urls: Mapping[str, str]) -> dict[str, str]:
+    """The environment of this process, with the base URLs that another process has found."""
+    return {**os.environ, **urls}
+
+
 def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
     """The registry, name to entry; raises UsageError."""
     path = path or find_experiments() / "models.toml"

@@ -9,6 +9,7 @@ MergeRunnerError
 │   ├── QuotaExhausted     the account has nothing left                         exit 3
 │   ├── ProviderDown       trials fail and nothing is answered any more         exit 1
 │   ├── ModelSwapped       --strict-model, and another model answers            exit 1
+│   ├── ClusterFailed      the cluster that plays cannot go on                  exit 1
 │   └── CacheFailed        replies cannot be kept or read                       exit 1
 ├── TrialSuspended         --max-cost cannot pay for the trial to go on         exit 3
 ├── StoreError             the database cannot be written or read               exit 1
@@ -83,6 +84,10 @@ class ProviderDown(SweepStopped):
 
 class ModelSwapped(SweepStopped):
     """Another model answers than was asked for, and the user wants none of it."""
+
+
+class ClusterFailed(SweepStopped):
+    """The Dask cluster is gone, or loses one worker after the other."""
 
 
 class CacheFailed(SweepStopped):

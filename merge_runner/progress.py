@@ -18,6 +18,8 @@ from merge_runner.texts import printable
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from merge_runner.players import Crew
+
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
 PULSE_S = 0.05
@@ -27,7 +29,7 @@ REASONS_SHOWN = 3
 
 @dataclass(slots=True)
 class Progress:
-    """Where a sweep stands; the meters are those of its clients.
+    """Where a sweep stands; ``crew`` plays its trials.
 
     ``expected_calls`` is about how many calls all trials take: trials that run in step all end
     late, so the calls tell the time left better than the trials do. ``worst_stall_s`` is by how
@@ -37,11 +39,10 @@ class Progress:
     title: str
     total: int
     expected_calls: int = 0
-    meters: Sequence[Meter] = ()
+    crew: Crew | None = None
     cap_usd: float | None = None
     ledger: Ledger | None = None
     done: Counter[str] = field(default_factory=Counter)
-    running: int = 0
     stored_before: int = 0
     started: float = field(default_factory=time.monotonic)
     worst_stall_s: float = 0.0
@@ -54,25 +55,36 @@ class Progress:
     def fields(self) -> list[tuple[str, str]]:
         """Name and text of every figure that is shown."""
         elapsed = time.monotonic() - self.started
-        live = sum(meter.calls_live for meter in self.meters)
-        cached = sum(meter.calls_cached for meter in self.meters)
-        rates = [meter.last_minute() for meter in self.meters]
+        meters = self.meters
+        live = sum(meter.calls_live for meter in meters)
+        cached = sum(meter.calls_cached for meter in meters)
+        rates = [meter.last_minute() for meter in meters]
         requests, tokens = (sum(rate[i] for rate in rates) for i in (0, 1))
-        cost = sum(meter.cost_usd for meter in self.meters)
+        cost = sum(meter.cost_usd for meter in meters)
         window = min(60.0, max(elapsed, 1.0)) / 60
         before = f" (+{self.stored_before} stored before)" if self.stored_before else ""
-        others = sum((meter.mismatches for meter in self.meters), Counter[str]())
+        others = sum((meter.mismatches for meter in meters), Counter[str]())
+        running = self.crew.running if self.crew else 0
         warnings = [("WARNING", f"another model answers: {pair}") for pair in sorted(others)]
         return [
             *warnings,
-            ("trials", f"{self.ended}/{self.total} ended{before}, {self.running} running"),
+            ("trials", f"{self.ended}/{self.total} ended{before}, {running} running{self._on()}"),
             ("failed", str(self.done["failed"])),
             ("calls", f"{live} live, {cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
             ("cost", f"{cost:.2f} USD{self._spent()}"),
-            *_waiting(self.meters),
+            *_waiting(meters),
             ("time", f"{elapsed:.0f} s{self._left(elapsed, live + cached)}"),
         ]
+
+    @property
+    def meters(self) -> Sequence[Meter]:
+        """One for each model."""
+        return tuple(self.crew.meters.values()) if self.crew else ()
+
+    def _on(self) -> str:
+        workers = self.crew.workers if self.crew else None
+        return "" if workers is None else f" on {workers or 'no'} worker{'s' * (workers != 1)}"
 
     def _spent(self) -> str:
         """What counts against the cap: all runs of the sweep, and what is set aside."""

@@ -12,13 +12,9 @@ from functools import partial
 from pathlib import Path
 
 from merge_runner.audit import Audit, audit_sweep
-from merge_runner.clients import Terms, live_clients, sealed_clients
+from merge_runner.clients import Addressed, Terms, live_clients, open_desk, reached, sealed_clients
 from merge_runner.config import ModelEntry, endpoint_identity
 from merge_runner.database import unreadable_is_usage
-from merge_runner.drivers.base import Driver
-from merge_runner.drivers.constant import ConstantDriver
-from merge_runner.drivers.llm_driver import LlmDriver
-from merge_runner.drivers.projected_order import ProjectedOrderDriver
 from merge_runner.errors import (
     MergeRunnerError,
     ProviderDown,
@@ -32,19 +28,17 @@ from merge_runner.estimate import Missing, worst_trial_usd
 from merge_runner.flusher import Flusher
 from merge_runner.interrupt import on_interrupt
 from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.client import LlmClient
 from merge_runner.llm.keys import canonical_json
 from merge_runner.llm.ledger import Ledger, Spending
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.misses import Miss, explain, misses_of
 from merge_runner.plan import PROMPTS_PER_DRIVER, Limits, Plan, spec_hash
+from merge_runner.players import Crew, Players
 from merge_runner.progress import Progress, shown
 from merge_runner.provenance import git_state, versions
 from merge_runner.recording import read_recording
-from merge_runner.records import SIDES, ChatReply, Side, Slot, TrialRecord, TrialSpec
-from merge_runner.scheduler import run_bounded
+from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.store import Store, SweepFacts, SweepRow, sweep_facts
-from merge_runner.trial import play_trial
 
 INTERRUPTED = 130
 SHOWN = 5
@@ -56,8 +50,8 @@ FROM_RECORDINGS = 16
 class Options:
     """How a sweep runs; nothing here changes a result.
 
-    ``faults_identity`` tells the answers of an emulator that is asked for bad answers from those
-    of the usual one.
+    ``dask`` names the cluster that plays; None: this process does. ``faults_identity`` tells the
+    answers of an emulator that is asked for bad answers from those of the usual one.
     """
 
     db: Path
@@ -69,6 +63,7 @@ class Options:
     emulator_options: Sequence[str] = ()
     faults_identity: str = ""
     strict_model: bool = False
+    dask: str | None = None
 
 
 @dataclass(slots=True)
@@ -136,7 +131,6 @@ class Sweep:
             ended = set() if options.replay else self._store.ended_trials(specs)
         self._stored = [key for key in specs if key in ended]
         self._todo = [spec for key, spec in specs.items() if key not in ended]
-        self._clients: dict[str, LlmClient] = {}
         self._sealed = SealedTransport()
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
@@ -163,14 +157,13 @@ class Sweep:
         outcome = Outcome(sweep_id, self._plan.trials, len(self._stored))
         async with AsyncExitStack() as stack:
             stack.callback(self._cache.close)
-            self._clients = await self._connect(stack)
-            meters = [client.meter for client in self._clients.values()]
-            self._progress.meters = meters
+            crew = await self._crew(stack)
+            self._progress.crew = crew
             flusher = Flusher(self._store, outcome.sweep_id, self._say)
             began = time.perf_counter()
             try:
                 async with shown(self._progress):
-                    await self._play(flusher, outcome)
+                    await self._play(crew, flusher, outcome)
             finally:
                 outcome.playing_s = time.perf_counter() - began
                 outcome.worst_stall_s = self._progress.worst_stall_s
@@ -181,7 +174,7 @@ class Sweep:
                 outcome.cache_cost_usd = self._cache.cost_usd()
             except MergeRunnerError as exc:
                 outcome.fail(exc.exit_code, str(exc))
-        for meter in meters:
+        for meter in crew.meters.values():
             outcome.damaged += meter.damaged
             outcome.calls_live += meter.calls_live
             outcome.calls_cached += meter.calls_cached
@@ -203,15 +196,15 @@ class Sweep:
 
     async def rehearse(self) -> Missing:
         """Play from the recorded replies alone, store nothing, and count what is missing."""
-        self._clients = sealed_clients(
+        clients = sealed_clients(
             self._plan.entries, self._endpoints, self._cache, SealedTransport()
         )
         trials = 0
         calls = dict.fromkeys(self._plan.entries, 0.0)
 
-        def ended(record: TrialRecord | None) -> None:
+        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             nonlocal trials
-            if record is None or record.status != "failed":
+            if isinstance(record, TrialSuspended) or record.status != "failed":
                 return
             trials += 1
             for side, name in self._plan.sides.items():
@@ -219,9 +212,7 @@ class Sweep:
                     answered = sum(row.side == side for row in record.decisions)
                     calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
 
-        await run_bounded(
-            (partial(self._trial, spec) for spec in self._todo), in_flight=1, on_done=ended
-        )
+        await Players(self._plan, clients, in_flight=1).play(self._todo, ended)
         facts = {name: self._cache.facts(e.id) for name, e in self._plan.entries.items()}
         return Missing(trials, calls, facts)
 
@@ -260,51 +251,54 @@ class Sweep:
         )
         return sweep_id
 
-    async def _connect(self, stack: AsyncExitStack) -> dict[str, LlmClient]:
-        entries, endpoints = self._plan.entries, self._endpoints
-        if self._options.replay or not self._todo or not entries:
-            return sealed_clients(entries, endpoints, self._cache, self._sealed)
-        return await live_clients(
-            entries,
-            endpoints,
-            self._cache,
-            Terms(
-                self._options.limits,
-                self._ledger,
-                worst_trial_usd(self._plan),
-                self._options.strict_model,
-            ),
-            emulator_options=self._options.emulator_options,
-            stack=stack,
+    async def _crew(self, stack: AsyncExitStack) -> Crew:
+        """Who plays: this process, or the workers of a cluster."""
+        plan, options = self._plan, self._options
+        if options.replay or not self._todo or not plan.entries:
+            clients = sealed_clients(plan.entries, self._endpoints, self._cache, self._sealed)
+            # Recorded replies are there at once: more in flight only take more memory.
+            return Players(plan, clients, min(options.in_flight, FROM_RECORDINGS))
+        terms = Terms(options.limits, self._ledger, worst_trial_usd(plan))
+        desk = open_desk(plan.entries, self._endpoints, self._cache, terms, stack)
+        urls = await reached(plan.entries, options.emulator_options, stack)
+        addressed = Addressed(self._endpoints, urls, options.strict_model)
+        if options.dask is None:
+            clients = live_clients(
+                plan.entries,
+                addressed,
+                self._cache,
+                desk,
+                connections=options.limits.connections,
+                stack=stack,
+            )
+            return Players(plan, clients, options.in_flight)
+        from merge_runner.cluster.connect import connected
+
+        client = await stack.enter_async_context(connected(options.dask))
+        from merge_runner.cluster.coordinator import Coordinator  # needs what was asked for
+
+        return await stack.enter_async_context(
+            Coordinator(client, plan, addressed, self._cache, desk, options.in_flight)
         )
 
-    async def _play(self, flusher: Flusher, outcome: Outcome) -> None:
+    async def _play(self, crew: Crew, flusher: Flusher, outcome: Outcome) -> None:
         """Run the trials until all have ended, or the sweep is stopped or interrupted."""
 
-        def ended(record: TrialRecord | None) -> None:
-            if record is None:
+        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+            if isinstance(record, TrialSuspended):
+                self._suspended.append(record)
                 return
             self._progress.done[record.status] += 1
             self._misses += misses_of(record, self._sealed)
             flusher.add(record)
-            self._watch_for_outage(record)
+            self._watch_for_outage(record, crew)
 
-        work = asyncio.create_task(
-            run_bounded(
-                (partial(self._stored_trial, spec, flusher) for spec in self._todo),
-                # Recorded replies are there at once: more in flight only take more memory.
-                in_flight=min(self._options.in_flight, FROM_RECORDINGS)
-                if self._options.replay
-                else self._options.in_flight,
-                on_done=ended,
-            )
-        )
-        drain = asyncio.create_task(self._drain(work))
+        work = asyncio.create_task(crew.play(self._todo, ended, room=flusher.room))
+        drain = asyncio.create_task(_drained(crew, work))
 
         def interrupted() -> None:
-            flying = sum(client.flying for client in self._clients.values())
             self._say(
-                f"Stopping: {flying} calls in flight are saved first; Ctrl-C again drops them."
+                f"Stopping: {crew.flying} calls in flight are saved first; Ctrl-C again drops them."
             )
             work.cancel()
 
@@ -317,12 +311,6 @@ class Sweep:
             outcome.fail(error.exit_code, str(error))
         elif error is not None:
             raise error
-
-    async def _drain(self, work: asyncio.Task[None]) -> None:
-        """When the work has ended, in whatever way, save the calls that are in flight."""
-        await asyncio.wait([work])
-        for client in self._clients.values():
-            await client.drain()
 
     async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> None:
         """Store what has ended and is not stored yet."""
@@ -355,32 +343,13 @@ class Sweep:
         except (StoreError, UsageError) as exc:
             outcome.fail(exc.exit_code, str(exc))
 
-    async def _stored_trial(self, spec: TrialSpec, flusher: Flusher) -> TrialRecord | None:
-        """Play a trial when there is room to keep it until it is stored."""
-        await flusher.room()
-        return await self._trial(spec)
-
-    async def _trial(self, spec: TrialSpec) -> TrialRecord | None:
-        """Play a trial; None: there is no money for it to go on."""
-        drivers = {side: self._driver(spec, side) for side in SIDES}
-        self._progress.running += 1
-        try:
-            return await play_trial(spec, self._plan.scenario, drivers)
-        except TrialSuspended as exc:
-            self._suspended.append(exc)
-            return None
-        finally:
-            self._progress.running -= 1
-            for client in self._clients.values():
-                client.leave(spec.order)
-
-    def _watch_for_outage(self, record: TrialRecord) -> None:
+    def _watch_for_outage(self, record: TrialRecord, crew: Crew) -> None:
         """Stop when trials fail for want of one model, which answers no call in between."""
         if self._options.replay:
             return
         for name in {self._plan.sides[failed.side] for failed in record.failed_calls}:
             outage = self._outages.setdefault(name, Outage())
-            answers = self._clients[name].meter.calls_live
+            answers = crew.answers(name)
             if answers > outage.answers:
                 outage.answers, outage.trials = answers, 0
             outage.trials += 1
@@ -390,21 +359,6 @@ class Sweep:
                     f"in between ({record.error}): the rest is not tried. When the service answers "
                     "again, run the same command to go on"
                 )
-
-    def _driver(self, spec: TrialSpec, side: Side) -> Driver:
-        name, scenario = self._plan.sides[side], self._plan.scenario
-        if name == "constant":
-            return ConstantDriver(scenario)
-        if name == "projected-order":
-            return ProjectedOrderDriver(scenario, side)
-        client = self._clients[name]
-
-        async def ask(prompt: str, number: int) -> ChatReply:
-            slot = Slot(spec.condition, spec.repetition, side, number, spec.sample_set)
-            return await client.ask(prompt, slot, order=spec.order)
-
-        assert spec.variant is not None, "only human trials have no prompt variant"
-        return LlmDriver(ask, spec.variant, scenario)
 
     def _endpoint(self, name: str, entry: ModelEntry) -> str:
         """The endpoint's identity: in a replay, the one under which the model is recorded."""
@@ -422,6 +376,12 @@ class Sweep:
                 "Set the base URL variable of its provider to the one to replay."
             )
         return recorded[0]
+
+
+async def _drained(crew: Crew, work: asyncio.Task[None]) -> None:
+    """When the work has ended, in whatever way, save the calls that are in flight."""
+    await asyncio.wait([work])
+    await crew.drain()
 
 
 def _overlay(recording: Path | None) -> Mapping[str, Entry]:

@@ -21,6 +21,7 @@ COMMANDS = {
 SWEEP_OPTIONS = {
     *("--model", "--reps", "--conditions", "--variants", "--sample-set", "--db", "--cache"),
     *("--in-flight", "--rpm", "--tpm", "--max-cost", "--dry-run", "--yes", "--replay", "--json"),
+    *("--dask", "--strict-model", "--order-seed"),
 }
 
 

@@ -12,6 +12,11 @@ from merge_runner.progress import Progress
 from merge_runner.records import Attempt, Usage
 
 
+def crew(*meters, running=0):
+    named = {str(number): meter for number, meter in enumerate(meters)}
+    return SimpleNamespace(meters=named, running=running, workers=None)
+
+
 def test_every_figure_is_that_of_the_meters():
     meters = [Meter(calls_live=30, calls_cached=12), Meter(calls_live=4)]
     meters[0].count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
@@ -21,11 +26,10 @@ def test_every_figure_is_that_of_the_meters():
         title="t",
         total=10,
         expected_calls=184,
-        meters=meters,
+        crew=crew(*meters, running=5),
         cap_usd=20,
         ledger=SimpleNamespace(spending=Spending(spent_usd=4.0, reserved_usd=0.25)),
         done=Counter(finished=2, failed=1),
-        running=5,
         stored_before=7,
         started=time.monotonic() - 60,
     )
@@ -42,8 +46,8 @@ def test_every_figure_is_that_of_the_meters():
 
 def test_the_calls_tell_the_time_left_while_no_trial_has_ended():
     meter = Meter(calls_live=25)
-    progress = Progress("t", 10, expected_calls=100, meters=[meter])
+    progress = Progress("t", 10, expected_calls=100, crew=crew(meter))
     progress.started = time.monotonic() - 10
     assert dict(progress.fields())["time"] == "10 s, about 30 s left"
-    progress.meters = [Meter()]
+    progress.crew = crew(Meter())
     assert dict(progress.fields())["time"] == "10 s"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Iterable
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.ledger import TOLERANCE_USD, Ledger
@@ -67,6 +68,19 @@ class Budget:
         self._left.add(trial)
         if self._allowances.pop(trial, None) is not None:
             self._tell()
+
+    def forsake(self, trials: Iterable[int], *, in_flight: int, queued_usd: float) -> None:
+        """Whoever played these trials is gone, and they may be admitted anew.
+
+        Of the attempts ``in_flight`` those that were begun stay set aside in the ledger; what was
+        set aside for the others, ``queued_usd`` in all, is free.
+        """
+        for trial in trials:
+            self._allowances.pop(trial, None)
+            self._left.discard(trial)
+        self._in_flight -= in_flight
+        self._queued_usd -= queued_usd
+        self._tell()
 
     async def reserve(self, trial: int, worst_usd: float) -> None:
         """Set an attempt's worst case aside; waits for others, else raises TrialSuspended."""

@@ -186,6 +186,10 @@ class ResponseCache:
         """An operation: keep the attempts at a call that has no answer yet."""
         self._disk.set(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())
 
+    async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
+        """Keep the attempts at a call that has no answer yet, durably."""
+        await self.write(lambda: self.keep_unanswered(key, attempts))
+
     async def write(self, operation: Callable[[], Any]) -> Any:  # noqa: ANN401 # the operation's own result
         """Run an operation on this cache in the next durable batch; raises CacheFailed."""
         return await self._writer.write(operation)

@@ -39,6 +39,10 @@ class Claims:
             return False
         return True
 
+    async def claim(self, key: str) -> bool:
+        """Claim a key; see ``take``."""
+        return self.take(key)
+
     def release(self, key: str) -> None:
         """Give a claim up; all of them are when this is closed."""
         if self._closed:

@@ -20,12 +20,9 @@ from merge_runner.errors import (
     QuotaExhausted,
     RecordingError,
 )
-from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.claims import Claims
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import make_request
-from merge_runner.llm.limiter import Limiter, Permit
 from merge_runner.llm.meter import Meter, Wait
 from merge_runner.llm.prices import Pricing
 from merge_runner.llm.retry import (
@@ -35,6 +32,7 @@ from merge_runner.llm.retry import (
     backoff_s,
     call_with_retries,
 )
+from merge_runner.llm.sharing import Claiming, Purse, Turn, Turns
 from merge_runner.llm.transport import Transport, TransportFailure
 from merge_runner.llm.verdicts import RawReply, Verdict, judge, may_be_charged
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
@@ -75,10 +73,10 @@ class LlmClient:
     endpoint: str
     cache: ResponseCache
     transport: Transport
-    limiter: Limiter
+    limiter: Turns
     pricing: Pricing
-    budget: Budget | None = None
-    claims: Claims | None = None
+    budget: Purse | None = None
+    claims: Claiming | None = None
     sealed: bool = False
     strict: bool = False
     meter: Meter = field(default_factory=Meter)
@@ -188,7 +186,7 @@ class LlmClient:
         if self.claims is None:
             self._set_aside_if_damaged(request)
             return await self._make(request, order)
-        while not self.claims.take(request.key):
+        while not await self.claims.claim(request.key):
             with self._giving_way(request, "for another merge-runner that makes the same call"):
                 await asyncio.sleep(CLAIM_POLL_S)
         try:
@@ -205,10 +203,10 @@ class LlmClient:
         worst_usd = self.pricing.cost_usd(worst) or 0.0
         call = _Call(request, order, list(earlier), len(earlier), worst, worst_usd)
 
-        async def take_turn() -> Permit:
+        async def take_turn() -> Turn:
             return await self._take_turn(call)
 
-        async def attempt(permit: Permit, number: int, seconds_left: float) -> None:
+        async def attempt(permit: Turn, number: int, seconds_left: float) -> None:
             await self._attempt(call, permit, call.earlier + number, seconds_left)
 
         async def sleep(seconds: float) -> None:
@@ -248,14 +246,14 @@ class LlmClient:
         """Keep the attempts for a later run; the ledger of a paid model did so already."""
         kept = tuple(call.attempts)
         if self.budget is None and len(kept) > call.earlier:
-            await self.cache.write(lambda: self.cache.keep_unanswered(call.request.key, kept))
+            await self.cache.put_unanswered(call.request.key, kept)
 
-    async def _take_turn(self, call: _Call) -> Permit:
+    async def _take_turn(self, call: _Call) -> Turn:
         """Money first: a permit must be used when it is given, or the limits do not hold."""
         if self.budget is not None:
             with self._giving_way(call.request, "for calls in flight to be paid, under --max-cost"):
                 await self.budget.reserve(call.order, call.worst_usd)
-        permit: Permit | None = None
+        permit: Turn | None = None
         try:
             with self._giving_way(call.request, "for a turn under the rate limits"):
                 permit = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
@@ -278,7 +276,7 @@ class LlmClient:
         finally:
             del self.meter.waits[request.key]
 
-    async def _attempt(self, call: _Call, permit: Permit, number: int, seconds_left: float) -> None:
+    async def _attempt(self, call: _Call, permit: Turn, number: int, seconds_left: float) -> None:
         """One attempt, appended to the call's; returns if it is the answer."""
         await self._begin(call)
         started_at, started = datetime.now(UTC), time.perf_counter()
@@ -385,7 +383,7 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
 
-    def _settle_tokens(self, permit: Permit, usage: Usage) -> None:
+    def _settle_tokens(self, permit: Turn, usage: Usage) -> None:
         if usage.output_tokens is not None:
             permit.settle((usage.input_tokens or 0) + usage.output_tokens)
 

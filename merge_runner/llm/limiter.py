@@ -64,6 +64,7 @@ class Limiter:
         pause: Pause | None = None,
         window_s: float = WINDOW_S,
     ) -> None:
+        self.limited = rpm is not None or tpm is not None
         self._tpm = tpm
         self._window_s = window_s
         self._throttles = [] if rpm is None else _throttles(rpm, window_s)
@@ -104,6 +105,11 @@ class Limiter:
         """Dispatch nothing for a while: the server asked everybody on this key to wait."""
         now = asyncio.get_running_loop().time()
         self._pause.until = max(self._pause.until, now + seconds)
+
+    @property
+    def paused_s(self) -> float:
+        """How long in s nothing will be dispatched, 0 where there is no pause."""
+        return max(0.0, self._pause.until - asyncio.get_running_loop().time())
 
     async def _dispatch(self) -> None:
         """Serve the queue until it is empty."""

@@ -69,6 +69,19 @@ class Meter:
         if served is not None and served not in accepted_models:
             self.mismatches[f"{reply.request.model} -> {served}"] += 1
 
+    def add(self, other: Meter) -> None:
+        """Count what another one has counted; its waits are not added."""
+        now = time.monotonic()
+        self.calls_live += other.calls_live
+        self.calls_cached += other.calls_cached
+        self.cost_usd += other.cost_usd
+        self.cost_unknown += other.cost_unknown
+        self.outcomes += other.outcomes
+        self.mismatches += other.mismatches
+        self.notes += other.notes
+        self.damaged += other.damaged
+        self.events += ((now, tokens) for _, tokens in other.events)  # clocks differ
+
     def last_minute(self) -> tuple[int, int]:
         """Requests and tokens of the last minute."""
         now = time.monotonic()
