@@ -23,8 +23,8 @@ from merge_runner.store import query
 Figures = dict[str, float]
 # In this condition both vehicles collide early whatever the server answers: 8 calls a trial.
 SHORT, SHORT_CALLS = ("--conditions", "R_-4_8"), 8
-KILLED_DELAY_MS = 1_000
-STUDIES = (110, 1_100, 11_000)
+KILLED_DELAY_MS, QUIET_S = 1_000, 0.15
+STUDIES, MOST_DRIVEN = (110, 1_100, 11_000), 1_100
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Bench:
         delay_ms: int = 0,
         until: Callable[[], bool] | None = None,
     ) -> Run:
-        """Our runner, off the server's CPUs."""
+        """Our runner, off the server's CPUs where it needs the server."""
         return run(
             [
                 *RUNNER,
@@ -64,7 +64,7 @@ class Bench:
             ],
             environment={"EMULATOR_BASE_URL": self.server.url(delay_ms)},
             until=until,
-            pinned=True,
+            pinned="--replay" not in options,
         )
 
     def floor(
@@ -75,6 +75,7 @@ class Bench:
         calls: int = CALLS,
         in_flight: int = 200,
         delay_ms: int = 0,
+        pinned: bool = True,
     ) -> Run:
         """The bare client with as many calls."""
         return run(
@@ -93,7 +94,7 @@ class Bench:
                 "--in-flight",
                 str(in_flight),
             ],
-            pinned=True,
+            pinned=pinned,
         )
 
 
@@ -135,7 +136,7 @@ def cold_floor(delay_ms: int) -> Callable[[Bench], Figures]:
 
 def cached_floor(bench: Bench) -> Figures:
     """The calls of the last ``cold_floor`` again."""
-    return figures_of(bench.floor(bench.folder / "floor"), calls=TRIALS * CALLS)
+    return figures_of(bench.floor(bench.folder / "floor", pinned=False), calls=TRIALS * CALLS)
 
 
 def replay(bench: Bench) -> Figures:
@@ -261,7 +262,7 @@ def resume(bench: Bench) -> Figures:
     return {**figures_of(ran), "asked": stats["asked"], "asked_again": stats["asked_again"]}
 
 
-def half_is_answered(server: Server) -> Callable[[], bool]:
+def half_is_answered(server: Server, trials: int = TRIALS) -> Callable[[], bool]:
     """Says when half of the workload is answered and all calls in flight wait for the server.
 
     An answer that is on its way when its reader dies is lost to whatever reader.
@@ -273,7 +274,7 @@ def half_is_answered(server: Server) -> Callable[[], bool]:
         answered, now = server.stats()["answered"], time.perf_counter()
         if answered != seen:
             seen, since = answered, now
-        return bool(answered >= TRIALS * CALLS // 2 and now - since > KILLED_DELAY_MS / 2000)
+        return bool(answered >= trials * CALLS // 2 and now - since > QUIET_S)
 
     return quiet_at_half
 
@@ -320,7 +321,9 @@ def analysis(trials: int, *argv: str, warm: bool) -> Callable[[Bench], Figures]:
     def measure(bench: Bench) -> Figures:
         made = bench.folder / f"study-{trials}.duckdb"
         if not made.exists():
-            run([PYTHON, "benchmarks/studies.py", str(made), "--trials", str(trials)])
+            copies = max(1, trials // MOST_DRIVEN)
+            sizes = ["--trials", str(trials // copies), "--copies", str(copies)]
+            run([PYTHON, "-m", "benchmarks.studies", str(made), *sizes])
         db = bench.folder / f"warm-{trials}.duckdb"
         if not warm or not db.exists():
             shutil.copy(made, db)

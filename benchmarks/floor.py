@@ -22,7 +22,8 @@ from benchmarks.workload import CALLS, PROMPT, TRIALS
 async def play(args: argparse.Namespace) -> None:
     """All trials, each with two calls at a time, as a trial's two drivers make them."""
     cache = diskcache.Cache(args.cache, eviction_policy="none", size_limit=2**62)
-    limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
+    connections = 2 * args.in_flight
+    limits = httpx.Limits(max_connections=connections, max_keepalive_connections=connections)
     in_flight = asyncio.Semaphore(args.in_flight)
 
     async def call(trial: int, number: int) -> None:

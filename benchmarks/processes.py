@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -24,7 +25,10 @@ PROGRAM = (PYTHON, "-c", "from analysis.commands import main; main()")
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What one process took: wall and CPU time in s, peak memory in MB; and what it printed."""
+    """What one process took: wall and CPU time in s, peak memory in MB; and what it printed.
+
+    A peak below that of this process cannot be told from it: 0.
+    """
 
     wall_s: float
     cpu_s: float
@@ -74,7 +78,9 @@ def run(
     if process.returncode and until is None:
         raise RuntimeError(f"{' '.join(argv)} ended with {process.returncode}\n{''.join(texts)}")
     cpu_s = usage.ru_utime + usage.ru_stime
-    return Run(wall_s, cpu_s, usage.ru_maxrss / 1024, texts[0])
+    ours_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak_kb = usage.ru_maxrss if usage.ru_maxrss > ours_kb else 0
+    return Run(wall_s, cpu_s, peak_kb / 1024, texts[0])
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
+import duckdb
 import numpy as np
 
 from analysis.human.record import PAIRS, SPEC, SPEC_HASH
@@ -54,10 +55,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, metavar="OUT.duckdb")
     parser.add_argument("--trials", type=int, default=1100, help="a multiple of 110")
+    parser.add_argument("--copies", type=int, default=1, help="so many times as many trials")
     arguments = parser.parse_args()
     if arguments.trials % (GROUPS * len(CONDITIONS)) or arguments.out.exists():
         parser.error("--trials is a multiple of 110, and OUT a new file")
     write_study(arguments.out, arguments.trials)
+    copy_trials(arguments.out, arguments.copies)
+
+
+def copy_trials(path: Path, copies: int) -> None:
+    """Have every trial so many times, under other names, as further repetitions."""
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("CREATE TEMP TABLE numbers AS SELECT unnest(range(1, ?)) AS n", [copies])
+        for table, also in (
+            ("trials", ", rep + 1000 * n AS rep"),
+            ("states", ""),
+            ("decisions", ", call_key || '/' || n AS call_key"),
+            ("calls", ", call_key || '/' || n AS call_key"),
+            ("sweep_trials", ""),
+        ):
+            connection.execute(
+                f"INSERT INTO {table} SELECT {table}.* REPLACE (trial_id || '/' || n AS trial_id{also}) "  # noqa: S608 # constants
+                f"FROM {table}, numbers"
+            )
 
 
 def write_study(path: Path, trials: int) -> None:

@@ -82,7 +82,7 @@ RecordingOption = Annotated[
 def main() -> None:
     """Run the command line and exit with the contract's code."""
     # What a sweep makes lives as long as its trial: frequent collections find next to nothing.
-    gc.set_threshold(100_000, 20, 20)
+    gc.set_threshold(20_000, 10, 100)
     debug = "--debug" in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != "--debug"]
     try:

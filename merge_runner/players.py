@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
 
@@ -17,7 +17,7 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
 from merge_runner.plan import Plan
 from merge_runner.records import SIDES, ChatReply, Side, Slot, TrialRecord, TrialSpec
-from merge_runner.scheduler import run_bounded
+from merge_runner.scheduler import Gate, run_bounded
 from merge_runner.trial import play_trial
 
 # Told of each trial that ends; a suspended one has no money to go on.
@@ -73,6 +73,7 @@ class Players:
     plan: Plan
     clients: Mapping[str, LlmClient]
     in_flight: int
+    gate: Gate = field(default_factory=Gate)
     running: int = 0
     workers: None = None
 
@@ -126,6 +127,7 @@ class Players:
         client = self.clients[name]
 
         async def ask(prompt: str, number: int) -> ChatReply:
+            await self.gate.enter()
             slot = Slot(spec.condition, spec.repetition, side, number, spec.sample_set)
             return await client.ask(prompt, slot, order=spec.order)
 

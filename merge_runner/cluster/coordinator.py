@@ -227,25 +227,20 @@ class Coordinator:
     async def _serve(self, comm: Comm) -> None:
         """Serve a worker's batch from its first word until it is gone."""
         session = Session(self, comm)
-        current = asyncio.current_task()
-        assert current is not None
-        self._sessions[session] = current
-        ended = False
-        try:
-            ended = await session.serve()
-        except Exception as exc:  # noqa: BLE001 # a fault of ours ends the run, which raises it
-            self.fail(exc)
-        finally:
-            del self._sessions[session]
-            self._free += session.in_flight
-            self._freed.set()
-            rest = sorted(session.trials.values(), key=lambda spec: spec.order)
-            if not self._stopping:
-                self._waiting.extendleft(reversed(rest))
-            if rest and not ended and not self._stopping:
-                self._note(
-                    f"the worker {session.worker} is lost: its {len(rest)} trials go to others"
-                )
+        serving = self._sessions[session] = asyncio.create_task(session.serve())
+        await asyncio.wait([serving])
+        del self._sessions[session]
+        self._free += session.in_flight
+        self._freed.set()
+        error = None if serving.cancelled() else serving.exception()
+        if error is not None:
+            self.fail(error)  # a fault of ours: the run raises it
+        if self._stopping:
+            return
+        rest = sorted(session.trials.values(), key=lambda spec: spec.order)
+        self._waiting.extendleft(reversed(rest))
+        if rest and not session.ended:
+            self._note(f"the worker {session.worker} is lost: its {len(rest)} trials go to others")
 
     def _note(self, line: str) -> None:
         next(iter(self.meters.values())).notes.append(line)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from merge_runner.cluster.batch import Told
 from merge_runner.cluster.link import Link
+from merge_runner.errors import RecordingError
 from merge_runner.llm.batches import Operation
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.limiter import Limiter
@@ -33,6 +34,8 @@ class WorkerCache(ResponseCache):
         told = self.told.get(key)
         if told is None:
             return None
+        if told.damaged:
+            raise RecordingError("what the main cache held of the call is damaged")
         if told.entry is not None:
             return told.entry
         left = super().get(key)
@@ -55,8 +58,9 @@ class WorkerCache(ResponseCache):
 
     def set_damage_aside(self, key: str) -> list[str]:
         """What was damaged, there or here."""
-        told = self.told.get(key)
-        return [*(told.damaged if told else ()), *super().set_damage_aside(key)]
+        told = self.told[key]
+        self.told[key] = replace(told, damaged=())
+        return [*told.damaged, *super().set_damage_aside(key)]
 
     def unanswered(self, key: str) -> tuple[Attempt, ...]:
         """The attempts that the main cache knows."""

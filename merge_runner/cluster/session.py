@@ -23,7 +23,10 @@ LASTING = frozenset({"keep", "unanswered", "settle", "begin", "end"})
 
 
 class Session:
-    """One batch at one worker. ``trials`` are those it holds, by their order in the sweep."""
+    """One batch at one worker.
+
+    ``trials`` are those it holds, by their order in the sweep; ``ended`` that it said so itself.
+    """
 
     def __init__(self, coordinator: Coordinator, comm: Comm) -> None:
         self.trials: dict[int, TrialSpec] = {}
@@ -40,7 +43,7 @@ class Session:
         self._waits: dict[str, set[str]] = {}
         self._open_attempts = 0
         self._queued_usd = 0.0
-        self._ended = False
+        self.ended = False
         budget = self._desk.budget
         self.link = Link(
             comm,
@@ -67,8 +70,8 @@ class Session:
             lasting=LASTING,
         )
 
-    async def serve(self) -> bool:
-        """Serve the worker until it hangs up; True if it said that it had ended."""
+    async def serve(self) -> None:
+        """Serve the worker until it hangs up; ``ended`` if it said that it had ended."""
         try:
             await self.link.serve()
         finally:
@@ -80,7 +83,6 @@ class Session:
             for name, keys in self._waits.items():
                 for key in keys:
                     self._run.meters[name].waits.pop(key, None)
-        return self._ended
 
     async def _join(self, token: str, fingerprint: str, worker: str, host: str) -> Batch | None:
         self.worker = worker
@@ -103,7 +105,7 @@ class Session:
             self._waits[name] = set(meter.waits)
 
     def _end(self, error: tuple[str, str] | None) -> None:
-        self._ended = True
+        self.ended = True
         if error is not None:
             name, text = error
             self._run.fail(rebuilt(name, f"{text} (told by the worker {self.worker})"))

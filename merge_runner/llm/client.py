@@ -132,16 +132,22 @@ class LlmClient:
                 raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
             return None
 
-    def _set_aside_if_damaged(self, request: ChatRequest) -> None:
-        """Move damage out of the way, and tell; only who has claimed the call may."""
-        if self.sealed:
-            return
-        for name in self.cache.set_damage_aside(request.key):
-            self.meter.damaged.append(name)
-            self.meter.notes.append(
-                f"{self.name}: {_who(request.slot)}: what is recorded is damaged; it is set aside "
-                f"in the cache as 'damaged {name}', and asked again"
-            )
+    def _known(self, request: ChatRequest) -> tuple[Entry | None, tuple[Attempt, ...]]:
+        """The recorded call, else the attempts of earlier runs; only who has claimed it may ask.
+
+        What is damaged is moved out of the way, and told.
+        """
+        key = request.key
+        try:
+            return self.cache.get(key), self.cache.unanswered(key)
+        except RecordingError:
+            for name in self.cache.set_damage_aside(key):
+                self.meter.damaged.append(name)
+                self.meter.notes.append(
+                    f"{self.name}: {_who(request.slot)}: what is recorded is damaged; it is set "
+                    f"aside in the cache as 'damaged {name}', and asked again"
+                )
+            return self.cache.get(key), self.cache.unanswered(key)
 
     def _check_served(self, reply: ChatReply) -> None:
         served = reply.attempts[-1].model_served
@@ -183,22 +189,22 @@ class LlmClient:
             # Before the claim: nobody waits for money with a call that another process needs.
             with self._giving_way(request, "for trials before it to end, under --max-cost"):
                 await self.budget.admit(order)
-        if self.claims is None:
-            self._set_aside_if_damaged(request)
-            return await self._make(request, order)
-        while not await self.claims.claim(request.key):
+        if self.sealed:
+            return await self._make(request, order, ())
+        while self.claims is not None and not await self.claims.claim(request.key):
             with self._giving_way(request, "for another merge-runner that makes the same call"):
                 await asyncio.sleep(CLAIM_POLL_S)
         try:
-            self._set_aside_if_damaged(request)
-            made = self._recorded(request)  # maybe just now
-            return (made, len(made.attempts)) if made else await self._make(request, order)
+            made, earlier = self._known(request)  # maybe just now
+            return (made, len(made.attempts)) if made else await self._make(request, order, earlier)
         finally:
-            self.claims.release(request.key)
+            if self.claims is not None:
+                self.claims.release(request.key)
 
-    async def _make(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
+    async def _make(
+        self, request: ChatRequest, order: int, earlier: tuple[Attempt, ...]
+    ) -> tuple[Entry, int]:
         """Make attempts until there is an answer, and save it with all of them."""
-        earlier = () if self.sealed else self.cache.unanswered(request.key)
         worst = self._worst_case(request)
         worst_usd = self.pricing.cost_usd(worst) or 0.0
         call = _Call(request, order, list(earlier), len(earlier), worst, worst_usd)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from http.cookiejar import DefaultCookiePolicy
 from typing import Any
 
 import aiohttp
@@ -18,15 +17,23 @@ from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
 # A shorter dummy key may be part of any text.
 SHORTEST_SECRET = 8
+NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
+class NoCookies(httpx.Cookies):
+    """Takes none: one would tie calls together that should be independent samples."""
+
+    def extract_cookies(self, response: httpx.Response) -> None:
+        """Leave them where they are."""
+
+
 class CookielessClient(HttpxAiohttpClient):
-    """Keeps no cookie: one would tie calls together that should be independent samples."""
+    """Keeps no cookie, neither of its own nor of the connections'."""
 
     def __init__(self, **options: Any) -> None:  # noqa: ANN401 # those of httpx.AsyncClient
         super().__init__(**options)
-        self.cookies.jar.set_policy(DefaultCookiePolicy(allowed_domains=[]))
+        self._cookies = NoCookies()
 
     def _init_transport(self, *args: Any, **options: Any) -> httpx.AsyncBaseTransport:  # noqa: ANN401
         return _cookieless(super()._init_transport(*args, **options))
@@ -72,21 +79,26 @@ class HttpTransport:
             mounts={f"all://{host}": None for host in LOOPBACK},
             timeout=None,  # every attempt runs under its own timeout
         )
+        self._headers = {**self._client.headers, "content-type": "application/json"}
+        self._urls: dict[str, httpx.URL] = {}
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Post the hashed bytes; raises TransportFailure."""
-        headers = {
-            "content-type": "application/json",
-            **request.headers,
-            **self._endpoint.auth_headers,
-        }
+        headers = {**self._headers, **request.headers, **self._endpoint.auth_headers}
         if self._endpoint.provider == "emulator":
             headers[SLOT_HEADER] = canonical_json(request.slot.as_dict())
             headers[ATTEMPT_HEADER] = str(attempt)
-        url = self._endpoint.base_url + request.path
+        # Made without the client, which would put the same together from its defaults each time.
+        asked = httpx.Request(
+            "POST",
+            self._url(request.path),
+            headers=headers,
+            content=request.body.encode(),
+            extensions=NO_TIMEOUT,
+        )
         try:
             async with asyncio.timeout(timeout_s):
-                reply = await self._client.post(url, content=request.body.encode(), headers=headers)
+                reply = await self._client.send(asked)
         except TimeoutError as exc:
             raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
         except (httpx.RequestError, aiohttp.ClientError) as exc:
@@ -101,6 +113,11 @@ class HttpTransport:
         for secret in self._secrets:
             body = body.replace(secret, "[key]")
         return RawReply(reply.status_code, {k.lower(): v for k, v in reply.headers.items()}, body)
+
+    def _url(self, path: str) -> httpx.URL:
+        if path not in self._urls:
+            self._urls[path] = httpx.URL(self._endpoint.base_url + path)
+        return self._urls[path]
 
     async def close(self) -> None:
         """Close all connections."""

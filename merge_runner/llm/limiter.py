@@ -85,6 +85,8 @@ class Limiter:
                 "experiments/models.toml"
             )
         loop = asyncio.get_running_loop()
+        if not self.limited and not self._waiters and not self.paused_s:
+            return Permit(loop.time(), tokens, self, counts=False)
         waiter = _Waiter(order, self._arrivals, tokens, loop.create_future())
         self._arrivals += 1
         waiter.turn.add_done_callback(lambda _: self._changed.set())
