@@ -75,8 +75,8 @@ def copy_trials(path: Path, copies: int) -> None:
             ("sweep_trials", ""),
         ):
             connection.execute(
-                f"INSERT INTO {table} SELECT {table}.* REPLACE (trial_id || '/' || n AS trial_id{also}) "  # noqa: S608 # constants
-                f"FROM {table}, numbers"
+                f"INSERT INTO {table} SELECT {table}.* "  # noqa: S608 # constants
+                f"REPLACE (trial_id || '/' || n AS trial_id{also}) FROM {table}, numbers"
             )
 
 
