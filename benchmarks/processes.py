@@ -65,6 +65,8 @@ def run(
                 stderr=errors,
             )
         while until is not None and not until():
+            if os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+                raise RuntimeError(f"{' '.join(argv)} ended before it was to be killed")
             time.sleep(0.01)
         if until is not None:
             process.send_signal(signal.SIGKILL)

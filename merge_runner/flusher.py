@@ -11,9 +11,9 @@ from merge_runner.records import TrialRecord
 from merge_runner.store import Store
 
 EVERY_S = 1.0
-BATCH = 128
+BATCH = 64
 """Trials in one transaction: few enough that a reader gets its turn soon."""
-MOST_PENDING = 2 * BATCH
+MOST_PENDING = 4 * BATCH
 LOCK_PATIENCE_S = 2.0
 # At the end: with a lock, which somebody will release, and with anything else, as a full disk.
 LAST_LOCK_PATIENCE_S, LAST_PATIENCE_S = 60.0, 3.0

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from benchmarks.__main__ import CASES, tables
-from benchmarks.cases import Bench, figures_of, resume
+from benchmarks.cases import Bench, figures_of
 from benchmarks.goals import GOALS, judged
 from benchmarks.processes import served, started_on
 from benchmarks.recorder import multiply
@@ -56,13 +56,6 @@ def test_the_server_knows_what_is_asked_again(bench):
     assert bench.server.stats()["asked_again"] == 2
     bench.server.reset()
     assert bench.server.stats()["asked"] == 0
-
-
-@pytest.mark.slow
-def test_a_killed_sweep_asks_for_no_answered_call_again(bench):
-    figures = resume(bench)
-    assert figures["asked_again"] == 0
-    assert figures["asked"] >= figures["calls"] > 2000
 
 
 def test_multiplied_recordings_are_those_of_a_sweep(bench):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from types import SimpleNamespace
 
 from aiohttp import web
 from harness import watched
@@ -59,6 +60,7 @@ async def test_an_error_in_a_servers_words_speaks_to_no_terminal(merge_runner):
 def test_a_servers_words_are_no_markup_in_the_display():
     meter = Meter(waits={"key": Wait("m: L_4_0", f"after HTTP 503: [/nope] {ESCAPE}")})
     shown = io.StringIO()
-    Console(file=shown, width=200).print(_table(Progress("title", 1, meters=[meter])))
+    crew = SimpleNamespace(meters={"m": meter}, running=1, workers=None)
+    Console(file=shown, width=200).print(_table(Progress("title", 1, crew=crew)))
     assert "[/nope]" in shown.getvalue()
     assert "\x1b" not in shown.getvalue()

@@ -86,7 +86,7 @@ def planted(file, **columns):
     row = dict(zip(COLUMNS, found, strict=True)) | columns
     slot = Slot(*(row[n] for n in ("condition", "repetition", "side", "decision", "sample_set")))
     # Where there is no key for it, any will do.
-    with suppress(ValueError, TypeError, RecursionError):
+    with suppress(ValueError, TypeError, AttributeError, RecursionError):
         row["call_key"] = call_key(
             endpoint=row["endpoint"],
             path=row["path"],

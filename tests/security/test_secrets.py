@@ -12,7 +12,6 @@ from aiohttp import web
 from harness import FAST, watched
 
 from analysis.report import write_report
-from analysis.study import Study
 
 KEYS = {
     "OPENAI_API_KEY": "sk-dummy-Zx81Qp55-openai",
@@ -144,8 +143,11 @@ async def test_no_key_and_no_account_id_is_in_anything_that_a_sweep_leaves(
     # What chance draws is of no interest here.
     monkeypatch.setattr("analysis.ceiling.DATA_SETS", 20)
     monkeypatch.setattr("analysis.contrasts.PERMUTATIONS", 99)
-    study = Study(tmp_path / "results/merge.duckdb", ["o3"])
-    assert list(write_report(study, tmp_path / "results/report.html", tmp_path / "files"))
+    results = tmp_path / "results"
+    report = write_report(
+        results / "merge.duckdb", ["o3"], results / "report.html", tmp_path / "files"
+    )
+    assert list(report)
     kept = everything_in(tmp_path) + str(runs)
     # The errors are kept, with the key taken out of them.
     assert "Bearer [key]" in kept
