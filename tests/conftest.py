@@ -17,6 +17,11 @@ settings.register_profile("gate", derandomize=True, deadline=None)
 settings.load_profile("gate")
 
 
+def pytest_collection_modifyitems(items):
+    """Begin with the longest, so that no worker is left with it in the end."""
+    items.sort(key=lambda item: "test_every_command_of_the_docs" not in item.name)
+
+
 @pytest.fixture(scope="session")
 def zygote():
     """What the program is forked from."""
