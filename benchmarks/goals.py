@@ -11,7 +11,7 @@ Samples = Mapping[str, list[dict[str, float]]]
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A figure with its bound; ``of`` computes it from the medians, None: it was not measured."""
+    """A figure with its bound; ``of`` computes it from the medians."""
 
     what: str
     bound: float
@@ -56,7 +56,7 @@ def judged(samples: Samples) -> Iterator[tuple[Goal, float]]:
             continue
 
 
-# The slowest call of a trial of 10 decisions waits 10 times for the server.
+# The longest trials of the workload decide 11 times, and wait for the server each time.
 IDEAL_S = 11 * 0.2
 
 GOALS = (

@@ -46,7 +46,7 @@ class Flusher:
 
     async def room(self) -> None:
         """Wait while much is still to be stored, and it can be."""
-        while len(self._pending) > MOST_PENDING and not self._stuck:
+        while len(self._pending) > MOST_PENDING and not self._stuck and not self._task.done():
             self._tried.clear()
             await self._tried.wait()
 

@@ -119,7 +119,9 @@ class Spec:
         """That part of the text of its keys; None where it is not known."""
         driver = self.driver(side)
         endpoint, path, headers = (driver.get(name) for name in ("endpoint", "path", "headers"))
-        if endpoint is None or path is None or headers is None:
+        if not isinstance(headers, dict):
+            return None
+        if not all(isinstance(text, str) for text in (endpoint, path, *headers.values())):
             return None
         return between_body_and_slot(endpoint, path, tuple(headers.items()))
 
