@@ -315,18 +315,25 @@ def import_humans(bench: Bench) -> Figures:
     return figures_of(run([*PROGRAM, "human", "import", str(archive), "--db", str(db)]), calls=0)
 
 
+def make_study(bench: Bench, trials: int) -> Path:
+    """A study of that size; a large one is a smaller one many times over."""
+    driven = bench.folder / f"driven-{min(trials, MOST_DRIVEN)}.duckdb"
+    studies = [PYTHON, "-m", "benchmarks.studies"]
+    if not driven.exists():
+        run([*studies, str(driven), "--trials", str(min(trials, MOST_DRIVEN))])
+    made = bench.folder / "made.duckdb"
+    shutil.copy(driven, made)
+    run([*studies, str(made), "--copies", str(max(1, trials // MOST_DRIVEN))])
+    return made
+
+
 def analysis(trials: int, *argv: str, warm: bool) -> Callable[[Bench], Figures]:
-    """Tables or a report of a study; cold: nothing is stored of an earlier one."""
+    """Tables or a report of a study; cold: nothing of it is stored, of a report but the tables."""
 
     def measure(bench: Bench) -> Figures:
-        made = bench.folder / f"study-{trials}.duckdb"
-        if not made.exists():
-            copies = max(1, trials // MOST_DRIVEN)
-            sizes = ["--trials", str(trials // copies), "--copies", str(copies)]
-            run([PYTHON, "-m", "benchmarks.studies", str(made), *sizes])
-        db = bench.folder / f"warm-{trials}.duckdb"
-        if not warm or not db.exists():
-            shutil.copy(made, db)
+        db = bench.folder / f"study-{trials}.duckdb"
+        if not db.exists() or (not warm and "tables" in argv):
+            make_study(bench, trials).replace(db)
         out = ["--out", str(bench.fresh("report") / "report.html")] if "report" in argv else []
         return figures_of(run([*PROGRAM, *argv, "--db", str(db), *out]), calls=0)
 

@@ -9,6 +9,7 @@ from benchmarks.processes import PROJECT, Run, run
 from benchmarks.workload import CALLS, TRIALS
 
 PEER = PROJECT / ".venv-peer" / "bin" / "python"
+FEW = TRIALS // 4
 
 
 def peer_cold(bench: Bench) -> Figures:
@@ -22,15 +23,15 @@ def peer_cached(bench: Bench) -> Figures:
 
 
 def peer_resume(bench: Bench) -> Figures:
-    """Half as many trials, killed without a word at half, and gone on with from its log."""
+    """A quarter of the trials, killed without a word at half, and gone on with from its log."""
     name = bench.fresh("peer-killed").name
     bench.server.reset()
-    few, until = ("--trials", str(TRIALS // 2)), half_is_answered(bench.server, TRIALS // 2)
+    few, until = ("--trials", str(FEW)), half_is_answered(bench.server, FEW)
     _peer(bench, name, *few, delay_ms=KILLED_DELAY_MS, until=until)
     ran = _peer(bench, name, "--retry", delay_ms=KILLED_DELAY_MS)
     stats = bench.server.stats()
     return {
-        **figures_of(ran, calls=CALLS * (TRIALS // 2)),
+        **figures_of(ran, calls=CALLS * FEW),
         "asked": stats["asked"],
         "asked_again": stats["asked_again"],
     }

@@ -1,8 +1,8 @@
 """Makes a database of a study of any size, to measure the analysis with.
 
-``python benchmarks/studies.py OUT.duckdb --trials 11000``: ten groups of equal size, o3 with eight
-prompts, another driver and humans, in all conditions. The trials are driven by simple controllers
-with noise, seeded: equal sizes give equal studies. Nothing of it is a result.
+``python -m benchmarks.studies STUDY.duckdb --trials 1100 --copies 10``: ten groups of equal size,
+o3 with eight prompts, another driver and humans, in all conditions. The trials are driven by simple
+controllers with noise, seeded: equal sizes give equal studies. Nothing of it is a result.
 """
 
 from __future__ import annotations
@@ -51,16 +51,17 @@ STARTED = datetime(2026, 11, 21, tzinfo=UTC).replace(tzinfo=None)
 
 
 def main() -> None:
-    """Write a study into a new file."""
+    """Write a study into a new file, or every trial of a study more often."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path, metavar="OUT.duckdb")
-    parser.add_argument("--trials", type=int, default=1100, help="a multiple of 110")
-    parser.add_argument("--copies", type=int, default=1, help="so many times as many trials")
+    parser.add_argument("study", type=Path, metavar="STUDY.duckdb")
+    parser.add_argument("--trials", type=int, help="write so many, a multiple of 110")
+    parser.add_argument("--copies", type=int, default=1, help="have every trial so many times")
     arguments = parser.parse_args()
-    if arguments.trials % (GROUPS * len(CONDITIONS)) or arguments.out.exists():
-        parser.error("--trials is a multiple of 110, and OUT a new file")
-    write_study(arguments.out, arguments.trials)
-    copy_trials(arguments.out, arguments.copies)
+    if arguments.trials is not None:
+        if arguments.trials % (GROUPS * len(CONDITIONS)) or arguments.study.exists():
+            parser.error("--trials is a multiple of 110, and STUDY a new file")
+        write_study(arguments.study, arguments.trials)
+    copy_trials(arguments.study, arguments.copies)
 
 
 def copy_trials(path: Path, copies: int) -> None:
