@@ -113,3 +113,17 @@ def _study(db: Path, models: str | None) -> Study:
     from analysis.study import Study
 
     return Study(db, listed(models))
+
+
+@app.command()
+def view(
+    port: Annotated[int, typer.Option(help="0: any free port.", min=0, max=65535)] = 8700,
+    bind: Annotated[
+        str, typer.Option("--bind", help="Another address to listen at; needs the token it prints.")
+    ] = "127.0.0.1",
+    db: DbOption = DEFAULT_DB,
+) -> None:
+    """Serve the explorer: watch trials, read decisions, follow a sweep in a browser."""
+    from analysis.explorer.server import serve
+
+    serve(db, port, bind, print_out)

@@ -1,0 +1,1 @@
+"""The explorer: pages in a browser on which a trial is watched and every decision read."""

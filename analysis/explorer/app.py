@@ -1,0 +1,97 @@
+"""The explorer as an application of Starlette: addresses to pages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.gzip import GZipMiddleware
+from starlette.requests import Request
+from starlette.responses import (
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    RedirectResponse,
+    Response,
+)
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from analysis.explorer.guard import Guard
+from analysis.explorer.pages import trial, trials
+from analysis.explorer.site import NotThere, Site
+from merge_runner.errors import MergeRunnerError
+
+STATIC = Path(__file__).with_name("static")
+KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
+# Nothing in a reply runs, whatever a browser takes it for.
+SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
+
+
+def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> Starlette:
+    """The application; see ``Guard`` for who may ask."""
+
+    def page(render: Callable[[Request], str]) -> Callable[[Request], Response]:
+        def answer(request: Request) -> Response:
+            site.catalogue.refresh()
+            return HTMLResponse(render(request))
+
+        return answer
+
+    def export(request: Request) -> Response:
+        site.catalogue.refresh()
+        form = request.path_params["form"]
+        if form not in KINDS:
+            raise NotThere(f"trials come as {' or '.join(KINDS)}")
+        asked = request.query_params
+        content = site.catalogue.export(trials.filter_of(asked), trials.sort_of(asked), form)
+        name = {"content-disposition": f'attachment; filename="trials.{form}"'}
+        return Response(content, media_type=KINDS[form], headers=name)
+
+    def raw(request: Request) -> Response:
+        text = trial.raw_reply(site, request.path_params["trial"], request.query_params)
+        return PlainTextResponse(text, headers=SEALED)
+
+    def data(request: Request) -> Response:
+        return JSONResponse(
+            trial.replay_json(site, request.path_params["trial"], request.query_params)
+        )
+
+    def home(_: Request) -> Response:
+        return RedirectResponse(site.at.to("trials"))
+
+    def message(request: Request, exc: Exception) -> Response:
+        code = 404 if isinstance(exc, NotThere) else 503
+        heading = "Not there" if code == 404 else "Not now"
+        values: dict[str, Any] = {"heading": heading, "text": str(exc), "here": ""}
+        return HTMLResponse(site.render("message.html", **values), code)
+
+    of_trial = "{trial:path}"
+    return Starlette(
+        routes=[
+            Route("/", home),
+            Route("/trials", page(lambda r: trials.trials_page(site, r.query_params))),
+            Route("/trials.{form}", export),
+            Route(
+                f"/trials/{of_trial}",
+                page(lambda r: trial.trial_page(site, r.path_params["trial"], r.query_params)),
+            ),
+            Route(
+                f"/decisions/{of_trial}",
+                page(
+                    lambda r: trial.decision_fragment(site, r.path_params["trial"], r.query_params)
+                ),
+            ),
+            Route(f"/data/{of_trial}", data),
+            Route(f"/raw/{of_trial}", raw),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ],
+        middleware=[
+            Middleware(Guard, hosts=hosts, token=token),
+            Middleware(GZipMiddleware, minimum_size=2_000),
+        ],
+        exception_handlers={NotThere: message, MergeRunnerError: message},
+    )

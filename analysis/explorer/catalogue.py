@@ -1,0 +1,312 @@
+"""The list of all trials, held in memory and kept up to date with the database."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import duckdb
+
+from merge_runner.database import SCHEMA, Instance, read_database
+from merge_runner.errors import UsageError
+
+PAGE = 100
+# What is said of each trial. Texts and prompts stay in the database.
+LISTED = """
+CREATE TABLE listed (
+    trial_id VARCHAR, spec_hash VARCHAR, source VARCHAR, model VARCHAR, variant VARCHAR,
+    condition VARCHAR, rep INTEGER, pair VARCHAR, status VARCHAR, merged_first VARCHAR,
+    outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE, error VARCHAR, scripted BOOLEAN,
+    gap_m DOUBLE, rmse_mps DOUBLE, decisions BIGINT, invalid BIGINT, fallbacks BIGINT,
+    attempts BIGINT, cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[]
+);
+CREATE TABLE members (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
+CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
+    fallbacks BIGINT);
+CREATE TABLE paid (trial_id VARCHAR, spec_hash VARCHAR, attempts BIGINT, cost_usd DOUBLE);
+"""
+# A failed trial may be played anew, and a file may be put in the place of another.
+FORGET = """
+DELETE FROM memory.listed WHERE (trial_id, spec_hash, status, end_time_s) NOT IN
+    (SELECT (trial_id, spec_hash, status, end_time_s) FROM trials);
+DELETE FROM memory.members;
+INSERT INTO memory.members SELECT DISTINCT * FROM sweep_trials;
+"""
+# The next 500: the file is not held for longer than that takes.
+TAKE = """
+INSERT INTO memory.trials BY NAME
+    FROM trials ANTI JOIN memory.listed USING (trial_id, spec_hash)
+    ORDER BY trial_id, spec_hash LIMIT 500;
+INSERT INTO memory.states BY NAME
+    FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
+INSERT INTO memory.decided
+    SELECT trial_id, spec_hash, count(*), count(*) FILTER (NOT valid), count(*) FILTER (fallback)
+    FROM decisions SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
+INSERT INTO memory.paid
+    SELECT trial_id, spec_hash, count(*), sum(cost_usd)
+    FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
+"""
+# A sparkline has about 24 points.
+LIST = """
+INSERT INTO listed BY NAME
+SELECT trials.trial_id, trials.spec_hash, source,
+    if(source = 'human', 'human', split_part(trials.trial_id, '/', 1)
+        || if(sample_set > 0, '/set' || sample_set, '')) AS model,
+    variant, condition, rep, pair, status, merged_first, end_time_s, error, scripted,
+    if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
+    CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
+        WHEN fallbacks > 0 THEN 'fallbacks' WHEN invalid > 0 THEN 'invalid'
+        ELSE 'all valid' END AS validity,
+    gap_m, rmse_mps, coalesce(decisions, 0) AS decisions, coalesce(invalid, 0) AS invalid,
+    coalesce(fallbacks, 0) AS fallbacks, coalesce(attempts, 0) AS attempts, cost_usd,
+    left_mps, right_mps
+FROM trials
+JOIN trial_metrics USING (trial_id, spec_hash)
+LEFT JOIN decided USING (trial_id, spec_hash)
+LEFT JOIN paid USING (trial_id, spec_hash)
+LEFT JOIN (
+    SELECT trial_id, spec_hash,
+        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'left') AS left_mps,
+        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'right') AS right_mps
+    FROM states JOIN (SELECT trial_id, spec_hash, min(step) AS first,
+            1 + (max(step) - min(step)) // 24 AS every FROM states GROUP BY ALL)
+        USING (trial_id, spec_hash)
+    WHERE time_s >= 0 AND (step - first) % every = 0 GROUP BY ALL
+) USING (trial_id, spec_hash);
+TRUNCATE trials; TRUNCATE states; TRUNCATE decided; TRUNCATE paid;
+"""
+FACETS = ("sweep", "model", "variant", "condition", "outcome", "validity")
+SORTS = {
+    "trial": "trial_id",
+    "outcome": "outcome",
+    "end": "end_time_s",
+    "gap": "gap_m",
+    "rmse": "rmse_mps",
+    "invalid": "invalid",
+    "cost": "cost_usd",
+}
+EXPORTED = "* EXCLUDE (left_mps, right_mps)"
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """Which trials are wanted; an empty text wants all. ``q`` is part of a name.
+
+    ``trials`` are names, where those behind a cell of a table are wanted.
+    """
+
+    sweep: str = ""
+    model: str = ""
+    variant: str = ""
+    condition: str = ""
+    outcome: str = ""
+    validity: str = ""
+    q: str = ""
+    trials: tuple[str, ...] | None = None
+
+    def where(self, leave_out: str = "") -> tuple[str, list[Any]]:
+        """The filter as SQL with its values; without one facet, to count its alternatives."""
+        parts, values = ["true"], list[Any]()
+        for name in FACETS[1:]:
+            if (value := getattr(self, name)) and name != leave_out:
+                parts.append(f"{name} = ?")
+                values.append(value)
+        if self.sweep and leave_out != "sweep":
+            parts.append("(trial_id, spec_hash) IN (SELECT (trial_id, spec_hash) FROM members "
+                         "WHERE sweep = ?)")  # fmt: skip
+            values.append(self.sweep)
+        if self.q:
+            parts.append("contains(lower(trial_id), lower(?))")
+            values.append(self.q)
+        if self.trials is not None:
+            parts.append("list_contains(?, trial_id)")
+            values.append(list(self.trials))
+        return " AND ".join(parts), values
+
+    @property
+    def chosen(self) -> dict[str, str]:
+        """What is asked for, by name."""
+        named = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "trials"}
+        return {name: value for name, value in named.items() if value}
+
+
+@dataclass(frozen=True, slots=True)
+class Totals:
+    """Counts over all trials of a filter, and means over those that have the value."""
+
+    trials: int
+    collided: int
+    failed: int
+    ended: int
+    decisions: int
+    invalid: int
+    fallbacks: int
+    cost_usd: float
+    gap_m: float | None
+    rmse_mps: float | None
+
+
+@dataclass(slots=True)
+class Catalogue:
+    """All trials of a database. Threads take turns."""
+
+    db: Path
+    _connection: duckdb.DuckDBPyConnection | None = None
+    _instance: Instance = field(default_factory=Instance)
+    _stamp: tuple[int, ...] | None = None
+    _lock: threading.RLock = field(default_factory=threading.RLock)
+
+    def refresh(self) -> bool:
+        """Take in what is new in the database; returns whether anything was.
+
+        The file is opened for a few hundred trials at a time, so that a sweep can write in between.
+        Raises UsageError and StoreError.
+        """
+        with self._lock:
+            before, stamp = self._stamp, stamp_of(self.db)
+            if stamp == before:
+                return False
+            if self._connection is None or before is None or stamp[0] != before[0]:
+                self._begin()
+            assert self._connection is not None
+            self._reading(FORGET)
+            while self._reading(TAKE):
+                self._connection.execute(LIST)
+            self._stamp = stamp
+            return True
+
+    def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
+        """Each facet's values with how many trials they would leave, the other facets as wanted."""
+        found = {}
+        for name in FACETS:
+            where, values = wanted.where(leave_out=name)
+            table = (
+                "listed" if name != "sweep" else "listed JOIN members USING (trial_id, spec_hash)"
+            )
+            found[name] = self._rows(
+                f"SELECT {name}, count(*) FROM {table} WHERE {where} AND {name} IS NOT NULL "  # noqa: S608 # constants
+                "GROUP BY ALL ORDER BY ALL",
+                values,
+            )
+        return found
+
+    def totals(self, wanted: Filter) -> Totals:
+        """What the trials of a filter come to."""
+        where, values = wanted.where()
+        (row,) = self._rows(
+            "SELECT count(*), count(*) FILTER (status = 'collided'), "  # noqa: S608 # constants
+            "count(*) FILTER (status = 'failed'), count(*) FILTER (status <> 'failed'), "
+            "coalesce(sum(decisions), 0), coalesce(sum(invalid), 0), coalesce(sum(fallbacks), 0), "
+            f"coalesce(sum(cost_usd), 0), avg(gap_m), avg(rmse_mps) FROM listed WHERE {where}",
+            values,
+        )
+        return Totals(*row)
+
+    def page(self, wanted: Filter, sort: str, number: int) -> list[dict[str, Any]]:
+        """The trials of one page, counted from 1; ``-gap`` sorts the largest gap first."""
+        where, values = wanted.where()
+        return self._records(
+            f"SELECT * FROM listed WHERE {where} ORDER BY {order_by(sort)} "  # noqa: S608 # constants
+            f"LIMIT {PAGE} OFFSET ?",
+            [*values, PAGE * (number - 1)],
+        )
+
+    def find(self, trial_id: str, spec_hash: str | None = None) -> dict[str, Any] | None:
+        """One trial; where its name stands for several, the one of that spec, or any."""
+        found = self._records(
+            "SELECT * FROM listed WHERE trial_id = ? AND spec_hash = coalesce(?, spec_hash) "
+            "ORDER BY spec_hash LIMIT 1",
+            [trial_id, spec_hash],
+        )
+        return found[0] if found else None
+
+    def near(self, wanted: Filter, row: dict[str, Any], limit: int) -> list[dict[str, Any]]:
+        """Some other trials of a filter to lay beside one: of each model and variant the first.
+
+        Equal repetitions come first, since they are the ones that are compared.
+        """
+        where, values = wanted.where()
+        return self._records(
+            "SELECT * EXCLUDE (left_mps, right_mps) FROM listed "  # noqa: S608 # constants
+            f"WHERE {where} AND (trial_id, spec_hash) <> (?, ?) QUALIFY row_number() OVER ("
+            "PARTITION BY model, variant, spec_hash ORDER BY rep <> ?, trial_id) <= ? "
+            "ORDER BY model, variant, trial_id",
+            [*values, row["trial_id"], row["spec_hash"], row["rep"], limit],
+        )
+
+    def names(self, wanted: Filter, limit: int) -> list[tuple[str, str]]:
+        """(trial, spec) of the trials of a filter, by name."""
+        where, values = wanted.where()
+        return self._rows(
+            f"SELECT trial_id, spec_hash FROM listed WHERE {where} ORDER BY ALL LIMIT {limit}",  # noqa: S608 # constants
+            values,
+        )
+
+    def export(self, wanted: Filter, sort: str, form: str) -> bytes:
+        """All trials of a filter as CSV or Parquet."""
+        where, values = wanted.where()
+        with tempfile.TemporaryDirectory() as folder, self._lock:
+            path = Path(folder) / f"trials.{form}"
+            assert self._connection is not None, "it was never refreshed"
+            chosen = self._connection.sql(
+                f"SELECT {EXPORTED} FROM listed WHERE {where} ORDER BY {order_by(sort)}",  # noqa: S608 # constants
+                params=values,
+            )
+            if form == "csv":
+                chosen.write_csv(str(path))
+            else:
+                chosen.write_parquet(str(path))
+            return path.read_bytes()
+
+    def _begin(self) -> None:
+        """Forget everything."""
+        self._instance.drop()
+        self._connection = self._instance.cursor()
+        self._connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        self._connection.execute(LISTED)
+
+    def _reading(self, sql: str) -> int:
+        """Run statements on the database and ours; returns how many trials wait to be listed."""
+        self._stamp = None  # whatever fails here, begin anew
+        with read_database(self.db, self._instance) as connection:
+            connection.execute(sql)
+            (waiting,) = connection.execute("SELECT count(*) FROM memory.trials").fetchall()
+        count: int = waiting[0]
+        return count
+
+    def _rows(self, sql: str, values: list[Any]) -> list[Any]:
+        assert self._connection is not None, "it was never refreshed"
+        with self._lock:
+            return self._connection.execute(sql, values).fetchall()
+
+    def _records(self, sql: str, values: list[Any]) -> list[dict[str, Any]]:
+        assert self._connection is not None, "it was never refreshed"
+        with self._lock:
+            found = self._connection.execute(sql, values)
+            names = [column[0] for column in found.description]
+            return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
+
+
+def order_by(sort: str) -> str:
+    """A sort as SQL: what has no value comes last, and equal ones by name."""
+    column = SORTS.get(sort.removeprefix("-"), "trial_id")
+    direction = "DESC" if sort.startswith("-") else "ASC"
+    return f"{column} {direction} NULLS LAST, trial_id, spec_hash"
+
+
+def stamp_of(db: Path) -> tuple[int, ...]:
+    """What changes when a database does; raises UsageError where there is none."""
+    found: list[int] = []
+    for path in (db, db.with_name(f"{db.name}.wal")):
+        try:
+            stat = path.stat()
+        except FileNotFoundError:
+            found += [0, 0, 0]
+        else:
+            found += [stat.st_ino, stat.st_mtime_ns, stat.st_size]
+    if not found[0]:
+        raise UsageError(f"there is no database {db}; `make sweep` makes one, --db names another")
+    return tuple(found)

@@ -1,0 +1,47 @@
+"""Addresses: every state of a page is one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import quote, urlencode
+
+
+class Links:
+    """Addresses of the pages as a server gives them."""
+
+    def to(self, name: str, /, **state: object) -> str:
+        """A page of its own: ``trials``, ``sql``."""
+        return f"/{name}" + query_of(state)
+
+    def trial(self, row: Mapping[str, Any], **state: object) -> str:
+        """A trial's page; ``row`` has its name and its spec."""
+        return f"/trials/{quote(row['trial_id'])}" + query_of({"spec": row["spec_hash"], **state})
+
+    def decision(self, row: Mapping[str, Any], side: str, number: int) -> str:
+        """What a decision's panel shows."""
+        state = {"spec": row["spec_hash"], "side": side, "decision": number}
+        return f"/decisions/{quote(row['trial_id'])}" + query_of(state)
+
+    def data(self, row: Mapping[str, Any]) -> str:
+        """What a replay draws of a trial, as JSON."""
+        return f"/data/{quote(row['trial_id'])}" + query_of({"spec": row["spec_hash"]})
+
+    def raw(self, row: Mapping[str, Any], side: str, number: int) -> str:
+        """A reply as a plain text."""
+        state = {"spec": row["spec_hash"], "side": side, "decision": number}
+        return f"/raw/{quote(row['trial_id'])}" + query_of(state)
+
+    def sweep(self, sweep_id: str) -> str:
+        """A sweep's page."""
+        return f"/sweeps/{quote(sweep_id)}"
+
+    def static(self, name: str) -> str:
+        """A script or a style."""
+        return f"/static/{name}"
+
+
+def query_of(state: Mapping[str, Any]) -> str:
+    """The part of an address after the path; what is empty is left out."""
+    given = {name: value for name, value in state.items() if value is not None and value != ""}
+    return f"?{urlencode(given)}" if given else ""

@@ -1,0 +1,1 @@
+"""The pages: each takes what an address says and returns HTML."""

@@ -1,0 +1,136 @@
+"""One trial, and one decision of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from markupsafe import Markup
+
+from analysis.explorer import views
+from analysis.explorer.catalogue import Filter
+from analysis.explorer.details import Row, Trial, read_decision, read_trial
+from analysis.explorer.site import NotThere, Site
+from analysis.explorer.texts import shortened
+from merge_runner.records import SIDES
+
+# So many trials of a kind are offered to compare with.
+OFFERED = 30
+
+
+def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
+    """A trial, with the decision that the address names."""
+    row = find(site, trial_id, asked)
+    trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
+    panel = ""
+    if asked.get("side") in SIDES and asked.get("decision", "").isdigit():
+        panel = decision_panel(site, row, trial, asked["side"], int(asked["decision"]))
+    decided = {
+        side: mine for side in SIDES if (mine := [d for d in trial.decisions if d["side"] == side])
+    }
+    return site.render(
+        "trial.html",
+        here="trials",
+        row=row,
+        outcome=views.outcome_text(row),
+        condition=views.condition_text(row["condition"]),
+        prompt=views.prompt_text(row["variant"]),
+        data=embedded(views.replay_data(row, trial)) if trial.states else None,
+        lines=views.summary(row, trial),
+        samples=views.sample_table(trial),
+        trial_decisions=decided,
+        alternatives=alternatives(site, row),
+        chosen_other=asked.get("compare", ""),
+        panel=Markup(panel),  # noqa: S704 # rendered by a template of ours, which escapes
+    )
+
+
+def decision_fragment(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
+    """The panel of one decision."""
+    row = find(site, trial_id, asked)
+    side, number = _decision_of(asked)
+    trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
+    return decision_panel(site, row, trial, side, number)
+
+
+def decision_panel(site: Site, row: Row, trial: Trial, side: str, number: int) -> str:
+    """What a driver was told, said, planned and did; raises NotThere."""
+    found = read_decision(site.db, row["trial_id"], row["spec_hash"], side, number)
+    if found is None:
+        raise NotThere(f"{row['trial_id']} has no decision {number} of the {side} driver")
+    body = next((a["reply"] for a in reversed(found.attempts) if a["reply"]), None)
+    text, more = shortened(body or "")
+    return site.render(
+        "_decision.html",
+        d=found.row,
+        before=found.before,
+        parts=found.parts,
+        meanings=views.BLOCK_MEANINGS,
+        attempts=found.attempts,
+        reply=None if body is None else {"text": text, "more": more},
+        raw=site.at.raw(row, side, number),
+        chart=views.plan_chart(found, trial.scenario),
+        points=views.step_points,
+        aftermath=views.aftermath(trial, found),
+    )
+
+
+def raw_reply(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
+    """The body of the last reply to a call, whole."""
+    row = find(site, trial_id, asked)
+    side, number = _decision_of(asked)
+    found = read_decision(site.db, row["trial_id"], row["spec_hash"], side, number)
+    bodies = [a["reply"] for a in found.attempts if a["reply"]] if found else []
+    if not bodies:
+        raise NotThere(f"{trial_id} has no reply to decision {number} of the {side} driver")
+    body: str = bodies[-1]
+    return body
+
+
+def replay_json(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any]:
+    """What a replay draws of a trial."""
+    row = find(site, trial_id, asked)
+    return views.replay_data(row, read_trial(site.db, row["trial_id"], row["spec_hash"]))
+
+
+def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
+    """The trial that an address names; raises NotThere."""
+    row = site.catalogue.find(trial_id, asked.get("spec") or None)
+    if row is None:
+        raise NotThere(f"the database holds no trial {trial_id}")
+    return row
+
+
+def alternatives(site: Site, row: Row) -> dict[str, list[Row]]:
+    """Trials to compare with, by what they differ in."""
+    same = Filter(condition=row["condition"])
+    kinds: dict[str, list[Row]] = {}
+    for other in site.catalogue.near(same, row, OFFERED):
+        kinds.setdefault(_differs(row, other), []).append(other)
+    return dict(sorted(kinds.items()))
+
+
+def embedded(data: dict[str, Any]) -> Markup:
+    """Data for a script, as JSON that no HTML can end."""
+    text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return Markup(text)  # noqa: S704 # it holds no character of HTML
+
+
+def _differs(row: Row, other: Row) -> str:
+    if other["source"] == "human":
+        return "humans"
+    if other["model"] != row["model"]:
+        return "another model"
+    if other["variant"] != row["variant"]:
+        return "another prompt"
+    return "another repetition"
+
+
+def _decision_of(asked: Mapping[str, str]) -> tuple[str, int]:
+    side, number = asked.get("side", ""), asked.get("decision", "")
+    if side not in SIDES or not number.isdigit():
+        raise NotThere("a decision is named by side=left or side=right, and decision=NUMBER")
+    return side, int(number)

@@ -1,0 +1,71 @@
+"""A prompt in its named blocks, with what changed since the one before."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from difflib import SequenceMatcher
+from typing import Literal
+
+from merge_runner.prompts.blocks import BLOCKS
+
+Change = Literal["same", "new", "gone"]
+_WORDS = re.compile(r"\s+|[^\s\[\](),]+|[\[\](),]")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One block of a prompt: its name, empty where no block of ours begins like it, and its text.
+
+    ``pieces`` are the text in order, with what was in the prompt before and is no more.
+    """
+
+    name: str
+    pieces: tuple[tuple[Change, str], ...]
+
+
+def parts_of(prompt: str, before: str | None) -> list[Part]:
+    """The parts of a prompt, each compared with the same block of the one before.
+
+    Without one before, nothing is marked.
+    """
+    earlier = dict(_blocks(before)) if before is not None else {}
+    return [
+        Part(name, _compared(earlier.get(name, "") if before is not None else text, text))
+        for name, text in _blocks(prompt)
+    ]
+
+
+def _blocks(prompt: str) -> list[tuple[str, str]]:
+    """Name and text of each block; paragraphs that begin no block belong to the one before."""
+    found: list[tuple[str, str]] = []
+    for paragraph in prompt.rstrip("\n").split("\n\n"):
+        name = _name(paragraph)
+        if name is None and found:
+            found[-1] = (found[-1][0], f"{found[-1][1]}\n\n{paragraph}")
+        else:
+            found.append((name or "", paragraph))
+    return found
+
+
+def _name(paragraph: str) -> str | None:
+    """The block whose template begins like this paragraph, up to the first value in it."""
+    for block in BLOCKS:
+        for template in (block.merge, block.straight):
+            if template is not None and paragraph.startswith(template.partition("{")[0]):
+                return block.name
+    return None
+
+
+def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
+    old, new = _WORDS.findall(before), _WORDS.findall(now)
+    pieces: list[tuple[Change, str]] = []
+    for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
+        if kind == "equal":
+            pieces.append(("same", "".join(new[j1:j2])))
+            continue
+        if gone := "".join(old[i1:i2]).strip():
+            pieces.append(("gone", gone))
+        if added := "".join(new[j1:j2]):
+            pieces.append(("new", added))
+    return tuple(pieces)

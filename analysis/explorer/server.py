@@ -1,0 +1,39 @@
+"""Serves the explorer until it is interrupted."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import uvicorn
+
+from analysis.explorer.app import explorer
+from analysis.explorer.site import Site
+from merge_runner.errors import UsageError
+
+LOOPBACK = "127.0.0.1"
+
+
+def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
+    """Serve a database; ``say`` is told the address. Raises UsageError."""
+    site = Site(db)
+    site.catalogue.refresh()
+    listener = _listen(bind, port)
+    port = listener.getsockname()[1]
+    token = None if bind == LOOPBACK else secrets.token_urlsafe(24)
+    hosts = {f"{LOOPBACK}:{port}", f"localhost:{port}"}
+    shown = LOOPBACK if bind == "0.0.0.0" else bind  # noqa: S104 # compared, not bound
+    say(f"http://{shown}:{port}/" + (f"?token={token}" if token else ""))
+    config = uvicorn.Config(explorer(site, hosts, token), log_level="error", ws="none")
+    uvicorn.Server(config).run(sockets=[listener])
+
+
+def _listen(bind: str, port: int) -> socket.socket:
+    try:
+        return socket.create_server((bind, port))
+    except OSError as exc:
+        raise UsageError(
+            f"nothing can listen at {bind}:{port} ({exc.strerror}); --port 0 takes a free port"
+        ) from exc

@@ -1,0 +1,44 @@
+"""What all pages share: the database, the list of its trials, the templates, the addresses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jinja2
+
+from analysis.explorer.catalogue import Catalogue
+from analysis.explorer.links import Links
+from analysis.explorer.texts import visible
+
+TEMPLATES = Path(__file__).with_name("templates")
+PAGES = {"Trials": "trials"}
+
+
+class NotThere(Exception):
+    """What an address asks for is not there; the text says what is."""
+
+
+@dataclass
+class Site:
+    """The explorer of one database."""
+
+    db: Path
+    at: Links = field(default_factory=Links)
+
+    def __post_init__(self) -> None:
+        self.catalogue = Catalogue(self.db)
+        self._environment = jinja2.Environment(
+            loader=jinja2.FileSystemLoader(TEMPLATES),
+            autoescape=True,
+            undefined=jinja2.StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        self._environment.globals.update(
+            at=self.at, pages=PAGES, study=str(self.db), visible=visible
+        )
+
+    def render(self, template: str, **values: object) -> str:
+        """A page, or a part of one."""
+        return self._environment.get_template(template).render(values)

@@ -1,0 +1,34 @@
+"use strict";
+// Keys that work on every page; off while something is typed.
+(() => {
+  const typing = (target) => target.matches("input:not([type=range]), select, textarea, [contenteditable]");
+  const help = document.getElementById("help");
+  document.getElementById("help-button").addEventListener("click", () => help.showModal());
+
+  let chosen = -1;
+  const choose = (step) => {
+    const rows = [...document.querySelectorAll("[data-list] tbody tr")];
+    if (!rows.length) return;
+    rows[chosen]?.classList.remove("chosen");
+    chosen = Math.min(Math.max(chosen + step, 0), rows.length - 1);
+    rows[chosen].classList.add("chosen");
+    rows[chosen].querySelector("a")?.focus({ preventScroll: true });
+    rows[chosen].scrollIntoView({ block: "nearest" });
+  };
+  document.addEventListener("htmx:afterSwap", () => { chosen = -1; });
+
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || typing(event.target)) {
+      if (event.key === "Escape") event.target.blur();
+      return;
+    }
+    if (help.open) return;
+    const search = document.getElementById("search");
+    if (event.key === "?") help.showModal();
+    else if (event.key === "/" && search) search.focus();
+    else if (event.key === "j") choose(1);
+    else if (event.key === "k") choose(-1);
+    else return;
+    event.preventDefault();
+  });
+})();

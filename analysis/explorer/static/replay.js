@@ -1,0 +1,303 @@
+"use strict";
+// The replay of a trial: track, charts, ribbons and clock, all of one moment.
+(() => {
+  const holder = document.getElementById("replay-data");
+  if (!holder) return;
+  const at = (id) => document.getElementById(id);
+  const trial = JSON.parse(holder.textContent);
+  const COLOURS = { left: "#0072b2", right: "#d55e00" };
+  const SPEEDS = [0.25, 0.5, 1, 2, 4];
+  const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const road = trial.track;
+  const times = (trial.sides.left ?? trial.sides.right).t;
+  const begin = times[0];
+  let now = begin, playing = false, speed = 1, last = 0, ghost = null, selected = null;
+
+  // ---- one moment of a trial
+
+  const sampled = (xs, ys, t) => {
+    if (t <= xs[0]) return ys[0];
+    let i = xs.findIndex((x) => x >= t);
+    if (i < 0) return ys[ys.length - 1];
+    const part = (t - xs[i - 1]) / (xs[i] - xs[i - 1]);
+    return ys[i - 1] + part * (ys[i] - ys[i - 1]);
+  };
+  const inside = (run, t) => t <= run.end + 1e-9;
+
+  // ---- the track, from left to right; the left branch is above
+
+  const SVG = "http://www.w3.org/2000/svg";
+  const draw = (name, attributes, parent, text) => {
+    const made = document.createElementNS(SVG, name);
+    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+    if (text) made.textContent = text;
+    parent.append(made);
+    return made;
+  };
+  const sign = (side) => (side === "left" ? -1 : 1);
+  const place = (side, s) => s >= road.merge
+    ? [road.merge * road.forward + s - road.merge, 0]
+    : [s * road.forward, sign(side) * (road.merge - s) * road.lateral];
+  const turned = (side, s) => s >= road.merge ? 0
+    : -sign(side) * Math.atan2(road.lateral, road.forward) * 180 / Math.PI;
+
+  const track = at("track");
+  const vehicles = {};
+  const drawTrack = () => {
+    const [mergeX] = place("left", road.merge);
+    const [endX] = place("left", road.end);
+    for (const kind of ["kerb", "lane"]) {
+      for (const side of ["left", "right"]) {
+        const [x, y] = place(side, 0);
+        draw("polyline", { class: kind, points: `${x},${y} ${mergeX},0 ${endX},0` }, track);
+      }
+    }
+    for (const side of ["left", "right"]) {
+      const [x0, y0] = place(side, 0), [x1, y1] = place(side, road.tunnel);
+      draw("line", { class: "tunnel", x1: x0, y1: y0, x2: x1, y2: y1 }, track);
+      draw("text", { class: "sign", x: x1, y: y1 + (side === "left" ? -3.4 : 5.2) }, track, "tunnel exit");
+      draw("text", { class: "sign side", x: x0 + 1, y: y0 + (side === "left" ? -3 : 4.6) }, track, side);
+    }
+    draw("line", { class: "merge", x1: mergeX, y1: -4, x2: mergeX, y2: 4 }, track);
+    draw("text", { class: "sign", x: mergeX, y: -5.2 }, track, "merge point");
+    draw("text", { class: "sign", x: endX - 5, y: -3.4 }, track, "end");
+    for (const name of ["ghost", "own"]) {
+      vehicles[name] = {};
+      for (const side of ["left", "right"]) {
+        const group = draw("g", { class: `vehicle ${name} ${side}` }, track);
+        draw("rect", { x: -road.length / 2, y: -road.width / 2, width: road.length, height: road.width, rx: 0.5 }, group);
+        draw("text", { x: 0, y: 0.62 }, group, side === "left" ? "L" : "R");
+        vehicles[name][side] = group;
+      }
+    }
+    vehicles.crash = draw("text", { class: "crash", y: -3 }, track, "✸ collision");
+  };
+  const move = (name, run) => {
+    for (const side of ["left", "right"]) {
+      const group = vehicles[name][side];
+      const samples = run?.sides[side];
+      group.toggleAttribute("hidden", !samples);
+      group.setAttribute("display", samples ? "inline" : "none");
+      if (!samples) continue;
+      const s = sampled(samples.t, samples.x, now);
+      const [x, y] = place(side, s);
+      group.setAttribute("transform", `translate(${x.toFixed(2)} ${y.toFixed(2)}) rotate(${turned(side, s).toFixed(1)})`);
+      group.classList.toggle("over", !inside(run, now));
+    }
+  };
+
+  // ---- charts on one time axis
+
+  const charts = [];
+  const clickable = (u) => {
+    u.over.addEventListener("click", (event) => {
+      seek(u.posToVal(event.clientX - u.over.getBoundingClientRect().left, "x"), true);
+    });
+  };
+  const resampled = (run, side, what) => times.map((t) => {
+    const samples = run.sides[side];
+    return samples && t <= run.end + 1e-9 && t >= samples.t[0] - 1e-9 ? sampled(samples.t, samples[what], t) : null;
+  });
+  const headways = (run) => {
+    const left = resampled(run, "left", "x"), right = resampled(run, "right", "x");
+    return left.map((x, i) => (x === null || right[i] === null ? null : x - right[i]));
+  };
+  const series = (label, colour, extra) => ({
+    label, stroke: colour, width: 1.6, points: { show: false },
+    value: (_, v) => (v === null || v === undefined ? "–" : v.toFixed(2)), ...extra,
+  });
+  const chart = (id, heading, unit, own, others, extra) => {
+    const plot = new uPlot({
+      title: heading, width: at("charts").clientWidth, height: 150, legend: { live: true },
+      cursor: { sync: { key: "replay" }, drag: { x: false, y: false } },
+      scales: { x: { time: false } },
+      axes: [{ size: 24, gap: 2, values: (_, ticks) => ticks.map((t) => `${t} s`) }, { size: 54, label: unit, labelSize: 18, labelGap: 0 }],
+      series: [{ label: "t", value: (_, v) => (v === null || v === undefined ? "–" : `${v.toFixed(1)} s`) }, ...own.map(([s]) => s), ...others.map(([s]) => s)],
+      hooks: { ready: [clickable, () => { placeRibbons(); show(); }] }, ...extra,
+    }, [times, ...own.map(([, values]) => values), ...others.map(([, values]) => values)], at(id));
+    plot.playhead = document.createElement("div");
+    plot.playhead.className = "playhead";
+    plot.over.append(plot.playhead);
+    charts.push(plot);
+  };
+  const drawCharts = () => {
+    for (const plot of charts.splice(0)) plot.destroy();
+    const dashed = { dash: [4, 4], width: 1.2 };
+    for (const [id, heading, unit, what] of [["chart-v", "Velocity", "m/s", "v"], ["chart-a", "Acceleration", "m/s²", "a"]]) {
+      const lines = (run, note, extra) => ["left", "right"].map((side) =>
+        [series(`${side}${note}`, COLOURS[side], extra), resampled(run, side, what)]);
+      chart(id, heading, unit, lines(trial, "", {}), ghost ? lines(ghost, ", other", dashed) : []);
+    }
+    const bound = trial.bounds, lower = bound.map((b) => (b === null ? null : -b));
+    chart("chart-h", "Headway: how far the left vehicle is ahead; shaded: collision", "m",
+      [[series("headway", "#000"), headways(trial)],
+        [series("collision below", "#999", { width: 0.5 }), bound], [series("and above", "#999", { width: 0.5 }), lower]],
+      ghost ? [[series("headway, other", "#000", dashed), headways(ghost)]] : [],
+      { bands: [{ series: [2, 3], fill: "rgba(204, 121, 167, .35)" }] });
+  };
+
+  // ---- ribbons of decisions, on the same axis
+
+  const decisions = [...document.querySelectorAll("a.decision")];
+  const placeRibbons = () => {
+    const ribbons = at("ribbons");
+    if (!ribbons || !charts.length) return;
+    const box = charts[0].over.getBoundingClientRect(), base = ribbons.getBoundingClientRect();
+    const offset = box.left - base.left, scale = (t) => charts[0].valToPos(t, "x");
+    const width = Math.max(14, scale(begin + 1) - scale(begin) - 2);
+    for (const link of decisions) {
+      link.parentElement.style.left = `${offset + scale(Number(link.dataset.t))}px`;
+      link.parentElement.style.width = `${width}px`;
+    }
+    ribbons.classList.add("placed");
+  };
+  const ordered = [...decisions].sort((a, b) => a.dataset.t - b.dataset.t || a.dataset.side.localeCompare(b.dataset.side));
+  const select = (link, { push = true, jump = true } = {}) => {
+    for (const other of decisions) other.removeAttribute("aria-current");
+    selected = link;
+    if (!link) return;
+    link.setAttribute("aria-current", "true");
+    if (jump) seek(Number(link.dataset.t));
+    const panel = document.querySelector("#decision .decision-panel");
+    if (panel?.dataset.side !== link.dataset.side || panel?.dataset.n !== link.dataset.n) {
+      htmx.ajax("GET", link.dataset.panel, { target: "#decision", swap: "innerHTML" });
+    }
+    remember(push);
+  };
+  const step = (by) => {
+    const from = selected ? ordered.indexOf(selected) : by > 0 ? -1 : ordered.length;
+    const next = ordered[Math.min(Math.max(from + by, 0), ordered.length - 1)];
+    if (next) select(next);
+  };
+
+  // ---- the clock
+
+  const show = () => {
+    move("own", trial);
+    move("ghost", ghost);
+    const over = trial.status === "collided" && now >= trial.end - 1e-9;
+    vehicles.crash.setAttribute("display", over ? "inline" : "none");
+    if (over) vehicles.crash.setAttribute("x", place("left", sampled(trial.sides.left.t, trial.sides.left.x, now))[0]);
+    at("scrub").value = now;
+    at("scrub").setAttribute("aria-valuetext", `${now.toFixed(1)} s`);
+    at("clock").textContent = `${now.toFixed(1)} s of ${trial.end.toFixed(1)} s`;
+    const told = ["left", "right"].filter((side) => trial.sides[side]).map((side) =>
+      `${side} ${sampled(trial.sides[side].t, trial.sides[side].v, now).toFixed(1)} m/s at ${sampled(trial.sides[side].t, trial.sides[side].x, now).toFixed(1)} m`);
+    at("now").textContent = told.join("; ");
+    for (const plot of charts) plot.playhead.style.transform = `translateX(${plot.valToPos(now, "x")}px)`;
+  };
+  const seek = (t, keep = false) => {
+    now = Math.min(Math.max(t, begin), trial.end);
+    show();
+    if (keep) remember(false);
+  };
+  const play = (on) => {
+    if (on && now >= trial.end - 1e-9) now = begin;
+    playing = on;
+    at("play").textContent = on ? "Pause" : "Play";
+    at("play").setAttribute("aria-pressed", String(on));
+    last = performance.now();
+    if (on) requestAnimationFrame(tick);
+    else remember(false);
+  };
+  const tick = (moment) => {
+    if (!playing) return;
+    const passed = speed * (moment - last) / 1000;
+    // Who wants no motion gets pictures, twice a second.
+    if (!calm || passed >= 0.5 * speed) {
+      last = moment;
+      seek(now + passed);
+    }
+    if (now >= trial.end - 1e-9) play(false);
+    else requestAnimationFrame(tick);
+  };
+  const setSpeed = (value) => {
+    speed = value;
+    at("speed").value = String(value);
+  };
+
+  // ---- the address tells the state
+
+  const remember = (push) => {
+    const address = new URL(location.href);
+    const state = { t: now > begin ? now.toFixed(1) : "", side: selected?.dataset.side, decision: selected?.dataset.n, compare: ghost?.id };
+    for (const [name, value] of Object.entries(state)) {
+      if (value) address.searchParams.set(name, value);
+      else address.searchParams.delete(name);
+    }
+    if (address.href === location.href) return;
+    history[push ? "pushState" : "replaceState"](null, "", address);
+  };
+  const recall = async () => {
+    const asked = new URL(location.href).searchParams;
+    const link = decisions.find((d) => d.dataset.side === asked.get("side") && d.dataset.n === asked.get("decision"));
+    select(link ?? null, { push: false, jump: !asked.has("t") });
+    if ((asked.get("compare") ?? "") !== (ghost?.id ?? "")) await compare(asked.get("compare") ?? "", false);
+    if (asked.has("t")) seek(Number(asked.get("t")) || begin);
+    else if (!link) seek(begin);
+  };
+
+  // ---- a second trial
+
+  const compare = async (id, push) => {
+    const chooser = at("compare");
+    const option = [...chooser.options].find((o) => o.value === id && o.dataset.url);
+    ghost = option ? await (await fetch(option.dataset.url)).json() : null;
+    chooser.value = option ? id : "";
+    at("ghost-key").hidden = !ghost;
+    at("ghost-key").textContent = ghost ? `dashed: ${ghost.label}. ${ghost.outcome}` : "";
+    drawCharts();
+    show();
+    remember(push);
+  };
+
+  // ---- hands
+
+  drawTrack();
+  at("scrub").min = begin;
+  at("scrub").max = trial.end;
+  at("scrub").addEventListener("input", (event) => seek(Number(event.target.value)));
+  at("scrub").addEventListener("change", () => remember(false));
+  at("play").addEventListener("click", () => play(!playing));
+  at("back").addEventListener("click", () => seek(now - 0.1, true));
+  at("on").addEventListener("click", () => seek(now + 0.1, true));
+  at("speed").addEventListener("change", (event) => setSpeed(Number(event.target.value)));
+  at("compare").addEventListener("change", (event) => compare(event.target.value, true));
+  for (const link of decisions) {
+    link.addEventListener("click", (event) => {
+      if (event.ctrlKey || event.metaKey || event.shiftKey) return;
+      event.preventDefault();
+      select(link);
+    });
+  }
+  addEventListener("popstate", recall);
+  let width = 0;
+  new ResizeObserver(() => {
+    if (at("charts").clientWidth === width) return;
+    width = at("charts").clientWidth;
+    for (const plot of charts) plot.setSize({ width, height: 150 });
+    placeRibbons();
+    show();
+  }).observe(at("charts"));
+
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+    const target = event.target;
+    if (target.matches("input:not([type=range]), select, textarea")) return;
+    const by = event.shiftKey ? 1 : 0.1;
+    if (event.key === " " && !target.matches("button, summary")) play(!playing);
+    else if (event.key === "ArrowLeft") seek(now - by, true);
+    else if (event.key === "ArrowRight") seek(now + by, true);
+    else if (event.key === "]") step(1);
+    else if (event.key === "[") step(-1);
+    else if (event.key === "c") at("compare").focus();
+    else if (/^[1-5]$/.test(event.key)) setSpeed(SPEEDS[Number(event.key) - 1]);
+    else if (event.key === "Escape" && selected) { select(null); remember(true); at("decision").replaceChildren(); }
+    else if (event.key === "Escape" && at("trial").dataset.list) location.href = at("trial").dataset.list;
+    else return;
+    event.preventDefault();
+  });
+
+  drawCharts();
+  recall();
+})();

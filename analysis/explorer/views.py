@@ -1,0 +1,262 @@
+"""What the pages show of trials and decisions, as plain values for the templates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from analysis.explorer.details import Decision, Row, Trial
+from merge_runner.config import Scenario
+from merge_runner.prompts.blocks import VARIANTS
+from merge_runner.records import SIDES
+from merge_runner.simulator import track
+from merge_runner.simulator.collision import collided
+from merge_runner.simulator.conditions import CONDITIONS
+
+BISECTIONS = 12
+WIDEST_M = 8.0
+# What each part of a prompt is for.
+BLOCK_MEANINGS = {
+    "C0": "situation",
+    "C1": "history",
+    "C2": "previous plan",
+    "C3.safety": "avoid a collision",
+    "C3.human": "drive like a human",
+    "C3.distance": "keep a distance",
+    "C3.reassess": "reassess",
+    "C4": "tactical decision",
+    "C5": "output format",
+}
+
+
+def sparkline(row: Row, width: int = 96, height: int = 22) -> dict[str, str]:
+    """The speeds of both vehicles as points of two lines, 6 to 14 m/s from bottom to top."""
+    return {
+        side: " ".join(
+            f"{width * i / max(len(speeds) - 1, 1):.1f},"
+            f"{height * (1 - (min(max(v, 6.0), 14.0) - 6) / 8):.1f}"
+            for i, v in enumerate(speeds)
+        )
+        for side, speeds in (("left", row["left_mps"] or []), ("right", row["right_mps"] or []))
+    }
+
+
+def condition_text(name: str) -> str:
+    """A condition in words."""
+    condition = CONDITIONS[name]
+    headway, velocity = condition.projected_headway_m, condition.relative_velocity_mps
+    if headway == 0:
+        ahead = "both would reach the merge point together"
+    else:
+        leader = "left" if headway > 0 else "right"
+        ahead = f"the {leader} vehicle would be {abs(headway):g} m ahead at the merge point"
+    if velocity == 0:
+        return f"{ahead}, at equal speeds"
+    compared = "faster" if velocity > 0 else "slower"
+    return f"{ahead}, and the left one is {abs(velocity):g} m/s {compared}"
+
+
+def prompt_text(variant: str | None) -> str:
+    """A prompt variant in words."""
+    if variant is None:
+        return ""
+    without = sorted(VARIANTS.get(variant, ()))
+    return "the whole prompt" if not without else f"the prompt without {', '.join(without)}"
+
+
+def outcome_text(row: Row) -> str:
+    """How a trial ended, in a sentence."""
+    end = f"{row['end_time_s']:.1f} s"
+    if row["status"] == "collided":
+        return f"The vehicles collided after {end}."
+    if row["status"] == "failed":
+        return f"The trial failed after {end}: {row['error']}."
+    if row["status"] == "timeout":
+        return f"Nobody had left the track after {end}."
+    first = row["merged_first"]
+    if first is None:
+        return f"The trial ended after {end}; no vehicle merged first."
+    other = "right" if first == "left" else "left"
+    gap = "" if row["gap_m"] is None else f", with a gap of {row['gap_m']:.1f} m"
+    return f"The {other} vehicle yielded: the {first} one reached the merge point first{gap}."
+
+
+def summary(row: Row, trial: Trial) -> list[str]:
+    """What the charts of a trial show, in sentences."""
+    lines = []
+    for side, samples in trial.states.items():
+        speeds = [
+            v for t, v in zip(samples["time_s"], samples["velocity_mps"], strict=True) if t >= 0
+        ]
+        if speeds:
+            hardest = max(samples["acceleration_mps2"], key=abs)
+            lines.append(
+                f"The {side} vehicle began at {speeds[0]:.1f} m/s, drove between "
+                f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s; "
+                f"its hardest acceleration was {hardest:+.1f} m/s²."
+            )
+    for side in SIDES:
+        mine = [d for d in trial.decisions if d["side"] == side]
+        if mine:
+            letters = " ".join(d["tactical"] or "–" for d in mine)
+            bad = [str(d["decision"]) for d in mine if not d["valid"]]
+            lines.append(
+                f"Decisions of the {side} driver: {letters}"
+                + (f"; without a valid plan: {', '.join(bad)}." if bad else ".")
+            )
+    return lines
+
+
+def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
+    """What the replay draws: samples, decisions, the track, the bounds of a collision."""
+    return {
+        "id": row["trial_id"],
+        "spec": row["spec_hash"],
+        "outcome": outcome_text(row),
+        "label": label(row),
+        "status": row["status"],
+        "end": trial.end_s,
+        "sides": {
+            side: {
+                "t": _rounded(samples["time_s"], 3),
+                "x": _rounded(samples["position_m"], 3),
+                "v": _rounded(samples["velocity_mps"], 3),
+                "a": _rounded(samples["acceleration_mps2"], 3),
+            }
+            for side, samples in trial.states.items()
+        },
+        "bounds": collision_bounds(trial),
+        "decisions": [
+            {
+                "n": d["decision"],
+                "t": round(d["time_s"], 3),
+                "side": d["side"],
+                "says": d["tactical"] or "",
+                "valid": d["valid"],
+                "fallback": d["fallback"],
+                "failure": d["failure"] or "",
+            }
+            for d in trial.decisions
+        ],
+        "track": {
+            "tunnel": track.TUNNEL_EXIT_M,
+            "merge": track.MERGE_POINT_M,
+            "end": track.TRACK_END_M,
+            "lateral": track.LATERAL,
+            "forward": track.FORWARD,
+            "length": trial.scenario.vehicle_length_m,
+            "width": trial.scenario.vehicle_width_m,
+        },
+    }
+
+
+def sample_table(trial: Trial) -> dict[str, Any]:
+    """All samples as texts: time, then position, speed and acceleration of each, and headway."""
+    sides = list(trial.states)
+    times = trial.states[sides[0]]["time_s"] if sides else []
+    rows = []
+    for i, time_s in enumerate(times):
+        line = [f"{time_s:.2f}"]
+        for samples in trial.states.values():
+            line += [
+                f"{samples['position_m'][i]:.2f}",
+                f"{samples['velocity_mps'][i]:.2f}",
+                f"{samples['acceleration_mps2'][i]:+.2f}",
+            ]
+        places = [samples["position_m"][i] for samples in trial.states.values()]
+        line.append(f"{places[0] - places[1]:+.2f}" if len(places) > 1 else "")
+        rows.append(line)
+    return {"sides": sides, "rows": rows}
+
+
+def label(row: Row) -> str:
+    """A trial in a few words."""
+    if row["source"] == "human":
+        return f"human {row['pair']}, {row['condition']}"
+    return f"{row['model']}, {row['variant']}, {row['condition']}, rep {row['rep']}"
+
+
+def collision_bounds(trial: Trial) -> list[float | None]:
+    """Below which headway the vehicles collide, at each sample's mean position; None: at none."""
+    left, right = trial.states.get("left"), trial.states.get("right")
+    if left is None or right is None:
+        return []
+    return [
+        _bound(trial.scenario, (a + b) / 2)
+        for a, b in zip(left["position_m"], right["position_m"], strict=False)
+    ]
+
+
+def _bound(scenario: Scenario, mean_m: float) -> float | None:
+    """By bisection; the further apart two vehicles are along the road, the less they overlap."""
+    if not collided(scenario, mean_m, mean_m):
+        return None
+    low, high = 0.0, WIDEST_M
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        if collided(scenario, mean_m + middle / 2, mean_m - middle / 2):
+            low = middle
+        else:
+            high = middle
+    return round(high, 3)
+
+
+def _rounded(values: Sequence[float], digits: int) -> list[float]:
+    return [round(value, digits) for value in values]
+
+
+def plan_chart(decision: Decision, scenario: Scenario) -> dict[str, Any] | None:
+    """A plan as steps over its horizon, beside what the plan before had in mind for that time.
+
+    None where there is no plan.
+    """
+    row, before = decision.row, decision.before
+    if row["lost"]:
+        return None
+    executed = len(row["applied"] or [])
+    old = (before["plan"] or [])[len(before["applied"]) :] if before else []
+    if not (row["plan"] or old or executed):
+        return None
+    return {
+        "plan": row["plan"] or [],
+        "before": old,
+        "applied": row["applied"] or [],
+        "step_s": scenario.step_s,
+        "most_mps2": scenario.max_acceleration_mps2,
+        "steps": scenario.plan_actions,
+    }
+
+
+def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
+    """Points of a step line from -1 to 1, ``steps`` across the width."""
+    points = []
+    for i, value in enumerate(values):
+        y = height * (1 - (min(max(value, -1.0), 1.0) + 1) / 2)
+        points += [f"{width * i / steps:.1f},{y:.1f}", f"{width * (i + 1) / steps:.1f},{y:.1f}"]
+    return " ".join(points)
+
+
+def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:
+    """Both vehicles where a decision was made and a second later, or at the end."""
+    if decision.row["lost"]:
+        return []
+    start = decision.row["time_s"]
+    second = 1 / trial.scenario.prompt_rate_hz
+    found = []
+    for side, samples in trial.states.items():
+        times = samples["time_s"]
+        inside = [i for i, t in enumerate(times) if start - 1e-9 <= t <= start + second + 1e-9]
+        if len(inside) > 1:
+            first, last = inside[0], inside[-1]
+            found.append(
+                {
+                    "side": side,
+                    "own": side == decision.row["side"],
+                    "lasted_s": times[last] - times[first],
+                    "from_mps": samples["velocity_mps"][first],
+                    "to_mps": samples["velocity_mps"][last],
+                    "moved_m": samples["position_m"][last] - samples["position_m"][first],
+                    "to_merge_m": track.MERGE_POINT_M - samples["position_m"][last],
+                }
+            )
+    return found
