@@ -81,6 +81,21 @@ def outcome_text(row: Row) -> str:
     return f"The {other} vehicle yielded: the {first} one reached the merge point first{gap}."
 
 
+def facts(row: Row) -> list[str]:
+    """What a trial was about and what was measured, in short sentences."""
+    text = condition_text(row["condition"])
+    found = [f"{row['condition']}: {text}."]
+    if row["variant"] is not None:
+        found.append(f"{row['variant']}: {prompt_text(row['variant'])}.")
+    if row["rmse_mps"] is not None:
+        found.append(f"RMSE of the speed {row['rmse_mps']:.2f} m/s.")
+    if row["decisions"]:
+        found.append(f"{row['invalid']} of {row['decisions']} decisions invalid.")
+    if row["cost_usd"] is not None:
+        found.append(f"{row['cost_usd']:.3f} USD.")
+    return found
+
+
 def summary(row: Row, trial: Trial) -> list[str]:
     """What the charts of a trial show, in sentences."""
     lines = []
@@ -146,6 +161,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
             "forward": track.FORWARD,
             "length": trial.scenario.vehicle_length_m,
             "width": trial.scenario.vehicle_width_m,
+            "hardest": trial.scenario.max_acceleration_mps2,
         },
     }
 

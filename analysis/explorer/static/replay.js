@@ -56,7 +56,7 @@
       const [x0, y0] = place(side, 0), [x1, y1] = place(side, road.tunnel);
       draw("line", { class: "tunnel", x1: x0, y1: y0, x2: x1, y2: y1 }, track);
       draw("text", { class: "sign", x: x1, y: y1 + (side === "left" ? -3.4 : 5.2) }, track, "tunnel exit");
-      draw("text", { class: "sign side", x: x0 + 1, y: y0 + (side === "left" ? -3 : 4.6) }, track, side);
+      draw("text", { class: "sign side", x: 0, y: 0.9, transform: `translate(${place(side, 4).join(" ")}) rotate(${turned(side, 4)})` }, track, `${side} tunnel`);
     }
     draw("line", { class: "merge", x1: mergeX, y1: -4, x2: mergeX, y2: 4 }, track);
     draw("text", { class: "sign", x: mergeX, y: -5.2 }, track, "merge point");
@@ -93,6 +93,7 @@
     u.over.addEventListener("click", (event) => {
       seek(u.posToVal(event.clientX - u.over.getBoundingClientRect().left, "x"), true);
     });
+    u.over.addEventListener("mouseleave", show);
   };
   const resampled = (run, side, what) => times.map((t) => {
     const samples = run.sides[side];
@@ -106,11 +107,11 @@
     label, stroke: colour, width: 1.6, points: { show: false },
     value: (_, v) => (v === null || v === undefined ? "–" : v.toFixed(2)), ...extra,
   });
-  const chart = (id, heading, unit, own, others, extra) => {
+  const chart = (id, heading, unit, own, others, { scales, ...extra } = {}) => {
     const plot = new uPlot({
       title: heading, width: at("charts").clientWidth, height: 150, legend: { live: true },
       cursor: { sync: { key: "replay" }, drag: { x: false, y: false } },
-      scales: { x: { time: false } },
+      scales: { x: { time: false }, ...scales },
       axes: [{ size: 24, gap: 2, values: (_, ticks) => ticks.map((t) => `${t} s`) }, { size: 54, label: unit, labelSize: 18, labelGap: 0 }],
       series: [{ label: "t", value: (_, v) => (v === null || v === undefined ? "–" : `${v.toFixed(1)} s`) }, ...own.map(([s]) => s), ...others.map(([s]) => s)],
       hooks: { ready: [clickable, () => { placeRibbons(); show(); }] }, ...extra,
@@ -123,11 +124,14 @@
   const drawCharts = () => {
     for (const plot of charts.splice(0)) plot.destroy();
     const dashed = { dash: [4, 4], width: 1.2 };
-    for (const [id, heading, unit, what] of [["chart-v", "Velocity", "m/s", "v"], ["chart-a", "Acceleration", "m/s²", "a"]]) {
-      const lines = (run, note, extra) => ["left", "right"].map((side) =>
-        [series(`${side}${note}`, COLOURS[side], extra), resampled(run, side, what)]);
-      chart(id, heading, unit, lines(trial, "", {}), ghost ? lines(ghost, ", other", dashed) : []);
-    }
+    const lines = (run, what, note, extra) => ["left", "right"].map((side) =>
+      [series(`${side}${note}`, COLOURS[side], extra), resampled(run, side, what)]);
+    const both = (id, heading, unit, what, extra, options) => chart(id, heading, unit,
+      lines(trial, what, "", extra), ghost ? lines(ghost, what, ", other", { ...dashed, ...extra }) : [], options);
+    both("chart-v", "Velocity", "m/s", "v", {});
+    // A sample's acceleration is that of the step before it.
+    both("chart-a", "Acceleration", "m/s²", "a", { paths: uPlot.paths.stepped({ align: -1 }) },
+      { scales: { y: { range: (_, low, high) => [Math.min(low, -road.hardest), Math.max(high, road.hardest)] } } });
     const bound = trial.bounds, lower = bound.map((b) => (b === null ? null : -b));
     chart("chart-h", "Headway: how far the left vehicle is ahead; shaded: collision", "m",
       [[series("headway", "#000"), headways(trial)],
@@ -144,10 +148,10 @@
     if (!ribbons || !charts.length) return;
     const box = charts[0].over.getBoundingClientRect(), base = ribbons.getBoundingClientRect();
     const offset = box.left - base.left, scale = (t) => charts[0].valToPos(t, "x");
-    const width = Math.max(14, scale(begin + 1) - scale(begin) - 2);
     for (const link of decisions) {
       link.parentElement.style.left = `${offset + scale(Number(link.dataset.t))}px`;
-      link.parentElement.style.width = `${width}px`;
+      const until = Math.min(Number(link.dataset.t) + 1, trial.end);
+      link.parentElement.style.width = `${Math.max(14, scale(until) - scale(Number(link.dataset.t)) - 2)}px`;
     }
     ribbons.classList.add("placed");
   };
@@ -184,7 +188,11 @@
     const told = ["left", "right"].filter((side) => trial.sides[side]).map((side) =>
       `${side} ${sampled(trial.sides[side].t, trial.sides[side].v, now).toFixed(1)} m/s at ${sampled(trial.sides[side].t, trial.sides[side].x, now).toFixed(1)} m`);
     at("now").textContent = told.join("; ");
-    for (const plot of charts) plot.playhead.style.transform = `translateX(${plot.valToPos(now, "x")}px)`;
+    const nearest = times.reduce((best, t, i) => (Math.abs(t - now) < Math.abs(times[best] - now) ? i : best), 0);
+    for (const plot of charts) {
+      plot.playhead.style.transform = `translateX(${plot.valToPos(now, "x")}px)`;
+      if (plot.cursor.idx === null || plot.cursor.left < 0) plot.setLegend({ idx: nearest });
+    }
   };
   const seek = (t, keep = false) => {
     now = Math.min(Math.max(t, begin), trial.end);
