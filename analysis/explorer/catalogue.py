@@ -35,11 +35,11 @@ DELETE FROM memory.listed WHERE (trial_id, spec_hash, status, end_time_s) NOT IN
 DELETE FROM memory.members;
 INSERT INTO memory.members SELECT DISTINCT * FROM sweep_trials;
 """
-# The next 500: the file is not held for longer than that takes.
+# The next 2,000: the file is not held for longer than that takes.
 TAKE = """
 INSERT INTO memory.trials BY NAME
     FROM trials ANTI JOIN memory.listed USING (trial_id, spec_hash)
-    ORDER BY trial_id, spec_hash LIMIT 500;
+    ORDER BY trial_id, spec_hash LIMIT 2000;
 INSERT INTO memory.states BY NAME
     FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
 INSERT INTO memory.decided
@@ -180,18 +180,31 @@ class Catalogue:
 
     def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
         """Each facet's values with how many trials they would leave, the other facets as wanted."""
-        found = {}
-        for name in FACETS:
-            where, values = wanted.where(leave_out=name)
-            table = (
-                "listed" if name != "sweep" else "listed JOIN members USING (trial_id, spec_hash)"
-            )
-            found[name] = self._rows(
-                f"SELECT {name}, count(*) FROM {table} WHERE {where} AND {name} IS NOT NULL "  # noqa: S608 # constants
-                "GROUP BY ALL ORDER BY ALL",
-                values,
-            )
+        found: dict[str, list[tuple[str, int]]] = {name: [] for name in FACETS}
+        # Those of which no value is chosen look at the same trials.
+        alike = [name for name in FACETS[1:] if not getattr(wanted, name)]
+        for names in (alike, *([name] for name in FACETS[1:] if name not in alike)):
+            for name, value, count in self._counts(names, wanted) if names else ():
+                found[name].append((value, count))
+        where, values = wanted.where(leave_out="sweep")
+        found["sweep"] = self._rows(
+            "SELECT sweep, count(*) FROM listed JOIN members USING (trial_id, spec_hash) "  # noqa: S608 # constants
+            f"WHERE {where} GROUP BY ALL ORDER BY ALL",
+            values,
+        )
         return found
+
+    def _counts(self, names: list[str], wanted: Filter) -> list[tuple[str, str, int]]:
+        """(facet, value, trials) of facets for which the same trials count."""
+        where, values = wanted.where(leave_out=names[0])
+        cases = " ".join(f"WHEN grouping({name}) = 0 THEN '{name}'" for name in names)
+        sets = ", ".join(f"({name})" for name in names)
+        return self._rows(
+            f"SELECT CASE {cases} END AS facet, coalesce({', '.join(names)}) AS value, count(*) "  # noqa: S608 # constants
+            f"FROM listed WHERE {where} GROUP BY GROUPING SETS ({sets}) "
+            "HAVING value IS NOT NULL ORDER BY ALL",
+            values,
+        )
 
     def totals(self, wanted: Filter) -> Totals:
         """What the trials of a filter come to."""

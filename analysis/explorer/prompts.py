@@ -60,8 +60,8 @@ def _name(paragraph: str) -> str | None:
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
     old, new = _WORDS.findall(before), _WORDS.findall(now)
     pieces: list[tuple[Change, str]] = []
-    for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
-        if kind == "equal":
+    for i1, i2, j1, j2, changed in _runs(old, new):
+        if not changed:
             pieces.append(("same", "".join(new[j1:j2])))
             continue
         if gone := "".join(old[i1:i2]).strip():
@@ -69,3 +69,16 @@ def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
         if added := "".join(new[j1:j2]):
             pieces.append(("new", added))
     return tuple(pieces)
+
+
+def _runs(old: list[str], new: list[str]) -> list[tuple[int, int, int, int, bool]]:
+    """Where two texts are equal and where not; a space between two changes is changed as well."""
+    runs: list[tuple[int, int, int, int, bool]] = []
+    for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
+        changed = kind != "equal"
+        if changed and len(runs) > 1 and not "".join(new[slice(*runs[-1][2:4])]).strip():
+            start = runs[-2]
+            runs[-2:] = [(start[0], i2, start[2], j2, True)]
+        else:
+            runs.append((i1, i2, j1, j2, changed))
+    return runs

@@ -275,4 +275,4 @@ def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:
                     "to_merge_m": track.MERGE_POINT_M - samples["position_m"][last],
                 }
             )
-    return found
+    return sorted(found, key=lambda vehicle: not vehicle["own"])
