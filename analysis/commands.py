@@ -15,6 +15,7 @@ import typer
 from analysis.forms import TableFormat
 from analysis.human.commands import human_app
 from merge_runner.cli import DbOption, app, listed, main, print_out, say
+from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
 
 if TYPE_CHECKING:
@@ -121,9 +122,32 @@ def view(
     bind: Annotated[
         str, typer.Option("--bind", help="Another address to listen at; needs the token it prints.")
     ] = "127.0.0.1",
+    export: Annotated[
+        Path | None, typer.Option("--export", help="Write a folder of pages instead of serving.")
+    ] = None,
+    single: Annotated[
+        Path | None, typer.Option("--single", help="Write one page with the --trials.")
+    ] = None,
+    trials: Annotated[
+        str | None,
+        typer.Option("--trials", help="Which to write: names, comma separated, * for anything."),
+    ] = None,
     db: DbOption = DEFAULT_DB,
 ) -> None:
     """Serve the explorer: watch trials, read decisions, follow a sweep in a browser."""
-    from analysis.explorer.server import serve
+    if export is None and single is None:
+        if trials is not None:
+            raise UsageError("--trials goes with --export DIR or --single FILE.html")
+        from analysis.explorer.server import serve
 
-    serve(db, port, bind, print_out)
+        serve(db, port, bind, print_out)
+        return
+    from analysis.explorer.export import export_folder, export_page
+
+    if single is not None and trials is None:
+        raise UsageError("--single FILE.html needs --trials: name some, or all with '*'")
+    wanted = listed(trials) or []
+    for path in export_folder(db, export, wanted) if export is not None else ():
+        say(f"wrote {path}")
+    for path in export_page(db, single, wanted) if single is not None else ():
+        say(f"wrote {path}")

@@ -227,6 +227,14 @@ class Catalogue:
             [*values, PAGE * (number - 1)],
         )
 
+    def every(self, wanted: Filter) -> list[dict[str, Any]]:
+        """All trials of a filter, by name."""
+        where, values = wanted.where()
+        return self._records(
+            f"SELECT * FROM listed WHERE {where} ORDER BY trial_id, spec_hash",  # noqa: S608 # constants
+            values,
+        )
+
     def find(self, trial_id: str, spec_hash: str | None = None) -> dict[str, Any] | None:
         """One trial; where its name stands for several, the one of that spec, or any."""
         found = self._records(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from merge_runner.database import read_database
 from merge_runner.records import SIDES, Side
 
 Row = dict[str, Any]
-OF_TRIAL = "trial_id = ? AND spec_hash = ?"
+OF_TRIAL = "trial_id = $trial AND spec_hash = $spec"
 STATES = f"""
 SELECT side, list(time_s ORDER BY step) AS time_s, list(position_m ORDER BY step) AS position_m,
     list(velocity_mps ORDER BY step) AS velocity_mps,
@@ -26,12 +27,15 @@ DECISIONS = f"""
 SELECT decision, time_s, side, valid, failure, tactical, plan, applied, fallback, rationale
 FROM decisions WHERE {OF_TRIAL} ORDER BY decision, side
 """  # noqa: S608 # constants
-# A decision and the one before it on the same side.
+SPEC = "SELECT spec FROM specs WHERE spec_hash = $spec"
+# Of one decision with the one before it, or of all.
 DECIDED = f"""
-SELECT * FROM decisions WHERE {OF_TRIAL} AND side = ? AND decision IN (?, ? - 1) ORDER BY decision
+SELECT * FROM decisions WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
+    AND ($number IS NULL OR decision IN ($number, $number - 1)) ORDER BY side, decision
 """  # noqa: S608 # constants
 ATTEMPTS = f"""
-SELECT * FROM calls WHERE {OF_TRIAL} AND side = ? AND decision = ? ORDER BY attempt
+SELECT * FROM calls WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
+    AND ($number IS NULL OR decision = $number) ORDER BY side, decision, attempt
 """  # noqa: S608 # constants
 
 
@@ -66,38 +70,54 @@ class Decision:
 
 def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     """Read a trial that is known to be there."""
-    key = [trial_id, spec_hash]
+    key = {"trial": trial_id, "spec": spec_hash}
     with read_database(db) as connection:
         states = {row.pop("side"): row for row in _records(connection, STATES, key)}
         decisions = _records(connection, DECISIONS, key)
-        spec = _records(connection, "SELECT spec FROM specs WHERE spec_hash = ?", [spec_hash])
+        spec = _records(connection, SPEC, {"spec": spec_hash})
     told = json.loads(spec[0]["spec"]) if spec else {}
     scenario = Scenario.model_validate(told.get("scenario", {}))
     ordered = {side: states[side] for side in SIDES if side in states}
     return Trial(trial_id, spec_hash, scenario, ordered, decisions)
 
 
-def read_decision(
-    db: Path, trial_id: str, spec_hash: str, side: str, number: int
-) -> Decision | None:
-    """Read a decision; None where there is none."""
-    key = [trial_id, spec_hash, side, number]
+def read_decisions(
+    db: Path, trial_id: str, spec_hash: str, side: str | None = None, number: int | None = None
+) -> dict[tuple[str, int], Decision]:
+    """Read the decisions of a trial, or one of a side, by side and number.
+
+    A call without an answer ends its trial before there is a decision: what was asked is there.
+    """
+    key = {"trial": trial_id, "spec": spec_hash, "side": side, "number": number}
     with read_database(db) as connection:
-        found = _records(connection, DECIDED, [*key, number])
-        attempts = _records(connection, ATTEMPTS, key)
-    if not found or found[-1]["decision"] != number:
-        if not attempts:
-            return None
-        # A call without an answer ends its trial before there is a decision.
-        row: Row = {"decision": number, "side": side, "prompt": None, "lost": True}
-        return Decision(row, None, [], attempts)
-    row = {**found[-1], "lost": False}
-    before = found[0] if len(found) > 1 else None
+        rows = _records(connection, DECIDED, key)
+        calls = _records(connection, ATTEMPTS, key)
+    decided = {(row["side"], row["decision"]): row for row in rows}
+    attempts: dict[tuple[str, int], list[Row]] = {}
+    for call in calls:
+        attempts.setdefault((call["side"], call["decision"]), []).append(call)
+    return {
+        at: _decision(at, decided, attempts.get(at, []))
+        for at in dict.fromkeys((*decided, *attempts))
+        if number in {None, at[1]}
+    }
+
+
+def _decision(
+    at: tuple[str, int], decided: dict[tuple[str, int], Row], attempts: list[Row]
+) -> Decision:
+    side, number = at
+    row = decided.get(at)
+    if row is None:
+        return Decision({"decision": number, "side": side, "lost": True}, None, [], attempts)
+    before = decided.get((side, number - 1))
     parts = parts_of(row["prompt"] or "", before["prompt"] if before else None)
-    return Decision(row, before, parts, attempts)
+    return Decision({**row, "lost": False}, before, parts, attempts)
 
 
-def _records(connection: duckdb.DuckDBPyConnection, sql: str, values: list[Any]) -> list[Row]:
-    found = connection.execute(sql, values)
+def _records(
+    connection: duckdb.DuckDBPyConnection, sql: str, values: Mapping[str, object]
+) -> list[Row]:
+    found = connection.execute(sql, dict(values))
     names = [column[0] for column in found.description]
     return [dict(zip(names, row, strict=True)) for row in found.fetchall()]

@@ -41,6 +41,36 @@ class Links:
         return f"/static/{name}"
 
 
+class StaticLinks(Links):
+    """Addresses of an exported study: files beside each other, a page of trials a condition."""
+
+    def to(self, name: str, /, **state: object) -> str:
+        """A page."""
+        return f"{name}.html" + query_of(state)
+
+    def trial(self, row: Mapping[str, Any], **state: object) -> str:
+        """A trial on the page of its condition."""
+        named = {"trial": row["trial_id"], "spec": row["spec_hash"], **state}
+        return bundle_name(row["condition"]) + query_of(named)
+
+    def decision(self, row: Mapping[str, Any], side: str, number: int) -> str:
+        """Nothing: the page has it."""
+        return ""
+
+    def data(self, row: Mapping[str, Any]) -> str:
+        """How the page calls a trial."""
+        return f"{row['trial_id']}|{row['spec_hash']}"
+
+    def raw(self, row: Mapping[str, Any], side: str, number: int) -> str:
+        """Nothing: no server has it."""
+        return ""
+
+
+def bundle_name(condition: str) -> str:
+    """The file with the trials of a condition."""
+    return f"trials-{condition}.html"
+
+
 def query_of(state: Mapping[str, Any]) -> str:
     """The part of an address after the path; what is empty is left out."""
     given = {name: value for name, value in state.items() if value is not None and value != ""}

@@ -21,10 +21,11 @@ class NotThere(Exception):
 
 @dataclass
 class Site:
-    """The explorer of one database."""
+    """The explorer of one database; ``static`` pages stand alone, without a server."""
 
     db: Path
     at: Links = field(default_factory=Links)
+    static: bool = False
 
     def __post_init__(self) -> None:
         self.catalogue = Catalogue(self.db)
@@ -36,7 +37,12 @@ class Site:
             lstrip_blocks=True,
         )
         self._environment.globals.update(
-            at=self.at, pages=PAGES, study=str(self.db), visible=visible
+            at=self.at,
+            pages=PAGES,
+            shell="static.html" if self.static else "base.html",
+            static=self.static,
+            study=self.db.name if self.static else str(self.db),
+            visible=visible,
         )
 
     def render(self, template: str, **values: object) -> str:

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from analysis.explorer import views
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.details import Row, Trial, read_decision, read_trial
+from analysis.explorer.details import Decision, Row, Trial, read_decisions, read_trial
 from analysis.explorer.site import NotThere, Site
 from analysis.explorer.texts import shortened
 from merge_runner.records import SIDES
@@ -26,23 +26,31 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     panel = ""
     if asked.get("side") in SIDES and asked.get("decision", "").isdigit():
         panel = decision_panel(site, row, trial, asked["side"], int(asked["decision"]))
-    decided = {
-        side: mine for side in SIDES if (mine := [d for d in trial.decisions if d["side"] == side])
-    }
+    values = shown(row, trial)
     return site.render(
         "trial.html",
         here="trials",
-        row=row,
-        outcome=views.outcome_text(row),
-        facts=views.facts(row),
-        data=embedded(views.replay_data(row, trial)) if trial.states else None,
-        lines=views.summary(row, trial),
-        samples=views.sample_table(trial),
-        trial_decisions=decided,
+        **values,
         alternatives=alternatives(site, row),
         chosen_other=asked.get("compare", ""),
         panel=Markup(panel),  # noqa: S704 # rendered by a template of ours, which escapes
     )
+
+
+def shown(row: Row, trial: Trial) -> dict[str, Any]:
+    """What the template shows of a trial."""
+    decided = {
+        side: mine for side in SIDES if (mine := [d for d in trial.decisions if d["side"] == side])
+    }
+    return {
+        "row": row,
+        "outcome": views.outcome_text(row),
+        "facts": views.facts(row),
+        "data": embedded(views.replay_data(row, trial)) if trial.states else None,
+        "lines": views.summary(row, trial),
+        "samples": views.sample_table(trial),
+        "trial_decisions": decided,
+    }
 
 
 def decision_fragment(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
@@ -55,9 +63,14 @@ def decision_fragment(site: Site, trial_id: str, asked: Mapping[str, str]) -> st
 
 def decision_panel(site: Site, row: Row, trial: Trial, side: str, number: int) -> str:
     """What a driver was told, said, planned and did; raises NotThere."""
-    found = read_decision(site.db, row["trial_id"], row["spec_hash"], side, number)
-    if found is None:
+    found = read_decisions(site.db, row["trial_id"], row["spec_hash"], side, number)
+    if (side, number) not in found:
         raise NotThere(f"{row['trial_id']} has no decision {number} of the {side} driver")
+    return rendered(site, row, trial, found[side, number])
+
+
+def rendered(site: Site, row: Row, trial: Trial, found: Decision) -> str:
+    """A decision's panel."""
     body = next((a["reply"] for a in reversed(found.attempts) if a["reply"]), None)
     text, more = shortened(body or "")
     return site.render(
@@ -68,7 +81,7 @@ def decision_panel(site: Site, row: Row, trial: Trial, side: str, number: int) -
         meanings=views.BLOCK_MEANINGS,
         attempts=found.attempts,
         reply=None if body is None else {"text": text, "more": more},
-        raw=site.at.raw(row, side, number),
+        raw=site.at.raw(row, found.row["side"], found.row["decision"]),
         chart=views.plan_chart(found, trial.scenario),
         points=views.step_points,
         aftermath=views.aftermath(trial, found),
@@ -79,8 +92,8 @@ def raw_reply(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     """The body of the last reply to a call, whole."""
     row = find(site, trial_id, asked)
     side, number = _decision_of(asked)
-    found = read_decision(site.db, row["trial_id"], row["spec_hash"], side, number)
-    bodies = [a["reply"] for a in found.attempts if a["reply"]] if found else []
+    found = read_decisions(site.db, row["trial_id"], row["spec_hash"], side, number)
+    bodies = [a["reply"] for one in found.values() for a in one.attempts if a["reply"]]
     if not bodies:
         raise NotThere(f"{trial_id} has no reply to decision {number} of the {side} driver")
     body: str = bodies[-1]

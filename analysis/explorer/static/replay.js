@@ -1,6 +1,11 @@
 "use strict";
 // The replay of a trial: track, charts, ribbons and clock, all of one moment.
-(() => {
+// Where a decision's panel and another trial's data come from; a page without a server has its own.
+window.explorer ??= {
+  panel: async (link) => (await fetch(link.dataset.panel)).text(),
+  data: async (option) => (await fetch(option.dataset.url)).json(),
+};
+window.startReplay = () => {
   const holder = document.getElementById("replay-data");
   if (!holder) return;
   const at = (id) => document.getElementById(id);
@@ -164,7 +169,7 @@
     if (jump) seek(Number(link.dataset.t));
     const panel = document.querySelector("#decision .decision-panel");
     if (panel?.dataset.side !== link.dataset.side || panel?.dataset.n !== link.dataset.n) {
-      htmx.ajax("GET", link.dataset.panel, { target: "#decision", swap: "innerHTML" });
+      explorer.panel(link).then((html) => { if (selected === link) at("decision").innerHTML = html; });
     }
     remember(push);
   };
@@ -250,7 +255,7 @@
   const compare = async (id, push) => {
     const chooser = at("compare");
     const option = [...chooser.options].find((o) => o.value === id && o.dataset.url);
-    ghost = option ? await (await fetch(option.dataset.url)).json() : null;
+    ghost = option ? await explorer.data(option) : null;
     chooser.value = option ? id : "";
     at("ghost-key").hidden = !ghost;
     at("ghost-key").textContent = ghost ? `dashed: ${ghost.label}. ${ghost.outcome}` : "";
@@ -308,4 +313,5 @@
 
   drawCharts();
   recall();
-})();
+};
+startReplay();

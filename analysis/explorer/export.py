@@ -1,0 +1,209 @@
+"""A study as a folder of pages, or trials as one page, that open without a server."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+import tempfile
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from markupsafe import Markup
+
+from analysis.explorer.catalogue import FACETS, Filter
+from analysis.explorer.details import Row, read_decisions, read_trial
+from analysis.explorer.links import StaticLinks, bundle_name
+from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
+from analysis.explorer.site import Site
+from analysis.explorer.views import sparkline
+from merge_runner.errors import UsageError
+from merge_runner.simulator.conditions import CONDITIONS
+
+STATIC = Path(__file__).with_name("static")
+STYLES = ("vendor/uplot-1.6.32.min.css", "explorer.css")
+LISTING = ("keys.js", "listing.js")
+BUNDLE = ("keys.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
+# A block of a prompt in a decision's panel: the same ones come again and again.
+_BLOCK = re.compile(r'<div class="block">.*?</div>', re.DOTALL)
+# What is taken for a secret wherever it stands, beside the values of this machine's keys.
+_KEYS = re.compile(r"\b(?:sk-[A-Za-z0-9_-]{16,}|AIza[A-Za-z0-9_-]{30,}|Bearer [A-Za-z0-9._-]{16,})")
+SHORTEST_SECRET = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Inlined:
+    """Styles and scripts within a page, and their hashes for its policy."""
+
+    styles: list[Markup]
+    scripts: list[Markup]
+    hashes: str
+
+
+@dataclass(slots=True)
+class Blocks:
+    """The blocks of all prompts of a page, each once."""
+
+    numbers: dict[str, int] = field(default_factory=dict)
+
+    def without(self, html: str) -> str:
+        """A panel with a number in the place of each block."""
+        return _BLOCK.sub(lambda found: f"\x01{self._number(found[0])};", html)
+
+    def _number(self, block: str) -> int:
+        return self.numbers.setdefault(block, len(self.numbers))
+
+
+def export_folder(db: Path, folder: Path, wanted: Sequence[str]) -> Iterator[Path]:
+    """Write the list of trials and a page for each condition; yields the paths.
+
+    ``wanted`` are names of trials, in which * stands for anything; none wants all. Nothing is
+    written where a page holds a key or a path of this machine. Raises UsageError.
+    """
+    site, rows = _opened(db, wanted)
+    pages = {"trials.html": _listing(site, rows)}
+    pages["index.html"] = pages["trials.html"]
+    for condition in CONDITIONS:
+        if mine := [row for row in rows if row["condition"] == condition]:
+            pages[bundle_name(condition)] = bundle_page(site, mine, f"Trials of {condition}")
+    yield from _written(folder, pages)
+
+
+def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Iterator[Path]:
+    """Write one page with the wanted trials; yields its path. Raises UsageError."""
+    site, rows = _opened(db, wanted)
+    yield from _written(file.parent, {file.name: bundle_page(site, rows, "Trials")})
+
+
+def bundle_page(site: Site, rows: list[Row], name: str) -> str:
+    """A page with several trials, of which it shows one."""
+    blocks = Blocks()
+    trials = {site.at.data(row): _packed(_trial(site, row, rows, blocks)) for row in rows}
+    bundle = {"trials": trials, "blocks": _packed(list(blocks.numbers))}
+    return site.render(
+        "bundle.html",
+        here="trials",
+        name=name,
+        rows=rows,
+        bundle=embedded(bundle),
+        inlined=inlined(BUNDLE),
+    )
+
+
+def _trial(site: Site, row: Row, beside: list[Row], blocks: Blocks) -> dict[str, object]:
+    """What the page needs of one trial."""
+    trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
+    found = read_decisions(site.db, row["trial_id"], row["spec_hash"])
+    values = shown(row, trial)
+    there = {(other["trial_id"], other["spec_hash"]) for other in beside}
+    others = {
+        kind: [other for other in kin if (other["trial_id"], other["spec_hash"]) in there]
+        for kind, kin in alternatives(site, row).items()
+    }
+    html = site.render(
+        "_trial.html", here="trials", **values, alternatives=others, chosen_other="", panel=""
+    )
+    panels = {
+        f"{side}/{number}": rendered(site, row, trial, decision)
+        for (side, number), decision in found.items()
+    }
+    _refuse_secrets(row["trial_id"], [html, *panels.values()])
+    data = json.loads(values["data"]) if values["data"] else None
+    small = {at: blocks.without(panel) for at, panel in panels.items()}
+    return {"html": html, "panels": small, "data": data}
+
+
+def _listing(site: Site, rows: list[Row]) -> str:
+    facets = {
+        name: sorted({(str(row[name]), 0) for row in rows if row[name] is not None})
+        for name in FACETS
+        if name != "sweep"
+    }
+    counted = {
+        name: [(value, sum(row[name] == value for row in rows)) for value, _ in values]
+        for name, values in facets.items()
+    }
+    return site.render(
+        "listing.html",
+        here="trials",
+        facets=counted,
+        rows=rows,
+        sorts={},
+        sort="",
+        chosen={},
+        sparkline=sparkline,
+        inlined=inlined(LISTING),
+    )
+
+
+def inlined(scripts: Sequence[str]) -> Inlined:
+    """Our styles and these scripts, to stand within a page."""
+
+    def texts(names: Sequence[str]) -> list[str]:
+        return [(STATIC / name).read_text(encoding="utf-8") for name in names]
+
+    styles, code = texts(STYLES), texts(scripts)
+    hashes = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+        for text in (*styles, *code)
+    )
+    return Inlined([Markup(text) for text in styles], [Markup(text) for text in code], hashes)  # noqa: S704 # files of ours
+
+
+def _opened(db: Path, wanted: Sequence[str]) -> tuple[Site, list[Row]]:
+    """A site of files and the wanted trials, by name; raises UsageError where there is none."""
+    site = Site(db, StaticLinks(), static=True)
+    site.catalogue.refresh()
+    every = site.catalogue.every(Filter())
+    rows = [
+        row
+        for row in every
+        if not wanted or any(fnmatchcase(row["trial_id"], pattern) for pattern in wanted)
+    ]
+    if not rows:
+        names = ", ".join(wanted) or "any name"
+        raise UsageError(f"{db} holds no trial called {names}; `merge-runner view` lists them")
+    return site, rows
+
+
+def _packed(value: object) -> str:
+    text = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
+    return base64.b64encode(zlib.compress(text.encode(errors="replace"), 9)).decode()
+
+
+def _written(folder: Path, pages: dict[str, str]) -> Iterator[Path]:
+    for name, text in pages.items():
+        _refuse_secrets(name, [text])
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in pages.items():
+            (folder / name).write_text(text, encoding="utf-8")
+            yield folder / name
+    except OSError as exc:
+        raise UsageError(f"{folder} cannot be written: {exc}") from exc
+
+
+def _refuse_secrets(where: str, texts: Sequence[str]) -> None:
+    """Raises UsageError where a text holds a key, or a path of this machine."""
+    secrets = {
+        value: name
+        for name, value in os.environ.items()
+        if name.endswith(("_API_KEY", "_TOKEN")) and len(value) >= SHORTEST_SECRET
+    }
+    paths = {str(Path.home()), str(Path.cwd()), tempfile.gettempdir()} - {"/", "/root", "/tmp"}  # noqa: S108 # names
+    for text in texts:
+        for value, name in secrets.items():
+            if value in text:
+                raise UsageError(f"nothing was written: {where} holds the value of {name}")
+        if found := _KEYS.search(text):
+            raise UsageError(
+                f"nothing was written: {where} holds what looks like a key: {found[0][:6]}..."
+            )
+        for path in sorted(paths):
+            if f"{path}/" in text:
+                raise UsageError(f"nothing was written: {where} names the path {path}")

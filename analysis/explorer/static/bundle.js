@@ -1,0 +1,30 @@
+"use strict";
+// An exported page holds many trials, each compressed by itself; the address names the one shown.
+(async () => {
+  const bundle = JSON.parse(document.getElementById("bundle").textContent);
+  const unpacked = async (text) => {
+    const bytes = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    return JSON.parse(await new Response(stream).text());
+  };
+  const blocks = await unpacked(bundle.blocks);
+  const whole = (html) => html.replace(/\u0001(\d+);/g, (_, number) => blocks[number]);
+  const chooser = document.getElementById("chooser");
+  const asked = new URL(location.href).searchParams;
+  const options = [...chooser.options];
+  const chosen = options.find((o) => o.value === `${asked.get("trial")}|${asked.get("spec")}`)
+    ?? options.find((o) => o.value.startsWith(`${asked.get("trial")}|`)) ?? options[0];
+  chooser.value = chosen.value;
+  chooser.addEventListener("change", () => {
+    const [trial, spec] = chooser.value.split("|");
+    location.search = new URLSearchParams({ trial, spec });
+  });
+  const trial = await unpacked(bundle.trials[chosen.value]);
+  window.explorer = {
+    panel: async (link) => whole(trial.panels[`${link.dataset.side}/${link.dataset.n}`]),
+    data: async (option) => (await unpacked(bundle.trials[option.dataset.url])).data,
+  };
+  document.getElementById("shown").innerHTML = trial.html;
+  document.title = `${chosen.value.split("|")[0]} · merge-runner`;
+  startReplay();
+})();
