@@ -10,7 +10,7 @@ from typing import Literal
 from merge_runner.prompts.blocks import BLOCKS
 
 Change = Literal["same", "new", "gone"]
-_WORDS = re.compile(r"\s+|[^\s\[\](),]+|[\[\](),]")
+_WORDS = re.compile(r"[^\s\[\](),]+\s*|[\[\](),]\s*|\s+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,25 +58,30 @@ def _name(paragraph: str) -> str | None:
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
-    old, new = _WORDS.findall(before), _WORDS.findall(now)
+    """Line by line where there are as many: the values change, and hardly the words."""
+    old, new = before.splitlines(keepends=True), now.splitlines(keepends=True)
+    if len(old) != len(new):
+        old, new = [before], [now]
     pieces: list[tuple[Change, str]] = []
-    for i1, i2, j1, j2, changed in _runs(old, new):
-        if not changed:
-            pieces.append(("same", "".join(new[j1:j2])))
+    for line_before, line in zip(old, new, strict=True):
+        if line_before == line:
+            pieces.append(("same", line))
             continue
-        if gone := "".join(old[i1:i2]).strip():
-            pieces.append(("gone", gone))
-        if added := "".join(new[j1:j2]):
-            pieces.append(("new", added))
+        words_before, words = _WORDS.findall(line_before), _WORDS.findall(line)
+        for i1, i2, j1, j2, changed in _runs(words_before, words):
+            if changed and i1 < i2:
+                pieces.append(("gone", "".join(words_before[i1:i2]).strip()))
+            if j1 < j2:
+                pieces.append(("new" if changed else "same", "".join(words[j1:j2])))
     return tuple(pieces)
 
 
 def _runs(old: list[str], new: list[str]) -> list[tuple[int, int, int, int, bool]]:
-    """Where two texts are equal and where not; a space between two changes is changed as well."""
+    """Where two lines are equal and where not; a comma between two changes is changed as well."""
     runs: list[tuple[int, int, int, int, bool]] = []
     for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
         changed = kind != "equal"
-        if changed and len(runs) > 1 and not "".join(new[slice(*runs[-1][2:4])]).strip():
+        if changed and len(runs) > 1 and "".join(new[slice(*runs[-1][2:4])]).strip() in {"", ","}:
             start = runs[-2]
             runs[-2:] = [(start[0], i2, start[2], j2, True)]
         else:
