@@ -20,7 +20,7 @@ def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
     """Serve a database; ``say`` is told the address. Raises UsageError."""
     site = Site(db)
     site.catalogue.refresh()
-    listener = _listen(bind, port)
+    listener = listen(bind, port)
     port = listener.getsockname()[1]
     token = None if bind == LOOPBACK else secrets.token_urlsafe(24)
     hosts = {f"{LOOPBACK}:{port}", f"localhost:{port}"}
@@ -30,7 +30,8 @@ def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
     uvicorn.Server(config).run(sockets=[listener])
 
 
-def _listen(bind: str, port: int) -> socket.socket:
+def listen(bind: str, port: int) -> socket.socket:
+    """A socket that listens, 0: at any free port; raises UsageError."""
     try:
         return socket.create_server((bind, port))
     except OSError as exc:

@@ -232,6 +232,7 @@ window.startReplay = () => {
   // ---- the address tells the state
 
   const remember = (push) => {
+    if (push === null) return; // what the address says is being done
     const address = new URL(location.href);
     const state = { t: now > begin ? now.toFixed(1) : "", side: selected?.dataset.side, decision: selected?.dataset.n, compare: ghost?.id };
     for (const [name, value] of Object.entries(state)) {
@@ -244,8 +245,8 @@ window.startReplay = () => {
   const recall = async () => {
     const asked = new URL(location.href).searchParams;
     const link = decisions.find((d) => d.dataset.side === asked.get("side") && d.dataset.n === asked.get("decision"));
-    select(link ?? null, { push: false, jump: !asked.has("t") });
-    if ((asked.get("compare") ?? "") !== (ghost?.id ?? "")) await compare(asked.get("compare") ?? "", false);
+    select(link ?? null, { push: null, jump: !asked.has("t") });
+    if ((asked.get("compare") ?? "") !== (ghost?.id ?? "")) await compare(asked.get("compare") ?? "", null);
     if (asked.has("t")) seek(Number(asked.get("t")) || begin);
     else if (!link) seek(begin);
   };

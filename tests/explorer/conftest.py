@@ -1,0 +1,102 @@
+"""The explorer of a small study, served to a real browser."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import uvicorn
+from harness import PROGRAM, RECORDING, environment
+from hostile import hostile_trial
+
+from analysis.explorer.app import explorer
+from analysis.explorer.server import listen
+from analysis.explorer.site import Site
+from merge_runner.store import Store
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+def pytest_runtest_setup(item):
+    """Without a browser the tests of pages are skipped, but not where they are required."""
+    if "page" in item.fixturenames and CHROMIUM is None:
+        if os.environ.get("MERGE_RUNNER_BROWSER") == "required":
+            pytest.fail("no chromium is installed")
+        pytest.skip("needs chromium: apt install chromium")
+
+
+@pytest.fixture(scope="session")
+def study(tmp_path_factory):
+    """Recorded trials of two conditions, one of which collides, and a hostile one."""
+    folder = tmp_path_factory.mktemp("study")
+    db = folder / "study.duckdb"
+    subprocess.run(
+        [
+            *(PROGRAM, "replay", "baseline", "--recording", RECORDING, "--db", db),
+            *("--cache", folder / "cache", "--reps", "3", "--conditions", "L_4_0,N_0_0"),
+        ],
+        check=True,
+        capture_output=True,
+        env=environment(),
+    )
+    Store(db).write("hostile", [hostile_trial()], patience_s=5)
+    return db
+
+
+@contextmanager
+def served(db: Path):
+    """The explorer of a database in a thread of its own; gives its address."""
+    listener = listen("127.0.0.1", 0)
+    host = f"127.0.0.1:{listener.getsockname()[1]}"
+    server = uvicorn.Server(
+        uvicorn.Config(explorer(Site(db), {host}), log_level="warning", ws="none")
+    )
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        while not server.started:
+            time.sleep(0.01)
+        yield f"http://{host}"
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture(scope="session")
+def site(study):
+    """The address of the explorer."""
+    with served(study) as address:
+        yield address
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Chromium without a window."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser, site):
+    """A page that may ask the explorer alone, and on which no script may fail."""
+    context = browser.new_context(base_url=site, viewport={"width": 1500, "height": 1000})
+    page = context.new_page()
+    asked, wrong = [], []
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    yield page
+    context.close()
+    # A filter that is changed before its list is there gives the first one up.
+    assert [said for said in wrong if not said.startswith("htmx:")] == []
+    assert [url for url in asked if not url.startswith((site, "file:", "data:", "blob:"))] == []

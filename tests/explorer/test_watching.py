@@ -1,0 +1,165 @@
+"""A trial is watched and its decisions read, by mouse, by keys and by address."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hostile import HOSTILE
+from playwright.sync_api import expect
+
+TRIAL = "/trials/emulator/baseline/N_0_0/rep01"
+COLLIDED = "/trials/emulator/baseline/N_0_0/rep03"
+
+
+def clock(page) -> float:
+    return float(page.locator("#clock").inner_text().split()[0])
+
+
+def place(page, side):
+    return page.locator(f"#track .own.{side}").get_attribute("transform")
+
+
+def test_the_list_leads_to_a_collision_and_its_words(page):
+    page.goto("/trials")
+    page.get_by_label("condition").select_option("N_0_0")
+    page.get_by_label("outcome").select_option("collided")
+    expect(page.locator(".totals")).to_contain_text("1 of 1 ended ones collided")
+    assert "condition=N_0_0" in page.url
+    assert "outcome=collided" in page.url
+    page.reload()
+    expect(page.locator("tbody tr")).to_have_count(1)
+    page.locator("tbody a").first.click()
+    expect(page.get_by_text("The vehicles collided")).to_be_visible()
+    page.locator("a.decision").last.click()
+    panel = page.locator(".decision-panel")
+    for heading in ("What it was told", "What it said", "What it planned", "What happened next"):
+        expect(panel.get_by_role("heading", name=heading)).to_be_visible()
+    expect(panel.locator("h4").first).to_contain_text("C0")
+    page.go_back()
+    page.go_back()
+    expect(page.locator("tbody tr")).to_have_count(1)
+
+
+def test_time_moves_by_play_scrub_and_keys(page):
+    page.goto(TRIAL)
+    start = place(page, "left")
+    page.keyboard.press("5")
+    page.keyboard.press(" ")
+    expect(page.locator("#clock")).to_have_text(re.compile(r"^[1-9]"))
+    page.keyboard.press(" ")
+    stopped = clock(page)
+    assert place(page, "left") != start
+    page.keyboard.press("ArrowRight")
+    assert clock(page) == pytest.approx(stopped + 0.1, abs=0.051)
+    page.keyboard.press("Shift+ArrowRight")
+    assert clock(page) == pytest.approx(stopped + 1.1, abs=0.051)
+    page.locator("#scrub").fill("2.5")
+    assert clock(page) == 2.5
+    left = page.locator("#chart-v .playhead").bounding_box()["x"]
+    page.keyboard.press("Shift+ArrowRight")
+    assert page.locator("#chart-v .playhead").bounding_box()["x"] > left
+    assert "t=3.5" in page.url
+
+
+def test_a_trial_is_played_to_its_end(page):
+    page.goto(f"{COLLIDED}?t=2.5")
+    crash = page.locator("#track .crash")
+    expect(crash).to_be_hidden()
+    page.keyboard.press("5")
+    page.locator("#play").click()
+    expect(crash).to_be_visible()
+    expect(page.locator("#play")).to_have_text("Play")
+
+
+def test_brackets_go_through_the_decisions_and_escape_goes_back(page):
+    page.goto(TRIAL)
+    for _ in range(3):
+        page.keyboard.press("]")
+    current = page.locator("a.decision[aria-current]")
+    expect(current).to_have_attribute("aria-label", re.compile("left, decision 1 at 1.0 s"))
+    expect(page.locator(".decision-panel h2")).to_contain_text("decision 1 at 1.0 s")
+    assert clock(page) == 1.0
+    page.keyboard.press("[")
+    expect(current).to_have_attribute("aria-label", re.compile("right, decision 0"))
+    page.keyboard.press("Escape")
+    expect(current).to_have_count(0)
+    page.keyboard.press("Escape")
+    page.wait_for_url("**/trials")
+
+
+def test_an_address_brings_everything_back(page):
+    other = "emulator/baseline/N_0_0/rep02"
+    page.goto(f"{TRIAL}?t=4.2&side=right&decision=3&compare={other}")
+    expect(page.locator(".decision-panel h2")).to_contain_text("right")
+    expect(page.locator("#clock")).to_have_text(re.compile(r"^4\.2 s"))
+    expect(page.locator("#ghost-key")).to_contain_text("rep 2")
+    expect(page.locator("#track .ghost.left")).to_be_visible()
+    page.locator("a.decision").first.click()
+    expect(page.locator(".decision-panel h2")).to_contain_text("decision 0")
+    page.go_back()
+    expect(page.locator(".decision-panel h2")).to_contain_text("decision 3")
+    expect(page.locator("#clock")).to_have_text(re.compile(r"^4\.2 s"))
+
+
+def test_keys_are_off_while_one_types(page):
+    page.goto("/trials")
+    page.keyboard.press("/")
+    page.keyboard.type("jk?1")
+    assert page.locator("#search").input_value() == "jk?1"
+    expect(page.locator("#help")).to_be_hidden()
+    page.locator("#search").fill("")
+    page.keyboard.press("Escape")
+    page.keyboard.press("?")
+    expect(page.locator("#help")).to_be_visible()
+
+
+def test_j_k_and_enter_open_a_trial(page):
+    page.goto("/trials?q=emulator")
+    for key in "jjk":
+        page.keyboard.press(key)
+    expect(page.locator("tr.chosen")).to_have_count(1)
+    name = page.locator("tr.chosen a").inner_text()
+    page.keyboard.press("Enter")
+    expect(page.locator("h1")).to_have_text(name)
+
+
+def test_a_click_into_a_chart_moves_the_clock(page):
+    page.goto(TRIAL)
+    box = page.locator("#chart-h .u-over").bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
+    end = float(page.locator("#clock").inner_text().split()[3])
+    assert clock(page) == pytest.approx(end / 2, abs=0.2)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_what_a_model_wrote_is_text(page, side):
+    page.goto(f"/trials/<b>o3</b>/baseline/L_4_0/rep01?side={side}&decision=1")
+    panel = page.locator(".decision-panel")
+    expect(panel).to_contain_text("<script>document.title='owned'</script>")
+    expect(panel).to_contain_text("{{ 7*7 }}")
+    expect(panel).to_contain_text("[U+202E]")
+    assert "owned" not in page.title()
+    assert panel.locator("script, img").count() == 0
+    panel.get_by_text("The whole reply").click()
+    raw = page.request.get(panel.get_by_role("link", name="the whole text").get_attribute("href"))
+    assert raw.headers["content-type"].startswith("text/plain")
+    assert "sandbox" in raw.headers["content-security-policy"]
+    assert len(raw.text()) > len(HOSTILE) + 1_000_000
+    assert len(panel.inner_text()) < 50_000
+
+
+def test_who_wants_no_motion_gets_pictures(browser, site):
+    context = browser.new_context(base_url=site, reduced_motion="reduce")
+    page = context.new_page()
+    page.goto(TRIAL)
+    page.evaluate(
+        "window.seen = new Set(); new MutationObserver(() => seen.add("
+        "document.getElementById('clock').textContent)).observe("
+        "document.getElementById('clock'), {childList: true, characterData: true, subtree: true})"
+    )
+    page.keyboard.press(" ")
+    page.wait_for_timeout(1500)
+    context_seen = page.evaluate("seen.size")
+    context.close()
+    assert 1 <= context_seen <= 4
