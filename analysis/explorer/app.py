@@ -20,8 +20,8 @@ from starlette.responses import (
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from analysis.explorer.guard import Guard
-from analysis.explorer.pages import trial, trials
+from analysis.explorer.guard import Guard, from_elsewhere
+from analysis.explorer.pages import sql, trial, trials
 from analysis.explorer.site import NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
@@ -87,6 +87,7 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             ),
             Route(f"/data/{of_trial}", data),
             Route(f"/raw/{of_trial}", raw),
+            *_sql_routes(site),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
@@ -95,3 +96,23 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
         ],
         exception_handlers={NotThere: message, MergeRunnerError: message},
     )
+
+
+def _sql_routes(site: Site) -> list[Route]:
+    """A query runs for us alone: where another site leads to it, it is shown."""
+
+    def sql_query(request: Request) -> Response:
+        run = not from_elsewhere(request.headers)
+        return HTMLResponse(sql.sql_page(site, request.query_params, run=run))
+
+    def sql_download(request: Request) -> Response:
+        if from_elsewhere(request.headers):
+            return RedirectResponse(site.at.to("sql", q=sql.query_in(request.query_params)))
+        try:
+            content = sql.sql_csv(site, request.query_params)
+        except sql.UNANSWERED as exc:
+            return HTMLResponse(sql.sql_page(site, request.query_params, problem=str(exc)), 400)
+        name = {"content-disposition": 'attachment; filename="query.csv"'}
+        return Response(content, media_type=KINDS["csv"], headers=name)
+
+    return [Route("/sql", sql_query), Route("/sql.csv", sql_download)]

@@ -9,10 +9,11 @@ import jinja2
 
 from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.links import Links
+from analysis.explorer.sandbox import Sandbox
 from analysis.explorer.texts import visible
 
 TEMPLATES = Path(__file__).with_name("templates")
-PAGES = {"Trials": "trials"}
+PAGES = {"Trials": "trials", "SQL": "sql"}
 
 
 class NotThere(Exception):
@@ -28,6 +29,7 @@ class Site:
 
     def __post_init__(self) -> None:
         self.catalogue = Catalogue(self.db)
+        self.sandbox = Sandbox(self.db)
         self._environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(TEMPLATES),
             autoescape=True,
