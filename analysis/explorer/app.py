@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import AsyncIterator, Callable, Collection
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,11 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
         values: dict[str, Any] = {"heading": heading, "text": str(exc), "here": ""}
         return HTMLResponse(site.render("message.html", **values), code)
 
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        yield
+        site.close()  # a server that is told to end is killed after this
+
     of_trial = "{trial:path}"
     return Starlette(
         routes=[
@@ -94,6 +100,7 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             Middleware(Guard, hosts=hosts, token=token),
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
+        lifespan=lifespan,
         exception_handlers={NotThere: message, MergeRunnerError: message},
     )
 

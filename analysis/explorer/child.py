@@ -14,7 +14,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ THREADS = 2
 BATCH = 64  # rows fetched at once: each may be large
 COLUMNS = 1000
 NAME = 200
+PLAN_TEXT = 200_000  # characters: a part of a plan of execution says little
 CELL_COSTS = 30  # bytes of a cell of the page, beside its text
 LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
 MEMORY = "needed more memory"  # the explorer says how much there was
@@ -114,7 +115,8 @@ def _run(query: Query) -> tuple[dict[str, Any], bytes]:
             return _csv([name for name, _ in columns], rows, query)
         if len(columns) > COLUMNS:
             return {"error": f"the result has more than {COLUMNS} columns: name those to show"}, b""
-        cells, more = _cells(rows, query)
+        is_plan = bool(columns) and columns[0][0] == "explain_key"
+        cells, more = _cells(rows, replace(query, text=PLAN_TEXT) if is_plan else query)
     names = [[name[:NAME], kind[:NAME]] for name, kind in columns]
     seconds = time.monotonic() - began
     return {"columns": names, "rows": cells, "more": more, "seconds": seconds}, b""

@@ -107,6 +107,10 @@ class Sandbox:
         """All that a query finds; raises NoAnswer and UsageError."""
         return self._answer(sql, as_csv=True)[1]
 
+    def close(self) -> None:
+        """Delete the copy, unless a query reads it: that one will."""
+        self._copy = None
+
     def _answer(self, sql: str, *, as_csv: bool) -> tuple[dict[str, Any], bytes]:
         if len(sql) > LONGEST:
             raise NoAnswer(f"a query has up to {LONGEST:,} characters here, this one {len(sql):,}")

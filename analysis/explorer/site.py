@@ -44,3 +44,7 @@ class Site:
     def render(self, template: str, **values: object) -> str:
         """A page, or a part of one."""
         return self._environment.get_template(template).render(values)
+
+    def close(self) -> None:
+        """Leave nothing behind."""
+        self.sandbox.close()

@@ -124,6 +124,12 @@ def test_a_large_result_is_cut_and_says_so(run):
     assert run("FROM range(1000)")["more"] is False
 
 
+def test_a_plan_of_execution_is_whole(run):
+    ((_, (plan, left_out)),) = run("EXPLAIN FROM trial_metrics")["rows"]
+    assert len(plan) > 10_000
+    assert left_out == 0
+
+
 def test_a_download_is_whole_or_refused(run):
     csv = run("SELECT 'a,\"b' AS x, NULL AS y, repeat('é', 3000) AS z FROM range(101)", as_csv=True)
     assert csv.decode().splitlines() == ["x,y,z", *['"a,""b",,' + "é" * 3000] * 101]
@@ -234,7 +240,8 @@ def test_a_copy_lasts_while_the_file_stays_and_no_longer(own):
     assert second.file != first.file
     kept = [first.file.parent, second.file.parent]
     assert all(folder.exists() for folder in kept)
-    del first, second, queries
+    del first, second
+    queries.close()
     gc.collect()
     assert not any(folder.exists() for folder in kept)
 
