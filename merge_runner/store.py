@@ -178,28 +178,37 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
     It reaches no file and no network, and changes no setting.
     """
     # The settings hold for a whole instance, and cannot be taken back.
-    with read_database(path, Instance()) as connection:
-        # External access alone leaves the database's own files open to COPY ... TO.
-        connection.execute(
-            "SET temp_directory = ''; SET enable_external_access = false; "
-            "SET disabled_filesystems = 'LocalFileSystem'; SET lock_configuration = true"
-        )
-        try:
-            statements = connection.extract_statements(sql)
-            if len(statements) != 1 or not _reads(statements[0]):
-                raise UsageError(
-                    "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
-                    "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
-                )
-            result = connection.execute(statements[0])
-            names = [column[0] for column in result.description or ()]
-            return names, result.fetchall()
-        except duckdb.IOException:
-            raise  # no query reaches a file but the database, so that one is damaged
-        except duckdb.Error as exc:
-            if "pytz" in str(exc):
-                raise UsageError("cast times with a zone, as in now()::TIMESTAMP") from exc
-            raise UsageError(f"the query failed: {exc}") from exc
+    with read_database(path, Instance()) as connection, answering(connection, sql) as result:
+        return [column[0] for column in result.description or ()], result.fetchall()
+
+
+@contextmanager
+def answering(
+    connection: duckdb.DuckDBPyConnection, sql: str
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Run one query, which reaches nothing but what is open, to be fetched; raises UsageError.
+
+    The connection's whole instance stays locked up.
+    """
+    # External access alone leaves the database's own files open to COPY ... TO.
+    connection.execute(
+        "SET temp_directory = ''; SET enable_external_access = false; "
+        "SET disabled_filesystems = 'LocalFileSystem'; SET lock_configuration = true"
+    )
+    try:
+        statements = connection.extract_statements(sql)
+        if len(statements) != 1 or not _reads(statements[0]):
+            raise UsageError(
+                "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
+                "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
+            )
+        yield connection.execute(statements[0])
+    except duckdb.IOException:
+        raise  # no query reaches a file but the database, so that one is damaged
+    except duckdb.Error as exc:
+        if "pytz" in str(exc):
+            raise UsageError("cast times with a zone, as in now()::TIMESTAMP") from exc
+        raise UsageError(f"the query failed: {exc}") from exc
 
 
 def _reads(statement: duckdb.Statement) -> bool:

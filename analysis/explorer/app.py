@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import AsyncIterator, Callable, Collection
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ from starlette.responses import (
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from analysis.explorer.guard import Guard
-from analysis.explorer.pages import trial, trials
+from analysis.explorer.guard import Guard, from_elsewhere
+from analysis.explorer.pages import sql, trial, trials
 from analysis.explorer.site import NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
@@ -69,6 +70,11 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
         values: dict[str, Any] = {"heading": heading, "text": str(exc), "here": ""}
         return HTMLResponse(site.render("message.html", **values), code)
 
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        yield
+        site.close()  # a server that is told to end is killed after this
+
     of_trial = "{trial:path}"
     return Starlette(
         routes=[
@@ -87,11 +93,33 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             ),
             Route(f"/data/{of_trial}", data),
             Route(f"/raw/{of_trial}", raw),
+            *_sql_routes(site),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
             Middleware(Guard, hosts=hosts, token=token),
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
+        lifespan=lifespan,
         exception_handlers={NotThere: message, MergeRunnerError: message},
     )
+
+
+def _sql_routes(site: Site) -> list[Route]:
+    """A query runs for us alone: where another site leads to it, it is shown."""
+
+    def sql_query(request: Request) -> Response:
+        run = not from_elsewhere(request.headers)
+        return HTMLResponse(sql.sql_page(site, request.query_params, run=run))
+
+    def sql_download(request: Request) -> Response:
+        if from_elsewhere(request.headers):
+            return RedirectResponse(site.at.to("sql", q=sql.query_in(request.query_params)))
+        try:
+            content = sql.sql_csv(site, request.query_params)
+        except sql.UNANSWERED as exc:
+            return HTMLResponse(sql.sql_page(site, request.query_params, problem=str(exc)), 400)
+        name = {"content-disposition": 'attachment; filename="query.csv"'}
+        return Response(content, media_type=KINDS["csv"], headers=name)
+
+    return [Route("/sql", sql_query), Route("/sql.csv", sql_download)]

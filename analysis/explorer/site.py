@@ -9,10 +9,11 @@ import jinja2
 
 from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.links import Links
+from analysis.explorer.sandbox import Sandbox
 from analysis.explorer.texts import visible
 
 TEMPLATES = Path(__file__).with_name("templates")
-PAGES = {"Trials": "trials"}
+PAGES = {"Trials": "trials", "SQL": "sql"}
 
 
 class NotThere(Exception):
@@ -29,6 +30,7 @@ class Site:
 
     def __post_init__(self) -> None:
         self.catalogue = Catalogue(self.db)
+        self.sandbox = Sandbox(self.db)
         self._environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(TEMPLATES),
             autoescape=True,
@@ -48,3 +50,7 @@ class Site:
     def render(self, template: str, **values: object) -> str:
         """A page, or a part of one."""
         return self._environment.get_template(template).render(values)
+
+    def close(self) -> None:
+        """Leave nothing behind."""
+        self.sandbox.close()

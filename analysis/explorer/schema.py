@@ -1,0 +1,80 @@
+"""Tables and views with their columns, as schema.sql defines and explains them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+
+import duckdb
+
+from merge_runner.database import SCHEMA
+
+_BEGINS = re.compile(r"CREATE (?:TABLE|VIEW) IF NOT EXISTS (\w+)")
+_COLUMN = re.compile(r" {4}(\w+) [A-Z][^-]*(?:-- (.*))?")
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column, its type, and what is said of it."""
+
+    name: str
+    kind: str
+    comment: str
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table or a view."""
+
+    name: str
+    is_view: bool
+    comment: str
+    columns: list[Column]
+
+
+@cache
+def tables() -> list[Table]:
+    """Tables, then views, in the order of their definitions."""
+    definitions = SCHEMA.read_text(encoding="utf-8")
+    said = _comments(definitions)
+    with duckdb.connect() as connection:
+        connection.execute(definitions)
+        found = connection.execute(
+            "SELECT table_name, table_name IN (SELECT view_name FROM duckdb_views()), "
+            "list((column_name, data_type) ORDER BY column_index) "
+            "FROM duckdb_columns() WHERE NOT internal GROUP BY ALL"
+        ).fetchall()
+    order = list(said)
+    made = [
+        Table(
+            name,
+            is_view,
+            said[name][""],
+            [Column(column, kind, said[name].get(column, "")) for column, kind in columns],
+        )
+        for name, is_view, columns in found
+    ]
+    return sorted(made, key=lambda table: (table.is_view, order.index(table.name)))
+
+
+def units() -> str:
+    """What holds for all columns: the definitions' first line."""
+    return SCHEMA.read_text(encoding="utf-8").partition("\n")[0].removeprefix("-- ")
+
+
+def _comments(definitions: str) -> dict[str, dict[str, str]]:
+    """What is said of each table, under an empty name, and of its columns."""
+    said: dict[str, dict[str, str]] = {}
+    above: list[str] = []
+    columns: dict[str, str] = {}
+    for line in definitions.splitlines():
+        if line.startswith("-- "):
+            above.append(line.removeprefix("-- "))
+            continue
+        if begins := _BEGINS.match(line):
+            columns = said[begins[1]] = {"": " ".join(above)}
+        elif (column := _COLUMN.fullmatch(line)) and column[2]:
+            columns[column[1]] = column[2]
+        above = []
+    return said

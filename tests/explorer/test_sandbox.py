@@ -1,0 +1,263 @@
+"""Queries of a browser run in a process of their own, on a copy, and within bounds."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import shutil
+import threading
+import time
+from pathlib import Path
+
+import duckdb
+import pytest
+from studies import write_study, yielding
+
+from analysis.explorer import child, sandbox
+from analysis.explorer.child import Query
+from analysis.explorer.sandbox import Caps, NoAnswer, Sandbox
+from merge_runner.database import open_database
+from merge_runner.errors import UsageError
+
+PROC = Path("/proc")
+LOADED_S = 60  # what a process may wait for its turn on a machine that does much else
+ENDLESS = "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM r) SELECT max(n) FROM r"
+REFUSED = {
+    "INSERT INTO meta VALUES (9)": "one that only reads",
+    "WITH x AS (INSERT INTO meta VALUES (9) RETURNING *) FROM x": "read-only",
+    "COPY trials TO 'out.csv'": "one that only reads",
+    "ATTACH 'new.duckdb'": "one that only reads",
+    "INSTALL httpfs": "one that only reads",
+    "LOAD httpfs": "one that only reads",
+    "SET memory_limit = '1TB'": "one that only reads",
+    "PRAGMA threads = 9": "one that only reads",
+    "SELECT 1; DROP TABLE meta": "one query at a time",
+    "EXPLAIN ANALYZE COPY (SELECT 1) TO 'out.csv'": "disabled",
+    "FROM read_csv('/etc/passwd', sep = ':')": "disabled",
+    "FROM glob('/*')": "disabled",
+    "SELECT getenv('OPENAI_API_KEY')": "getenv does not exist",
+}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sandbox")
+    return write_study(folder / "study.duckdb", yielding("o3", reps=1)[:2])
+
+
+@pytest.fixture(scope="module")
+def queries(study):
+    return Sandbox(study, Caps(seconds=LOADED_S))
+
+
+@pytest.fixture
+def run(study, monkeypatch):
+    """Runs a query as its process would, in this one: starting one takes longer than most."""
+    monkeypatch.setattr(child, "_confine", lambda query: None)
+
+    def answer(sql, *, as_csv=False, rows=1000, size=5_000_000):
+        query = Query(str(study), sql, as_csv, rows, 2000, size, memory_mb=512, seconds=10)
+        said, content = child._run(query)
+        return content if as_csv and not said else said
+
+    return answer
+
+
+@pytest.fixture
+def own(study, tmp_path):
+    """A database that a test may change."""
+    return shutil.copy(study, tmp_path / "own.duckdb")
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def refusal(queries, sql):
+    with pytest.raises(NoAnswer) as refused:
+        queries.result(sql)
+    assert len(str(refused.value).splitlines()) == 1
+    return str(refused.value)
+
+
+def texts(rows):
+    return [[cell and cell[0] for cell in row] for row in rows]
+
+
+def test_what_is_more_than_a_query_of_the_database_is_refused_and_changes_nothing(study, run):
+    before = contents(study.parent)
+    for sql, words in REFUSED.items():
+        with pytest.raises(UsageError) as refused:
+            run(sql)
+        assert words in str(refused.value), sql
+    assert contents(study.parent) == before
+
+
+def test_values_of_all_kinds_become_texts(run):
+    values = {
+        "NULL": None,
+        "true": "true",
+        "170141183460469231731687303715884105727::HUGEINT": str(2**127 - 1),
+        "0.1": "0.1",
+        "'nan'::DOUBLE": "nan",
+        "'-inf'::FLOAT": "-inf",
+        "DATE '290000-01-01'": "290000-01-01",
+        "TIMESTAMP '2026-01-02 03:04:05.5'": "2026-01-02 03:04:05.500000",
+        "'\\xAA\\x00'::BLOB": "0xaa00",
+        "[1.5::DOUBLE, NULL, 'nan']": "[1.5, null, NaN]",
+        "{'x': [DATE '2026-01-02'], 'y': '<é\"'}": '{"x": ["2026-01-02"], "y": "<é\\""}',
+        "MAP([[1]], [2])": '{"key": [[1]], "value": [2]}',
+        "'a' || chr(0) || chr(8238)": "a\0\u202e",
+    }
+    said = run(f"SELECT {', '.join(values)}")
+    assert texts(said["rows"]) == [list(values.values())]
+    assert said["columns"][1][1] == "BOOLEAN"
+
+
+def test_a_large_result_is_cut_and_says_so(run):
+    said = run("SELECT range, repeat('x', 2100) AS x FROM range(1000000000)")
+    assert (len(said["rows"]), said["more"]) == (1000, True)
+    assert said["rows"][999] == [("999", 0), ("x" * 2000, 100)]
+    said = run("SELECT repeat('x', 900) FROM range(999)", size=100_000)
+    assert (50 < len(said["rows"]) < 120, said["more"]) == (True, True)
+    assert run("FROM range(1000)")["more"] is False
+
+
+def test_a_plan_of_execution_is_whole(run):
+    ((_, (plan, left_out)),) = run("EXPLAIN FROM trial_metrics")["rows"]
+    assert len(plan) > 10_000
+    assert left_out == 0
+
+
+def test_a_download_is_whole_or_refused(run):
+    csv = run("SELECT 'a,\"b' AS x, NULL AS y, repeat('é', 3000) AS z FROM range(101)", as_csv=True)
+    assert csv.decode().splitlines() == ["x,y,z", *['"a,""b",,' + "é" * 3000] * 101]
+    assert run("SELECT 1 AS x WHERE false", as_csv=True) == b"x\r\n"
+    assert len(run("FROM range(100)", as_csv=True, rows=100).splitlines()) == 101
+    assert "up to 100 rows" in run("FROM range(101)", as_csv=True, rows=100)["error"]
+    assert "has more" in run("FROM range(1000)", as_csv=True, size=1000)["error"]
+
+
+def test_a_query_is_answered_and_a_refusal_is_one_line(queries):
+    before = contents(queries.db.parent)
+    result = queries.result("SELECT '\u202e<é' AS x")
+    assert (result.columns, result.rows) == ([("x", "VARCHAR")], [[["\u202e<é", 0]]])
+    writing = "WITH x AS (INSERT INTO meta VALUES (9) RETURNING *) FROM x"
+    assert "read-only" in refusal(queries, writing)
+    assert contents(queries.db.parent) == before
+
+
+def test_what_needs_too_much_memory_is_stopped_soon(queries):
+    began = time.monotonic()
+    assert refusal(queries, "SELECT repeat('x', 2000000000)") == "the query needed more than 512 MB"
+    assert time.monotonic() - began < 2 * LOADED_S
+
+
+def test_an_endless_query_is_stopped_in_time(queries):
+    began = time.monotonic()
+    assert refusal(Sandbox(queries.db, Caps(seconds=2)), ENDLESS) == "stopped after 2 s"
+    assert time.monotonic() - began < 2 + LOADED_S
+
+
+def test_a_sweep_writes_while_a_query_runs(own, monkeypatch):
+    monkeypatch.setenv("OPENAI_API_KEY", "sk-secret")
+    processes = recorded(monkeypatch, "subprocess.Popen")
+    clocks = recorded(monkeypatch, "threading.Timer")
+    queries = Sandbox(own, Caps(seconds=60))
+    copy = queries._current()
+    said = []
+    asking = threading.Thread(target=lambda: said.append(refusal(queries, ENDLESS)))
+    asking.start()
+    until(lambda: len(processes) == 2 and reads(processes[1], copy.file))
+    with open_database(own, read_only=False, patience_s=0) as connection:
+        connection.execute("DELETE FROM sweeps")
+    if PROC.exists():
+        assert b"sk-secret" not in (PROC / str(processes[1].pid) / "environ").read_bytes()
+    assert processes[1].poll() is None
+    clocks[1].function()  # as if its time were over
+    asking.join(LOADED_S)
+    assert said == ["stopped after 60 s"]
+    assert processes[1].poll() is not None
+    assert queries._current() is not copy
+
+
+def recorded(monkeypatch, name):
+    """What is made of a class of the standard library from now on."""
+    module, _, kind = name.partition(".")
+    made, original = [], getattr(getattr(sandbox, module), kind)
+
+    def make(*arguments, **options):
+        made.append(original(*arguments, **options))
+        return made[-1]
+
+    monkeypatch.setattr(f"analysis.explorer.sandbox.{name}", make)
+    return made
+
+
+def until(condition):
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < LOADED_S
+        time.sleep(0.02)
+
+
+def reads(process, file):
+    """Whether a process has opened a file."""
+    if not PROC.exists():
+        time.sleep(1)
+        return True
+    opened = []
+    for number in (PROC / str(process.pid) / "fd").iterdir():
+        with contextlib.suppress(OSError):  # closed meanwhile
+            opened.append(number.readlink())
+    return file in opened
+
+
+def test_the_environment_of_a_query_holds_nothing_of_ours(monkeypatch):
+    for name in ("ANTHROPIC_API_KEY", "HTTPS_PROXY", "HOME", "PYTHONPATH"):
+        monkeypatch.setenv(name, "ours")
+    assert "ours" not in sandbox._environment().values()
+
+
+def test_what_lies_in_the_log_beside_the_database_is_read(own, tmp_path):
+    crashed = tmp_path / "crashed.duckdb"
+    with duckdb.connect(str(own)) as connection:
+        connection.execute("SET checkpoint_threshold = '1TB'; INSERT INTO meta VALUES (-1)")
+        for end in ("", ".wal"):
+            shutil.copy(f"{own}{end}", f"{crashed}{end}")
+    assert Path(f"{crashed}.wal").stat().st_size > 0
+    result = Sandbox(crashed, Caps(seconds=LOADED_S)).result("SELECT min(schema_version) FROM meta")
+    assert texts(result.rows) == [["-1"]]
+
+
+def test_a_copy_lasts_while_the_file_stays_and_no_longer(own):
+    queries = Sandbox(own)
+    first = queries._current()
+    assert queries._current() is first
+    os.utime(own, ns=(0, 0))
+    second = queries._current()
+    assert second.file != first.file
+    kept = [first.file.parent, second.file.parent]
+    assert all(folder.exists() for folder in kept)
+    del first, second
+    queries.close()
+    gc.collect()
+    assert not any(folder.exists() for folder in kept)
+
+
+def test_who_finds_others_running_is_told_after_a_while(study):
+    queries = Sandbox(study, patience_s=0.1)
+    with queries._turn(), queries._turn():
+        assert "2 other queries are running" in refusal(queries, "SELECT 1")
+    for _ in range(sandbox.AT_ONCE + sandbox.WAITING):
+        queries._places.acquire()
+    assert "too many queries are waiting" in refusal(queries, "SELECT 1")
+
+
+def test_what_is_no_database_is_said(tmp_path):
+    (tmp_path / "text.duckdb").write_text("no database")
+    assert "cannot be opened as a database" in refusal(
+        Sandbox(tmp_path / "text.duckdb"), "SELECT 1"
+    )
+    assert "up to 10,000 characters" in refusal(Sandbox(tmp_path), "x" * 10_001)
