@@ -10,7 +10,8 @@ from typing import Any
 
 import duckdb
 
-from merge_runner.database import SCHEMA, Instance, read_database
+from analysis.explorer.reading import reading
+from merge_runner.database import SCHEMA, Instance
 from merge_runner.errors import UsageError
 
 PAGE = 100
@@ -292,7 +293,7 @@ class Catalogue:
     def _reading(self, sql: str) -> int:
         """Run statements on the database and ours; returns how many trials wait to be listed."""
         self._stamp = None  # whatever fails here, begin anew
-        with read_database(self.db, self._instance) as connection:
+        with reading(self.db, self._instance) as connection:
             connection.execute(sql)
             (waiting,) = connection.execute("SELECT count(*) FROM memory.trials").fetchall()
         count: int = waiting[0]

@@ -11,8 +11,8 @@ from typing import Any
 import duckdb
 
 from analysis.explorer.prompts import Part, parts_of
+from analysis.explorer.reading import reading
 from merge_runner.config import Scenario
-from merge_runner.database import read_database
 from merge_runner.records import SIDES, Side
 
 Row = dict[str, Any]
@@ -71,7 +71,7 @@ class Decision:
 def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     """Read a trial that is known to be there."""
     key = {"trial": trial_id, "spec": spec_hash}
-    with read_database(db) as connection:
+    with reading(db) as connection:
         states = {row.pop("side"): row for row in _records(connection, STATES, key)}
         decisions = _records(connection, DECISIONS, key)
         spec = _records(connection, SPEC, {"spec": spec_hash})
@@ -89,7 +89,7 @@ def read_decisions(
     A call without an answer ends its trial before there is a decision: what was asked is there.
     """
     key = {"trial": trial_id, "spec": spec_hash, "side": side, "number": number}
-    with read_database(db) as connection:
+    with reading(db) as connection:
         rows = _records(connection, DECIDED, key)
         calls = _records(connection, ATTEMPTS, key)
     decided = {(row["side"], row["decision"]): row for row in rows}
