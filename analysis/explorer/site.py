@@ -8,11 +8,17 @@ from pathlib import Path
 import jinja2
 
 from analysis.explorer.catalogue import Catalogue
+from analysis.explorer.computing import Computing
 from analysis.explorer.links import Links
 from analysis.explorer.texts import visible
 
 TEMPLATES = Path(__file__).with_name("templates")
-PAGES = {"Trials": "trials"}
+PAGES = {
+    "Trials": "trials",
+    "Tables": "tables",
+    "Ablations": "ablations",
+    "Humans": "humans",
+}
 
 
 class NotThere(Exception):
@@ -28,6 +34,7 @@ class Site:
 
     def __post_init__(self) -> None:
         self.catalogue = Catalogue(self.db)
+        self.computing = Computing(self.db)
         self._environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(TEMPLATES),
             autoescape=True,
