@@ -165,7 +165,10 @@ class Computing:
         if self._computer is None or not stays:
             self._end()
             # Another process for another state: all that was made of the old one ends with it.
-            self._computer, self._state = self.start(self.db), state
+            try:
+                self._computer, self._state = self.start(self.db), state
+            except OSError as exc:
+                raise Failure(f"no process can be started to compute: {exc}") from exc
         if self._closed:
             self._end()
             raise Failure("the explorer ends")
@@ -186,4 +189,4 @@ class Computing:
 
 def about_s(request: Request, trials: int) -> int:
     """About how long a first answer takes, in s: to load pandas, to read the trials, to fit."""
-    return round(8 + trials / 500 + sum(LONG_S.get(name, 1) for name in request[1:]))
+    return round(12 + trials / 500 + sum(LONG_S.get(name, 1) for name in request[1:]))

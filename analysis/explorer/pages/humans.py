@@ -28,7 +28,7 @@ SHAPE_WORDS = {
     "plus": "plus",
 }
 # Of a picture, in its units.
-LEFT, TOP, HEIGHT, FOOT, STEP, LEAST = 46.0, 8.0, 120.0, 40.0, 13.0, 96.0
+LEFT, TOP, HEIGHT, FOOT, STEP, LEAST = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +213,8 @@ def scale(values: Sequence[float], most: float | None) -> tuple[float, float, li
     """Both ends of an axis, and its ticks: round steps, with 0 in it."""
     low, high = min(values, default=0.0), max(values, default=1.0)
     low, high = min(low, 0.0), most if most is not None else max(high, 0.0)
-    rough = (high - low or 1.0) / 4
+    high = high if high > low else low + 1.0
+    rough = (high - low) / 4
     size = 10.0 ** floor(log10(rough))
     step = next(size * m for m in (1, 2, 2.5, 5, 10) if size * m >= rough * 0.999)
     first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
@@ -223,14 +224,14 @@ def scale(values: Sequence[float], most: float | None) -> tuple[float, float, li
 
 def marker(shape: str, x: float, y: float, r: float = 4.2) -> str:
     """A shape about a point, as a path."""
-    lines = {
+    corners: dict[str, list[tuple[float, float]]] = {
         "square": [(-1, -1), (1, -1), (1, 1), (-1, 1)],
         "triangle": [(0, -1.2), (1.15, 0.9), (-1.15, 0.9)],
         "down": [(0, 1.2), (1.15, -0.9), (-1.15, -0.9)],
         "diamond": [(0, -1.35), (1.35, 0), (0, 1.35), (-1.35, 0)],
     }
-    if shape in lines:
-        points = [f"{x + r * 0.9 * dx:.1f} {y + r * 0.9 * dy:.1f}" for dx, dy in lines[shape]]
+    if shape in corners:
+        points = [f"{x + r * 0.9 * dx:.1f} {y + r * 0.9 * dy:.1f}" for dx, dy in corners[shape]]
         return f"M{' L'.join(points)}Z"
     if shape == "cross":
         return (
