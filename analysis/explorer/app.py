@@ -22,7 +22,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from analysis.explorer.guard import Guard, from_elsewhere
-from analysis.explorer.pages import sql, trial, trials
+from analysis.explorer.pages import ablations, humans, sql, tables, trial, trials
 from analysis.explorer.site import NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
@@ -42,13 +42,18 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
 
         return answer
 
+    def may_wait(request: Request) -> dict[str, bool]:
+        # A script of ours asks for what a page has said to be on its way.
+        return {"patient": request.headers.get("hx-request") == "true"}
+
     def export(request: Request) -> Response:
         site.catalogue.refresh()
         form = request.path_params["form"]
         if form not in KINDS:
             raise NotThere(f"trials come as {' or '.join(KINDS)}")
         asked = request.query_params
-        content = site.catalogue.export(trials.filter_of(asked), trials.sort_of(asked), form)
+        wanted = trials.export_filter(site, asked)
+        content = site.catalogue.export(wanted, trials.sort_of(asked), form)
         name = {"content-disposition": f'attachment; filename="trials.{form}"'}
         return Response(content, media_type=KINDS[form], headers=name)
 
@@ -79,7 +84,9 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
     return Starlette(
         routes=[
             Route("/", home),
-            Route("/trials", page(lambda r: trials.trials_page(site, r.query_params))),
+            Route(
+                "/trials", page(lambda r: trials.trials_page(site, r.query_params, **may_wait(r)))
+            ),
             Route("/trials.{form}", export),
             Route(
                 f"/trials/{of_trial}",
@@ -94,6 +101,23 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             Route(f"/data/{of_trial}", data),
             Route(f"/raw/{of_trial}", raw),
             *_sql_routes(site),
+            Route("/tables", page(lambda _: tables.tables_page(site))),
+            Route(
+                "/tables/{name}",
+                page(
+                    lambda r: tables.table_page(
+                        site, r.path_params["name"], r.query_params, **may_wait(r)
+                    )
+                ),
+            ),
+            Route(
+                "/ablations",
+                page(lambda r: ablations.ablations_page(site, r.query_params, **may_wait(r))),
+            ),
+            Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),
+            Route(
+                "/humans", page(lambda r: humans.humans_page(site, r.query_params, **may_wait(r)))
+            ),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[

@@ -15,14 +15,27 @@ from merge_runner.database import SCHEMA, Instance
 from merge_runner.errors import UsageError
 
 PAGE = 100
+# Two are equal where the same trials are listed: unlike a stamp, it stands when tables are kept.
+State = tuple[int, int]
+# Trials of a variant and of its driver's baseline in equal conditions and repetitions; ``fate`` is
+# what is compared.
+PAIRS = """
+SELECT one.condition, one.rep, one.trial_id, one.spec_hash, one.outcome, one.{fate} AS fate,
+    base.trial_id AS base_id, base.spec_hash AS base_hash, base.outcome AS base_outcome,
+    base.{fate} AS base_fate
+FROM listed AS one JOIN listed AS base USING (model, condition, rep)
+WHERE one.model = ? AND one.variant = ? AND base.variant = 'baseline' AND one.source <> 'human'
+    AND one.{fate} IS NOT NULL AND base.{fate} IS NOT NULL
+ORDER BY one.trial_id, one.spec_hash, base.spec_hash
+"""
 # What is said of each trial. Texts and prompts stay in the database.
 LISTED = """
 CREATE TABLE listed (
     trial_id VARCHAR, spec_hash VARCHAR, source VARCHAR, model VARCHAR, variant VARCHAR,
     condition VARCHAR, rep INTEGER, pair VARCHAR, status VARCHAR, merged_first VARCHAR,
     outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE, error VARCHAR, scripted BOOLEAN,
-    gap_m DOUBLE, rmse_mps DOUBLE, decisions BIGINT, invalid BIGINT, fallbacks BIGINT,
-    attempts BIGINT, cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[]
+    gap_m DOUBLE, rmse_mps DOUBLE, joint BOOLEAN, decisions BIGINT, invalid BIGINT,
+    fallbacks BIGINT, attempts BIGINT, cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[]
 );
 CREATE TABLE members (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
@@ -61,7 +74,7 @@ SELECT trials.trial_id, trials.spec_hash, source,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
         WHEN fallbacks > 0 THEN 'fallbacks' WHEN invalid > 0 THEN 'invalid'
         ELSE 'all valid' END AS validity,
-    gap_m, rmse_mps, coalesce(decisions, 0) AS decisions, coalesce(invalid, 0) AS invalid,
+    gap_m, rmse_mps, joint, coalesce(decisions, 0) AS decisions, coalesce(invalid, 0) AS invalid,
     coalesce(fallbacks, 0) AS fallbacks, coalesce(attempts, 0) AS attempts, cost_usd,
     left_mps, right_mps
 FROM trials
@@ -96,7 +109,7 @@ EXPORTED = "* EXCLUDE (left_mps, right_mps)"
 class Filter:
     """Which trials are wanted; an empty text wants all. ``q`` is part of a name.
 
-    ``trials`` are names, where those behind a cell of a table are wanted.
+    ``trials`` are (trial, spec), where those behind a cell of a table are wanted.
     """
 
     sweep: str = ""
@@ -106,7 +119,7 @@ class Filter:
     outcome: str = ""
     validity: str = ""
     q: str = ""
-    trials: tuple[str, ...] | None = None
+    trials: tuple[tuple[str, str], ...] | None = None
 
     def where(self, leave_out: str = "") -> tuple[str, list[Any]]:
         """The filter as SQL with its values; without one facet, to count its alternatives."""
@@ -123,8 +136,9 @@ class Filter:
             parts.append("contains(lower(trial_id), lower(?))")
             values.append(self.q)
         if self.trials is not None:
-            parts.append("list_contains(?, trial_id)")
-            values.append(list(self.trials))
+            parts.append("(trial_id, spec_hash) IN (SELECT (unnest(?::VARCHAR[]), "
+                         "unnest(?::VARCHAR[])))")  # fmt: skip
+            values += [[name for name, _ in self.trials], [spec for _, spec in self.trials]]
         return " AND ".join(parts), values
 
     @property
@@ -266,6 +280,19 @@ class Catalogue:
             f"SELECT trial_id, spec_hash FROM listed WHERE {where} ORDER BY ALL LIMIT {limit}",  # noqa: S608 # constants
             values,
         )
+
+    def pairs(self, model: str, variant: str, fate: str) -> list[dict[str, Any]]:
+        """Trials of a variant beside those of the baseline; ``fate``: outcome or joint."""
+        return self._records(PAIRS.format(fate=fate), [model, variant])
+
+    def state(self) -> State:
+        """What is listed now, as a number of trials and a sum over their names and ends."""
+        (row,) = self._rows(
+            "SELECT count(*), coalesce(sum(hash(trial_id, spec_hash, status, end_time_s)), 0) "
+            "FROM listed",
+            [],
+        )
+        return int(row[0]), int(row[1])
 
     def export(self, wanted: Filter, sort: str, form: str) -> bytes:
         """All trials of a filter as CSV or Parquet."""

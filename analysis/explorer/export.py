@@ -135,7 +135,7 @@ def _listing(site: Site, rows: list[Row]) -> str:
         rows=rows,
         sorts={},
         sort="",
-        chosen={},
+        kept={},
         sparkline=sparkline,
         inlined=inlined(LISTING),
     )

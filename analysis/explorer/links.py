@@ -32,6 +32,17 @@ class Links:
         state = {"spec": row["spec_hash"], "side": side, "decision": number}
         return f"/raw/{quote(row['trial_id'])}" + query_of(state)
 
+    def table(self, name: str, **state: object) -> str:
+        """A table of the analysis."""
+        return f"/tables/{quote(name)}" + query_of(state)
+
+    def cell(self, table: str, row: str, column: str) -> str:
+        """The trials behind a cell.
+
+        No table's name has a slash and no column's a colon, whatever is in the row's.
+        """
+        return self.to("trials", cell=f"{table}/{row}:{column}")
+
     def sweep(self, sweep_id: str) -> str:
         """A sweep's page."""
         return f"/sweeps/{quote(sweep_id)}"

@@ -27,7 +27,10 @@ def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
     shown = LOOPBACK if bind == "0.0.0.0" else bind  # noqa: S104 # compared, not bound
     say(f"http://{shown}:{port}/" + (f"?token={token}" if token else ""))
     config = uvicorn.Config(explorer(site, hosts, token), log_level="error", ws="none")
-    uvicorn.Server(config).run(sockets=[listener])
+    try:
+        uvicorn.Server(config).run(sockets=[listener])
+    finally:
+        site.computing.close()
 
 
 def listen(bind: str, port: int) -> socket.socket:

@@ -8,12 +8,19 @@ from pathlib import Path
 import jinja2
 
 from analysis.explorer.catalogue import Catalogue
+from analysis.explorer.computing import Computing
 from analysis.explorer.links import Links
 from analysis.explorer.sandbox import Sandbox
 from analysis.explorer.texts import visible
 
 TEMPLATES = Path(__file__).with_name("templates")
-PAGES = {"Trials": "trials", "SQL": "sql"}
+PAGES = {
+    "Trials": "trials",
+    "Tables": "tables",
+    "Ablations": "ablations",
+    "Humans": "humans",
+    "SQL": "sql",
+}
 
 
 class NotThere(Exception):
@@ -31,6 +38,7 @@ class Site:
     def __post_init__(self) -> None:
         self.catalogue = Catalogue(self.db)
         self.sandbox = Sandbox(self.db)
+        self.computing = Computing(self.db)
         self._environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(TEMPLATES),
             autoescape=True,
@@ -40,7 +48,7 @@ class Site:
         )
         self._environment.globals.update(
             at=self.at,
-            pages=PAGES,
+            pages={"Trials": "trials"} if self.static else PAGES,
             shell="static.html" if self.static else "base.html",
             static=self.static,
             study=self.db.name if self.static else str(self.db),

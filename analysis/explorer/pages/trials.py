@@ -7,13 +7,24 @@ from dataclasses import replace
 from typing import Any
 
 from analysis.explorer.catalogue import FACETS, PAGE, SORTS, Filter
-from analysis.explorer.site import Site
+from analysis.explorer.pages.computed import computed
+from analysis.explorer.site import NotThere, Site
 from analysis.explorer.views import sparkline
+from analysis.tables import TABLES
+from merge_runner.errors import StoreError
+
+EXPORT_WAIT_S = 300.0
 
 
-def trials_page(site: Site, asked: Mapping[str, str]) -> str:
-    """One page of the trials that an address asks for."""
+def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
+    """One page of the trials that an address asks for; ``patient``: an answer may take a while."""
     wanted, sort = filter_of(asked), sort_of(asked)
+    cell, named = asked.get("cell", ""), None
+    if cell:
+        named = computed(site, cell_request(cell), asked, patient=patient)
+        if named.result is None:
+            return site.render("behind.html", here="trials", cell=cell, computed=named)
+        wanted = replace(wanted, trials=behind(named.result.content))
     totals = site.catalogue.totals(wanted)
     last = max(1, -(-totals.trials // PAGE))
     number = min(page_of(asked), last)
@@ -22,7 +33,9 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         here="trials",
         facets=site.catalogue.facets(wanted),
         chosen=wanted.chosen,
-        cell=asked.get("cell", ""),
+        kept={**wanted.chosen, "cell": cell},
+        cell=cell,
+        computed=named,
         sort=sort,
         sorts=SORTS,
         totals=totals,
@@ -30,6 +43,33 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         page=number,
         last_page=last,
         sparkline=sparkline,
+    )
+
+
+def export_filter(site: Site, asked: Mapping[str, str]) -> Filter:
+    """The filter in an address, whose cell may have to be computed; raises NotThere, StoreError."""
+    wanted, cell = filter_of(asked), asked.get("cell", "")
+    if not cell:
+        return wanted
+    named = computed(site, cell_request(cell), asked, wait_s=EXPORT_WAIT_S)
+    if named.result is None:
+        raise StoreError(named.failure or f"the trials behind {cell} are still being looked up")
+    return replace(wanted, trials=behind(named.result.content))
+
+
+def cell_request(cell: str) -> tuple[str, str, str, str]:
+    """What is asked for a cell, ``TABLE/ROW:COLUMN``; raises NotThere."""
+    table, _, rest = cell.partition("/")
+    row, _, column = rest.rpartition(":")
+    if table not in TABLES or not row:
+        raise NotThere(f"a cell is named TABLE/ROW:COLUMN; the tables are {', '.join(TABLES)}")
+    return "cell", table, row, column
+
+
+def behind(content: dict[str, Any]) -> tuple[tuple[str, str], ...]:
+    """The (trial, spec) of all groups behind a cell."""
+    return tuple(
+        (name, source["spec"]) for source in content["sources"] for name in source["names"]
     )
 
 

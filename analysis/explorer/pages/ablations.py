@@ -1,0 +1,244 @@
+"""What leaving out a part of the prompt does: variants beside the baseline, measure by measure."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from analysis.explorer import views
+from analysis.explorer.pages.computed import computed
+from analysis.explorer.reading import reading
+from analysis.explorer.site import NotThere, Site
+from analysis.tables.formats import shown_value
+from analysis.tables.model import Column, Row, Table, Value, from_text
+from merge_runner.prompts.blocks import VARIANTS
+
+BASELINE = "baseline"
+# Rates are decided trial by trial, and differ in single trials. Collisions are outcomes.
+FATES = {"collided_percent": "outcome", "joint_percent": "joint"}
+JOINT = {True: "joint", False: "not joint"}
+# A difference is drawn so wide, in units of its picture.
+WIDTH = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A variant's difference from the baseline: texts, and numbers for its picture."""
+
+    value: float
+    low: float | None
+    high: float | None
+    text: str
+    interval: str
+    p_holm: str
+    p_bh: str
+
+    @property
+    def apart(self) -> bool:
+        """Whether the interval leaves out 0."""
+        return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One measure of a variant: its estimate with interval and n, and its difference."""
+
+    measure: str
+    row: str
+    estimate: str
+    interval: str
+    n: int | None
+    difference: Difference | None
+
+
+@dataclass(frozen=True, slots=True)
+class Driver:
+    """A driver's variants, the baseline first; ``widest`` by measure: the picture's half range."""
+
+    name: str
+    variants: dict[str, list[Cell]]
+    widest: dict[str, float] = field(default_factory=dict)
+
+
+def ablations_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
+    """All drivers with their variants."""
+    found = computed(site, ("tables", "ablation-quantitative", "contrasts"), asked, patient=patient)
+    values: dict[str, Any] = {"drivers": [], "alone": [], "measures": [], "notes": ()}
+    if found.result is not None:
+        quantitative, contrasts = map(from_text, found.result.content["tables"])
+        drivers = ablations(quantitative, contrasts)
+        values = {
+            "drivers": [d for d in drivers if set(d.variants) - {BASELINE}],
+            "alone": [d.name for d in drivers if not set(d.variants) - {BASELINE}],
+            "measures": measures(quantitative),
+            "notes": contrasts.notes,
+        }
+    return site.render(
+        "ablations.html",
+        here="ablations",
+        computed=found,
+        left_out=left_out,
+        fates=FATES,
+        bar=bar,
+        width=WIDTH,
+        **values,
+    )
+
+
+def left_out(variant: str) -> str:
+    """What a variant's prompt leaves out, by name and purpose."""
+    names = sorted(VARIANTS.get(variant, ()))
+    if not names:
+        return "the whole prompt" if variant in VARIANTS else ""
+    return "without " + ", ".join(f"{name}: {views.BLOCK_MEANINGS[name]}" for name in names)
+
+
+def measures(quantitative: Table) -> list[Column]:
+    """The columns of Table VII that are measures: those with an interval beside them."""
+    names = {column.name for column in quantitative.columns}
+    return [column for column in quantitative.columns if f"{column.name}_ci" in names]
+
+
+def ablations(quantitative: Table, contrasts: Table) -> list[Driver]:
+    """Every driver's variants, from the two tables that say what there is to say of them."""
+    compared = {row.id: row for row in contrasts.rows}
+    # The baseline's n stands beside every difference from it.
+    of_baseline = {
+        (f"{row.values['driver']}/{BASELINE}", row.id.rpartition("/")[2]): row.values["n_reference"]
+        for row in contrasts.rows
+        if row.values["reference"] == BASELINE
+    }
+    drivers: dict[str, Driver] = {}
+    for row in quantitative.rows:
+        name, setting = str(row.values["driver"]), str(row.values["setting"])
+        if setting:
+            variants = drivers.setdefault(name, Driver(name, {})).variants
+            variants[setting] = [
+                _cell(quantitative, contrasts, row, column, compared, of_baseline)
+                for column in measures(quantitative)
+            ]
+    for driver in drivers.values():
+        _reach(driver)
+    return list(drivers.values())
+
+
+def _cell(
+    quantitative: Table,
+    contrasts: Table,
+    row: Row,
+    column: Column,
+    compared: Mapping[str, Row],
+    of_baseline: Mapping[tuple[str, str], Value],
+) -> Cell:
+    found = compared.get(f"{row.id}/baseline/{column.name}")
+    interval = next(c for c in quantitative.columns if c.name == f"{column.name}_ci")
+    limits = row.values.get(interval.name)
+    n = of_baseline.get((row.id, column.name)) if found is None else found.values["n"]
+    # Collisions are counted over all that ended, which is the n of the row.
+    n = row.values["n"] if column.name == "collided_percent" else n
+    return Cell(
+        column.name,
+        row.id,
+        shown_value(column, row.values.get(column.name)),
+        shown_value(interval, limits) if limits is not None else "",
+        n if isinstance(n, int) else None,
+        _difference(contrasts, found) if found is not None else None,
+    )
+
+
+def _reach(driver: Driver) -> None:
+    """How far the differences of each measure reach, with their intervals."""
+    for i, measure in enumerate(cell.measure for cell in next(iter(driver.variants.values()))):
+        found = [cells[i].difference for cells in driver.variants.values()]
+        reach = [
+            abs(limit)
+            for difference in found
+            if difference is not None
+            for limit in (difference.value, difference.low, difference.high)
+            if limit is not None
+        ]
+        driver.widest[measure] = max(reach, default=0.0) or 1.0
+
+
+def _difference(contrasts: Table, row: Row) -> Difference:
+    columns = {column.name: column for column in contrasts.columns}
+    value, limits = row.values["difference"], row.values.get("ci")
+    assert isinstance(value, float)
+    low, high = limits if isinstance(limits, tuple) else (None, None)
+    text = shown_value(columns["difference"], value)
+    return Difference(
+        value,
+        low,
+        high,
+        f"+{text}" if value > 0 and float(text) != 0 else text,
+        shown_value(columns["ci"], limits) if limits is not None else "",
+        shown_value(columns["p_holm"], row.values["p_holm"]),
+        shown_value(columns["p_bh"], row.values["p_bh"]),
+    )
+
+
+def bar(difference: Difference, widest: float) -> dict[str, float]:
+    """Where a difference and its ends lie in a picture of ``WIDTH``, 0 in its middle."""
+
+    def x(value: float) -> float:
+        return round(WIDTH / 2 * (1 + 0.94 * value / widest), 1)
+
+    low = difference.value if difference.low is None else difference.low
+    high = difference.value if difference.high is None else difference.high
+    return {"low": x(low), "at": x(difference.value), "high": x(high)}
+
+
+def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
+    """The pairs of trials that ended otherwise with a variant than with the baseline."""
+    model, variant = asked.get("model", ""), asked.get("variant", "")
+    fate = asked.get("by", "outcome")
+    if fate not in FATES.values():
+        raise NotThere(f"pairs differ by {' or '.join(FATES.values())}")
+    if not model or not variant:
+        raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
+    # A mark tells apart drivers that ran under several settings of the task.
+    found = site.catalogue.pairs(model, variant, fate) or site.catalogue.pairs(
+        model.partition(" [")[0], variant, fate
+    )
+    pairs = of_equal_tasks(site, found)
+    differing = [pair for pair in pairs if pair["fate"] != pair["base_fate"]]
+    kinds: dict[tuple[str, str], int] = {}
+    for pair in differing:
+        kind = (_fate(pair["base_fate"]), _fate(pair["fate"]))
+        kinds[kind] = kinds.get(kind, 0) + 1
+    return site.render(
+        "discordant.html",
+        here="ablations",
+        model=model,
+        variant=variant,
+        left_out=left_out(variant),
+        by=fate,
+        said=_fate,
+        pairs=pairs,
+        differing=differing,
+        kinds=sorted(kinds.items(), key=lambda item: (-item[1], item[0])),
+        settings=sorted({(pair["spec_hash"], pair["base_hash"]) for pair in pairs}),
+    )
+
+
+def of_equal_tasks(site: Site, pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The pairs whose two specs differ in nothing but the prompt."""
+    hashes = list({pair[name] for pair in pairs for name in ("spec_hash", "base_hash")})
+    with reading(site.db) as connection:
+        rows = connection.execute(
+            "SELECT spec_hash, spec FROM specs WHERE list_contains(?, spec_hash)", [hashes]
+        ).fetchall()
+    tasks = {spec_hash: _task(spec) for spec_hash, spec in rows}
+    return [pair for pair in pairs if tasks.get(pair["spec_hash"]) == tasks.get(pair["base_hash"])]
+
+
+def _task(spec: str) -> str:
+    told = json.loads(spec)
+    told.pop("prompt_blocks", None)
+    return json.dumps(told, sort_keys=True)
+
+
+def _fate(value: str | bool) -> str:
+    return JOINT[value] if isinstance(value, bool) else value

@@ -1,0 +1,76 @@
+"""What pages show of a computation: its result, that it takes a while, or why there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+
+from analysis.explorer.computing import Request, Result, Waiting, about_s
+from analysis.explorer.links import query_of
+from analysis.explorer.site import Site
+
+# What is kept in the database comes within the first; the second is for a page that shows a clock.
+AT_ONCE_S = 0.3
+PATIENT_S = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Computed:
+    """A result, or None with the seconds that it takes so far, or with a failure.
+
+    ``listed`` is how many trials the database holds now, and ``older`` whether they are others than
+    those counted. ``again`` is the query of this page with everything computed anew.
+    """
+
+    result: Result | None
+    failure: str
+    elapsed_s: float
+    about_s: int
+    listed: int
+    older: bool
+    again: str
+    here: str
+
+    @property
+    def clock(self) -> str:
+        """When the result was made, in local time."""
+        assert self.result is not None
+        return f"{datetime.fromtimestamp(self.result.at).astimezone():%Y-%m-%d %H:%M:%S}"
+
+
+def computed(
+    site: Site,
+    request: Request,
+    asked: Mapping[str, str],
+    *,
+    patient: bool = False,
+    wait_s: float = AT_ONCE_S,
+) -> Computed:
+    """Ask for something; a ``patient`` page has said already that it takes a while."""
+    state = site.catalogue.state()
+    found = site.computing.ask(
+        request, state, since=since_of(asked), wait_s=PATIENT_S if patient else wait_s
+    )
+    result = found if isinstance(found, Result) else None
+    failure = "" if isinstance(found, Result | Waiting) else found.text
+    later = {"since": f"{result.at + 0.001:.3f}"} if result else {}
+    return Computed(
+        result=result,
+        failure=failure,
+        elapsed_s=found.elapsed_s if isinstance(found, Waiting) else 0.0,
+        about_s=about_s(request, state[0]),
+        listed=state[0],
+        older=result is not None and result.state != state,
+        again=query_of({**asked, **later}),
+        here=query_of(asked),
+    )
+
+
+def since_of(asked: Mapping[str, str]) -> float:
+    """The time in an address, in s since 1970; 0 where there is none."""
+    text = asked.get("since", "")
+    whole, _, part = text.partition(".")
+    if whole.isascii() and whole.isdigit() and len(text) < 20 and (not part or part.isdigit()):
+        return float(text)
+    return 0.0

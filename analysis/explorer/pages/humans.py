@@ -1,0 +1,267 @@
+"""The drivers beside the humans, in each condition of the experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil, floor, log10
+from typing import Any
+
+from analysis.explorer import views
+from analysis.explorer.pages.computed import computed
+from analysis.explorer.site import Site
+from analysis.tables.formats import shown_value
+from analysis.tables.model import Table, from_text
+from merge_runner.simulator.conditions import CONDITIONS
+
+HUMAN = "human"
+# Okabe and Ito's colours that show on white, each with a shape; humans are black circles.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+SHAPES = ("square", "triangle", "diamond", "down", "cross", "plus")
+SHAPE_WORDS = {
+    "circle": "circle",
+    "square": "square",
+    "triangle": "triangle",
+    "diamond": "diamond",
+    "down": "triangle that points down",
+    "cross": "cross",
+    "plus": "plus",
+}
+# Of a picture, in its units.
+LEFT, TOP, HEIGHT, FOOT, STEP, LEAST = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A row of panels: one measure. ``most`` is the end of a scale that has one."""
+
+    name: str
+    heading: str
+    unit: str
+    digits: int
+    meaning: str
+    most: float | None = None
+
+
+KINDS = (
+    Kind(
+        "left_first_percent",
+        "The left vehicle merges first",
+        "%",
+        0,
+        "of finished trials with a first merger; Wilson intervals",
+        100.0,
+    ),
+    Kind(
+        "gap_m",
+        "Gap",
+        "m",
+        2,
+        "mean of finished trials; Student's t",
+    ),
+    Kind(
+        "rmse_mps",
+        "RMSE of the speed",
+        "m/s",
+        2,
+        "from the initial speed to the first merge, mean of both vehicles and of finished trials; "
+        "Student's t",
+    ),
+    Kind(
+        "collided_percent",
+        "Collisions",
+        "%",
+        1,
+        "of the trials that ended; Wilson intervals; the table has both denominators",
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """How a group is drawn."""
+
+    group: str
+    colour: str
+    shape: str
+    scripted: bool = False
+
+    @property
+    def word(self) -> str:
+        """The shape in words."""
+        return SHAPE_WORDS[self.shape]
+
+
+def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
+    """Small multiples over the conditions, one row a measure, and the differences."""
+    found = computed(site, ("humans",), asked, patient=patient)
+    values: dict[str, Any] = {}
+    if found.result is not None:
+        content = found.result.content
+        groups = content["groups"]
+        values = {
+            "human": next((group for group in groups if group["id"] == HUMAN), None),
+            "measured": content["measured"],
+            "published": content["published"],
+            "groups": groups,
+            "marks": marks(groups),
+            "charts": [chart(kind, groups, content["published"]) for kind in KINDS],
+            "collisions": collisions(groups),
+            "differences": differences(from_text(content["tables"][0])),
+        }
+    return site.render(
+        "humans.html",
+        here="humans",
+        computed=found,
+        conditions={name: views.condition_text(name) for name in CONDITIONS},
+        path=marker,
+        value=value_text,
+        **values,
+    )
+
+
+def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
+    """A colour and a shape for each group; humans are black."""
+    found: dict[str, Mark] = {}
+    models = 0
+    for group in groups:
+        colour, shape = "#000000", "circle"
+        if group["id"] != HUMAN:
+            # With more drivers than colours the next round pairs them otherwise.
+            colour = COLOURS[models % len(COLOURS)]
+            shape = SHAPES[(models + models // len(COLOURS)) % len(SHAPES)]
+            models += 1
+        found[group["id"]] = Mark(group["id"], colour, shape, group["scripted"])
+    return found
+
+
+def collisions(groups: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Collided, ended and all trials of each group, by condition and together."""
+    rows = []
+    for group in groups:
+        cells: dict[str, tuple[int, int, int]] = {
+            name: (found["collided_percent"]["k"], found["ended"], found["all"])
+            for name, found in group["conditions"].items()
+        }
+        k, ended, every = (sum(cell[i] for cell in cells.values()) for i in range(3))
+        rows.append({"group": group["id"], "cells": cells, "total": (k, ended, every)})
+    return rows
+
+
+def differences(contrasts: Table) -> list[dict[str, Any]]:
+    """The baselines' differences from the humans, as printed."""
+    columns = {column.name: column for column in contrasts.columns}
+    return [
+        {
+            "row": row.id,
+            "note": row.note,
+            **{name: shown_value(columns[name], row.values.get(name)) for name in columns},
+        }
+        for row in contrasts.rows
+        if row.values["reference"] == HUMAN
+    ]
+
+
+def chart(
+    kind: Kind,
+    groups: Sequence[Mapping[str, Any]],
+    published: Mapping[str, Any] | None,
+) -> dict[str, Any]:
+    """One row of panels: where everything is drawn, in the units of the picture."""
+    printed = _printed(kind, published)
+    shown = [
+        limit
+        for group in groups
+        for found in group["conditions"].values()
+        for limit in _limits(found.get(kind.name))
+    ] + list(printed.values())
+    low, high, ticks = scale(shown, kind.most)
+    panel = max(LEAST, STEP * (len(groups) + 1))
+
+    def y(value: float) -> float:
+        return round(TOP + HEIGHT * (1 - (value - low) / (high - low)), 1)
+
+    panels = []
+    for i, name in enumerate(CONDITIONS):
+        x0 = LEFT + i * panel
+        points = []
+        for j, group in enumerate(groups):
+            found = group["conditions"][name].get(kind.name)
+            if found is None or found["value"] is None:
+                continue
+            x = round(x0 + panel / 2 + STEP * (j - (len(groups) - 1) / 2), 1)
+            ends = None if found["low"] is None else (y(found["low"]), y(found["high"]))
+            points.append(
+                {"group": group["id"], "x": x, "y": y(found["value"]), "ends": ends, "of": found}
+            )
+        line = y(printed[name]) if name in printed else None
+        panels.append({"name": name, "x": round(x0, 1), "points": points, "line": line})
+    return {
+        "kind": kind,
+        "width": round(LEFT + panel * len(CONDITIONS) + 4),
+        "height": TOP + HEIGHT + FOOT,
+        "top": TOP,
+        "bottom": TOP + HEIGHT,
+        "panel": panel,
+        "ticks": [(y(tick), f"{tick:g}") for tick in ticks],
+        "panels": panels,
+        "printed": printed,
+    }
+
+
+def scale(values: Sequence[float], most: float | None) -> tuple[float, float, list[float]]:
+    """Both ends of an axis, and its ticks: round steps, with 0 in it."""
+    low, high = min(values, default=0.0), max(values, default=1.0)
+    low, high = min(low, 0.0), most if most is not None else max(high, 0.0)
+    high = high if high > low else low + 1.0
+    rough = (high - low) / 4
+    size = 10.0 ** floor(log10(rough))
+    step = next(size * m for m in (1, 2, 2.5, 5, 10) if size * m >= rough * 0.999)
+    first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
+    last = max(last, first + 1)
+    return first * step, last * step, [round(i * step, 6) for i in range(first, last + 1)]
+
+
+def marker(shape: str, x: float, y: float, r: float = 4.2) -> str:
+    """A shape about a point, as a path."""
+    corners: dict[str, list[tuple[float, float]]] = {
+        "square": [(-1, -1), (1, -1), (1, 1), (-1, 1)],
+        "triangle": [(0, -1.2), (1.15, 0.9), (-1.15, 0.9)],
+        "down": [(0, 1.2), (1.15, -0.9), (-1.15, -0.9)],
+        "diamond": [(0, -1.35), (1.35, 0), (0, 1.35), (-1.35, 0)],
+    }
+    if shape in corners:
+        points = [f"{x + r * 0.9 * dx:.1f} {y + r * 0.9 * dy:.1f}" for dx, dy in corners[shape]]
+        return f"M{' L'.join(points)}Z"
+    if shape == "cross":
+        return (
+            f"M{x - r:.1f} {y - r:.1f} L{x + r:.1f} {y + r:.1f} "
+            f"M{x - r:.1f} {y + r:.1f} L{x + r:.1f} {y - r:.1f}"
+        )
+    if shape == "plus":
+        return f"M{x - r:.1f} {y:.1f} H{x + r:.1f} M{x:.1f} {y - r:.1f} V{y + r:.1f}"
+    return f"M{x - r:.1f} {y:.1f} a{r} {r} 0 1 0 {2 * r:.1f} 0 a{r} {r} 0 1 0 {-2 * r:.1f} 0Z"
+
+
+def value_text(found: Mapping[str, Any] | None, digits: int) -> str:
+    """An estimate with its interval and n, for the table behind a chart."""
+    if found is None or found["value"] is None:
+        return "–"
+    interval = ""
+    if found["low"] is not None:
+        interval = f" [{found['low']:.{digits}f}, {found['high']:.{digits}f}]"
+    return f"{found['value']:.{digits}f}{interval}, n {found['n']}"
+
+
+def _limits(found: Mapping[str, Any] | None) -> list[float]:
+    if found is None:
+        return []
+    return [found[name] for name in ("value", "low", "high") if found[name] is not None]
+
+
+def _printed(kind: Kind, published: Mapping[str, Any] | None) -> dict[str, float]:
+    """The published human value in each condition, where no trial of humans has the measure."""
+    value = (published or {}).get(kind.name)
+    if value is None:
+        return {}
+    return dict(value) if isinstance(value, Mapping) else dict.fromkeys(CONDITIONS, float(value))

@@ -1,0 +1,283 @@
+"""Tables, ablations and humans in the explorer: every number leads to its trials."""
+
+from __future__ import annotations
+
+import re
+import threading
+from dataclasses import replace
+from html import unescape
+from html.parser import HTMLParser
+from urllib.parse import parse_qs, urlsplit
+
+import duckdb
+import pytest
+from starlette.testclient import TestClient
+from studies import Said, write_study, yielding
+
+from analysis.explain import explain
+from analysis.explorer.app import explorer
+from analysis.explorer.computing import Child, Computing, Ended, Failed, Failure, Result, Waiting
+from analysis.explorer.numbers import Numbers
+from analysis.explorer.pages.ablations import ablations
+from analysis.explorer.pages.humans import KINDS, scale
+from analysis.explorer.pages.tables import ABOUT
+from analysis.explorer.site import Site
+from analysis.study import Study
+from analysis.tables import TABLES, make_tables
+from merge_runner.errors import MergeRunnerError
+from merge_runner.simulator.conditions import CONDITIONS
+
+HERE = "127.0.0.1:8700"
+HOSTILE = '<img src=x onerror="alert(1)">'
+
+
+class InProcess:
+    """Computes where the test runs; a process of its own takes seconds to begin."""
+
+    def __init__(self, db):
+        self._numbers = Numbers(db)
+
+    def ask(self, request):
+        try:
+            return self._numbers.answer(request)
+        except MergeRunnerError as exc:
+            raise Failure(str(exc)) from exc
+
+    def close(self):
+        pass
+
+
+class Addresses(HTMLParser):
+    """All addresses of a page, and its attributes of style and script."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.to, self.inline = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        for name, value in attrs:
+            if name == "href":
+                self.to.append(value)
+            if name == "style" or name.startswith("on"):
+                self.inline.append((tag, name))
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    """o3 with a variant that did some trials otherwise and lost one; a hostile name."""
+    variant = yielding("o3", "A1", reps=2)
+    variant[0] = replace(variant[0], left=(0.0,), right=(0.0,))
+    variant[3] = replace(variant[3], left=(0.0,), right=(0.5,) * 3)
+    variant[7] = replace(variant[7], left=variant[7].right, right=variant[7].left)
+    lost = replace(variant[4], said={1: Said(("timeout",), lost=True)})
+    drives = [
+        *yielding("o3", reps=3),
+        *variant[:4],
+        lost,
+        *variant[5:],
+        *yielding(HOSTILE, reps=1),
+    ]
+    return write_study(tmp_path_factory.mktemp("pages") / "study.duckdb", drives)
+
+
+@pytest.fixture(scope="module")
+def site(db):
+    site = Site(db)
+    site.computing = Computing(db, InProcess)
+    yield site
+    site.computing.close()
+
+
+@pytest.fixture(scope="module")
+def ask(site):
+    """Gets a page that may take a while; returns its text."""
+    client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
+
+    def get(address, code=200):
+        for _ in range(20):
+            reply = client.get(address, headers={"hx-request": "true"})
+            assert reply.status_code == code, reply.text
+            if 'class="computing"' not in reply.text:
+                break
+        return reply.text
+
+    return get
+
+
+def listed(text):
+    """How many trials a list says there are."""
+    return int(re.search(r"<strong>(\d+)</strong> trials", text)[1])
+
+
+@pytest.mark.parametrize(("name", "every"), [("ablation-quantitative", 3), ("contrasts", 9)])
+def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, every):
+    study = Study(db)
+    (table,) = make_tables(study, [name])
+    links = [a for a in Addresses(ask(f"/tables/{name}")).to if a.startswith("/trials?cell=")]
+    assert len(links) > 20
+    for link in links[::every]:
+        (cell,) = parse_qs(urlsplit(link).query)["cell"]
+        assert cell.startswith(f"{name}/")
+        found = explain(study, table, cell.removeprefix(f"{name}/"))
+        page = ask(link)
+        assert listed(page) == sum(len(source.trials) for source in found.sources)
+        assert found.value in unescape(page)
+
+
+def test_facets_sorting_and_exports_keep_the_cell(ask):
+    cell = "attempts/o3/A1:lost"
+    text = ask(f"/trials?cell={cell}")
+    assert listed(text) == 1
+    kept = [a for a in Addresses(text).to if a.startswith(("/trials?", "/trials."))]
+    assert len(kept) > 8
+    assert all(parse_qs(urlsplit(a).query)["cell"] == [cell] for a in kept)
+    assert f'name="cell" value="{cell}"' in text
+    assert listed(ask(f"/trials?cell={cell}&outcome=collided")) == 0
+    assert len(ask(f"/trials.csv?cell={cell}").splitlines()) == 2
+
+
+def test_a_cell_that_is_none_says_so(ask):
+    assert "has no row" in ask("/trials?cell=attempts/nobody:n")
+    assert "TABLE/ROW:COLUMN" in ask("/trials?cell=nothing", 404)
+    assert "who-first" in ask("/tables/nothing", 404)
+    assert set(ABOUT) == set(TABLES)
+
+
+def test_discordant_trials_are_the_pairs_that_differ(ask, db):
+    text = ask("/discordant?model=o3&variant=A1")
+    with duckdb.connect(str(db), read_only=True) as connection:
+        pairs = connection.execute(
+            "SELECT a.trial_id, b.trial_id FROM trials AS a JOIN trials AS b "
+            "ON a.condition = b.condition AND a.rep = b.rep AND a.model_left = b.model_left "
+            "WHERE a.model_left = 'o3' AND a.variant = 'A1' AND b.variant = 'baseline' "
+            "AND (a.status, a.merged_first) IS DISTINCT FROM (b.status, b.merged_first)"
+        ).fetchall()
+    assert len(pairs) >= 3
+    shown = [
+        (urlsplit(a).path.removeprefix("/trials/"), parse_qs(urlsplit(a).query)["compare"][0])
+        for a in Addresses(text).to
+        if "compare=" in a
+    ]
+    assert sorted(shown) == sorted(pairs)
+    assert f"<strong>{len(pairs)}</strong> of 22 pairs differ" in text
+    joint = ask("/discordant?model=o3&variant=A1&by=joint")
+    assert "<strong>1</strong> of 20 pairs differ" in joint
+    assert "right first</span>, not joint" in joint
+    assert "no trial of this variant" in ask("/discordant?model=o3&variant=A7")
+    ask("/discordant?model=o3&variant=A1&by=source", 404)
+
+
+def test_an_ablation_has_the_numbers_of_both_tables(ask, db):
+    quantitative, contrasts = make_tables(Study(db), ["ablation-quantitative", "contrasts"])
+    drivers = {driver.name: driver.variants for driver in ablations(quantitative, contrasts)}
+    assert list(drivers["o3"]) == ["baseline", "A1"]
+    rows = {row.id: row.values for row in contrasts.rows}
+    for cell, base in zip(drivers["o3"]["A1"], drivers["o3"]["baseline"], strict=True):
+        found = rows[f"o3/A1/baseline/{cell.measure}"]
+        assert cell.difference.value == found["difference"]
+        assert (cell.difference.low, cell.difference.high) == found["ci"]
+        assert (cell.n, base.n) == (found["n"], found["n_reference"])
+        assert base.difference is None
+    text = ask("/ablations")
+    assert "without C1: history" in text
+    assert text.count("<svg") == 4
+    assert "/discordant?model=o3&amp;variant=A1&amp;by=outcome" in text
+
+
+def test_humans_stand_in_every_condition_with_both_denominators(ask):
+    text = ask("/humans")
+    panels = re.findall(r'<text class="condition"[^>]*>([^<]+)<', text)
+    assert panels == list(CONDITIONS) * len(KINDS)
+    # The published counts: 28 of 990 collided; o3 lost no baseline trial.
+    assert re.search(r"<strong>28</strong> of 990 ended.*?of 990 trials", text, re.DOTALL)
+    assert re.search(r"<strong>0</strong> of 33 ended.*?of 33 trials", text, re.DOTALL)
+    assert "human 5 of 90" in text
+    assert "The recordings of the humans are not imported" in text
+
+
+def test_a_failed_trial_is_in_one_denominator_alone(tmp_path):
+    drives = yielding("o3", reps=1)
+    drives[0] = replace(drives[0], said={1: Said(("timeout",), lost=True)})
+    found = Numbers(write_study(tmp_path / "t.duckdb", drives)).answer(["humans"])
+    (o3,) = (group for group in found["groups"] if group["id"] == "o3/baseline")
+    condition = o3["conditions"][drives[0].condition]
+    assert (condition["all"], condition["ended"]) == (1, 0)
+    assert condition["collided_percent"]["value"] is None
+
+
+@pytest.mark.parametrize("address", ["/tables/attempts", "/ablations", "/humans", "/tables"])
+def test_a_name_is_shown_as_text_and_nothing_is_inline(ask, address):
+    text = ask(address)
+    assert HOSTILE not in text
+    assert Addresses(text).inline == []
+
+
+def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
+    going, asked = threading.Event(), threading.Event()
+
+    class Slow(InProcess):
+        def ask(self, request):
+            asked.set()
+            going.wait(20)
+            raise Ended("it broke <off>")
+
+    site = Site(db)
+    site.computing = Computing(db, Slow)
+    client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
+    assert "Computing, about" in client.get("/humans").text
+    assert asked.wait(5)
+    assert listed(client.get("/trials").text) == 66
+    assert "Computing, about" in client.get("/ablations").text
+    going.set()
+    later = client.get("/humans", headers={"hx-request": "true"}).text
+    assert "This could not be computed:</strong> it broke &lt;off&gt;" in later
+    site.computing.close()
+
+
+def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
+    made = []
+
+    class Counting(InProcess):
+        def ask(self, request):
+            made.append(request)
+            return {"counted": len(made)}
+
+    computing = Computing(db, Counting)
+    first = computing.ask(("humans",), (1, 1), wait_s=5)
+    assert computing.ask(("humans",), (2, 2)) == first
+    assert first.state == (1, 1)
+    second = computing.ask(("humans",), (2, 2), since=first.at + 0.001, wait_s=5)
+    assert isinstance(second, Result)
+    assert (second.state, second.content) == ((2, 2), {"counted": 2})
+    computing.close()
+
+
+def test_a_process_of_its_own_answers_alike_and_its_end_is_a_failure(db):
+    computing = Computing(db, Child)
+    request = ("tables", "attempts")
+    while isinstance(found := computing.ask(request, (1, 1), wait_s=30), Waiting):
+        pass
+    assert found.content == Numbers(db).answer(request)
+    broken = computing.ask(("nothing",), (1, 1), wait_s=30)
+    assert broken == Failed("nothing answers ['nothing']")
+    computing.close()
+    child = Child(db)
+    child.close()
+    with pytest.raises(Ended):
+        child.ask(request)
+
+
+@pytest.mark.parametrize(
+    ("values", "most", "ends"),
+    [
+        ([], None, (0, 1)),
+        ([0.0], None, (0, 1)),
+        ([3, 97], 100, (0, 100)),
+        ([-0.2, 1], None, (-0.5, 1)),
+    ],
+)
+def test_a_scale_holds_all_values_and_0(values, most, ends):
+    low, high, ticks = scale(values, most)
+    assert (low, high) == ends
+    assert {low, 0, high} <= {round(tick, 6) for tick in ticks}
