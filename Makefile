@@ -9,7 +9,7 @@ PYTHON ?= python3
 RUN := .venv/bin/merge-runner
 export Q
 
-.PHONY: help sweep replay report sql test lint check bench lock
+.PHONY: help sweep replay report view sql test lint check bench lock
 
 help:
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -22,6 +22,9 @@ replay: .venv/runtime ## the same from recorded replies alone: MODEL=, SWEEP=, R
 
 report: .venv/runtime ## tables, figures and the HTML report of what the database holds: ARGS=
 	@$(RUN) report --out results/report.html --files results/report $(ARGS)
+
+view: .venv/runtime ## the explorer in a browser: ARGS=
+	@$(RUN) view $(ARGS)
 
 sql: .venv/runtime ## a query over the results: Q="select ...", ARGS=
 	@$(RUN) sql "$$Q" $(ARGS)
@@ -42,7 +45,7 @@ bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/performance.md
 
 lock: ## renew the lock files (needs uv)
 	uv pip compile $(LOCK) --group dev -o requirements-dev.lock pyproject.toml
-	uv pip compile $(LOCK) --group build -c requirements-dev.lock -o requirements.lock pyproject.toml
+	uv pip compile $(LOCK) --group build --extra view -c requirements-dev.lock -o requirements.lock pyproject.toml
 	uv pip compile $(LOCK) --group pyproject.toml:peer -o requirements-peer.lock
 
 LOCK := --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \

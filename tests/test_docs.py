@@ -33,6 +33,7 @@ INSTALLED = (
 # Of our program these run in the test's own process, where the libraries are loaded already: they
 # ask no question and start no event loop. All else runs in a shell.
 HERE = ("audit", "digest", "explain", "human", "recording", "tables")
+SERVES = re.compile(r" emulate |make view$| view$| view --(port|bind)")
 LINKED = (
     ".venv",
     "Makefile",
@@ -88,7 +89,7 @@ async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
         start_new_session=True,
     )
     os.write(screen, b"y\n")
-    if " emulate " in command:  # runs until it is stopped: its first line is all there is
+    if SERVES.search(command):  # runs until it is stopped: its first line is all there is
         out = await process.stdout.readline()
         os.killpg(process.pid, signal.SIGTERM)
         await process.wait()

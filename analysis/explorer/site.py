@@ -62,3 +62,4 @@ class Site:
     def close(self) -> None:
         """Leave nothing behind."""
         self.sandbox.close()
+        self.computing.close()
