@@ -12,7 +12,7 @@ from analysis.explorer.links import Links
 from analysis.explorer.texts import visible
 
 TEMPLATES = Path(__file__).with_name("templates")
-PAGES = {"Trials": "trials"}
+PAGES = {"Sweeps": "sweeps", "Trials": "trials"}
 
 
 class NotThere(Exception):
@@ -25,6 +25,8 @@ class Site:
 
     db: Path
     at: Links = field(default_factory=Links)
+    closing: bool = False
+    """Whether the server ends: a stream must not keep it waiting."""
 
     def __post_init__(self) -> None:
         self.catalogue = Catalogue(self.db)
