@@ -34,7 +34,7 @@ CREATE TABLE flaws (trial_id VARCHAR, spec_hash VARCHAR, failure VARCHAR, times 
 CREATE VIEW causes AS
 SELECT trial_id, spec_hash, 'trial: ' || left(regexp_replace(regexp_replace(split_part(
         regexp_replace(coalesce(error, 'no reason is known'), '^(left|right): ', ''), ' (', 1),
-        '[0-9a-f]{16,}', '…', 'g'), '(^| )[0-9]+', '\1…', 'g'), 70) AS cause, 1 AS times
+        '[0-9a-f]{16,}', '…', 'g'), '(^| )[0-9]+', '\\1…', 'g'), 70) AS cause, 1 AS times
 FROM listed WHERE status = 'failed'
 UNION ALL SELECT trial_id, spec_hash, 'plan: ' || failure, times FROM flaws
 UNION ALL SELECT trial_id, spec_hash, 'attempt: ' || outcome, sum(times)

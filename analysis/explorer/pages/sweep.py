@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -15,6 +15,7 @@ from analysis.explorer.sweeps import Cell, Sweep, duration, find_sweep, list_swe
 from analysis.explorer.views import condition_text, prompt_text
 from merge_runner.errors import MergeRunnerError
 from merge_runner.progress_file import read_standing
+from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.simulator.conditions import CONDITIONS
 
 LOOK_EVERY_S = 1.0
@@ -25,7 +26,7 @@ LOOKS = 10
 KINDS = {
     "trial": "Trials that failed",
     "plan": "Replies without a valid plan",
-    "attempt": "Attempts without a good reply (most are made again at once, and do no harm)",
+    "attempt": "Attempts without a good reply",
 }
 
 
@@ -119,12 +120,8 @@ def _find(site: Site, sweep_id: str) -> Sweep:
 
 def _values(sweep: Sweep) -> dict[str, object]:
     """What the templates of a sweep show."""
-    variants = list(dict.fromkeys(variant for variant, _ in sweep.cells))
-    known = list(CONDITIONS)
-    conditions = sorted(
-        dict.fromkeys(condition for _, condition in sweep.cells),
-        key=lambda name: (known.index(name) if name in CONDITIONS else len(known), name),
-    )
+    variants = _ordered({variant for variant, _ in sweep.cells}, VARIANTS)
+    conditions = _ordered({condition for _, condition in sweep.cells}, CONDITIONS)
     rows = [
         (condition, [sweep.cells.get((variant, condition)) for variant in variants])
         for condition in conditions
@@ -149,6 +146,12 @@ def _values(sweep: Sweep) -> dict[str, object]:
         "duration": duration,
         "lasted": _lasted(sweep.entry.row["started_at"], sweep.entry.last_word),
     }  # fmt: skip
+
+
+def _ordered(names: Iterable[str], usual: Iterable[str]) -> list[str]:
+    """Names in their usual order, those that are unknown last."""
+    places = {name: place for place, name in enumerate(usual)}
+    return sorted(names, key=lambda name: (places.get(name, len(places)), name))
 
 
 def bar(cell: Cell) -> list[tuple[str, float, float]]:
