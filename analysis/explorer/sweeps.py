@@ -299,7 +299,10 @@ def verdict_of(entry: Entry, later: str, mismatches: int) -> Verdict:
     complete = entry.ended == entry.planned
     code = entry.row["exit_code"]
     if entry.state == "lost":
-        text = f"Stopped without a word: its process is gone, or frozen. {counted} are stored{failures}."
+        text = (
+            "Stopped without a word: its process is gone, or frozen. "
+            f"{counted} are stored{failures}."
+        )
     elif code in REASONS:
         text = f"Stopped: {REASONS[code]}. {counted} have an outcome{failures}."
     elif complete:
