@@ -174,17 +174,22 @@ class Sweep:
 
 
 def list_sweeps(catalogue: Catalogue) -> list[Entry]:
-    """All sweeps, the newest first."""
-    rows = catalogue.ask(SWEEPS)
+    """All sweeps, the newest first. Raises what ``Catalogue.refresh`` does."""
+    # In this order, for a sweep notes its end in the database before its file goes.
+    told = {
+        row["sweep_id"]: read_standing(catalogue.db, row["sweep_id"])
+        for row in catalogue.ask(SWEEPS)
+        if row["ended_at"] is None
+    }
+    catalogue.refresh()
     return [
-        Entry(row, config_of(row["config"]), read_standing(catalogue.db, row["sweep_id"]))
-        for row in rows
+        Entry(row, config_of(row["config"]), told.get(row["sweep_id"]))
+        for row in catalogue.ask(SWEEPS)
     ]
 
 
 def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> Sweep | None:
     """One sweep; None where there is none. Raises what ``Catalogue.refresh`` does."""
-    # In this order, for a sweep notes its end in the database before its file goes.
     standing = read_standing(catalogue.db, sweep_id)
     if refresh:
         catalogue.refresh()
