@@ -9,9 +9,11 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
+from merge_runner.plan import Choice, make_plan
 from merge_runner.players import Players
 from merge_runner.progress import Progress
 from merge_runner.progress_file import ProgressFile, clear_dead, read_standing
+from merge_runner.sweep import Options, Sweep
 
 NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
 SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm", 100)
@@ -55,6 +57,21 @@ async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_
     assert (alive, read_standing(db, found.sweep_id).alive) == (True, False)
     assert (await merge_runner("sweep", "baseline", "--model", "constant", "--db", db)).code == 0
     assert not path.parent.exists()
+
+
+async def test_the_last_word_of_a_sweep_is_that_it_checks_what_each_cell_came_to(
+    tmp_path, monkeypatch
+):
+    said = []
+    monkeypatch.setattr(ProgressFile, "write", lambda _, standing: said.append(standing))
+    plan = make_plan(Choice("baseline", "constant", repetitions=2, conditions=["N_0_0", "L_4_0"]))
+    await Sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print).run()
+    first, last = said[0], said[-1]
+    assert (first.doing, last.doing) == ("playing", "checking")
+    assert [(c.condition, c.ended, c.failed) for c in first.cells] == [
+        (c.condition, 0, 0) for c in last.cells
+    ]
+    assert [(c.planned, c.collided, c.ended) for c in last.cells] == [(2, 2, 2)] * 2
 
 
 @pytest.mark.parametrize(
