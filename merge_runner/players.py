@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,7 +17,7 @@ from merge_runner.errors import TrialSuspended
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
 from merge_runner.plan import Plan
-from merge_runner.records import SIDES, ChatReply, Side, Slot, TrialRecord, TrialSpec
+from merge_runner.records import SIDES, Cell, ChatReply, Side, Slot, TrialRecord, TrialSpec
 from merge_runner.scheduler import Gate, run_bounded
 from merge_runner.trial import play_trial
 
@@ -41,6 +42,11 @@ class Crew(Protocol):
     @property
     def running(self) -> int:
         """How many trials are being played."""
+        ...
+
+    @property
+    def playing(self) -> Mapping[Cell, int] | None:
+        """How many trials of each cell are being played; None: only the workers know."""
         ...
 
     @property
@@ -74,8 +80,13 @@ class Players:
     clients: Mapping[str, LlmClient]
     in_flight: int
     gate: Gate = field(default_factory=Gate)
-    running: int = 0
+    playing: Counter[Cell] = field(default_factory=Counter)
     workers: None = None
+
+    @property
+    def running(self) -> int:
+        """How many trials are being played."""
+        return self.playing.total()
 
     @property
     def meters(self) -> Mapping[str, Meter]:
@@ -108,13 +119,13 @@ class Players:
     ) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
         await room()
         drivers = {side: self._driver(spec, side) for side in SIDES}
-        self.running += 1
+        self.playing[spec.cell] += 1
         try:
             return spec, await play_trial(spec, self.plan.scenario, drivers)
         except TrialSuspended as exc:
             return spec, exc
         finally:
-            self.running -= 1
+            self.playing[spec.cell] -= 1
             for client in self.clients.values():
                 client.leave(spec.order)
 

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Literal
 
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.meter import Meter, Wait
+from merge_runner.progress_file import (
+    EVERY_S,
+    MACHINE,
+    CellStanding,
+    ProgressFile,
+    Standing,
+    clear_dead,
+)
+from merge_runner.records import Cell
 from merge_runner.texts import printable
 
 if TYPE_CHECKING:
@@ -33,7 +44,8 @@ class Progress:
 
     ``expected_calls`` is about how many calls all trials take: trials that run in step all end
     late, so the calls tell the time left better than the trials do. ``worst_stall_s`` is by how
-    much the event loop was late at worst.
+    much the event loop was late at worst. ``planned``, ``stored`` before this run, and ``by_cell``,
+    how this run's trials ended, are told to other processes alone.
     """
 
     title: str
@@ -46,6 +58,19 @@ class Progress:
     stored_before: int = 0
     started: float = field(default_factory=time.monotonic)
     worst_stall_s: float = 0.0
+    name: str = ""
+    model: str = ""
+    planned: dict[Cell, int] = field(default_factory=dict)
+    stored: Counter[Cell] = field(default_factory=Counter)
+    by_cell: dict[Cell, Counter[str]] = field(default_factory=dict)
+    began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+    doing: Literal["playing", "checking"] = "playing"
+
+    def count(self, cell: Cell, status: str) -> None:
+        """A trial has ended, or waits for money: ``suspended``."""
+        self.by_cell.setdefault(cell, Counter())[status] += 1
+        if status != "suspended":
+            self.done[status] += 1
 
     @property
     def ended(self) -> int:
@@ -61,21 +86,51 @@ class Progress:
         rates = [meter.last_minute() for meter in meters]
         requests, tokens = (sum(rate[i] for rate in rates) for i in (0, 1))
         cost = sum(meter.cost_usd for meter in meters)
+        left_s = self._left_s(elapsed, live + cached)
+        left = "" if left_s is None else f", about {left_s:.0f} s left"
         window = min(60.0, max(elapsed, 1.0)) / 60
         before = f" (+{self.stored_before} stored before)" if self.stored_before else ""
-        others = sum((meter.mismatches for meter in meters), Counter[str]())
         running = self.crew.running if self.crew else 0
-        warnings = [("WARNING", f"another model answers: {pair}") for pair in sorted(others)]
         return [
-            *warnings,
+            *(("WARNING", text) for text in self._warnings()),
             ("trials", f"{self.ended}/{self.total} ended{before}, {running} running{self._on()}"),
             ("failed", str(self.done["failed"])),
             ("calls", f"{live} live, {cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
             ("cost", f"{cost:.2f} USD{self._spent()}"),
-            *_waiting(meters),
-            ("time", f"{elapsed:.0f} s{self._left(elapsed, live + cached)}"),
+            *(("calls waiting", "; ".join(texts)) for texts in [_waiting(meters)] if texts),
+            ("time", f"{elapsed:.0f} s{left}"),
         ]
+
+    def standing(self, sweep_id: str) -> Standing:
+        """The same for other processes, cell by cell."""
+        meters, crew = self.meters, self.crew
+        live = sum(meter.calls_live for meter in meters)
+        cached = sum(meter.calls_cached for meter in meters)
+        return Standing(
+            sweep_id=sweep_id,
+            name=self.name,
+            model=self.model,
+            pid=os.getpid(),
+            machine=MACHINE,
+            started_at=self.began_at,
+            updated_at=datetime.now(UTC),
+            doing=self.doing,
+            trials=self.total + self.stored_before,
+            stored_before=self.stored_before,
+            running=crew.running if crew else 0,
+            workers=crew.workers if crew else None,
+            cells=tuple(map(self._cell, self.planned)),
+            calls_live=live,
+            calls_cached=cached,
+            cost_usd=sum(meter.cost_usd for meter in meters),
+            cap_usd=self.cap_usd,
+            committed_usd=self.ledger.spending.committed_usd if self.ledger else None,
+            left_s=self._left_s(time.monotonic() - self.started, live + cached),
+            worst_stall_s=self.worst_stall_s,
+            waiting=tuple(map(printable, _waiting(meters))),
+            warnings=tuple(map(printable, self._warnings())),
+        )
 
     @property
     def meters(self) -> Sequence[Meter]:
@@ -92,12 +147,44 @@ class Progress:
             return ""
         return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
 
-    def _left(self, elapsed: float, calls: int) -> str:
+    def _cell(self, cell: Cell) -> CellStanding:
+        playing = self.crew.playing if self.crew else {}
+        ways = self.by_cell.get(cell, Counter())
+        return CellStanding(
+            *cell,
+            planned=self.planned[cell],
+            stored=self.stored[cell],
+            running=None if playing is None else playing.get(cell, 0),
+            finished=ways["finished"],
+            collided=ways["collided"],
+            timeout=ways["timeout"],
+            failed=ways["failed"],
+            suspended=ways["suspended"],
+        )
+
+    def _warnings(self) -> list[str]:
+        others = sum((meter.mismatches for meter in self.meters), Counter[str]())
+        return [f"another model answers: {pair}" for pair in sorted(others)]
+
+    def _left_s(self, elapsed: float, calls: int) -> float | None:
         if self.ended == self.total or not (self.ended or calls):
-            return ""
+            return None
         by_calls = min(calls / self.expected_calls, 0.99) if self.expected_calls else 0.0
         part = max(self.ended / self.total, by_calls)
-        return f", about {elapsed / part - elapsed:.0f} s left"
+        return elapsed / part - elapsed if part else None
+
+
+@asynccontextmanager
+async def told(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
+    """Keep the file of a sweep up to date while the body runs, and remove it at its end."""
+    clear_dead(file.db)
+    file.write(progress.standing(file.sweep_id))
+    telling = asyncio.create_task(_tell(progress, file))
+    try:
+        yield
+    finally:
+        telling.cancel()
+        file.remove()
 
 
 @asynccontextmanager
@@ -113,6 +200,12 @@ async def shown(progress: Progress) -> AsyncIterator[None]:
         pulse.cancel()
         stop.set()
         await display
+
+
+async def _tell(progress: Progress, file: ProgressFile) -> None:
+    while True:
+        await asyncio.sleep(EVERY_S)
+        await asyncio.to_thread(file.write, progress.standing(file.sweep_id))
 
 
 async def _feel_pulse(progress: Progress) -> None:
@@ -174,7 +267,7 @@ def _notes(progress: Progress) -> list[str]:
     return lines[:NOTES_SHOWN] + more
 
 
-def _waiting(meters: Sequence[Meter]) -> list[tuple[str, str]]:
+def _waiting(meters: Sequence[Meter]) -> list[str]:
     """How many calls wait for what, and until when at the latest, where that is known."""
     waits: dict[str, list[Wait]] = {}
     for meter in meters:
@@ -186,7 +279,7 @@ def _waiting(meters: Sequence[Meter]) -> list[tuple[str, str]]:
         until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
         texts.append(f"{len(those)} {what}{until}")
     more = [f"{len(texts) - REASONS_SHOWN} other reasons"] * (len(texts) > REASONS_SHOWN)
-    return [("calls waiting", "; ".join(texts[:REASONS_SHOWN] + more))] if texts else []
+    return texts[:REASONS_SHOWN] + more
 
 
 async def _stopped(stop: asyncio.Event, seconds: float) -> bool:

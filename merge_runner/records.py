@@ -9,6 +9,8 @@ Side = Literal["left", "right"]
 Road = Literal["merge", "straight"]
 Tactical = Literal["M", "Y"]
 Status = Literal["finished", "collided", "timeout", "failed"]
+# A prompt variant and a condition.
+Cell = tuple[str, str]
 
 SIDES: tuple[Side, Side] = ("left", "right")
 
@@ -176,6 +178,11 @@ class TrialSpec:
     order: int
     scripted: bool = False
     pair: str | None = None
+
+    @property
+    def cell(self) -> Cell:
+        """Its prompt variant and condition."""
+        return self.variant or "", self.condition
 
 
 @dataclass(frozen=True, slots=True)

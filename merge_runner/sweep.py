@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
@@ -34,7 +35,8 @@ from merge_runner.llm.transport import SealedTransport
 from merge_runner.misses import Miss, explain, misses_of
 from merge_runner.plan import PROMPTS_PER_DRIVER, Limits, Plan, spec_hash
 from merge_runner.players import Crew, Players
-from merge_runner.progress import Progress, shown
+from merge_runner.progress import Progress, shown, told
+from merge_runner.progress_file import ProgressFile
 from merge_runner.provenance import git_state, versions
 from merge_runner.recording import read_recording
 from merge_runner.records import TrialRecord, TrialSpec
@@ -143,6 +145,10 @@ class Sweep:
             cap_usd=options.limits.max_cost_usd,
             ledger=self._ledger,
             stored_before=len(self._stored),
+            name=plan.name,
+            model=plan.model,
+            planned=Counter(spec.cell for spec in specs.values()),
+            stored=Counter(specs[key].cell for key in self._stored),
         )
 
     @property
@@ -154,6 +160,16 @@ class Sweep:
         """Play what is missing and store it; what goes wrong is in the outcome."""
         with unreadable_is_usage():
             sweep_id = self._begin()
+        file = ProgressFile(self._options.db, sweep_id)
+        async with told(self._progress, file):
+            outcome = await self._run(sweep_id)
+            self._progress.doing = "checking"
+            file.write(self._progress.standing(sweep_id))
+            self._end(outcome)
+        return outcome
+
+    async def _run(self, sweep_id: str) -> Outcome:
+        """Play what is missing and store it."""
         outcome = Outcome(sweep_id, self._plan.trials, len(self._stored))
         async with AsyncExitStack() as stack:
             stack.callback(self._cache.close)
@@ -191,7 +207,6 @@ class Sweep:
             )
         if self._progress.done["failed"] and not self._misses:
             outcome.fail(1, f"{self._progress.done['failed']} trials failed")
-        self._end(outcome)
         return outcome
 
     async def rehearse(self) -> Missing:
@@ -284,11 +299,12 @@ class Sweep:
     async def _play(self, crew: Crew, flusher: Flusher, outcome: Outcome) -> None:
         """Run the trials until all have ended, or the sweep is stopped or interrupted."""
 
-        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             if isinstance(record, TrialSuspended):
+                self._progress.count(spec.cell, "suspended")
                 self._suspended.append(record)
                 return
-            self._progress.done[record.status] += 1
+            self._progress.count(spec.cell, record.status)
             self._misses += misses_of(record, self._sealed)
             flusher.add(record)
             self._watch_for_outage(record, crew)

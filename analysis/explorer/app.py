@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
@@ -17,12 +18,13 @@ from starlette.responses import (
     PlainTextResponse,
     RedirectResponse,
     Response,
+    StreamingResponse,
 )
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from analysis.explorer.guard import Guard, from_elsewhere
-from analysis.explorer.pages import ablations, humans, sql, tables, trial, trials
+from analysis.explorer.pages import ablations, humans, sql, sweep, tables, trial, trials
 from analysis.explorer.site import NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
@@ -67,7 +69,17 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
         )
 
     def home(_: Request) -> Response:
-        return RedirectResponse(site.at.to("trials"))
+        site.catalogue.refresh()
+        return RedirectResponse(sweep.home(site))
+
+    async def events(request: Request) -> Response:
+        sweep_id = request.path_params["sweep"]
+        await run_in_threadpool(sweep.require_sweep, site, sweep_id)
+        # Nothing between us and the browser may hold the stream back.
+        plain = {"x-accel-buffering": "no"}
+        return StreamingResponse(
+            sweep.sweep_events(site, sweep_id), media_type="text/event-stream", headers=plain
+        )
 
     def message(request: Request, exc: Exception) -> Response:
         code = 404 if isinstance(exc, NotThere) else 503
@@ -84,6 +96,12 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
     return Starlette(
         routes=[
             Route("/", home),
+            Route("/sweeps", page(lambda _: sweep.sweeps_page(site))),
+            Route("/sweeps/{sweep:path}/events", events),
+            Route(
+                "/sweeps/{sweep:path}",
+                page(lambda r: sweep.sweep_page(site, r.path_params["sweep"])),
+            ),
             Route(
                 "/trials", page(lambda r: trials.trials_page(site, r.query_params, **may_wait(r)))
             ),

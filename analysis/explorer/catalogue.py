@@ -41,13 +41,31 @@ CREATE TABLE members (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
     fallbacks BIGINT);
 CREATE TABLE paid (trial_id VARCHAR, spec_hash VARCHAR, attempts BIGINT, cost_usd DOUBLE);
+CREATE TABLE tried (trial_id VARCHAR, spec_hash VARCHAR, requested VARCHAR, served VARCHAR,
+    answered BOOLEAN, outcome VARCHAR, unpriced BIGINT, times BIGINT);
+CREATE TABLE flaws (trial_id VARCHAR, spec_hash VARCHAR, failure VARCHAR, times BIGINT);
+-- What went wrong in a trial, and how often; of an error the words before its particulars.
+CREATE VIEW causes AS
+SELECT trial_id, spec_hash, 'trial: ' || left(regexp_replace(regexp_replace(split_part(
+        regexp_replace(coalesce(error, 'no reason is known'), '^(left|right): ', ''), ' (', 1),
+        '[0-9a-f]{16,}', '…', 'g'), '(^| )[0-9]+', '\\1…', 'g'), 70) AS cause, 1 AS times
+FROM listed WHERE status = 'failed'
+UNION ALL SELECT trial_id, spec_hash, 'plan: ' || failure, times FROM flaws
+UNION ALL SELECT trial_id, spec_hash, 'attempt: ' || outcome, sum(times)
+FROM tried WHERE outcome <> 'ok' GROUP BY ALL;
 """
 # A failed trial may be played anew, and a file may be put in the place of another.
 FORGET = """
 DELETE FROM memory.listed WHERE (trial_id, spec_hash, status, end_time_s) NOT IN
     (SELECT (trial_id, spec_hash, status, end_time_s) FROM trials);
+DELETE FROM memory.tried WHERE (trial_id, spec_hash) NOT IN
+    (SELECT (trial_id, spec_hash) FROM memory.listed);
+DELETE FROM memory.flaws WHERE (trial_id, spec_hash) NOT IN
+    (SELECT (trial_id, spec_hash) FROM memory.listed);
 DELETE FROM memory.members;
 INSERT INTO memory.members SELECT DISTINCT * FROM sweep_trials;
+DELETE FROM memory.sweeps;
+INSERT INTO memory.sweeps BY NAME FROM sweeps;
 """
 # The next 2,000: the file is not held for longer than that takes.
 TAKE = """
@@ -62,6 +80,13 @@ INSERT INTO memory.decided
 INSERT INTO memory.paid
     SELECT trial_id, spec_hash, count(*), sum(cost_usd)
     FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
+INSERT INTO memory.tried
+    SELECT trial_id, spec_hash, model_requested, model_served, http_status = 200, outcome,
+        count(*) FILTER (cost_usd IS NULL), count(*)
+    FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
+INSERT INTO memory.flaws
+    SELECT trial_id, spec_hash, failure, count(*) FROM decisions
+    SEMI JOIN memory.trials USING (trial_id, spec_hash) WHERE failure IS NOT NULL GROUP BY ALL;
 """
 # A sparkline has about 24 points.
 LIST = """
@@ -92,7 +117,9 @@ LEFT JOIN (
 ) USING (trial_id, spec_hash);
 TRUNCATE trials; TRUNCATE states; TRUNCATE decided; TRUNCATE paid;
 """
-FACETS = ("sweep", "model", "variant", "condition", "outcome", "validity")
+FACETS = ("sweep", "model", "variant", "condition", "outcome", "validity", "cause")
+# Facets of which a trial may have several: their tables.
+SEVERAL = {"sweep": "members", "cause": "causes"}
 SORTS = {
     "trial": "trial_id",
     "outcome": "outcome",
@@ -118,20 +145,22 @@ class Filter:
     condition: str = ""
     outcome: str = ""
     validity: str = ""
+    cause: str = ""
     q: str = ""
     trials: tuple[tuple[str, str], ...] | None = None
 
     def where(self, leave_out: str = "") -> tuple[str, list[Any]]:
         """The filter as SQL with its values; without one facet, to count its alternatives."""
         parts, values = ["true"], list[Any]()
-        for name in FACETS[1:]:
+        for name in FACETS:
             if (value := getattr(self, name)) and name != leave_out:
-                parts.append(f"{name} = ?")
+                parts.append(
+                    f"(trial_id, spec_hash) IN (SELECT (trial_id, spec_hash) FROM {SEVERAL[name]} "  # noqa: S608 # constants
+                    f"WHERE {name} = ?)"
+                    if name in SEVERAL
+                    else f"{name} = ?"
+                )
                 values.append(value)
-        if self.sweep and leave_out != "sweep":
-            parts.append("(trial_id, spec_hash) IN (SELECT (trial_id, spec_hash) FROM members "
-                         "WHERE sweep = ?)")  # fmt: skip
-            values.append(self.sweep)
         if self.q:
             parts.append("contains(lower(trial_id), lower(?))")
             values.append(self.q)
@@ -196,17 +225,19 @@ class Catalogue:
     def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
         """Each facet's values with how many trials they would leave, the other facets as wanted."""
         found: dict[str, list[tuple[str, int]]] = {name: [] for name in FACETS}
+        own = [name for name in FACETS if name not in SEVERAL]
         # Those of which no value is chosen look at the same trials.
-        alike = [name for name in FACETS[1:] if not getattr(wanted, name)]
-        for names in (alike, *([name] for name in FACETS[1:] if name not in alike)):
+        alike = [name for name in own if not getattr(wanted, name)]
+        for names in (alike, *([name] for name in own if name not in alike)):
             for name, value, count in self._counts(names, wanted) if names else ():
                 found[name].append((value, count))
-        where, values = wanted.where(leave_out="sweep")
-        found["sweep"] = self._rows(
-            "SELECT sweep, count(*) FROM listed JOIN members USING (trial_id, spec_hash) "  # noqa: S608 # constants
-            f"WHERE {where} GROUP BY ALL ORDER BY ALL",
-            values,
-        )
+        for name, table in SEVERAL.items():
+            where, values = wanted.where(leave_out=name)
+            found[name] = self._rows(
+                f"SELECT {name}, count(*) FROM listed JOIN {table} USING (trial_id, spec_hash) "  # noqa: S608 # constants
+                f"WHERE {where} AND {name} IS NOT NULL GROUP BY ALL ORDER BY ALL",
+                values,
+            )
         return found
 
     def _counts(self, names: list[str], wanted: Filter) -> list[tuple[str, str, int]]:
@@ -293,6 +324,10 @@ class Catalogue:
             [],
         )
         return int(row[0]), int(row[1])
+
+    def ask(self, sql: str, *values: object) -> list[dict[str, Any]]:
+        """Rows of a query of ours on what is in memory."""
+        return self._records(sql, list(values))
 
     def export(self, wanted: Filter, sort: str, form: str) -> bytes:
         """All trials of a filter as CSV or Parquet."""

@@ -27,10 +27,20 @@ def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
     shown = LOOPBACK if bind == "0.0.0.0" else bind  # noqa: S104 # compared, not bound
     say(f"http://{shown}:{port}/" + (f"?token={token}" if token else ""))
     config = uvicorn.Config(explorer(site, hosts, token), log_level="error", ws="none")
-    try:
-        uvicorn.Server(config).run(sockets=[listener])
-    finally:
-        site.computing.close()
+    _Server(config, site).run(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    """One that ends the streams when it ends: it waits for its connections otherwise."""
+
+    def __init__(self, config: uvicorn.Config, site: Site) -> None:
+        super().__init__(config)
+        self._site = site
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop serving."""
+        self._site.closing = True
+        await super().shutdown(sockets)
 
 
 def listen(bind: str, port: int) -> socket.socket:

@@ -15,6 +15,7 @@ from analysis.explorer.texts import visible
 
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {
+    "Sweeps": "sweeps",
     "Trials": "trials",
     "Tables": "tables",
     "Ablations": "ablations",
@@ -34,6 +35,8 @@ class Site:
     db: Path
     at: Links = field(default_factory=Links)
     static: bool = False
+    closing: bool = False
+    """Whether the server ends: a stream must not keep it waiting."""
 
     def __post_init__(self) -> None:
         self.catalogue = Catalogue(self.db)

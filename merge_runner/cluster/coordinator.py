@@ -69,6 +69,7 @@ class Coordinator:
         self.answered: Counter[str] = Counter()
         self.meters = {name: Meter() for name in plan.entries}
         self.workers = 0
+        self.playing = None
         self._client = client
         self._plan = plan
         self._addressed = addressed

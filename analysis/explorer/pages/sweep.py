@@ -1,0 +1,201 @@
+"""The list of sweeps, and the page of one, which follows it while it runs."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from markupsafe import escape
+
+from analysis.explorer.site import NotThere, Site
+from analysis.explorer.sweeps import Cell, Sweep, duration, find_sweep, list_sweeps
+from analysis.explorer.views import condition_text, prompt_text
+from merge_runner.errors import MergeRunnerError
+from merge_runner.progress_file import read_standing
+from merge_runner.prompts.blocks import VARIANTS
+from merge_runner.simulator.conditions import CONDITIONS
+
+LOOK_EVERY_S = 1.0
+READ_EVERY_S = 3.0
+BEAT_EVERY_S = 15.0
+# Between two looks it is seen so often whether the server ends.
+LOOKS = 10
+KINDS = {
+    "trial": "Trials that failed",
+    "plan": "Replies without a valid plan",
+    "attempt": "Attempts without a good reply",
+}
+
+
+def home(site: Site) -> str:
+    """The address to begin at: the newest sweep."""
+    sweeps = list_sweeps(site.catalogue)
+    return site.at.sweep(sweeps[0].sweep_id) if sweeps else site.at.to("trials")
+
+
+def sweeps_page(site: Site) -> str:
+    """All sweeps."""
+    return site.render(
+        "sweeps.html", here="sweeps", sweeps=list_sweeps(site.catalogue), lasted=_lasted
+    )
+
+
+def sweep_page(site: Site, sweep_id: str) -> str:
+    """One sweep; raises NotThere."""
+    sweep = _find(site, sweep_id)
+    return site.render("sweep.html", here="sweeps", **_values(sweep))
+
+
+def require_sweep(site: Site, sweep_id: str) -> None:
+    """Raise NotThere where there is no such sweep."""
+    _find(site, sweep_id)
+
+
+async def sweep_events(site: Site, sweep_id: str) -> AsyncIterator[str]:
+    """What changes on a sweep's page, as server-sent events, until the sweep ends.
+
+    ``sweep`` is the part of the page that is replaced, ``state`` a sentence for who listens, and
+    ``done`` the last one.
+    """
+    watched = _Watched(site, sweep_id)
+    spoke = time.monotonic()
+    while not site.closing:
+        for name, text in await asyncio.to_thread(watched.news):
+            yield _event(name, text)
+            spoke = time.monotonic()
+            if name == "done":
+                return
+        if time.monotonic() - spoke >= BEAT_EVERY_S:
+            spoke = time.monotonic()
+            yield ": still here\n\n"
+        for _ in range(LOOKS):
+            if not site.closing:
+                await asyncio.sleep(LOOK_EVERY_S / LOOKS)
+
+
+@dataclass(slots=True)
+class _Watched:
+    """What one browser has been told of a sweep."""
+
+    site: Site
+    sweep_id: str
+    updated_at: datetime | None = None
+    read_at: float = 0.0
+    state: str = ""
+
+    def news(self) -> list[tuple[str, str]]:
+        """The events since the last look."""
+        standing = read_standing(self.site.db, self.sweep_id)
+        alive = standing if standing and standing.alive else None
+        if alive and alive.updated_at == self.updated_at:
+            return []
+        if alive and time.monotonic() - self.read_at < READ_EVERY_S:
+            sweep = find_sweep(self.site.catalogue, self.sweep_id, refresh=False)
+        else:
+            try:
+                sweep = find_sweep(self.site.catalogue, self.sweep_id)
+            except MergeRunnerError:
+                return []  # somebody else holds the database: there is a next time
+            self.read_at = time.monotonic()
+        if sweep is None:
+            return [("done", "")]
+        self.updated_at = alive.updated_at if alive else None
+        events = [("sweep", self.site.render("_sweep.html", **_values(sweep)))]
+        if sweep.entry.state != self.state:
+            # Once per state, and not once a second: it is read out.
+            events.append(("state", str(escape(sweep.verdict.text))))
+            self.state = sweep.entry.state
+        return events if sweep.entry.live else [*events, ("done", "")]
+
+
+def _find(site: Site, sweep_id: str) -> Sweep:
+    sweep = find_sweep(site.catalogue, sweep_id)
+    if sweep is None:
+        raise NotThere(f"the database holds no sweep {sweep_id}")
+    return sweep
+
+
+def _values(sweep: Sweep) -> dict[str, object]:
+    """What the templates of a sweep show."""
+    variants = _ordered({variant for variant, _ in sweep.cells}, VARIANTS)
+    conditions = _ordered({condition for _, condition in sweep.cells}, CONDITIONS)
+    rows = [
+        (condition, [sweep.cells.get((variant, condition)) for variant in variants])
+        for condition in conditions
+    ]
+    return {
+        "sweep": sweep,
+        "entry": sweep.entry,
+        "verdict": sweep.verdict,
+        "variants": variants,
+        "matrix": rows,
+        "totals": [_total(variant, [cells[i] for _, cells in rows]) for i, variant in
+                   enumerate(variants)],
+        "causes": {
+            text: [row for row in sweep.causes if row["cause"].startswith(f"{kind}: ")]
+            for kind, text in KINDS.items()
+        },
+        "bar": bar,
+        "condition_texts": {
+            name: condition_text(name) if name in CONDITIONS else "" for name in conditions
+        },
+        "prompt_text": prompt_text,
+        "duration": duration,
+        "lasted": _lasted(sweep.entry.row["started_at"], sweep.entry.last_word),
+    }  # fmt: skip
+
+
+def _ordered(names: Iterable[str], usual: Iterable[str]) -> list[str]:
+    """Names in their usual order, those that are unknown last."""
+    places = {name: place for place, name in enumerate(usual)}
+    return sorted(names, key=lambda name: (places.get(name, len(places)), name))
+
+
+def bar(cell: Cell) -> list[tuple[str, float, float]]:
+    """(what, from, width) of a bar of 100 units for the planned trials of a cell."""
+    whole = max(cell.planned, cell.ended + cell.failed + (cell.running or 0), 1)
+    parts, begin = [], 0.0
+    for name, count in (
+        ("ended", cell.ended),
+        ("failed", cell.failed),
+        ("running", cell.running or 0),
+    ):
+        width = 100 * count / whole
+        if count:
+            parts.append((name, round(begin, 2), round(width, 2)))
+        begin += width
+    return parts
+
+
+def _total(variant: str, cells: list[Cell | None]) -> Cell:
+    """One variant over all conditions."""
+    there = [cell for cell in cells if cell is not None]
+    running = [cell.running for cell in there]
+    return Cell(
+        variant,
+        "",
+        planned=sum(cell.planned for cell in there),
+        ended=sum(cell.ended for cell in there),
+        failed=sum(cell.failed for cell in there),
+        running=None if None in running else sum(count or 0 for count in running),
+        suspended=sum(cell.suspended for cell in there),
+        decisions=sum(cell.decisions for cell in there),
+        invalid=sum(cell.invalid for cell in there),
+    )
+
+
+def _lasted(began: datetime, until: datetime | None) -> str:
+    """A time span; the database's times are UTC without saying so."""
+    if until is None:
+        return ""
+    if until.tzinfo is None:
+        until = until.replace(tzinfo=UTC)
+    return duration((until - began.replace(tzinfo=UTC)).total_seconds())
+
+
+def _event(name: str, text: str) -> str:
+    lines = "".join(f"data: {line}\n" for line in text.splitlines() or [""])
+    return f"event: {name}\n{lines}\n"

@@ -1,0 +1,363 @@
+"""Sweeps as the database and their progress files know them: how far, how well, at what price."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from analysis.explorer.catalogue import Catalogue
+from merge_runner.audit.expected import ModelFacts
+from merge_runner.progress_file import Standing, read_standing
+
+Row = dict[str, Any]
+OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (trial_id, spec_hash)"
+SWEEPS = """
+SELECT sweep_id, name, started_at, ended_at, exit_code, config::VARCHAR AS config,
+    coalesce(trials, 0) AS trials, coalesce(failed, 0) AS failed, coalesce(cost_usd, 0) AS cost_usd
+FROM sweeps LEFT JOIN (
+    SELECT sweep AS sweep_id, count(*) AS trials, count(*) FILTER (status = 'failed') AS failed,
+        sum(cost_usd) AS cost_usd
+    FROM members JOIN listed USING (trial_id, spec_hash) GROUP BY ALL
+) USING (sweep_id)
+ORDER BY started_at DESC, sweep_id DESC
+"""
+CELLS = f"""
+SELECT coalesce(variant, '') AS variant, condition,
+    count(*) FILTER (status <> 'failed') AS ended, count(*) FILTER (status = 'failed') AS failed,
+    count(*) FILTER (status = 'collided') AS collided, sum(decisions)::BIGINT AS decisions,
+    sum(invalid)::BIGINT AS invalid, sum(fallbacks)::BIGINT AS fallbacks
+FROM listed {OF_SWEEP} GROUP BY ALL ORDER BY ALL
+"""  # noqa: S608 # constants
+TRIED = f"""
+SELECT requested, served, answered, outcome, sum(times)::BIGINT AS times,
+    sum(unpriced)::BIGINT AS unpriced
+FROM tried {OF_SWEEP} GROUP BY ALL ORDER BY ALL
+"""  # noqa: S608 # constants
+CAUSES = f"""
+SELECT cause, count(*) AS trials, sum(times)::BIGINT AS times
+FROM causes {OF_SWEEP} GROUP BY ALL ORDER BY trials DESC, cause
+"""  # noqa: S608 # constants
+# Why a run ended early, by its exit code.
+REASONS = {
+    2: "the service refused the key or the model, or a setting was wrong",
+    3: "the account's quota or --max-cost was used up",
+    4: "a replay makes no calls, and some replies are not recorded",
+    130: "it was interrupted (Ctrl-C)",
+}
+
+
+class Config(BaseModel):
+    """What a sweep planned, as far as its row tells; an older program may have told less."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    model: str = ""
+    models: dict[str, ModelFacts] = {}
+    repetitions: dict[str, int] = {}
+    conditions: tuple[str, ...] = ()
+    sample_set: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One sweep of the list. ``standing`` is what its process says, None where no file does."""
+
+    row: Row
+    config: Config
+    standing: Standing | None
+
+    @property
+    def sweep_id(self) -> str:
+        """Its name, which no other sweep has."""
+        return str(self.row["sweep_id"])
+
+    @property
+    def state(self) -> str:
+        """``running``, ``checking`` what is stored, ``lost``, ``finished``, or ``stopped``."""
+        if self.row["ended_at"] is None:
+            return self._unended
+        return "stopped" if self.row["exit_code"] else "finished"
+
+    @property
+    def live(self) -> Standing | None:
+        """What its process says, while it runs."""
+        return self.standing if self.state in {"running", "checking"} else None
+
+    @property
+    def planned(self) -> int:
+        """How many trials it wants; 0 where nobody says."""
+        return sum(self.config.repetitions.values()) * len(self.config.conditions)
+
+    @property
+    def ended(self) -> int:
+        """How many of its trials have an outcome."""
+        if self.live:
+            return sum(cell.ended for cell in self.live.cells)
+        return int(self.row["trials"] - self.row["failed"])
+
+    @property
+    def failed(self) -> int:
+        """How many of its trials have none, and ended."""
+        if self.live:
+            return sum(cell.failed for cell in self.live.cells)
+        return int(self.row["failed"])
+
+    @property
+    def last_word(self) -> datetime | None:
+        """When it ended, or was heard of last."""
+        told: datetime | None = self.row["ended_at"]
+        return self.standing.updated_at if told is None and self.standing else told
+
+    @property
+    def _unended(self) -> str:
+        if self.standing is None or not self.standing.alive:
+            return "lost"
+        return "running" if self.standing.doing == "playing" else "checking"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Trials of one variant and condition; ``running`` is None where nobody knows.
+
+    ``decisions`` and ``invalid`` are those of stored trials.
+    """
+
+    variant: str
+    condition: str
+    planned: int = 0
+    ended: int = 0
+    failed: int = 0
+    running: int | None = 0
+    suspended: int = 0
+    decisions: int = 0
+    invalid: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """``count`` of ``of`` things; ``state`` is the filter of the trials behind it."""
+
+    name: str
+    count: int
+    of: int
+    things: str
+    meaning: str
+    state: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The answer in one sentence; ``command`` goes on, unless a ``later`` sweep already did."""
+
+    kind: str
+    text: str
+    command: str = ""
+    later: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One sweep with all that its page shows."""
+
+    entry: Entry
+    verdict: Verdict
+    cells: dict[tuple[str, str], Cell]
+    rates: list[Rate]
+    mismatches: dict[str, int]
+    causes: list[Row]
+    unpriced: int
+
+
+def list_sweeps(catalogue: Catalogue) -> list[Entry]:
+    """All sweeps, the newest first. Raises what ``Catalogue.refresh`` does."""
+    # In this order, for a sweep notes its end in the database before its file goes.
+    told = {
+        row["sweep_id"]: read_standing(catalogue.db, row["sweep_id"])
+        for row in catalogue.ask(SWEEPS)
+        if row["ended_at"] is None
+    }
+    catalogue.refresh()
+    return [
+        Entry(row, config_of(row["config"]), told.get(row["sweep_id"]))
+        for row in catalogue.ask(SWEEPS)
+    ]
+
+
+def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> Sweep | None:
+    """One sweep; None where there is none. Raises what ``Catalogue.refresh`` does."""
+    standing = read_standing(catalogue.db, sweep_id)
+    if refresh:
+        catalogue.refresh()
+    rows = catalogue.ask(SWEEPS)
+    place = next((i for i, row in enumerate(rows) if row["sweep_id"] == sweep_id), None)
+    if place is None:
+        return None
+    entry = Entry(rows[place], config_of(rows[place]["config"]), standing)
+    stored = catalogue.ask(CELLS, sweep_id)
+    tried = catalogue.ask(TRIED, sweep_id)
+    mismatches = mismatches_of(entry.config, tried)
+    return Sweep(
+        entry=entry,
+        verdict=verdict_of(entry, _later(entry, rows[:place]), sum(mismatches.values())),
+        cells=cells_of(entry, stored),
+        rates=rates_of(stored, tried, sum(mismatches.values()), sweep_id),
+        mismatches=mismatches,
+        causes=catalogue.ask(CAUSES, sweep_id),
+        unpriced=sum(row["unpriced"] for row in tried),
+    )
+
+
+def config_of(text: str) -> Config:
+    """The configuration in a sweep's row."""
+    try:
+        return Config.model_validate_json(text)
+    except ValidationError:
+        return Config()
+
+
+def cells_of(entry: Entry, stored: list[Row]) -> dict[tuple[str, str], Cell]:
+    """Every cell that was planned, and any other that holds a trial."""
+    planned = {
+        (variant, condition): repetitions
+        for variant, repetitions in entry.config.repetitions.items()
+        for condition in entry.config.conditions
+    }
+    found = {(row["variant"], row["condition"]): row for row in stored}
+    told = {(cell.variant, cell.condition): cell for cell in entry.live.cells} if entry.live else {}
+    cells = {}
+    for key in planned | found:
+        row, now = found.get(key, {}), told.get(key)
+        cells[key] = Cell(
+            variant=key[0],
+            condition=key[1],
+            planned=planned.get(key, 0),
+            ended=now.ended if now else row.get("ended", 0),
+            failed=now.failed if now else row.get("failed", 0),
+            running=now.running if now else 0,
+            suspended=now.suspended if now else 0,
+            decisions=row.get("decisions", 0),
+            invalid=row.get("invalid", 0),
+        )
+    return cells
+
+
+def rates_of(stored: list[Row], tried: list[Row], other: int, sweep_id: str) -> list[Rate]:
+    """How often what happened that may cost trust, each with what it is counted over."""
+    sums = Counter[str]()
+    for row in stored:
+        sums.update({name: value for name, value in row.items() if isinstance(value, int)})
+    outcomes = Counter[str]()
+    for row in tried:
+        outcomes[row["outcome"]] += row["times"]
+    answers = sum(row["times"] for row in tried if row["answered"])
+    played, attempts = sums["ended"] + sums["failed"], outcomes.total()
+    return [
+        Rate(name, count, of, things, meaning, {"sweep": sweep_id, **state} if state else {})
+        for name, count, of, things, meaning, state in (
+            ("collisions", sums["collided"], sums["ended"], "ended trials",
+             "the vehicles touched", {"outcome": "collided"}),
+            ("failed trials", sums["failed"], played, "stored trials",
+             "a call got no answer; the trial has no outcome and can be played anew",
+             {"outcome": "failed"}),
+            ("invalid replies", sums["invalid"], sums["decisions"], "decisions",
+             "the reply held no valid plan", {}),
+            ("fallbacks", sums["fallbacks"], sums["decisions"], "decisions",
+             "an older plan was driven on, or none", {"validity": "fallbacks"}),
+            ("refusals", outcomes["refusal"], attempts, "attempts",
+             "the model, or a filter before it, declined", {"cause": "attempt: refusal"}),
+            ("truncated replies", outcomes["truncated"], attempts, "attempts",
+             "the reply was cut off at its longest", {"cause": "attempt: truncated"}),
+            ("another model answered", other, answers, "answers",
+             "it is neither the one asked for nor a declared alias of it", {}),
+        )
+    ]  # fmt: skip
+
+
+def mismatches_of(config: Config, tried: list[Row]) -> dict[str, int]:
+    """Requested and served model, where the latter is neither the id nor an alias."""
+    accepted = {model.id: set(model.accepted) for model in config.models.values()}
+    others = Counter[str]()
+    for row in tried:
+        asked, served = row["requested"], row["served"]
+        if row["answered"] and served is not None and served not in accepted.get(asked, {asked}):
+            others[f"{asked} → {served}"] += row["times"]
+    return dict(others)
+
+
+def verdict_of(entry: Entry, later: str, mismatches: int) -> Verdict:
+    """Say whether it is finished, and can be trusted."""
+    counted = f"{entry.ended} of {entry.planned or '?'} trials"
+    failures = f", {entry.failed} failed" if entry.failed else ""
+    if entry.state == "checking":
+        return Verdict("running", f"Nearly done: {counted} ended{failures}; the audit runs.")
+    if entry.live:
+        left_s = entry.live.left_s
+        left = f", about {duration(left_s)} left" if left_s is not None else ""
+        return Verdict("running", f"Running: {counted} ended{failures}{left}.")
+    if entry.state == "finished":
+        return _finished(entry, mismatches)
+    complete = entry.ended == entry.planned
+    code = entry.row["exit_code"]
+    if entry.state == "lost":
+        text = (
+            "Stopped without a word: its process is gone, or frozen. "
+            f"{counted} are stored{failures}."
+        )
+    elif code in REASONS:
+        text = f"Stopped: {REASONS[code]}. {counted} have an outcome{failures}."
+    elif complete:
+        text = (
+            f"Ended with faults: {counted} have an outcome, but what is stored does not hold "
+            f"together. See: merge-runner audit --sweep {entry.sweep_id}"
+        )
+    elif entry.failed:
+        text = f"Ended: {counted} have an outcome{failures}."
+    else:
+        text = f"Stopped by an error that it printed: {counted} have an outcome."
+    if complete or later or code == 4:
+        return Verdict("stopped", text, later=later)
+    return Verdict("stopped", text, command=_again(entry))
+
+
+def duration(seconds: float) -> str:
+    """A time span as a reader says it."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    if seconds < 5_400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def _finished(entry: Entry, mismatches: int) -> Verdict:
+    if entry.planned and entry.ended < entry.planned:
+        return Verdict(
+            "stopped",
+            f"It had finished, but the database holds only {entry.ended} of its {entry.planned} "
+            "trials.",
+        )
+    text = f"Finished: all {entry.ended} trials ended, and the audit found nothing"
+    if mismatches:
+        return Verdict("doubtful", f"{text}; but another model gave {mismatches} answers.")
+    return Verdict("finished", f"{text}.")
+
+
+def _again(entry: Entry) -> str:
+    words = ["merge-runner", "sweep", entry.row["name"], "--model", entry.config.model or "?"]
+    if entry.config.sample_set:
+        words += ["--sample-set", str(entry.config.sample_set)]
+    return shlex.join(words)
+
+
+def _later(entry: Entry, newer: list[Row]) -> str:
+    """The newest sweep that went on with the same trials."""
+    for row in newer:
+        config = config_of(row["config"])
+        same = (config.model, config.sample_set) == (entry.config.model, entry.config.sample_set)
+        if row["name"] == entry.row["name"] and same:
+            return str(row["sweep_id"])
+    return ""

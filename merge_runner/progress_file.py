@@ -1,0 +1,179 @@
+"""What a running sweep says of itself, in a small file beside its database, to other processes."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+from urllib.parse import quote
+
+from pydantic import AwareDatetime, NonNegativeInt, TypeAdapter, ValidationError
+
+EVERY_S = 1.0
+STALE_S = 10.0
+# While a sweep checks what it stored, nothing else is done: only its process says that it lives.
+CHECKING_STALE_S = 600.0
+MOST_BYTES = 1_000_000
+LOG = logging.getLogger(__name__)
+# Tells machines that share a folder apart, for a process id means nothing on another one.
+MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+
+
+@dataclass(frozen=True, slots=True)
+class CellStanding:
+    """Trials of one prompt variant and condition: planned, stored before this run, and this run's.
+
+    ``suspended`` ones wait for money. ``running`` is None where only the workers know.
+    """
+
+    variant: str
+    condition: str
+    planned: NonNegativeInt
+    stored: NonNegativeInt = 0
+    running: NonNegativeInt | None = None
+    finished: NonNegativeInt = 0
+    collided: NonNegativeInt = 0
+    timeout: NonNegativeInt = 0
+    failed: NonNegativeInt = 0
+    suspended: NonNegativeInt = 0
+
+    @property
+    def ended(self) -> int:
+        """Trials with an outcome, from all runs."""
+        return self.stored + self.finished + self.collided + self.timeout
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Where a sweep stands. ``committed_usd`` counts against ``cap_usd``, over all runs.
+
+    ``waiting`` says what its calls wait for, ``warnings`` what its user should know. ``left_s`` is
+    an estimate, None where nothing tells yet.
+    """
+
+    sweep_id: str
+    name: str
+    model: str
+    pid: int
+    machine: str
+    started_at: AwareDatetime
+    updated_at: AwareDatetime
+    doing: Literal["playing", "checking"]
+    trials: NonNegativeInt
+    stored_before: NonNegativeInt
+    running: NonNegativeInt
+    workers: NonNegativeInt | None
+    cells: tuple[CellStanding, ...]
+    calls_live: NonNegativeInt
+    calls_cached: NonNegativeInt
+    cost_usd: float
+    cap_usd: float | None
+    committed_usd: float | None
+    left_s: float | None
+    worst_stall_s: float
+    waiting: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the sweep still runs, as far as its file and its process tell."""
+        if self.machine == MACHINE and not _exists(self.pid):
+            return False
+        age_s = (datetime.now(UTC) - self.updated_at).total_seconds()
+        return age_s < (CHECKING_STALE_S if self.doing == "checking" else STALE_S)
+
+
+_STANDING = TypeAdapter(Standing)
+
+
+@dataclass(slots=True)
+class ProgressFile:
+    """The file of one sweep. A disk that takes none is told of once, and fails nothing."""
+
+    db: Path
+    sweep_id: str
+    _gone: bool = False
+    _newest: datetime | None = None
+    _told: bool = False
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def write(self, standing: Standing) -> None:
+        """Replace the file: who reads it sees one state or the other, and no half of one."""
+        path = _path(self.db, self.sweep_id)
+        made = path.with_suffix(".tmp")
+        with self._lock:
+            # A thread may come with what was so before.
+            if self._gone or (self._newest and standing.updated_at < self._newest):
+                return
+            self._newest = standing.updated_at
+            try:
+                path.parent.mkdir(exist_ok=True)
+                made.write_bytes(_STANDING.dump_json(standing))
+                os.replace(made, path)
+            except OSError as exc:
+                if not self._told:
+                    LOG.warning("nobody else can see how far the sweep is: %s", exc)
+                self._told = True
+
+    def remove(self) -> None:
+        """The sweep has ended in order: nothing stays, and nothing is written any more."""
+        path = _path(self.db, self.sweep_id)
+        with self._lock:
+            self._gone = True
+            for name in (path, path.with_suffix(".tmp")):
+                with suppress(OSError):
+                    name.unlink()
+            with suppress(OSError):
+                path.parent.rmdir()
+
+
+def read_standing(db: Path, sweep_id: str) -> Standing | None:
+    """Where a sweep stands, or stood when it was killed; None where no file says so."""
+    standing = _read(_path(db, sweep_id))
+    return standing if standing and standing.sweep_id == sweep_id else None
+
+
+def clear_dead(db: Path) -> None:
+    """Remove what sweeps left that were killed."""
+    with suppress(OSError):
+        for path in _folder(db).iterdir():
+            if path.suffix not in {".json", ".tmp"}:
+                continue
+            standing = _read(path)
+            fresh = time.time() - path.stat().st_mtime < STALE_S
+            if not (standing.alive if standing else fresh):
+                path.unlink(missing_ok=True)
+
+
+def _folder(db: Path) -> Path:
+    return db.with_name(f"{db.name}.progress")
+
+
+def _path(db: Path, sweep_id: str) -> Path:
+    return _folder(db) / f"{quote(sweep_id, safe='+')}.json"
+
+
+def _read(path: Path) -> Standing | None:
+    try:
+        with path.open("rb") as file:
+            return _STANDING.validate_json(file.read(MOST_BYTES))
+    except (OSError, ValidationError):
+        return None
+
+
+def _exists(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -1,0 +1,141 @@
+"""What a running sweep tells other processes in the file beside its database."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from merge_runner.plan import Choice, make_plan
+from merge_runner.players import Players
+from merge_runner.progress import Progress
+from merge_runner.progress_file import ProgressFile, clear_dead, read_standing
+from merge_runner.sweep import Options, Sweep
+
+NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
+SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm", 100)
+
+
+def standing(sweep_id="s", **changes):
+    plain = Progress("t", 2, planned={("baseline", "N_0_0"): 2}).standing(sweep_id)
+    return replace(plain, **changes)
+
+
+async def begun(db):
+    """The one sweep of a database, as soon as some of its calls are answered."""
+    async with asyncio.timeout(30):
+        while True:
+            for path in db.parent.glob("*.progress/*.json"):
+                found = read_standing(db, path.stem)
+                if found and found.calls_live:
+                    return found, path
+            await asyncio.sleep(0.1)
+
+
+async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_tidies_up(
+    merge_runner, tmp_path, emulator_url
+):
+    db = tmp_path / "m.duckdb"
+    process = await merge_runner.start(*SWEEP, "--db", db, EMULATOR_BASE_URL=emulator_url)
+    try:
+        found, path = await begun(db)
+        text, alive = path.read_text(), found.alive
+    finally:
+        process.kill()
+        await process.communicate()
+    assert found.pid == process.pid
+    assert (found.trials, found.running) == (4, 4)
+    assert {(c.variant, c.condition): (c.planned, c.running) for c in found.cells} == {
+        ("baseline", "N_0_0"): (2, 2),
+        ("baseline", "L_4_0"): (2, 2),
+    }
+    assert any("rate limits" in line for line in found.waiting)
+    assert str(tmp_path) not in text
+    assert (alive, read_standing(db, found.sweep_id).alive) == (True, False)
+    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--db", db)).code == 0
+    assert not path.parent.exists()
+
+
+async def test_the_last_word_of_a_sweep_is_that_it_checks_what_each_cell_came_to(
+    tmp_path, monkeypatch
+):
+    said = []
+    monkeypatch.setattr(ProgressFile, "write", lambda _, standing: said.append(standing))
+    plan = make_plan(Choice("baseline", "constant", repetitions=2, conditions=["N_0_0", "L_4_0"]))
+    await Sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print).run()
+    first, last = said[0], said[-1]
+    assert (first.doing, last.doing) == ("playing", "checking")
+    assert [(c.condition, c.ended, c.failed) for c in first.cells] == [
+        (c.condition, 0, 0) for c in last.cells
+    ]
+    assert [(c.planned, c.collided, c.ended) for c in last.cells] == [(2, 2, 2)] * 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "age_s", "alive"),
+    [
+        ({}, 9, True),
+        ({}, 11, False),  # frozen
+        ({"doing": "checking"}, 11, True),  # it does nothing else meanwhile
+        ({"doing": "checking", "pid": NO_PROCESS}, 1, False),
+        ({"pid": NO_PROCESS}, 1, False),
+        ({"pid": NO_PROCESS, "machine": "another"}, 1, True),  # its ids mean nothing here
+    ],
+)
+def test_a_sweep_is_dead_when_its_process_is_gone_or_silent(changes, age_s, alive):
+    updated_at = datetime.now(UTC) - timedelta(seconds=age_s)
+    assert standing(updated_at=updated_at, **changes).alive == alive
+
+
+def test_a_living_sweep_of_the_same_database_keeps_its_file(tmp_path):
+    db = tmp_path / "m.duckdb"
+    ProgressFile(db, "a").write(standing("a"))
+    ProgressFile(db, "b").write(standing("b", pid=NO_PROCESS))
+    clear_dead(db)
+    assert (read_standing(db, "a").pid, read_standing(db, "b")) == (os.getpid(), None)
+
+
+def test_an_older_state_never_takes_the_place_of_a_newer_one_nor_comes_after_the_end(tmp_path):
+    db = tmp_path / "m.duckdb"
+    file, old = ProgressFile(db, "s"), standing()
+    new = replace(old, updated_at=old.updated_at + timedelta(seconds=1), doing="checking")
+    file.write(new)
+    file.write(old)
+    assert read_standing(db, "s") == new
+    file.remove()
+    file.write(replace(new, updated_at=new.updated_at + timedelta(seconds=1)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_takes_no_file_fails_nothing_and_is_told_of_once(tmp_path, caplog):
+    (tmp_path / "m.duckdb.progress").write_text("a file where the folder should be")
+    file = ProgressFile(tmp_path / "m.duckdb", "s")
+    for _ in range(3):
+        file.write(standing())
+    file.remove()
+    clear_dead(tmp_path / "m.duckdb")
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"sweep_id": "s"}', "\x00" * 9, "[" * 10_000])
+def test_a_file_that_is_none_of_ours_says_nothing(tmp_path, text):
+    (tmp_path / "m.duckdb.progress").mkdir()
+    (tmp_path / "m.duckdb.progress/s.json").write_text(text)
+    assert read_standing(tmp_path / "m.duckdb", "s") is None
+
+
+def test_trials_are_told_cell_by_cell():
+    cells = [("baseline", "N_0_0"), ("A1", "N_0_0")]
+    players = Players(None, {}, 1)
+    players.playing[cells[1]] += 1
+    progress = Progress("t", 5, planned=dict.fromkeys(cells, 3), crew=players)
+    progress.stored[cells[0]] = 1
+    for status in ("collided", "failed", "suspended"):
+        progress.count(cells[0], status)
+    first, second = progress.standing("s").cells
+    assert (first.ended, first.failed, first.suspended, first.running) == (2, 1, 1, 0)
+    assert (second.ended, second.running) == (0, 1)
+    assert progress.ended == 2

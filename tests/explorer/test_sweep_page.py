@@ -1,0 +1,254 @@
+"""The sweeps' pages: how far, how well, what went wrong; and how a page follows a sweep."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from collections import Counter
+from dataclasses import replace
+from datetime import datetime
+from urllib.parse import parse_qs, urlsplit
+
+import duckdb
+import pytest
+from starlette.testclient import TestClient
+from studies import Said, write_study, yielding
+
+from analysis.explorer.app import explorer
+from analysis.explorer.pages import sweep as page
+from analysis.explorer.pages.trials import filter_of
+from analysis.explorer.site import Site
+from analysis.explorer.sweeps import Config, Entry, config_of, verdict_of
+from merge_runner.audit.expected import ModelFacts
+from merge_runner.progress import Progress
+from merge_runner.progress_file import ProgressFile
+from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.store import Store, sweep_facts
+
+URL = "/sweeps/sweep-1"
+CONFIG = {
+    "model": "o3",
+    "models": {"o3": {"id": "o3", "provider": "openai", "aliases": ["o3-alias"]}},
+    "repetitions": {"baseline": 3},
+    "conditions": list(CONDITIONS),
+}
+TROUBLE = (
+    Said(("refusal",), "refusal"),
+    Said(failure="no_array"),
+    Said(("timeout", "timeout"), lost=True),
+    Said(("rate_limit", "ok")),
+    Said(("unknown", "ok")),
+    Said(served="another"),
+    Said(served="o3-alias"),
+)
+END = datetime(2026, 11, 21, 1)  # noqa: DTZ001 # as the database keeps times
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A sweep of 33 planned trials that holds 30, one of them failed, with troubles."""
+    drives = yielding("o3")[:30]
+    asked = [
+        replace(drive, said={1: TROUBLE[i]} if i < len(TROUBLE) else {})
+        for i, drive in enumerate(drives)
+    ]
+    path = tmp_path_factory.mktemp("study") / "m.duckdb"
+    write_study(path, asked, config=CONFIG)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE calls SET http_status = 200 WHERE model_served IS NOT NULL")
+    return path
+
+
+@pytest.fixture
+def study(written, tmp_path):
+    """The same, to change it."""
+    path = tmp_path / "m.duckdb"
+    path.write_bytes(written.read_bytes())
+    return path
+
+
+def browser(db):
+    site = Site(db)
+    return TestClient(explorer(site, {"127.0.0.1:1"}), base_url="http://127.0.0.1:1")
+
+
+def text_of(client, url=URL):
+    reply = client.get(url)
+    assert reply.status_code == 200
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", reply.text)).split())
+
+
+def running(db, **changes):
+    """Say that the sweep runs, in this process."""
+    progress = Progress("t", 33, planned={("baseline", name): 3 for name in CONDITIONS})
+    progress.by_cell["baseline", "N_0_0"] = Counter(changes.pop("ended", {"finished": 2}))
+    standing = replace(progress.standing("sweep-1"), left_s=20.0, **changes)
+    file = ProgressFile(db, "sweep-1")
+    file.write(standing)
+    return file
+
+
+def test_the_page_has_the_numbers_of_the_database(written):
+    text, facts = text_of(browser(written)), sweep_facts(written, "sweep-1")
+    attempts = sum(row[-1] for row in facts.ledger)
+    collided = sum(row[-1] for row in facts.outcomes if row[2] == "collided")
+    for said in (
+        f"collisions {collided} of 29 ended trials",
+        f"failed trials {len(facts.failed)} of 30 stored trials",
+        f"invalid replies {facts.invalid} of {facts.decisions} decisions",
+        f"fallbacks {facts.fallbacks} of {facts.decisions} decisions",
+        f"refusals 1 of {attempts} attempts",
+        f"another model answered 1 of {sum(row[-1] for row in facts.served)} answers",
+        "asked for: o3 → another (1 answers)",
+        "1 attempts of unknown cost are not in it",
+    ):
+        assert said in text
+    assert (facts.invalid, facts.fallbacks, len(facts.failed)) == (2, 2, 1)
+
+
+def test_every_cell_and_every_cause_leads_to_the_trials_that_it_counts(written):
+    site = Site(written)
+    shown = page_of(site)
+    links = re.findall(r'href="(/trials\?[^"]*)"[^>]*>(\d+)( of 3| of 33| trials?)?<', shown)
+    kinds = [kind for _, _, kind in links]
+    assert (kinds.count(" of 3"), kinds.count(" of 33")) == (len(CONDITIONS), 1)
+    assert {kind for kind in kinds if "trial" in kind} == {" trial"}
+    for url, count, _ in links:
+        asked = {k: v[0] for k, v in parse_qs(urlsplit(html.unescape(url)).query).items()}
+        totals = site.catalogue.totals(filter_of(asked))
+        there = totals.trials if "cause" in asked else totals.ended
+        assert there == int(count), url
+    causes = {parse_qs(urlsplit(html.unescape(url)).query)["cause"][0]
+              for url, _, kind in links if "trial" in kind}  # fmt: skip
+    assert causes == {
+        "trial: no answer after … attempts",
+        "plan: no_array",
+        "plan: refusal",
+        *(f"attempt: {name}" for name in ("refusal", "timeout", "rate_limit", "unknown")),
+    }
+
+
+def page_of(site):
+    site.catalogue.refresh()
+    return page.sweep_page(site, "sweep-1")
+
+
+def test_what_a_server_wrote_is_shown_as_text(study):
+    hostile = "<script>alert(1)</script>\u202e<img src=x>"
+    with duckdb.connect(str(study)) as connection:
+        connection.execute("UPDATE trials SET error = ? WHERE status = 'failed'", [hostile])
+        connection.execute("UPDATE calls SET model_served = ? WHERE model_served = 'another'",
+                           [hostile])  # fmt: skip
+    running(study, warnings=(f"another model answers: {hostile}",), waiting=(hostile,))
+    shown = browser(study).get(URL).text
+    assert shown.count("&lt;script&gt;alert(1)&lt;/script&gt;[U+202E]&lt;img src=x&gt;") >= 4
+    assert "<script>alert" not in shown
+    assert "<img" not in shown
+
+
+def test_while_it_runs_the_cells_are_those_of_its_progress_file(study):
+    running(study, ended={"finished": 1, "failed": 1}, cost_usd=1.5, cap_usd=9.0, committed_usd=2.5)
+    client = browser(study)
+    text = text_of(client)
+    assert "Running: 1 of 33 trials ended, 1 failed, about 20 s left." in text
+    assert "1.50 USD in this run; 2.50 of at most 9.00 USD over all runs" in text
+    assert "N_0_0 1 of 3 1 failed" in text
+    assert "all 1 of 33 1 failed" in text
+    assert f'sse-connect="{URL}/events"' in client.get(URL).text
+
+
+@pytest.mark.parametrize(
+    ("code", "ended", "failed", "kind", "words", "goes_on"),
+    [
+        (0, 33, 0, "finished", "Finished: all 33 trials ended, and the audit found nothing.", 0),
+        (0, 30, 0, "stopped", "holds only 30 of its 33 trials", 0),
+        (None, 30, 0, "stopped", "Stopped without a word", 1),
+        (130, 30, 0, "stopped", "Stopped: it was interrupted (Ctrl-C). 30 of 33 trials", 1),
+        (3, 30, 0, "stopped", "the account's quota or --max-cost was used up", 1),
+        (4, 30, 3, "stopped", "a replay makes no calls", 0),
+        (1, 31, 2, "stopped", "31 of 33 trials have an outcome, 2 failed", 1),
+        (1, 33, 0, "stopped", "merge-runner audit --sweep s", 0),
+    ],
+)
+def test_the_verdict_says_how_it_ended_and_what_to_type(code, ended, failed, kind, words, goes_on):
+    row = {"sweep_id": "s", "name": "baseline", "exit_code": code, "trials": ended + failed,
+           "failed": failed, "ended_at": None if code is None else END}  # fmt: skip
+    entry = Entry(row, config_of(json.dumps(CONFIG)), None)
+    verdict = verdict_of(entry, "", 0)
+    assert verdict.kind == kind
+    assert words in verdict.text
+    assert verdict.command == ("merge-runner sweep baseline --model o3" if goes_on else "")
+    assert verdict_of(entry, "later", 0).command == ""
+
+
+def test_a_finished_sweep_that_another_model_answered_is_doubtful():
+    row = {"sweep_id": "s", "name": "n", "exit_code": 0, "trials": 0, "failed": 0, "ended_at": END}
+    entry = Entry(row, Config(models={"o3": ModelFacts(id="o3", provider="openai")}), None)
+    assert verdict_of(entry, "", 7).kind == "doubtful"
+
+
+async def test_a_stream_tells_what_is_new_and_ends_with_the_sweep(study, monkeypatch):
+    monkeypatch.setattr(page, "LOOK_EVERY_S", 0.02)
+    file = running(study)
+    site = Site(study)
+    events = page.sweep_events(site, "sweep-1")
+    assert "event: sweep" in await anext(events)
+    assert await anext(events) == (
+        "event: state\ndata: Running: 2 of 33 trials ended, about 20 s left.\n\n"
+    )
+    running(study, ended={"finished": 3})
+    assert "Running: 3 of 33" in await anext(events)
+    Store(study).end_sweep("sweep-1", END, 130)
+    file.remove()
+    rest = [event async for event in events]
+    assert [event.split("\n")[0] for event in rest] == [
+        "event: sweep",
+        "event: state",
+        "event: done",
+    ]
+    assert "it was interrupted" in rest[0]
+
+
+async def test_a_stream_ends_when_the_server_does(study, monkeypatch):
+    monkeypatch.setattr(page, "LOOK_EVERY_S", 0.02)
+    monkeypatch.setattr(page, "BEAT_EVERY_S", 0.0)
+    running(study)
+    site = Site(study)
+    events = page.sweep_events(site, "sweep-1")
+    heard = [await anext(events) for _ in range(3)]
+    assert heard[-1] == ": still here\n\n"
+    site.closing = True
+    assert [event async for event in events] == []
+
+
+def test_a_stream_is_never_packed(study):
+    running(study, pid=2**22 + 1)
+    reply = browser(study).get(f"{URL}/events", headers={"accept-encoding": "gzip"})
+    assert reply.headers["content-type"].startswith("text/event-stream")
+    assert "content-encoding" not in reply.headers
+    assert reply.text.endswith("event: done\ndata: \n\n")
+
+
+def test_the_newest_sweep_is_the_first_page_and_the_first_of_the_list(study):
+    client = browser(study)
+    with duckdb.connect(str(study)) as connection:
+        connection.execute(
+            "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id, "
+            "started_at + INTERVAL 1 DAY AS started_at) FROM sweeps"
+        )
+    assert client.get("/", follow_redirects=False).headers["location"] == "/sweeps/newer"
+    assert re.findall(r'<th scope="row"><a href="([^"]*)"', client.get("/sweeps").text) == [
+        "/sweeps/newer",
+        URL,
+    ]
+    assert "A later run went on with it." in text_of(client)
+
+
+def test_a_database_without_sweeps_begins_with_its_trials(tmp_path):
+    Store(tmp_path / "m.duckdb")
+    client = browser(tmp_path / "m.duckdb")
+    assert client.get("/", follow_redirects=False).headers["location"] == "/trials"
+    assert "holds no sweep" in client.get("/sweeps").text
+    assert client.get("/sweeps/none").status_code == 404
+    assert client.get("/sweeps/none/events").status_code == 404
