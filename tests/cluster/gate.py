@@ -45,9 +45,10 @@ class Gate:
 
 
 def workers_of(pid: int) -> list[psutil.Process]:
-    """The workers that a coordinator has started."""
-    children = psutil.Process(pid).children(recursive=True)
-    return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+    """The workers that a coordinator has started: what is forked from a process of its own."""
+    children = psutil.Process(pid).children()
+    servers = [child for child in children if "forkserver" in " ".join(child.cmdline())]
+    return [worker for server in servers for worker in server.children()]
 
 
 def held_from(gate: Gate, worker: psutil.Process) -> set[str]:
