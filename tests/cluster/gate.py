@@ -8,6 +8,9 @@ import psutil
 
 from merge_runner.records import SLOT_HEADER
 
+# Six trials of 19 calls each.
+SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "L_4_0,N_0_0,R_-4_8", "--json")
+
 
 class Gate:
     """Lets a number of requests through, and holds the next ones until it opens."""
