@@ -6,6 +6,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from multiprocessing import resource_tracker
@@ -68,7 +69,7 @@ async def _local_cluster(workers: int) -> AsyncIterator[object]:
     import dask
     from distributed import LocalCluster
 
-    _fork_workers_where_it_is_possible()
+    _choose_how_workers_start()
     # None is what was set there: asked for a forkserver by name, Dask would have it import pandas.
     with dask.config.set({"distributed.worker.multiprocessing-method": None}):
         cluster = LocalCluster(
@@ -86,13 +87,12 @@ async def _local_cluster(workers: int) -> AsyncIterator[object]:
             yield cluster
 
 
-def _fork_workers_where_it_is_possible() -> None:
-    """From a process that has imported what they need; elsewhere each imports it anew."""
-    if "forkserver" in multiprocessing.get_all_start_methods():
-        multiprocessing.set_start_method("forkserver", force=True)
+def _choose_how_workers_start() -> None:
+    """Forked from a process that has imported what they need; on Linux, where that is safe."""
+    method = "forkserver" if sys.platform == "linux" else "spawn"
+    multiprocessing.set_start_method(method, force=True)
+    if method == "forkserver":
         multiprocessing.set_forkserver_preload(SHARED)
-    else:
-        multiprocessing.set_start_method("spawn", force=True)
 
 
 @contextmanager
