@@ -212,7 +212,7 @@ async def test_an_account_problem_stops_the_sweep_and_it_goes_on_later(
 async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(merge_runner):
     async with watched(faults=FaultPlan(latency_s=0.2)) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await merge_runner.start(*SMALL, **env)
+        process = await merge_runner.fork(*SMALL, **env)
         while server.requests < 60:
             await asyncio.sleep(0.02)
         process.send_signal(signal.SIGINT)
@@ -230,7 +230,7 @@ async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(merge
 
 async def test_two_signals_at_once_end_it_as_one_does(merge_runner):
     async with watched(faults=FaultPlan(latency_s=0.2)) as server:
-        process = await merge_runner.start(*SMALL, EMULATOR_BASE_URL=f"{server.url}/v1")
+        process = await merge_runner.fork(*SMALL, EMULATOR_BASE_URL=f"{server.url}/v1")
         while server.requests < 40:
             await asyncio.sleep(0.02)
         process.send_signal(signal.SIGINT)
@@ -252,7 +252,7 @@ async def test_bad_answers_on_purpose_are_not_kept_as_the_emulators_own(merge_ru
 async def test_another_process_queries_while_a_sweep_runs(merge_runner):
     async with watched(faults=FaultPlan(latency_s=0.1)) as server:
         sweep = ("sweep", "baseline", "--reps", 3, "--in-flight", 8)
-        process = await merge_runner.start(*sweep, EMULATOR_BASE_URL=f"{server.url}/v1")
+        process = await merge_runner.fork(*sweep, EMULATOR_BASE_URL=f"{server.url}/v1")
         ended = asyncio.create_task(process.communicate())
         seen = set()
         while not ended.done():
@@ -265,7 +265,7 @@ async def test_another_process_queries_while_a_sweep_runs(merge_runner):
 
 async def test_a_locked_database_is_waited_for(merge_runner, tmp_path):
     await merge_runner(*SMALL, "--conditions", "N_0_0")
-    process = await merge_runner.start(
+    process = await merge_runner.fork(
         *SMALL, *TWO, "--reps", 2, "--fault-rate", 0, "--in-flight", 1
     )
     await asyncio.sleep(1.2)

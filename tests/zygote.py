@@ -29,6 +29,7 @@ WARM = (
     "rich.live",
     "rich.table",
 )
+DIGITS = 10  # of a process id, as it is sent
 
 
 class Zygote:
@@ -54,20 +55,70 @@ class Zygote:
 
     async def run(self, arguments, *, cwd, env) -> tuple[int, str, str]:
         """Run the program to its end; returns its exit code and what it wrote."""
+        process = await self.start(arguments, cwd=cwd, env=env)
+        out, err = await process.communicate()
+        return process.returncode, out.decode(), err.decode()
+
+    def run_blocking(self, arguments, *, cwd, env) -> tuple[int, str, str]:
+        """The same where no loop runs: in what prepares tests."""
         with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-            request = {"arguments": list(map(str, arguments)), "cwd": str(cwd), "env": env}
-            with socket.socket(socket.AF_UNIX) as link:
-                link.connect(self._address)
-                socket.send_fds(link, [json.dumps(request).encode()], [out.fileno(), err.fileno()])
-                link.shutdown(socket.SHUT_WR)
-                link.setblocking(False)
-                code = int(await asyncio.get_running_loop().sock_recv(link, 16))
-            return code, *(_content(file) for file in (out, err))
+            with self._request(arguments, cwd, env, out, err) as link, link.makefile() as told:
+                code = int(told.read()[DIGITS:])
+            return code, _content(out).decode(), _content(err).decode()
+
+    async def start(self, arguments, *, cwd, env) -> Forked:
+        """Start the program, to be signalled and waited for."""
+        out, err = (tempfile.TemporaryFile() for _ in "oe")  # noqa: SIM115 # closed at its end
+        link = self._request(arguments, cwd, env, out, err)
+        link.setblocking(False)
+        pid = int(await asyncio.get_running_loop().sock_recv(link, DIGITS))
+        return Forked(pid, link, out, err)
+
+    def _request(self, arguments, cwd, env, out, err) -> socket.socket:
+        request = {"arguments": list(map(str, arguments)), "cwd": str(cwd), "env": env}
+        link = socket.socket(socket.AF_UNIX)
+        link.connect(self._address)
+        socket.send_fds(link, [json.dumps(request).encode()], [out.fileno(), err.fileno()])
+        link.shutdown(socket.SHUT_WR)
+        return link
 
 
-def _content(file) -> str:
+class Forked:
+    """A running program: what tests use of ``asyncio.subprocess.Process``."""
+
+    def __init__(self, pid, link, *streams):
+        self.pid = pid
+        self.returncode: int | None = None
+        self._ended = asyncio.create_task(self._end(link, streams))
+
+    async def _end(self, link, streams) -> tuple[bytes, ...]:
+        with link:
+            self.returncode = int(await asyncio.get_running_loop().sock_recv(link, DIGITS))
+        written = tuple(map(_content, streams))
+        for stream in streams:
+            stream.close()
+        return written
+
+    async def communicate(self) -> tuple[bytes, ...]:
+        return await asyncio.shield(self._ended)
+
+    async def wait(self) -> int:
+        await self.communicate()
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+def _content(file) -> bytes:
     file.seek(0)
-    return file.read().decode()
+    return file.read()
 
 
 def serve(address: str) -> None:
@@ -105,6 +156,7 @@ def _attend(link: socket.socket) -> None:
         _become_the_program(request, streams)
         main()
         sys.exit()
+    link.sendall(f"{child:{DIGITS}}".encode())
     _, status = os.waitpid(child, 0)
     link.sendall(str(os.waitstatus_to_exitcode(status)).encode())
     os._exit(0)

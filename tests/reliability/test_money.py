@@ -130,7 +130,7 @@ async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(me
     sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
     async with watched(middle) as server:
         env = account(server)
-        process = await merge_runner.start(*sweep, **env)
+        process = await merge_runner.fork(*sweep, **env)
         await arrived.wait()
         await asyncio.sleep(0.3)
         process.kill()

@@ -77,7 +77,7 @@ async def test_a_sweep_goes_on_with_the_calls_of_one_that_died_beside_it(merge_r
     sweep = (*SWEEP, "--conditions", "L_4_8")
     async with watched(middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        first = await merge_runner.start(*sweep, **env)
+        first = await merge_runner.fork(*sweep, **env)
         await held.wait()
         second = asyncio.create_task(merge_runner(*sweep, **env))
         await asyncio.sleep(2)
