@@ -1,12 +1,14 @@
 """Starts the program by forking a process that has imported it already.
 
-Half of what a short command takes is imports. A test that runs the program to its end gets a real
-process with arguments, environment, folder and streams of its own, without that half.
+Most of what a short command takes is imports, and their teardown. A test gets a real process with
+arguments, environment, folder and streams of its own, without those.
 """
 
 from __future__ import annotations
 
 import asyncio
+import atexit
+import gc
 import importlib
 import json
 import os
@@ -15,6 +17,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
 from harness import PROJECT, environment
@@ -125,6 +128,9 @@ def serve(address: str) -> None:
     """Fork a process for each request until standard input closes."""
     for name in WARM:
         importlib.import_module(name)
+    # What is imported stays shared with the forked: their collector does not look at it.
+    gc.collect()
+    gc.freeze()
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(address)
     listener.listen(64)
@@ -154,12 +160,31 @@ def _attend(link: socket.socket) -> None:
     if child == 0:
         link.close()
         _become_the_program(request, streams)
-        main()
-        sys.exit()
+        _run_to_its_end(main)
     link.sendall(f"{child:{DIGITS}}".encode())
     _, status = os.waitpid(child, 0)
     link.sendall(str(os.waitstatus_to_exitcode(status)).encode())
     os._exit(0)
+
+
+def _run_to_its_end(main) -> None:
+    """Run it and end as the interpreter does, but for the teardown of every imported module.
+
+    That would touch, and so copy, all the memory that was forked: more work than most commands.
+    Whatever ends the program in another way than by ``sys.exit`` is left to the interpreter.
+    """
+    code = 0
+    try:
+        main()
+    except SystemExit as exc:
+        if not isinstance(exc.code, int | None):
+            raise
+        code = exc.code or 0
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _become_the_program(request, streams) -> None:
