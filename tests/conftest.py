@@ -12,6 +12,8 @@ from harness import PROGRAM, Run, environment
 from hypothesis import settings
 from zygote import Zygote
 
+from merge_runner.store import results_digest
+
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)
 settings.load_profile("gate")
@@ -86,6 +88,14 @@ def prepare(zygote, emulator_url):
         return Run(*zygote.run_blocking(arguments, cwd=folder, env=env))
 
     return run
+
+
+@pytest.fixture(scope="session")
+def quiet(prepare, tmp_path_factory):
+    """The digest of an undisturbed ``sweep baseline --reps 1``."""
+    folder = tmp_path_factory.mktemp("quiet")
+    assert prepare(folder, "sweep", "baseline", "--reps", 1).code == 0
+    return results_digest(folder / "results/merge.duckdb")
 
 
 def beside(emulator_url, arguments, changes):
