@@ -182,6 +182,8 @@ def _run_to_its_end(main) -> None:
         code = exc.code or 0
     threading._shutdown()
     atexit._run_exitfuncs()
+    # What the program itself has made goes as it would: SQLite tidies its folder up only then.
+    gc.collect()
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
