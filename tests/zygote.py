@@ -1,12 +1,14 @@
 """Starts the program by forking a process that has imported it already.
 
-Half of what a short command takes is imports. A test that runs the program to its end gets a real
-process with arguments, environment, folder and streams of its own, without that half.
+Most of what a short command takes is imports, and their teardown. A test gets a real process with
+arguments, environment, folder and streams of its own, without those.
 """
 
 from __future__ import annotations
 
 import asyncio
+import atexit
+import gc
 import importlib
 import json
 import os
@@ -16,6 +18,8 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
+from functools import partial
 from pathlib import Path
 
 from harness import PROGRAM, PROJECT, environment
@@ -30,6 +34,7 @@ WARM = (
     "rich.live",
     "rich.table",
 )
+DIGITS = 10  # of a process id, as it is sent
 
 
 class Zygote:
@@ -45,7 +50,7 @@ class Zygote:
             [sys.executable, __file__, self._address, *self._more],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=environment(PYTHONPATH=f"{PROJECT}:{PROJECT}/tests", OPENBLAS_NUM_THREADS="1"),
+            env=environment(PYTHONPATH=f"{PROJECT}:{PROJECT}/tests"),
             start_new_session=True,
         )
         assert self._process.stdout.readline() == b"ready\n"
@@ -62,58 +67,76 @@ class Zygote:
         out, err = await process.communicate()
         return process.returncode, out.decode(), err.decode()
 
+    def run_blocking(self, arguments, *, cwd, env) -> tuple[int, str, str]:
+        """The same where no loop runs: in what prepares tests."""
+        with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+            with self._request(arguments, cwd, env, out, err) as link, link.makefile() as told:
+                code = int(told.read()[DIGITS:])
+            return code, _content(out).decode(), _content(err).decode()
+
     async def start(self, arguments, *, cwd, env, module="") -> Forked:
-        """Start the program, or a module in its place as ``python -m`` does."""
-        request = {"arguments": list(map(str, arguments)), "cwd": str(cwd), "env": env}
-        link = socket.socket(socket.AF_UNIX)
-        streams = [tempfile.TemporaryFile() for _ in ("out", "err")]  # noqa: SIM115 # it closes them
-        link.connect(self._address)
-        data = json.dumps({**request, "module": module}).encode()
-        socket.send_fds(link, [data], [file.fileno() for file in streams])
-        link.shutdown(socket.SHUT_WR)
+        """Start the program, or a module in its place as ``python -m`` does; to be waited for."""
+        out, err = (tempfile.TemporaryFile() for _ in "oe")  # noqa: SIM115 # closed at its end
+        link = self._request(arguments, cwd, env, out, err, module)
         link.setblocking(False)
-        pid = int(await asyncio.get_running_loop().sock_recv(link, 16))
-        return Forked(pid, link, streams)
+        pid = int(await asyncio.get_running_loop().sock_recv(link, DIGITS))
+        return Forked(pid, link, out, err)
+
+    def _request(self, arguments, cwd, env, out, err, module="") -> socket.socket:
+        request = {"arguments": list(map(str, arguments)), "cwd": str(cwd), "env": env}
+        request["module"] = module
+        link = socket.socket(socket.AF_UNIX)
+        link.connect(self._address)
+        socket.send_fds(link, [json.dumps(request).encode()], [out.fileno(), err.fileno()])
+        link.shutdown(socket.SHUT_WR)
+        return link
 
 
 class Forked:
-    """The program, as asyncio's Process has it."""
+    """A running program: what tests use of ``asyncio.subprocess.Process``."""
 
-    def __init__(self, pid, link, streams) -> None:
+    def __init__(self, pid, link, *streams):
         self.pid = pid
         self.returncode: int | None = None
-        self._link = link
-        self._streams = streams
-        self._written: list[bytes] = []
+        self._ended = asyncio.create_task(self._end(link, streams))
+
+    async def _end(self, link, streams) -> tuple[bytes, ...]:
+        with link:
+            self.returncode = int(await asyncio.get_running_loop().sock_recv(link, DIGITS))
+        written = tuple(map(_content, streams))
+        for stream in streams:
+            stream.close()
+        return written
+
+    async def communicate(self) -> tuple[bytes, ...]:
+        return await asyncio.shield(self._ended)
 
     async def wait(self) -> int:
-        if self.returncode is None:
-            self.returncode = int(await asyncio.get_running_loop().sock_recv(self._link, 16))
-            self._link.close()
-            self._written = [_content(file) for file in self._streams]
+        await self.communicate()
         return self.returncode
-
-    async def communicate(self) -> list[bytes]:
-        await self.wait()
-        return self._written
 
     def send_signal(self, number: int) -> None:
         os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
         self.send_signal(signal.SIGKILL)
 
 
 def _content(file) -> bytes:
-    with file:
-        file.seek(0)
-        return file.read()
+    file.seek(0)
+    return file.read()
 
 
 def serve(address: str, *more: str) -> None:
     """Fork a process for each request until standard input closes."""
     for name in (*WARM, *more):
         importlib.import_module(name)
+    # What is imported stays shared with the forked: their collector does not look at it.
+    gc.collect()
+    gc.freeze()
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(address)
     listener.listen(64)
@@ -131,7 +154,7 @@ def serve(address: str, *more: str) -> None:
 
 
 def _attend(link: socket.socket) -> None:
-    """Run one request in a child of its own; tell its number, and how it ended."""
+    """Run one request in a child of its own, and tell how it ended."""
     from analysis.commands import main
 
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -143,15 +166,34 @@ def _attend(link: socket.socket) -> None:
     if child == 0:
         link.close()
         _become_the_program(request, streams)
-        if request["module"]:
-            runpy.run_module(request["module"], run_name="__main__", alter_sys=True)
-        else:
-            main()
-        sys.exit()
-    link.sendall(str(child).encode())
+        module = partial(runpy.run_module, request["module"], run_name="__main__", alter_sys=True)
+        _run_to_its_end(module if request["module"] else main)
+    link.sendall(f"{child:{DIGITS}}".encode())
     _, status = os.waitpid(child, 0)
     link.sendall(str(os.waitstatus_to_exitcode(status)).encode())
     os._exit(0)
+
+
+def _run_to_its_end(main) -> None:
+    """Run it and end as the interpreter does, but for the teardown of every imported module.
+
+    That would touch, and so copy, all the memory that was forked: more work than most commands.
+    Whatever ends the program in another way than by ``sys.exit`` is left to the interpreter.
+    """
+    code = 0
+    try:
+        main()
+    except SystemExit as exc:
+        if not isinstance(exc.code, int | None):
+            raise
+        code = exc.code or 0
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    # What the program itself has made goes as it would: SQLite tidies its folder up only then.
+    gc.collect()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _become_the_program(request, streams) -> None:
