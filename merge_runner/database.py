@@ -48,7 +48,10 @@ class Instance:
         """A connection of its own."""
         if self._connection is None:
             self._connection = duckdb.connect(config=SETTINGS)
-        return self._connection.cursor()
+        cursor = self._connection.cursor()
+        # Where Python looks interactive, as with -c, a slow query would draw a bar on our output.
+        cursor.execute("SET enable_progress_bar = false")
+        return cursor
 
     def name(self) -> str:
         """A name for a file that no other one has."""
