@@ -23,7 +23,7 @@ from merge_runner.store import query
 Figures = dict[str, float]
 # In this condition both vehicles collide early whatever the server answers: 8 calls a trial.
 SHORT, SHORT_CALLS = ("--conditions", "R_-4_8"), 8
-KILLED_DELAY_MS, QUIET_S = 1_000, 0.15
+KILLED_DELAY_MS, QUIET_S = 500, 0.15
 STUDIES, MOST_DRIVEN = (110, 1_100, 11_000), 1_100
 
 

@@ -9,7 +9,7 @@ from benchmarks.processes import PROJECT, Run, run
 from benchmarks.workload import CALLS, TRIALS
 
 PEER = PROJECT / ".venv-peer" / "bin" / "python"
-FEW = TRIALS // 4
+FEW = TRIALS // 8
 
 
 def peer_cold(bench: Bench) -> Figures:
@@ -23,7 +23,7 @@ def peer_cached(bench: Bench) -> Figures:
 
 
 def peer_resume(bench: Bench) -> Figures:
-    """A quarter of the trials, killed without a word at half, and gone on with from its log."""
+    """An eighth of the trials, killed without a word at half, and gone on with from its log."""
     name = bench.fresh("peer-killed").name
     bench.server.reset()
     few, until = ("--trials", str(FEW)), half_is_answered(bench.server, FEW)

@@ -23,7 +23,8 @@ SCHEMA = Path(__file__).with_name("schema.sql")
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
 LOG = logging.getLogger(__name__)
-SETTINGS: dict[str, str | bool | int | float | list[str]] = {
+Settings = dict[str, str | bool | int | float | list[str]]
+SETTINGS: Settings = {
     "memory_limit": "200MB",  # of the machine's by default; it is a cache of the file most of all
     "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
 }
@@ -31,6 +32,14 @@ REBUILD = (
     "move it away, or name another with --db, and run the same sweep again: it is rebuilt from the "
     "cache without a call"
 )
+
+
+def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
+    """A database of its own, in memory."""
+    connection = duckdb.connect(config=settings)
+    # DuckDB takes `python -c` for a person at a prompt: a slow query would draw on our output.
+    connection.execute("SET enable_progress_bar = false")
+    return connection
 
 
 class Instance:
@@ -47,7 +56,7 @@ class Instance:
     def cursor(self) -> duckdb.DuckDBPyConnection:
         """A connection of its own."""
         if self._connection is None:
-            self._connection = duckdb.connect(config=SETTINGS)
+            self._connection = in_memory(SETTINGS)
         return self._connection.cursor()
 
     def name(self) -> str:

@@ -24,6 +24,7 @@ from typing import Any
 import duckdb
 from pydantic import TypeAdapter
 
+from merge_runner.database import Settings, in_memory
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, Entry, ResponseCache
 from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
@@ -54,7 +55,7 @@ MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """DuckDB hands out this many rows at once, and their texts may have this many bytes."""
 LARGEST_NUMBER = 2**31 - 1
-READING: dict[str, str | bool | int | float | list[str]] = {
+READING: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
     "memory_limit": "1GB",  # what is unpacked counts too
@@ -102,7 +103,7 @@ def export_recording(
         "calls": str(len(rows)),
         "content_sha256": content.hexdigest(),
     }
-    with _written(file), duckdb.connect() as connection:
+    with _written(file), in_memory({}) as connection:
         columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
         connection.execute(f"CREATE TABLE calls ({columns})")
         appender = connection.appender("calls")
@@ -291,7 +292,7 @@ def _opened(file: Path) -> duckdb.DuckDBPyConnection:
     """A connection with the view ``recording``; raises for anything but one of our files."""
     if not file.is_file():
         raise UsageError(f"there is no recording {file}")
-    connection = duckdb.connect(config=READING)
+    connection = in_memory(READING)
     try:
         connection.execute(
             "CREATE VIEW recording AS FROM "

@@ -12,6 +12,8 @@ from harness import PROGRAM, Run, environment
 from hypothesis import settings
 from zygote import Zygote
 
+from merge_runner.store import results_digest
+
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)
 settings.load_profile("gate")
@@ -48,14 +50,18 @@ def emulator_url():
 def merge_runner(tmp_path, zygote, emulator_url):
     """Runs ``merge-runner`` in an empty folder, beside an emulator.
 
-    With ``EMULATOR_BASE_URL=""``, or with faults, a sweep starts an emulator of its own.
+    With ``EMULATOR_BASE_URL=""``, or with faults, a sweep starts an emulator of its own. ``fork``
+    returns once it has begun, to be signalled; ``start`` does so with a process of its own
+    command line and imports.
     """
 
     async def run(*arguments: object, cwd: Path = tmp_path, **changes: str) -> Run:
-        own = any(str(argument).startswith("--fault") for argument in arguments)
-        url = {} if own else {"EMULATOR_BASE_URL": emulator_url}
-        env = environment(**{**url, **changes})
+        env = beside(emulator_url, arguments, changes)
         return Run(*await zygote.run(arguments, cwd=cwd, env=env))
+
+    async def fork(*arguments: object, cwd: Path = tmp_path, **changes: str):
+        env = beside(emulator_url, arguments, changes)
+        return await zygote.start(arguments, cwd=cwd, env=env)
 
     async def start(*arguments: object, cwd: Path = tmp_path, **changes: str):
         return await asyncio.create_subprocess_exec(
@@ -68,5 +74,31 @@ def merge_runner(tmp_path, zygote, emulator_url):
             stderr=asyncio.subprocess.PIPE,
         )
 
+    run.fork = fork
     run.start = start
     return run
+
+
+@pytest.fixture(scope="session")
+def prepare(zygote, emulator_url):
+    """Runs ``merge-runner`` in a folder, for what is made once for several tests."""
+
+    def run(folder: Path, *arguments: object, **changes: str) -> Run:
+        env = beside(emulator_url, arguments, changes)
+        return Run(*zygote.run_blocking(arguments, cwd=folder, env=env))
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def quiet(prepare, tmp_path_factory):
+    """The digest of an undisturbed ``sweep baseline --reps 1``."""
+    folder = tmp_path_factory.mktemp("quiet")
+    assert prepare(folder, "sweep", "baseline", "--reps", 1).code == 0
+    return results_digest(folder / "results/merge.duckdb")
+
+
+def beside(emulator_url, arguments, changes):
+    """The environment of a run beside the emulator, unless it needs one of its own."""
+    own = any(str(argument).startswith("--fault") for argument in arguments)
+    return environment(**{**({} if own else {"EMULATOR_BASE_URL": emulator_url}), **changes})

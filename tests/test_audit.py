@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
-import subprocess
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import duckdb
 import pytest
 from aiohttp import web
-from harness import FAST, PROGRAM, RECORDING, environment, watched
+from harness import FAST, RECORDING, watched
 from recordings import drive, write_folder
 from typer.testing import CliRunner
 
@@ -83,16 +82,13 @@ def audit(*arguments: object) -> Audited:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A folder in which the program ran three sweeps."""
+def made(tmp_path_factory, prepare):
+    """A folder in which the program ran these sweeps."""
     folder = tmp_path_factory.mktemp("made")
     (folder / "faults.toml").write_text(FAULTS)
     (folder / "restarts.toml").write_text(RESTARTS)
     for sweep in SWEEPS:
-        subprocess.run(
-            [PROGRAM, "sweep", *sweep],
-            cwd=folder, env=environment(), check=True, capture_output=True,
-        )  # fmt: skip
+        assert prepare(folder, "sweep", *sweep).code == 0
     return folder
 
 
@@ -545,7 +541,7 @@ async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tm
     assert "word for word as before: are they samples?" in found.notes
 
 
-def test_a_database_of_humans_alone_passes_and_says_that_there_is_no_sweep(tmp_path):
+def test_a_database_of_humans_alone_passes_and_says_that_there_is_no_sweep(prepare, tmp_path):
     write_folder(
         tmp_path / "recordings",
         {
@@ -553,10 +549,7 @@ def test_a_database_of_humans_alone_passes_and_says_that_there_is_no_sweep(tmp_p
             for i, name in enumerate(CONDITIONS, 1)
         },
     )
-    subprocess.run(
-        [PROGRAM, "human", "import", "recordings"],
-        cwd=tmp_path, env=environment(), check=True, capture_output=True,
-    )  # fmt: skip
+    assert prepare(tmp_path, "human", "import", "recordings").code == 0
     found = audit("--db", tmp_path / "results/merge.duckdb")
     assert found.code == 0
     assert found.notes == "there is no sweep in this database"
@@ -587,31 +580,28 @@ def test_the_committed_recording_passes():
     assert found.audits[0]["counts"]["answers ok"] == 2054
 
 
-def export(made: Path, trial: str, file: Path) -> None:
+def export(prepare, made: Path, trial: str, file: Path) -> None:
     """Export the recording of the sweep that has a trial."""
     with duckdb.connect(str(made / "results/merge.duckdb"), read_only=True) as connection:
         (sweep,) = connection.execute(
             "SELECT sweep_id FROM sweep_trials WHERE trial_id = ?", [trial]
         ).fetchone()
-    subprocess.run(
-        [PROGRAM, "recording", "export", file, "--sweep", sweep],
-        cwd=made, env=environment(), check=True, capture_output=True,
-    )  # fmt: skip
+    assert prepare(made, "recording", "export", file, "--sweep", sweep).code == 0
 
 
 @pytest.mark.parametrize("trial", [PAIR, "emulator/baseline/R_-4_8/rep01"])
-def test_recordings_of_several_variants_and_of_a_late_start_pass(made, tmp_path, trial):
-    export(made, trial, tmp_path / "sweep.parquet")
+def test_recordings_of_several_variants_and_of_a_late_start_pass(prepare, made, tmp_path, trial):
+    export(prepare, made, trial, tmp_path / "sweep.parquet")
     found = audit("--recording", tmp_path / "sweep.parquet")
     assert found.code == 0
     assert found.audits[0]["counts"]["answers refusal"] > 0
 
 
 @pytest.fixture(scope="module")
-def exported(made, tmp_path_factory):
+def exported(prepare, made, tmp_path_factory):
     """The entries of the mixed pair's recording, in order, and what it says of its origin."""
     file = tmp_path_factory.mktemp("exported") / "mixed.parquet"
-    export(made, MIXED, file)
+    export(prepare, made, MIXED, file)
     with duckdb.connect() as connection:
         told = connection.execute(f"FROM parquet_kv_metadata('{file}')").fetchall()
     return list(read_recording(file)), {k.decode(): v.decode() for _, k, v in told}

@@ -244,3 +244,14 @@ async def test_a_database_that_stays_locked_is_given_up_with_what_to_do(
     with pytest.raises(StoreError, match=r"1 trials are not stored.*run the same command again"):
         await waiting.close()
     process.communicate("")
+
+
+def test_a_slow_query_draws_no_bar_on_the_output():
+    # DuckDB takes -c for a person at a prompt.
+    asked = (
+        "from merge_runner.database import in_memory; query = "
+        "\"SELECT current_setting('enable_progress_bar')\"; "
+        "print(in_memory({}).execute(query).fetchone())"
+    )
+    run = subprocess.run([sys.executable, "-c", asked], capture_output=True, check=True)
+    assert run.stdout == b"(False,)\n"

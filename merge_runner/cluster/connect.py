@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
+import os
 import signal
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -17,6 +21,9 @@ if TYPE_CHECKING:
 
 CONNECT_TIMEOUT_S = 10
 SCHEMES = ("tcp", "tls")
+WORKER = "merge_runner.cluster.worker"
+# What a worker imports, and a process from which all are forked imports once.
+SHARED = ["distributed", WORKER, "merge_runner.llm.http"]
 VALID = (
     "valid: local:N (N workers on this machine), the address of a scheduler "
     "(tcp://HOST:PORT, tls://HOST:PORT), or its scheduler file (PATH.json)"
@@ -26,6 +33,8 @@ VALID = (
 @asynccontextmanager
 async def connected(where: str) -> AsyncIterator[Client]:
     """Connect to the cluster, or start it where it is local; raises UsageError."""
+    workers = _local_workers(where)
+    to = {} if workers else _scheduler(where)
     try:
         import distributed
     except ModuleNotFoundError as exc:
@@ -34,17 +43,13 @@ async def connected(where: str) -> AsyncIterator[Client]:
         ) from exc
 
     _silence()
-    kind, _, rest = where.partition(":")
-    if kind == "local":
-        if not (rest.isascii() and rest.isdigit() and int(rest) > 0):
-            raise _unknown(where)
+    if workers:
         async with (
-            _local_cluster(int(rest)) as cluster,
+            _local_cluster(workers) as cluster,
             distributed.Client(cluster, asynchronous=True) as client,
         ):
             yield client
         return
-    to = {"scheduler_file": where} if _is_scheduler_file(where) else {"address": _address(where)}
     try:
         client = await distributed.Client(**to, asynchronous=True, timeout=CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as exc:
@@ -61,24 +66,50 @@ async def connected(where: str) -> AsyncIterator[Client]:
 @asynccontextmanager
 async def _local_cluster(workers: int) -> AsyncIterator[object]:
     """Worker processes; Ctrl-C is for us alone, who stop them in order."""
+    import dask
     from distributed import LocalCluster
 
-    cluster = LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address=None,
-        silence_logs=logging.CRITICAL,
-        preload=["merge_runner.cluster.worker"],  # also for one that takes a lost one's place
-        asynchronous=True,
-    )
+    _choose_how_workers_start()
+    # None is what was set there: asked for a forkserver by name, Dask would have it import pandas.
+    with dask.config.set({"distributed.worker.multiprocessing-method": None}):
+        cluster = LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+            preload=[WORKER],  # also for one that takes a lost one's place
+            asynchronous=True,
+        )
+        with _for_children():
+            await cluster
+        async with cluster:
+            yield cluster
+
+
+def _choose_how_workers_start() -> None:
+    """Forked from a process that has imported what they need; on Linux, where that is safe."""
+    method = "forkserver" if sys.platform == "linux" else "spawn"
+    multiprocessing.set_start_method(method, force=True)
+    if method == "forkserver":
+        multiprocessing.set_forkserver_preload(SHARED)
+
+
+@contextmanager
+def _for_children() -> Iterator[None]:
+    """Start processes that Ctrl-C does not reach, and that import nothing from this folder."""
+    resource_tracker.ensure_running()  # else it starts within, and lets Ctrl-C through again
+    name = "PYTHONSAFEPATH"
+    kept = os.environ.get(name)
+    os.environ[name] = "1"
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # children inherit it
     try:
-        await cluster
+        yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    async with cluster:
-        yield cluster
+        del os.environ[name]
+        if kept is not None:
+            os.environ[name] = kept
 
 
 def _silence() -> None:
@@ -88,12 +119,23 @@ def _silence() -> None:
             logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
-def _is_scheduler_file(where: str) -> bool:
+def _local_workers(where: str) -> int:
+    """How many workers are to be started on this machine; none where a scheduler is named."""
+    kind, _, number = where.partition(":")
+    if kind != "local":
+        return 0
+    if not (number.isascii() and number.isdigit() and int(number) > 0):
+        raise _unknown(where)
+    return int(number)
+
+
+def _scheduler(where: str) -> dict[str, str]:
+    """How the Dask client calls what is named: an address, or a scheduler file."""
     if not where.endswith(".json"):
-        return False
+        return {"address": _address(where)}
     if not Path(where).is_file():
         raise UsageError(f"there is no scheduler file {where}; {VALID}")
-    return True
+    return {"scheduler_file": where}
 
 
 def _address(where: str) -> str:

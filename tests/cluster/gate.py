@@ -8,6 +8,9 @@ import psutil
 
 from merge_runner.records import SLOT_HEADER
 
+# Six trials of 19 calls each.
+SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "L_4_0,N_0_0,R_-4_8", "--json")
+
 
 class Gate:
     """Lets a number of requests through, and holds the next ones until it opens."""
@@ -45,9 +48,10 @@ class Gate:
 
 
 def workers_of(pid: int) -> list[psutil.Process]:
-    """The workers that a coordinator has started."""
-    children = psutil.Process(pid).children(recursive=True)
-    return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+    """The workers that a coordinator has started: what is forked from a process of its own."""
+    children = psutil.Process(pid).children()
+    servers = [child for child in children if "forkserver" in " ".join(child.cmdline())]
+    return [worker for server in servers for worker in server.children()]
 
 
 def held_from(gate: Gate, worker: psutil.Process) -> set[str]:

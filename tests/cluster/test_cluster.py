@@ -12,31 +12,31 @@ import pytest
 from aiohttp import web
 from harness import PROJECT, environment, watched
 
+from merge_runner.cluster.connect import connected
 from merge_runner.emulator.faults import FaultPlan
+from merge_runner.errors import UsageError
 
-GOLDEN = (PROJECT / "tests/golden/emulator-baseline.digest").read_text()
 SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
 
 
 @pytest.mark.slow
 async def test_three_workers_come_to_the_results_of_one_process(merge_runner):
+    sweep = ("sweep", "baseline", "--reps", 2, "--json")
     async with watched(faults=FaultPlan(latency_s=0.02)) as server:
-        url = f"{server.url}/v1"
-        run = await merge_runner(
-            "sweep", "baseline", "--json", "--in-flight", 12, "--dask", "local:3",
-            EMULATOR_BASE_URL=url,
-        )  # fmt: skip
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--in-flight", 12, "--dask", "local:3", **env)
         assert run.code == 0, run.err
         assert "on 3 workers" in run.err
         assert set(server.asked.values()) == {1}
         assert run.summary["calls"] == {"live": server.requests, "cached": 0}
-        again = await merge_runner(
-            "sweep", "baseline", "--json", "--dask", "local:1", "--reps", 1, "--db", "other",
-            EMULATOR_BASE_URL=url,
-        )  # fmt: skip
+        again = await merge_runner(*sweep, "--db", "again", **env)
         assert again.summary["calls"]["live"] == 0, "all is recorded"
         assert run.summary["calls"]["live"] == server.requests
-    assert (await merge_runner("digest")).out == GOLDEN
+    one = await merge_runner(*sweep, "--db", "one", "--cache", "new")
+    assert one.code == 0, one.err
+    digest = (await merge_runner("digest")).out
+    assert digest == (await merge_runner("digest", "--db", "one")).out
+    assert "22 trials" in digest
 
 
 @pytest.mark.parametrize(
@@ -51,10 +51,16 @@ async def test_three_workers_come_to_the_results_of_one_process(merge_runner):
         ("none.json", "there is no scheduler file none.json"),
     ],
 )
-async def test_a_word_that_names_no_cluster_is_told(merge_runner, where, says):
-    run = await merge_runner(*SMALL, "--dask", where)
+async def test_a_word_that_names_no_cluster_is_refused(where, says):
+    with pytest.raises(UsageError, match=says):
+        async with connected(where):
+            pass
+
+
+async def test_a_word_that_names_no_cluster_is_told_in_one_line(merge_runner):
+    run = await merge_runner(*SMALL, "--dask", "local:0")
     assert run.code == 2
-    assert says in run.err
+    assert "valid: local:N" in run.err
     assert len(run.err.splitlines()) == 1
 
 
@@ -106,22 +112,25 @@ async def test_what_stops_a_sweep_stops_it_at_all_workers_in_one_line(merge_runn
 
 
 @pytest.fixture
-async def scheduler(tmp_path):
-    """A scheduler of its own, and a way to add workers to it."""
+async def scheduler(tmp_path, zygote):
+    """A scheduler of its own; called, it adds a worker."""
     file = tmp_path / "scheduler.json"
+    to = ("--scheduler-file", file, "--no-dashboard")
     processes = []
 
-    async def start(program, *arguments, **changes):
+    async def start(*arguments, **changes):
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", f"distributed.cli.dask_{program}", *arguments,
-            "--scheduler-file", str(file), "--no-dashboard",
+            sys.executable, "-m", "distributed.cli.dask_worker", *arguments, *map(str, to),
             cwd=tmp_path, env=environment(**changes),
             stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
         )  # fmt: skip
         processes.append(psutil.Process(process.pid))
-        return process
 
-    start.process = await start("scheduler", "--port", "0", "--host", "127.0.0.1")
+    start.process = await zygote.start(
+        ("--port", "0", "--host", "127.0.0.1", *to),
+        cwd=tmp_path, env=environment(), module="distributed.cli.dask_scheduler",
+    )  # fmt: skip
+    processes.append(psutil.Process(start.process.pid))
     while not file.exists():
         await asyncio.sleep(0.1)
     start.file = file
@@ -136,7 +145,7 @@ async def test_workers_of_another_scheduler_play_with_their_own_keys(merge_runne
     async with watched() as server:
         env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
         sweep = (*SMALL, "--model", "o3", "--yes", "--dask", scheduler.file)
-        await scheduler("worker", "--no-nanny")
+        await scheduler("--no-nanny")
         run = await merge_runner(*sweep, **env)
         assert run.code == 2
         assert "o3 needs a key: set OPENAI_API_KEY" in run.err
@@ -151,7 +160,7 @@ async def test_a_worker_with_other_source_is_refused(merge_runner, scheduler, tm
     shutil.copytree(PROJECT / "merge_runner", other / "merge_runner")
     with (other / "merge_runner/errors.py").open("a") as file:
         file.write("# another one\n")
-    await scheduler("worker", "--no-nanny", PYTHONPATH=str(other))
+    await scheduler("--no-nanny", PYTHONPATH=str(other))
     run = await merge_runner(*SMALL, "--dask", scheduler.file)
     assert run.code == 2
     assert "install the same one for all" in run.err
@@ -165,7 +174,7 @@ async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, sche
             scheduler.process.kill()
         return await handler(request)
 
-    await scheduler("worker", "--no-nanny")
+    await scheduler("--no-nanny")
     async with watched(middle, FaultPlan(latency_s=0.2)) as server:
         url = f"{server.url}/v1"
         run = await merge_runner(*SMALL, "--dask", scheduler.file, EMULATOR_BASE_URL=url)

@@ -81,7 +81,7 @@ async def test_where_one_worker_is_asked_to_wait_all_wait(merge_runner):
 
     async with watched(middle) as server:
         url = f"{server.url}/v1"
-        run = await merge_runner(*SWEEP, *ON_THREE, EMULATOR_BASE_URL=url)
+        run = await merge_runner(*SWEEP, *ON_THREE, *THREE, "--reps", 2, EMULATOR_BASE_URL=url)
     assert run.code == 0, run.err
     assert run.summary["attempts"] == {"ok": len(clock.times), "rate_limited": 1}
     assert not [t for t in clock.times if asked[0] + 0.3 < t < asked[0] + 2.9]

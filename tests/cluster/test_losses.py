@@ -8,29 +8,27 @@ import signal
 
 import psutil
 import pytest
-from gate import Gate, held_from, workers_of
+from gate import SWEEP, Gate, held_from, workers_of
 from harness import watched
 
 pytestmark = pytest.mark.slow
 
-SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "L_4_0,N_0_0,R_-4_8", "--json")
 ON_THREE = (*SWEEP, "--dask", "local:3")
 ON_TWO = (*SWEEP, "--dask", "local:2")
 
 
 async def ended(process) -> tuple[int, str, str]:
+    """How a sweep ended, of which no process may be left."""
+    family = psutil.Process(process.pid).children(recursive=True)
     async with asyncio.timeout(40):
         out, err = await process.communicate()
+    _, alive = psutil.wait_procs(family, timeout=5)
+    assert not alive
     return process.returncode, out.decode(), err.decode()
 
 
-async def quiet_digest(merge_runner):
-    assert (await merge_runner(*SWEEP, "--db", "quiet", "--cache", "new")).code == 0
-    return (await merge_runner("digest", "--db", "quiet")).out
-
-
 async def test_a_worker_that_is_killed_costs_its_calls_in_flight_and_nothing_else(
-    merge_runner, started
+    merge_runner, started, quiet_digest
 ):
     gate = Gate(40)
     async with watched(gate.middle) as server:
@@ -46,10 +44,12 @@ async def test_a_worker_that_is_killed_costs_its_calls_in_flight_and_nothing_els
     assert gate.asked_again == lost
     assert "is lost: its " in err
     assert json.loads(out)["trials"]["finished"] + json.loads(out)["trials"]["collided"] == 6
-    assert (await merge_runner("digest")).out == await quiet_digest(merge_runner)
+    assert (await merge_runner("digest")).out == quiet_digest
 
 
-async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(merge_runner, started):
+async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
+    merge_runner, started, quiet_digest
+):
     gate = Gate(40)
     async with watched(gate.middle) as server:
         process = await started(*ON_THREE, "--in-flight", 3, EMULATOR_BASE_URL=f"{server.url}/v1")
@@ -67,27 +67,30 @@ async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(merge_ru
     assert own
     assert code == 0, err
     assert not gate.asked_again
-    assert (await merge_runner("digest")).out == await quiet_digest(merge_runner)
+    assert (await merge_runner("digest")).out == quiet_digest
 
 
-async def test_a_coordinator_that_is_killed_loses_the_calls_in_flight(merge_runner, started):
+async def test_a_coordinator_that_is_killed_loses_the_calls_in_flight(
+    merge_runner, started, quiet_digest
+):
     gate = Gate(40)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)
         await gate.quiet(held=3)
         workers = workers_of(process.pid)
+        family = psutil.Process(process.pid).children(recursive=True)
         lost = set(gate.held)
         process.kill()
         await process.wait()
-        gone, alive = psutil.wait_procs(workers, timeout=10)
-        assert (len(gone), alive) == (2, [])
+        _, alive = psutil.wait_procs(family, timeout=10)
+        assert (len(workers), alive) == (2, [])
         gate.open()
         run = await merge_runner(*SWEEP, **env)
     assert run.code == 0, run.err
     assert gate.asked_again <= lost
     assert run.summary["calls"]["live"] <= 114 - 40 + len(lost)
-    assert (await merge_runner("digest")).out == await quiet_digest(merge_runner)
+    assert (await merge_runner("digest")).out == quiet_digest
 
 
 async def test_ctrl_c_saves_what_the_workers_have_in_flight(merge_runner, started):

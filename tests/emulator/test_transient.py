@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
-
 import pytest
-from harness import PROGRAM, environment, watched
+from harness import watched
 
 from merge_runner.emulator.faults import TRANSIENT, FaultPlan
 from merge_runner.store import results_digest
@@ -48,11 +46,9 @@ def folder(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def clean_digest(tmp_path_factory):
+def clean_digest(prepare, tmp_path_factory):
     folder = write_experiments(tmp_path_factory.mktemp("clean"))
-    subprocess.run(
-        [PROGRAM, *COMMAND], cwd=folder, env=environment(), check=True, capture_output=True
-    )
+    assert prepare(folder, *COMMAND).code == 0
     return results_digest(folder / "results/merge.duckdb")
 
 

@@ -130,7 +130,7 @@ async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(me
     sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
     async with watched(middle) as server:
         env = account(server)
-        process = await merge_runner.start(*sweep, **env)
+        process = await merge_runner.fork(*sweep, **env)
         await arrived.wait()
         await asyncio.sleep(0.3)
         process.kill()
@@ -164,7 +164,8 @@ async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_r
         assert second.summary["calls"]["live"] == server.requests - first.summary["calls"]["live"]
         assert second.summary["estimate"]["calls"] == dry["calls"]
         words = [word for word in SWEEP if word != "--json"]
-        text = await merge_runner(*words, "--reps", 3, "--yes", *FAST, **env)
+        one = ("--conditions", "L_4_0", "--reps", 3)
+        text = await merge_runner(*words, *one, "--yes", *FAST, **env)
         assert "estimated before: " in text.out
         replay = await merge_runner("replay", *SWEEP[1:], "--reps", 2, "--db", "other", **env)
     assert replay.summary["cost_usd"] == 0

@@ -79,7 +79,7 @@ async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tm
 
 async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_path):
     service = Service(working=False)
-    sweep = configured(tmp_path, deadline_s=0.6)
+    sweep = (*configured(tmp_path, deadline_s=0.6), "--reps", 3)
     async with watched(service.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         run = await merge_runner(*sweep, "--in-flight", 4, **env)
@@ -89,13 +89,13 @@ async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_pat
         )
         assert "run the same command to go on" in run.err
         assert run.summary["trials"]["failed"] <= 14
-        # Two sides of at most 14 of 110 trials, with two or three attempts each.
+        # Two sides of at most 14 of 33 trials, with two or three attempts each.
         assert server.requests <= 2 * 14 * 3
         service.working = True
         configured(tmp_path, deadline_s=60)
         again = await merge_runner(*sweep, "--in-flight", 20, **env)
     assert again.code == 0, again.err
-    assert again.summary["trials"]["finished"] + again.summary["trials"]["collided"] == 110
+    assert again.summary["trials"]["finished"] + again.summary["trials"]["collided"] == 33
 
 
 async def test_nobody_listens(merge_runner, tmp_path):

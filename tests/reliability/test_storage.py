@@ -9,6 +9,8 @@ import sys
 import pytest
 from harness import watched
 
+from merge_runner.store import results_digest
+
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
 LOCK = """
 import duckdb, sys, time
@@ -22,17 +24,6 @@ def line(run):
     """The one error line of a run that had nothing else to say."""
     (only,) = [text for text in run.err.splitlines() if text.startswith("error: ")]
     return only
-
-
-async def digest(merge_runner, db="results/merge.duckdb"):
-    return (await merge_runner("digest", "--db", db)).out
-
-
-@pytest.fixture
-async def quiet(merge_runner):
-    """The digest of an undisturbed run."""
-    await merge_runner(*SWEEP, "--db", "quiet", "--cache", "quiet-cache")
-    return await digest(merge_runner, "quiet")
 
 
 @pytest.mark.slow
@@ -62,7 +53,8 @@ async def test_a_disk_that_fills_up_ends_the_run_and_the_next_one_goes_on(
         assert set(server.asked.values()) == {1}
     else:
         assert again.summary["calls"]["cached"] > 0
-    assert await digest(merge_runner, moved if what == "db" else "results/merge.duckdb") == quiet
+    db = moved if what == "db" else tmp_path / "results/merge.duckdb"
+    assert results_digest(db) == quiet
 
 
 async def copied(source, target):
@@ -78,11 +70,12 @@ async def test_a_read_only_folder_is_told_before_anything_is_asked(
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         place = folder / ("r.duckdb" if what == "db" else "responses")
-        assert (await merge_runner(*SWEEP, "--reps", 1, f"--{what}", place, **env)).code == 0
+        sweep = (*SWEEP, "--conditions", "R_-4_8")
+        assert (await merge_runner(*sweep, f"--{what}", place, **env)).code == 0
         asked = server.requests
         for again in (place, folder / "new"):
             with read_only(folder):
-                run = await merge_runner(*SWEEP, "--reps", 2, f"--{what}", again, **env)
+                run = await merge_runner(*sweep, "--reps", 2, f"--{what}", again, **env)
             assert run.code == 2, run.err
             assert str(again.parent) in line(run)
             assert f"--{what}" in line(run)
@@ -125,7 +118,7 @@ async def test_a_truncated_database_is_left_alone_and_rebuilt_from_the_cache(
         db.rename(tmp_path / "damaged")
         assert (await merge_runner(*SWEEP, **env)).code == 0
         assert server.requests == asked
-    assert await digest(merge_runner) == quiet
+    assert results_digest(db) == quiet
 
 
 async def test_a_damaged_reply_is_asked_again_in_a_sweep_and_never_in_a_replay(
@@ -151,7 +144,7 @@ async def test_a_damaged_reply_is_asked_again_in_a_sweep_and_never_in_a_replay(
         assert server.requests == asked + 1
     with stock(tmp_path / "cache/responses") as cache:
         assert cache[f"damaged {key}"] == damaged
-    assert await digest(merge_runner, "new") == quiet
+    assert results_digest(tmp_path / "new") == quiet
 
 
 async def test_a_damaged_cache_file_is_told_in_one_line(merge_runner, tmp_path):

@@ -12,6 +12,7 @@ from harness import watched
 
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.llm.claims import Claims
+from merge_runner.store import results_digest
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
 TAKE = """
@@ -24,7 +25,7 @@ time.sleep(60)
 """
 
 
-async def test_two_sweeps_share_every_call_and_lose_no_row(merge_runner):
+async def test_two_sweeps_share_every_call_and_lose_no_row(merge_runner, tmp_path, quiet):
     async with watched(faults=FaultPlan(latency_s=0.05)) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         # The same trials in another order, so that each waits for the other now and then.
@@ -45,10 +46,7 @@ async def test_two_sweeps_share_every_call_and_lose_no_row(merge_runner):
     assert json.loads(counted.out) == [
         {"rows": server.requests, "calls": server.requests, "trials": 11, "linked": 22}
     ]
-    await merge_runner(*SWEEP, "--db", "quiet", "--cache", "new")
-    digests = [(await merge_runner("digest", "--db", db)).out
-               for db in ("results/merge.duckdb", "quiet")]  # fmt: skip
-    assert digests[0] == digests[1]
+    assert results_digest(tmp_path / "results/merge.duckdb") == quiet
 
 
 async def test_a_claim_is_free_when_its_holder_dies(tmp_path):
@@ -77,7 +75,7 @@ async def test_a_sweep_goes_on_with_the_calls_of_one_that_died_beside_it(merge_r
     sweep = (*SWEEP, "--conditions", "L_4_8")
     async with watched(middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        first = await merge_runner.start(*sweep, **env)
+        first = await merge_runner.fork(*sweep, **env)
         await held.wait()
         second = asyncio.create_task(merge_runner(*sweep, **env))
         await asyncio.sleep(2)

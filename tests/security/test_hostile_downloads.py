@@ -7,13 +7,12 @@ import pickle
 import random
 import stat
 import struct
-import subprocess
 import zipfile
 import zlib
 from contextlib import suppress
 
 import pytest
-from harness import PROGRAM, Run, environment
+from harness import Run, environment
 from recordings import drive, write_folder, write_zip
 
 from analysis.human.archive import Unreadable, open_files
@@ -37,21 +36,14 @@ class Bomb:
 
 
 @pytest.fixture
-def imported(tmp_path):
+def imported(tmp_path, zygote):
     """Imports a download with the program, in an empty folder."""
 
     def run(path):
-        done = subprocess.run(
-            [PROGRAM, "human", "import", str(path)],
-            cwd=tmp_path,
-            env=environment(),
-            capture_output=True,
-            text=True,
-            check=False,
-            stdin=subprocess.DEVNULL,
-        )
-        assert "Traceback" not in done.stderr
-        return Run(done.returncode, done.stdout, done.stderr)
+        command = ("human", "import", path)
+        done = Run(*zygote.run_blocking(command, cwd=tmp_path, env=environment()))
+        assert "Traceback" not in done.err
+        return done
 
     return run
 

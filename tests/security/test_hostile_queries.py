@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import duckdb
@@ -14,20 +15,29 @@ from merge_runner.store import Store, query
 DB = Path("results/merge.duckdb")
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
     """A folder with a database and files that a query may be after."""
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "private.csv").write_text("word\nprivate\n")
+    (folder / "private.json").write_text('{"word": "private"}')
+    with duckdb.connect() as connection:
+        connection.execute(f"COPY (SELECT 'private' AS word) TO '{folder}/private.parquet'")
+        connection.execute(
+            f"ATTACH '{folder}/other.duckdb' AS other;"
+            "CREATE TABLE other.t AS SELECT 'private' AS word"
+        )
+    Store(folder / DB)
+    return folder
+
+
+@pytest.fixture
+def here(made, tmp_path, monkeypatch):
+    """A copy of it, in which the program runs."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MERGE_RUNNER_TEST_SECRET", "in the environment")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    (tmp_path / "private.csv").write_text("word\nprivate\n")
-    (tmp_path / "private.json").write_text('{"word": "private"}')
-    with duckdb.connect() as connection:
-        connection.execute("COPY (SELECT 'private' AS word) TO 'private.parquet'")
-        connection.execute(
-            "ATTACH 'other.duckdb'; CREATE TABLE other.t AS SELECT 'private' AS word"
-        )
-    Store(DB)
     return tmp_path
 
 
