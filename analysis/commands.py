@@ -138,7 +138,12 @@ def view(
     if export is None and single is None:
         if trials is not None:
             raise UsageError("--trials goes with --export DIR or --single FILE.html")
-        from analysis.explorer.server import serve
+        try:
+            from analysis.explorer.server import serve
+        except ModuleNotFoundError as exc:
+            raise UsageError(
+                f"the explorer needs {exc.name}: pip install 'merge-runner[view]'"
+            ) from exc
 
         serve(db, port, bind, print_out)
         return

@@ -9,28 +9,39 @@ import os
 import re
 import tempfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from markupsafe import Markup
 
-from analysis.explorer.catalogue import FACETS, Filter
+from analysis.explorer.catalogue import FACETS, SEVERAL, Filter
 from analysis.explorer.details import Row, read_decisions, read_trial
 from analysis.explorer.links import StaticLinks, bundle_name
+from analysis.explorer.pages.ablations import ablations_page
+from analysis.explorer.pages.humans import humans_page
+from analysis.explorer.pages.sweep import sweep_page, sweeps_page
+from analysis.explorer.pages.tables import table_page, tables_page
 from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
 from analysis.explorer.site import Site
+from analysis.explorer.sweeps import list_sweeps
 from analysis.explorer.views import sparkline
+from analysis.tables import TABLES
 from merge_runner.errors import UsageError
 from merge_runner.simulator.conditions import CONDITIONS
 
 STATIC = Path(__file__).with_name("static")
 STYLES = ("vendor/uplot-1.6.32.min.css", "explorer.css")
+PLAIN = ("keys.js",)
 LISTING = ("keys.js", "listing.js")
 BUNDLE = ("keys.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
 # A block of a prompt in a decision's panel: the same ones come again and again.
 _BLOCK = re.compile(r'<div class="block">.*?</div>', re.DOTALL)
+# Where a server would lead on, a file does not.
+_LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 # What is taken for a secret wherever it stands, beside the values of this machine's keys.
 _KEYS = re.compile(r"\b(?:sk-[A-Za-z0-9_-]{16,}|AIza[A-Za-z0-9_-]{30,}|Bearer [A-Za-z0-9._-]{16,})")
 SHORTEST_SECRET = 8
@@ -65,19 +76,41 @@ def export_folder(db: Path, folder: Path, wanted: Sequence[str]) -> Iterator[Pat
     ``wanted`` are names of trials, in which * stands for anything; none wants all. Nothing is
     written where a page holds a key or a path of this machine. Raises UsageError.
     """
-    site, rows = _opened(db, wanted)
-    pages = {"trials.html": _listing(site, rows)}
-    pages["index.html"] = pages["trials.html"]
-    for condition in CONDITIONS:
-        if mine := [row for row in rows if row["condition"] == condition]:
-            pages[bundle_name(condition)] = bundle_page(site, mine, f"Trials of {condition}")
-    yield from _written(folder, pages)
+    with _opened(db, wanted) as (site, rows):
+        pages = {site.at.to("trials"): _listing(site, rows)}
+        for condition in CONDITIONS:
+            if mine := [row for row in rows if row["condition"] == condition]:
+                pages[bundle_name(condition)] = bundle_page(site, mine, f"Trials of {condition}")
+        if not wanted:
+            pages |= {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site)}
+    yield from _written(folder, {**pages, "index.html": _index(pages)})
 
 
 def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Iterator[Path]:
     """Write one page with the wanted trials; yields its path. Raises UsageError."""
-    site, rows = _opened(db, wanted)
-    yield from _written(file.parent, {file.name: bundle_page(site, rows, "Trials")})
+    with _opened(db, wanted) as (site, rows):
+        page = bundle_page(site, rows, "Trials")
+    yield from _written(file.parent, {file.name: page})
+
+
+def _study(site: Site) -> Iterator[tuple[str, str]]:
+    """The pages of the whole study: its sweeps, the newest first, and what is computed of it."""
+    at = site.at
+    for entry in list_sweeps(site.catalogue):
+        yield at.sweep(entry.sweep_id), sweep_page(site, entry.sweep_id)
+    yield at.to("sweeps"), sweeps_page(site)
+    yield at.to("tables"), tables_page(site)
+    for name in TABLES:
+        yield at.table(name), table_page(site, name, {})
+    yield at.to("ablations"), ablations_page(site, {})
+    yield at.to("humans"), humans_page(site, {})
+
+
+def _index(pages: Mapping[str, str]) -> str:
+    """The page to begin at: the newest sweep, or the trials."""
+    return next((text for name, text in pages.items() if name.startswith("sweep-")), "") or next(
+        iter(pages.values())
+    )
 
 
 def bundle_page(site: Site, rows: list[Row], name: str) -> str:
@@ -120,18 +153,14 @@ def _trial(site: Site, row: Row, beside: list[Row], blocks: Blocks) -> dict[str,
 
 def _listing(site: Site, rows: list[Row]) -> str:
     facets = {
-        name: sorted({(str(row[name]), 0) for row in rows if row[name] is not None})
+        name: sorted(Counter(row[name] for row in rows if row[name] is not None).items())
         for name in FACETS
-        if name != "sweep"
-    }
-    counted = {
-        name: [(value, sum(row[name] == value for row in rows)) for value, _ in values]
-        for name, values in facets.items()
+        if name not in SEVERAL
     }
     return site.render(
         "listing.html",
         here="trials",
-        facets=counted,
+        facets=facets,
         rows=rows,
         sorts={},
         sort="",
@@ -155,9 +184,10 @@ def inlined(scripts: Sequence[str]) -> Inlined:
     return Inlined([Markup(text) for text in styles], [Markup(text) for text in code], hashes)  # noqa: S704 # files of ours
 
 
-def _opened(db: Path, wanted: Sequence[str]) -> tuple[Site, list[Row]]:
+@contextmanager
+def _opened(db: Path, wanted: Sequence[str]) -> Iterator[tuple[Site, list[Row]]]:
     """A site of files and the wanted trials, by name; raises UsageError where there is none."""
-    site = Site(db, StaticLinks(), static=True)
+    site = Site(db, StaticLinks(), static=True, shared={"inlined": inlined(PLAIN)})
     site.catalogue.refresh()
     every = site.catalogue.every(Filter())
     rows = [
@@ -168,7 +198,10 @@ def _opened(db: Path, wanted: Sequence[str]) -> tuple[Site, list[Row]]:
     if not rows:
         names = ", ".join(wanted) or "any name"
         raise UsageError(f"{db} holds no trial called {names}; `merge-runner view` lists them")
-    return site, rows
+    try:
+        yield site, rows
+    finally:
+        site.close()
 
 
 def _packed(value: object) -> str:

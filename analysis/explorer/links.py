@@ -52,12 +52,16 @@ class Links:
         return f"/static/{name}"
 
 
+# The pages that an export has, each as a file of this name.
+EXPORTED = ("sweeps", "trials", "tables", "ablations", "humans")
+
+
 class StaticLinks(Links):
     """Addresses of an exported study: files beside each other, a page of trials a condition."""
 
     def to(self, name: str, /, **state: object) -> str:
-        """A page."""
-        return f"{name}.html" + query_of(state)
+        """A page, or nothing where only a server has it."""
+        return f"{name}.html" + query_of(state) if name in EXPORTED else ""
 
     def trial(self, row: Mapping[str, Any], **state: object) -> str:
         """A trial on the page of its condition."""
@@ -75,6 +79,18 @@ class StaticLinks(Links):
     def raw(self, row: Mapping[str, Any], side: str, number: int) -> str:
         """Nothing: no server has it."""
         return ""
+
+    def table(self, name: str, **state: object) -> str:
+        """A table of the analysis."""
+        return f"table-{name}.html"
+
+    def cell(self, table: str, row: str, column: str) -> str:
+        """Nothing: a server finds the trials behind a cell."""
+        return ""
+
+    def sweep(self, sweep_id: str) -> str:
+        """A sweep's page."""
+        return f"sweep-{quote(sweep_id, safe='')}.html"
 
 
 def bundle_name(condition: str) -> str:

@@ -35,6 +35,8 @@ class Site:
     db: Path
     at: Links = field(default_factory=Links)
     static: bool = False
+    shared: dict[str, object] = field(default_factory=dict)
+    """What else all templates see."""
     closing: bool = False
     """Whether the server ends: a stream must not keep it waiting."""
 
@@ -51,11 +53,12 @@ class Site:
         )
         self._environment.globals.update(
             at=self.at,
-            pages={"Trials": "trials"} if self.static else PAGES,
+            pages={name: page for name, page in PAGES.items() if self.at.to(page)},
             shell="static.html" if self.static else "base.html",
             static=self.static,
             study=self.db.name if self.static else str(self.db),
             visible=visible,
+            **self.shared,
         )
 
     def render(self, template: str, **values: object) -> str:

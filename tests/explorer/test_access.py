@@ -7,6 +7,14 @@ from importlib.resources import files
 import pytest
 
 PAGES = (
+    "/sweeps",
+    "/",
+    "/tables",
+    "/tables/attempts",
+    "/ablations",
+    "/humans",
+    "/sql?q=select+1",
+    "/nowhere",
     "/trials",
     "/trials?outcome=collided",
     "/trials/emulator/baseline/N_0_0/rep01?side=left&decision=2",

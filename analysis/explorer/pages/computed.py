@@ -13,6 +13,8 @@ from analysis.explorer.site import Site
 # What is kept in the database comes within the first; the second is for a page that shows a clock.
 AT_ONCE_S = 0.3
 PATIENT_S = 4.0
+# A page that stands alone must hold the result.
+EXPORT_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +51,11 @@ def computed(
 ) -> Computed:
     """Ask for something; a ``patient`` page has said already that it takes a while."""
     state = site.catalogue.state()
-    found = site.computing.ask(
-        request, state, since=since_of(asked), wait_s=PATIENT_S if patient else wait_s
-    )
+    if site.static:
+        wait_s = EXPORT_S
+    elif patient:
+        wait_s = PATIENT_S
+    found = site.computing.ask(request, state, since=since_of(asked), wait_s=wait_s)
     result = found if isinstance(found, Result) else None
     failure = "" if isinstance(found, Result | Waiting) else found.text
     later = {"since": f"{result.at + 0.001:.3f}"} if result else {}
