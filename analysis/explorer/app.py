@@ -9,6 +9,7 @@ from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
@@ -82,9 +83,10 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
         )
 
     def message(request: Request, exc: Exception) -> Response:
-        code = 404 if isinstance(exc, NotThere) else 503
+        code = 503 if isinstance(exc, MergeRunnerError) else 404
         heading = "Not there" if code == 404 else "Not now"
-        values: dict[str, Any] = {"heading": heading, "text": str(exc), "here": ""}
+        text = f"there is no page {request.url.path}" if isinstance(exc, HTTPException) else exc
+        values: dict[str, Any] = {"heading": heading, "text": str(text), "here": ""}
         return HTMLResponse(site.render("message.html", **values), code)
 
     @asynccontextmanager
@@ -143,7 +145,7 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
         lifespan=lifespan,
-        exception_handlers={NotThere: message, MergeRunnerError: message},
+        exception_handlers={NotThere: message, MergeRunnerError: message, 404: message},
     )
 
 

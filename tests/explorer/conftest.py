@@ -76,9 +76,9 @@ def site(study):
         yield address
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser():
-    """Chromium without a window."""
+    """Chromium without a window; while it is there an event loop runs, and no other test's can."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:

@@ -14,7 +14,6 @@ PAGES = (
     "/ablations",
     "/humans",
     "/sql?q=select+1",
-    "/nowhere",
     "/trials",
     "/trials?outcome=collided",
     "/trials/emulator/baseline/N_0_0/rep01?side=left&decision=2",

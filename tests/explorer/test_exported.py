@@ -25,6 +25,8 @@ def exported(study, tmp_path_factory):
 def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     page.context.set_offline(True)
     page.goto(f"file://{exported}/index.html")
+    expect(page.locator(".sweep-verdict")).to_contain_text("Finished")
+    page.get_by_role("link", name="Trials", exact=True).click()
     page.get_by_label("outcome").select_option("collided")
     expect(page.locator("tbody tr:visible")).to_have_count(1)
     page.locator("tbody tr:visible a").click()

@@ -1,0 +1,80 @@
+"""Who may ask, and what a page may do."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from starlette.testclient import TestClient
+
+from analysis.explorer.app import explorer
+from analysis.explorer.guard import COOKIE
+from analysis.explorer.site import Site
+from merge_runner.errors import UsageError
+
+HOST = "127.0.0.1:8700"
+
+
+@pytest.fixture
+def client(study):
+    with TestClient(explorer(Site(study), {HOST}), base_url=f"http://{HOST}") as client:
+        yield client
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"host": "evil.example:8700"},
+        {"host": "127.0.0.1:8701"},
+        {"host": "127.0.0.1"},
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"sec-fetch-site": "cross-site", "sec-fetch-mode": "cors"},
+    ],
+)
+def test_another_name_or_another_sites_page_is_refused(client, headers):
+    assert client.get("/trials", headers=headers).status_code == 403
+
+
+def test_ours_and_a_link_from_elsewhere_are_answered(client):
+    for headers in (
+        {},
+        {"origin": f"http://{HOST}"},
+        {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"},
+    ):
+        assert client.get("/trials", headers=headers).status_code == 200
+
+
+@pytest.mark.parametrize("address", ["/trials", "/nowhere", "/static/keys.js"])
+def test_no_page_runs_what_is_not_a_file_of_ours(client, address):
+    policy = client.get(address).headers["content-security-policy"]
+    assert "default-src 'none'; script-src 'self'; style-src 'self'" in policy
+    assert "unsafe" not in policy
+    text = client.get(address).text
+    assert not re.search(r"<script(?![^>]*(src=|application/json))|\son[a-z]+=|style=", text) or (
+        address.startswith("/static")
+    )
+
+
+def test_what_is_not_there_is_said_and_no_markup_of_the_address_is_kept(client):
+    reply = client.get("/<b>nowhere</b>")
+    assert reply.status_code == 404
+    assert "there is no page" in reply.text
+    assert "<b>nowhere" not in reply.text
+
+
+def test_at_another_address_one_needs_the_token(study):
+    app = explorer(Site(study), {HOST}, token="the-token")
+    with TestClient(app, base_url="http://10.0.0.5:8700", follow_redirects=False) as client:
+        assert client.get("/trials").status_code == 403
+        assert client.get("/trials?token=another").status_code == 403
+        told = client.get("/trials?token=the-token&model=o3")
+        assert (told.status_code, told.headers["location"]) == (303, "/trials?model=o3")
+        assert "httponly" in told.headers["set-cookie"].lower()
+        client.cookies.set(COOKIE, "the-token")
+        assert client.get("/trials").status_code == 200
+
+
+def test_a_database_that_is_not_there_is_told(tmp_path):
+    with pytest.raises(UsageError, match="make sweep"):
+        Site(tmp_path / "none.duckdb").catalogue.refresh()
