@@ -23,7 +23,9 @@ from merge_runner.store import query
 Figures = dict[str, float]
 # In this condition both vehicles collide early whatever the server answers: 8 calls a trial.
 SHORT, SHORT_CALLS = ("--conditions", "R_-4_8"), 8
-KILLED_DELAY_MS, QUIET_S = 500, 0.15
+# Few trials, whose calls are all under way before the first of them is answered.
+KILLED, KILLED_TRIALS = ("--reps", "2"), 22
+KILLED_DELAY_MS, QUIET_S = 1_000, 0.15
 STUDIES, MOST_DRIVEN = (110, 1_100, 11_000), 1_100
 
 
@@ -256,13 +258,23 @@ def resume(bench: Bench) -> Figures:
     """A sweep that is killed without a word at half, and run again."""
     folder = bench.fresh("killed")
     bench.server.reset()
-    bench.sweep(folder, delay_ms=KILLED_DELAY_MS, until=half_is_answered(bench.server))
-    ran = bench.sweep(folder, delay_ms=KILLED_DELAY_MS)
-    stats = bench.server.stats()
-    return {**figures_of(ran), "asked": stats["asked"], "asked_again": stats["asked_again"]}
+    until = half_is_answered(bench.server, KILLED_TRIALS)
+    bench.sweep(folder, *KILLED, delay_ms=KILLED_DELAY_MS, until=until)
+    return asked_again(bench.server, lambda: bench.sweep(folder, *KILLED, delay_ms=KILLED_DELAY_MS))
 
 
-def half_is_answered(server: Server, trials: int = TRIALS) -> Callable[[], bool]:
+def asked_again(server: Server, go_on: Callable[[], Run], calls: int | None = None) -> Figures:
+    """What a run that goes on after a kill asks again of what was answered before."""
+    before = server.stats()["answered"]
+    ran = go_on()
+    stats = server.stats()
+    if stats["answered"] == before:
+        raise RuntimeError("it was killed when everything was answered")
+    told = {"answered_before": before, "asked_again": stats["asked_again"]}
+    return {**figures_of(ran, calls=calls), "answered_after": stats["answered"] - before, **told}
+
+
+def half_is_answered(server: Server, trials: int) -> Callable[[], bool]:
     """Says when half of the workload is answered and all calls in flight wait for the server.
 
     An answer that is on its way when its reader dies is lost to whatever reader.

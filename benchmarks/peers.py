@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from benchmarks.cases import KILLED_DELAY_MS, Bench, Figures, figures_of, half_is_answered
+from benchmarks.cases import (
+    KILLED_DELAY_MS,
+    Bench,
+    Figures,
+    asked_again,
+    figures_of,
+    half_is_answered,
+)
 from benchmarks.processes import PROJECT, Run, run
 from benchmarks.workload import CALLS, TRIALS
 
@@ -28,13 +35,11 @@ def peer_resume(bench: Bench) -> Figures:
     bench.server.reset()
     few, until = ("--trials", str(FEW)), half_is_answered(bench.server, FEW)
     _peer(bench, name, *few, delay_ms=KILLED_DELAY_MS, until=until)
-    ran = _peer(bench, name, "--retry", delay_ms=KILLED_DELAY_MS)
-    stats = bench.server.stats()
-    return {
-        **figures_of(ran, calls=CALLS * FEW),
-        "asked": stats["asked"],
-        "asked_again": stats["asked_again"],
-    }
+    return asked_again(
+        bench.server,
+        lambda: _peer(bench, name, "--retry", delay_ms=KILLED_DELAY_MS),
+        calls=CALLS * FEW,
+    )
 
 
 def _measured(ran: Run) -> Figures:
