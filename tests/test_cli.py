@@ -15,7 +15,7 @@ from analysis.commands import app
 
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
-    *("tables", "figures", "report", "explain", "human"),
+    *("tables", "figures", "report", "explain", "human", "view"),
 }
 # The promised options; more may be there.
 SWEEP_OPTIONS = {
