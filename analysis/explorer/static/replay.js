@@ -75,7 +75,7 @@ window.startReplay = () => {
         vehicles[name][side] = group;
       }
     }
-    vehicles.crash = draw("text", { class: "crash", y: -3 }, track, "✸ collision");
+    vehicles.crash = draw("text", { class: "crash", y: 9 }, track, "✸ collision");
   };
   const move = (name, run) => {
     for (const side of ["left", "right"]) {
