@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
@@ -29,6 +30,9 @@ from analysis.explorer.pages import ablations, humans, sql, sweep, tables, trial
 from analysis.explorer.site import NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
+LOG = logging.getLogger(__name__)
+# A page that is to be asked for again, in s.
+AGAIN = {"refresh": "1"}
 STATIC = Path(__file__).with_name("static")
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 # Nothing in a reply runs, whatever a browser takes it for.
@@ -37,13 +41,6 @@ SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
 
 def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> Starlette:
     """The application; see ``Guard`` for who may ask."""
-
-    def page(render: Callable[[Request], str]) -> Callable[[Request], Response]:
-        def answer(request: Request) -> Response:
-            site.catalogue.refresh()
-            return HTMLResponse(render(request))
-
-        return answer
 
     def may_wait(request: Request) -> dict[str, bool]:
         # A script of ours asks for what a page has said to be on its way.
@@ -69,10 +66,6 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             trial.replay_json(site, request.path_params["trial"], request.query_params)
         )
 
-    def home(_: Request) -> Response:
-        site.catalogue.refresh()
-        return RedirectResponse(sweep.home(site))
-
     async def events(request: Request) -> Response:
         sweep_id = request.path_params["sweep"]
         await run_in_threadpool(sweep.require_sweep, site, sweep_id)
@@ -82,22 +75,16 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             sweep.sweep_events(site, sweep_id), media_type="text/event-stream", headers=plain
         )
 
-    def message(request: Request, exc: Exception) -> Response:
-        code = 503 if isinstance(exc, MergeRunnerError) else 404
-        heading = "Not there" if code == 404 else "Not now"
-        text = f"there is no page {request.url.path}" if isinstance(exc, HTTPException) else exc
-        values: dict[str, Any] = {"heading": heading, "text": str(text), "here": ""}
-        return HTMLResponse(site.render("message.html", **values), code)
-
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         yield
         site.close()  # a server that is told to end is killed after this
 
+    page = partial(_page, site)
     of_trial = "{trial:path}"
     return Starlette(
         routes=[
-            Route("/", home),
+            Route("/", page(lambda _: RedirectResponse(sweep.home(site)))),
             Route("/sweeps", page(lambda _: sweep.sweeps_page(site))),
             Route("/sweeps/{sweep:path}/events", events),
             Route(
@@ -145,8 +132,40 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
         lifespan=lifespan,
-        exception_handlers={NotThere: message, MergeRunnerError: message, 404: message},
+        exception_handlers=_errors(site),
     )
+
+
+def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[Request], Response]:
+    """A page, of what the database holds now."""
+
+    def answer(request: Request) -> Response:
+        if site.beginning:
+            return HTMLResponse(site.render("beginning.html", here=""), headers=AGAIN)
+        site.catalogue.refresh()
+        rendered = render(request)
+        return HTMLResponse(rendered) if isinstance(rendered, str) else rendered
+
+    return answer
+
+
+def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
+    """What is said where there is no page."""
+
+    def said(heading: str, text: str, code: int) -> Response:
+        return HTMLResponse(site.render("message.html", heading=heading, text=text, here=""), code)
+
+    def fault(request: Request, exc: Exception) -> Response:
+        LOG.error("%s: a fault of the explorer: %r", request.url.path, exc)
+        LOG.debug("where it happened", exc_info=exc)
+        return said("A fault", f"A fault of the explorer: {exc!r}. The other pages go on.", 500)
+
+    return {
+        NotThere: lambda _, exc: said("Not there", str(exc), 404),
+        404: lambda request, _: said("Not there", f"there is no page {request.url.path}", 404),
+        MergeRunnerError: lambda _, exc: said("Not now", str(exc), 503),
+        Exception: fault,
+    }
 
 
 def _sql_routes(site: Site) -> list[Route]:

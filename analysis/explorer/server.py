@@ -10,6 +10,7 @@ from pathlib import Path
 import uvicorn
 
 from analysis.explorer.app import explorer
+from analysis.explorer.reading import reading
 from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
 
@@ -19,14 +20,16 @@ LOOPBACK = "127.0.0.1"
 def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
     """Serve a database; ``say`` is told the address. Raises UsageError."""
     site = Site(db)
-    site.catalogue.refresh()
+    with reading(db):
+        pass  # what is wrong with it is said at once
+    site.begin()
     listener = listen(bind, port)
     port = listener.getsockname()[1]
     token = None if bind == LOOPBACK else secrets.token_urlsafe(24)
     hosts = {f"{LOOPBACK}:{port}", f"localhost:{port}"}
     shown = LOOPBACK if bind == "0.0.0.0" else bind  # noqa: S104 # compared, not bound
     say(f"http://{shown}:{port}/" + (f"?token={token}" if token else ""))
-    config = uvicorn.Config(explorer(site, hosts, token), log_level="error", ws="none")
+    config = uvicorn.Config(explorer(site, hosts, token), log_level="critical", ws="none")
     _Server(config, site).run(sockets=[listener])
 
 

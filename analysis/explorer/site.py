@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from analysis.explorer.computing import Computing
 from analysis.explorer.links import Links
 from analysis.explorer.sandbox import Sandbox
 from analysis.explorer.texts import visible
+from merge_runner.errors import MergeRunnerError
 
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {
@@ -41,6 +44,7 @@ class Site:
     """Whether the server ends: a stream must not keep it waiting."""
 
     def __post_init__(self) -> None:
+        self._first_reading: threading.Thread | None = None
         self.catalogue = Catalogue(self.db)
         self.sandbox = Sandbox(self.db)
         self.computing = Computing(self.db)
@@ -60,6 +64,21 @@ class Site:
             visible=visible,
             **self.shared,
         )
+
+    def begin(self) -> None:
+        """Read the trials for the first time, which may take a while, beside what else is done."""
+        self._first_reading = threading.Thread(target=self._read_first, daemon=True)
+        self._first_reading.start()
+
+    def _read_first(self) -> None:
+        # What is wrong is told by the first page, which tries again.
+        with contextlib.suppress(MergeRunnerError):
+            self.catalogue.refresh()
+
+    @property
+    def beginning(self) -> bool:
+        """Whether the trials are being read for the first time."""
+        return self._first_reading is not None and self._first_reading.is_alive()
 
     def render(self, template: str, **values: object) -> str:
         """A page, or a part of one."""

@@ -78,3 +78,26 @@ def test_at_another_address_one_needs_the_token(study):
 def test_a_database_that_is_not_there_is_told(tmp_path):
     with pytest.raises(UsageError, match="make sweep"):
         Site(tmp_path / "none.duckdb").catalogue.refresh()
+
+
+def test_while_the_trials_are_read_for_the_first_time_a_page_says_so(study, monkeypatch):
+    site = Site(study)
+    monkeypatch.setattr(Site, "beginning", True)
+    with TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}") as client:
+        reply = client.get("/trials")
+    assert "Reading the trials" in reply.text
+    assert reply.headers["refresh"] == "1"
+
+
+def test_a_fault_is_one_line_and_the_other_pages_go_on(study, monkeypatch, caplog):
+    site = Site(study)
+    monkeypatch.setattr("analysis.explorer.pages.sweep.sweeps_page", lambda _: 1 / 0)
+    app = explorer(site, {HOST})
+    with TestClient(app, base_url=f"http://{HOST}", raise_server_exceptions=False) as client:
+        reply = client.get("/sweeps")
+        assert reply.status_code == 500
+        assert "A fault of the explorer: ZeroDivisionError" in reply.text
+        assert client.get("/trials").status_code == 200
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [
+        "/sweeps: a fault of the explorer: ZeroDivisionError('division by zero')"
+    ]
