@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 import threading
 import time
 from contextlib import contextmanager
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import uvicorn
-from harness import PROGRAM, RECORDING, environment
+from harness import RECORDING
 from hostile import hostile_trial
 
 from analysis.explorer.app import explorer
@@ -33,21 +32,14 @@ def pytest_runtest_setup(item):
 
 
 @pytest.fixture(scope="session")
-def study(tmp_path_factory):
+def study(prepare, tmp_path_factory):
     """Recorded trials of two conditions, one of which collides, and a hostile one."""
     folder = tmp_path_factory.mktemp("study")
-    db = folder / "study.duckdb"
-    subprocess.run(
-        [
-            *(PROGRAM, "replay", "baseline", "--recording", RECORDING, "--db", db),
-            *("--cache", folder / "cache", "--reps", "3", "--conditions", "L_4_0,N_0_0"),
-        ],
-        check=True,
-        capture_output=True,
-        env=environment(),
-    )
-    Store(db).write("hostile", [hostile_trial()], patience_s=5)
-    return db
+    sweep = ("replay", "baseline", "--recording", RECORDING, "--db", "study.duckdb")
+    run = prepare(folder, *sweep, "--reps", 3, "--conditions", "L_4_0,N_0_0")
+    assert run.code == 0, run.err
+    Store(folder / "study.duckdb").write("hostile", [hostile_trial()], patience_s=5)
+    return folder / "study.duckdb"
 
 
 @contextmanager
