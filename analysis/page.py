@@ -16,7 +16,7 @@ from analysis.provenance import provenance
 from analysis.published import published
 from analysis.study import Study
 from analysis.tables.against import PAPER, against, in_paper
-from analysis.tables.formats import notes_of, shown_columns, shown_value
+from analysis.tables.formats import table_view
 from analysis.tables.model import Column, Row, Table
 from merge_runner.provenance import git_state
 
@@ -58,8 +58,8 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
             {"name": name, "caption": FIGURES[name][1], "data": data}
             for name, data in figures.items()
         ],
-        tables=[_view(table, links) for table in tables],
-        beside=[_view(against(table, PAPER), links) for table in tables if in_paper(table)],
+        tables=[table_view(table, links.to) for table in tables],
+        beside=[table_view(against(table, PAPER), links.to) for table in tables if in_paper(table)],
         sources=[(number, sources) for sources, number in links.found.items()],
         listed=LISTED,
         command=sql_command(study),
@@ -70,35 +70,6 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         sources_cited=_records(published("sources")),
         program=git_state(),
     )
-
-
-def _view(table: Table, links: Links) -> dict[str, object]:
-    """A table as its template needs it: headings, cells with links, notes."""
-    columns = shown_columns(table)
-    return {
-        "name": table.name,
-        "heading": table.heading,
-        "columns": [
-            {"heading": c.heading, "meaning": c.meaning, "text": c.kind == "text"} for c in columns
-        ],
-        "rows": [
-            {
-                "id": row.id,
-                "cells": [
-                    {
-                        "text": shown_value(column, row.values.get(column.name)),
-                        "left": column.kind == "text",
-                        "link": None
-                        if column.kind == "text" or row.values.get(column.name) is None
-                        else links.to(table, row, column),
-                    }
-                    for column in columns
-                ],
-            }
-            for row in table.rows
-        ],
-        "notes": notes_of(table),
-    }
 
 
 def _records(frame: pd.DataFrame) -> list[dict[str, object]]:

@@ -206,7 +206,7 @@ class Catalogue:
     def refresh(self) -> bool:
         """Take in what is new in the database; returns whether anything was.
 
-        The file is opened for a few hundred trials at a time, so that a sweep can write in between.
+        The file is opened for 2,000 trials at a time, so that a sweep can write in between.
         Raises UsageError and StoreError.
         """
         with self._lock:
@@ -302,14 +302,6 @@ class Catalogue:
             "PARTITION BY model, variant, spec_hash ORDER BY rep <> ?, trial_id) <= ? "
             "ORDER BY model, variant, trial_id",
             [*values, row["trial_id"], row["spec_hash"], row["rep"], limit],
-        )
-
-    def names(self, wanted: Filter, limit: int) -> list[tuple[str, str]]:
-        """(trial, spec) of the trials of a filter, by name."""
-        where, values = wanted.where()
-        return self._rows(
-            f"SELECT trial_id, spec_hash FROM listed WHERE {where} ORDER BY ALL LIMIT {limit}",  # noqa: S608 # constants
-            values,
         )
 
     def pairs(self, model: str, variant: str, fate: str) -> list[dict[str, Any]]:

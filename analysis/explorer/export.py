@@ -228,7 +228,7 @@ def _refuse_secrets(where: str, texts: Sequence[str]) -> None:
         for name, value in os.environ.items()
         if name.endswith(("_API_KEY", "_TOKEN")) and len(value) >= SHORTEST_SECRET
     }
-    paths = {str(Path.home()), str(Path.cwd()), tempfile.gettempdir()} - {"/", "/root", "/tmp"}  # noqa: S108 # names
+    paths = {str(Path.home()), str(Path.cwd()), tempfile.gettempdir()} - {"/", "/tmp"}  # noqa: S108 # names
     for text in texts:
         for value, name in secrets.items():
             if value in text:

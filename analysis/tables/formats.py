@@ -243,3 +243,38 @@ def _escaped(text: str) -> str:
         **{character: f"\\{character}" for character in "&%$#_{}"},
     }
     return "".join(special.get(character, character) for character in text)
+
+
+def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> dict[str, object]:
+    """A table as templates need it: headings, cells with what ``link`` leads to, notes.
+
+    The texts that lead a row are its headers.
+    """
+    columns = shown_columns(table)
+    leading = next((i for i, c in enumerate(columns) if c.kind != "text"), len(columns))
+    return {
+        "name": table.name,
+        "heading": table.heading,
+        "columns": [
+            {"heading": c.heading, "meaning": c.meaning, "text": c.kind == "text"} for c in columns
+        ],
+        "rows": [
+            {
+                "id": row.id,
+                "cells": [
+                    {
+                        "text": shown_value(column, row.values.get(column.name)),
+                        "left": column.kind == "text",
+                        "header": i < leading,
+                        "link": None
+                        if column.kind == "text" or row.values.get(column.name) is None
+                        else link(table, row, column),
+                        "label": f"{column.heading} of {row.id}",
+                    }
+                    for i, column in enumerate(columns)
+                ],
+            }
+            for row in table.rows
+        ],
+        "notes": notes_of(table),
+    }

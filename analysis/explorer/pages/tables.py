@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
-from analysis.explorer.links import Links
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import NotThere, Site
 from analysis.tables import TABLES
-from analysis.tables.formats import notes_of, shown_columns, shown_value
-from analysis.tables.model import Table, from_text
+from analysis.tables.formats import table_view
+from analysis.tables.model import from_text
 
 # What stands in each, for the list of them: their titles are known once they are made.
 ABOUT = {
@@ -42,7 +40,10 @@ def table_page(site: Site, name: str, asked: Mapping[str, str], *, patient: bool
     found = computed(site, ("tables", name), asked, patient=patient)
     shown = None
     if found.result is not None:
-        shown = table_view(from_text(found.result.content["tables"][0]), site.at)
+        shown = table_view(
+            from_text(found.result.content["tables"][0]),
+            lambda table, row, column: site.at.cell(table.name, row.id, column.name),
+        )
     names = list(TABLES)
     at = names.index(name)
     return site.render(
@@ -55,38 +56,3 @@ def table_page(site: Site, name: str, asked: Mapping[str, str], *, patient: bool
         before=names[at - 1] if at else None,
         after=names[at + 1] if at + 1 < len(names) else None,
     )
-
-
-def table_view(table: Table, at: Links) -> dict[str, Any]:
-    """A table as its template needs it: headings, cells with addresses, notes.
-
-    The texts that lead a row are its headers.
-    """
-    columns = shown_columns(table)
-    leading = next((i for i, c in enumerate(columns) if c.kind != "text"), len(columns))
-    return {
-        "name": table.name,
-        "heading": table.heading,
-        "columns": [
-            {"heading": c.heading, "meaning": c.meaning, "text": c.kind == "text"} for c in columns
-        ],
-        "rows": [
-            {
-                "id": row.id,
-                "cells": [
-                    {
-                        "text": shown_value(column, row.values.get(column.name)),
-                        "left": column.kind == "text",
-                        "header": i < leading,
-                        "link": None
-                        if column.kind == "text" or row.values.get(column.name) is None
-                        else at.cell(table.name, row.id, column.name),
-                        "label": f"{column.heading} of {row.id}",
-                    }
-                    for i, column in enumerate(columns)
-                ],
-            }
-            for row in table.rows
-        ],
-        "notes": notes_of(table),
-    }
