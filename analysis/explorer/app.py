@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
@@ -42,10 +42,49 @@ SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
 def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> Starlette:
     """The application; see ``Guard`` for who may ask."""
 
-    def may_wait(request: Request) -> dict[str, bool]:
-        # A script of ours asks for what a page has said to be on its way.
-        return {"patient": request.headers.get("hx-request") == "true"}
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        yield
+        site.close()  # a server that is told to end is killed after this
 
+    return Starlette(
+        routes=[
+            *_sweep_routes(site),
+            *_trial_routes(site),
+            *_computed_routes(site),
+            *_sql_routes(site),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ],
+        middleware=[
+            Middleware(Guard, hosts=hosts, token=token),
+            Middleware(GZipMiddleware, minimum_size=2_000),
+        ],
+        lifespan=lifespan,
+        exception_handlers=_errors(site),
+    )
+
+
+def _sweep_routes(site: Site) -> list[Route]:
+    async def events(request: Request) -> Response:
+        sweep_id = request.path_params["sweep"]
+        await run_in_threadpool(sweep.require_sweep, site, sweep_id)
+        # Nothing between us and the browser may hold the stream back.
+        plain = {"x-accel-buffering": "no"}
+        return StreamingResponse(
+            sweep.sweep_events(site, sweep_id), media_type="text/event-stream", headers=plain
+        )
+
+    page = partial(_page, site)
+    one = page(lambda r: sweep.sweep_page(site, r.path_params["sweep"]))
+    return [
+        Route("/", page(lambda _: RedirectResponse(sweep.home(site)))),
+        Route("/sweeps", page(lambda _: sweep.sweeps_page(site))),
+        Route("/sweeps/{sweep:path}/events", events),
+        Route("/sweeps/{sweep:path}", one),
+    ]
+
+
+def _trial_routes(site: Site) -> list[Route]:
     def export(request: Request) -> Response:
         site.catalogue.refresh()
         form = request.path_params["form"]
@@ -62,78 +101,44 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
         return PlainTextResponse(text, headers=SEALED)
 
     def data(request: Request) -> Response:
-        return JSONResponse(
-            trial.replay_json(site, request.path_params["trial"], request.query_params)
-        )
+        named = request.path_params["trial"]
+        return JSONResponse(trial.replay_json(site, named, request.query_params))
 
-    async def events(request: Request) -> Response:
-        sweep_id = request.path_params["sweep"]
-        await run_in_threadpool(sweep.require_sweep, site, sweep_id)
-        # Nothing between us and the browser may hold the stream back.
-        plain = {"x-accel-buffering": "no"}
-        return StreamingResponse(
-            sweep.sweep_events(site, sweep_id), media_type="text/event-stream", headers=plain
-        )
+    def of_trial(render: Callable[[Site, str, Mapping[str, str]], str]) -> Callable[..., Response]:
+        return _page(site, lambda r: render(site, r.path_params["trial"], r.query_params))
 
-    @asynccontextmanager
-    async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        yield
-        site.close()  # a server that is told to end is killed after this
+    listing = _page(site, lambda r: trials.trials_page(site, r.query_params, **_patience(r)))
+    return [
+        Route("/trials", listing),
+        Route("/trials.{form}", export),
+        Route("/trials/{trial:path}", of_trial(trial.trial_page)),
+        Route("/decisions/{trial:path}", of_trial(trial.decision_fragment)),
+        Route("/data/{trial:path}", data),
+        Route("/raw/{trial:path}", raw),
+    ]
+
+
+def _computed_routes(site: Site) -> list[Route]:
+    def table(request: Request) -> str:
+        name, asked = request.path_params["name"], request.query_params
+        return tables.table_page(site, name, asked, **_patience(request))
+
+    def patient(render: Callable[..., str]) -> Callable[[Request], Response]:
+        return _page(site, lambda r: render(site, r.query_params, **_patience(r)))
 
     page = partial(_page, site)
-    of_trial = "{trial:path}"
-    return Starlette(
-        routes=[
-            Route("/", page(lambda _: RedirectResponse(sweep.home(site)))),
-            Route("/sweeps", page(lambda _: sweep.sweeps_page(site))),
-            Route("/sweeps/{sweep:path}/events", events),
-            Route(
-                "/sweeps/{sweep:path}",
-                page(lambda r: sweep.sweep_page(site, r.path_params["sweep"])),
-            ),
-            Route(
-                "/trials", page(lambda r: trials.trials_page(site, r.query_params, **may_wait(r)))
-            ),
-            Route("/trials.{form}", export),
-            Route(
-                f"/trials/{of_trial}",
-                page(lambda r: trial.trial_page(site, r.path_params["trial"], r.query_params)),
-            ),
-            Route(
-                f"/decisions/{of_trial}",
-                page(
-                    lambda r: trial.decision_fragment(site, r.path_params["trial"], r.query_params)
-                ),
-            ),
-            Route(f"/data/{of_trial}", data),
-            Route(f"/raw/{of_trial}", raw),
-            *_sql_routes(site),
-            Route("/tables", page(lambda _: tables.tables_page(site))),
-            Route(
-                "/tables/{name}",
-                page(
-                    lambda r: tables.table_page(
-                        site, r.path_params["name"], r.query_params, **may_wait(r)
-                    )
-                ),
-            ),
-            Route(
-                "/ablations",
-                page(lambda r: ablations.ablations_page(site, r.query_params, **may_wait(r))),
-            ),
-            Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),
-            Route(
-                "/humans", page(lambda r: humans.humans_page(site, r.query_params, **may_wait(r)))
-            ),
-            Mount("/static", StaticFiles(directory=STATIC)),
-        ],
-        middleware=[
-            Middleware(Guard, hosts=hosts, token=token),
-            Middleware(GZipMiddleware, minimum_size=2_000),
-        ],
-        lifespan=lifespan,
-        exception_handlers=_errors(site),
-    )
+    return [
+        Route("/tables", page(lambda _: tables.tables_page(site))),
+        Route("/tables/{name}", page(table)),
+        Route("/ablations", patient(ablations.ablations_page)),
+        Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),
+        Route("/humans", patient(humans.humans_page)),
+    ]
+
+
+def _patience(request: Request) -> dict[str, bool]:
+    """A script of ours asks for what a page has said to be on its way."""
+    return {"patient": request.headers.get("hx-request") == "true"}
 
 
 def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[Request], Response]:
