@@ -145,7 +145,11 @@ def view(
                 f"the explorer needs {exc.name}: pip install 'merge-runner[view]'"
             ) from exc
 
-        serve(db, port, bind, print_out)
+        def told(address: str) -> None:
+            print_out(address)
+            say("open this address in a browser; Ctrl-C ends the explorer")
+
+        serve(db, port, bind, told)
         return
     from analysis.explorer.export import export_folder, export_page
 

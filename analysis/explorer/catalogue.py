@@ -34,8 +34,9 @@ CREATE TABLE listed (
     trial_id VARCHAR, spec_hash VARCHAR, source VARCHAR, model VARCHAR, variant VARCHAR,
     condition VARCHAR, rep INTEGER, pair VARCHAR, status VARCHAR, merged_first VARCHAR,
     outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE, error VARCHAR, scripted BOOLEAN,
-    gap_m DOUBLE, rmse_mps DOUBLE, joint BOOLEAN, decisions BIGINT, invalid BIGINT,
-    fallbacks BIGINT, attempts BIGINT, cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[]
+    time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE, joint BOOLEAN, decisions BIGINT,
+    invalid BIGINT, fallbacks BIGINT, attempts BIGINT, cost_usd DOUBLE, left_mps FLOAT[],
+    right_mps FLOAT[]
 );
 CREATE TABLE members (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
@@ -99,9 +100,9 @@ SELECT trials.trial_id, trials.spec_hash, source,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
         WHEN fallbacks > 0 THEN 'fallbacks' WHEN invalid > 0 THEN 'invalid'
         ELSE 'all valid' END AS validity,
-    gap_m, rmse_mps, joint, coalesce(decisions, 0) AS decisions, coalesce(invalid, 0) AS invalid,
-    coalesce(fallbacks, 0) AS fallbacks, coalesce(attempts, 0) AS attempts, cost_usd,
-    left_mps, right_mps
+    time_to_merge_s, gap_m, rmse_mps, joint, coalesce(decisions, 0) AS decisions,
+    coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
+    coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps
 FROM trials
 JOIN trial_metrics USING (trial_id, spec_hash)
 LEFT JOIN decided USING (trial_id, spec_hash)

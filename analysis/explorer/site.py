@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from analysis.explorer.links import Links
 from analysis.explorer.sandbox import Sandbox
 from analysis.explorer.texts import visible
 from merge_runner.errors import MergeRunnerError
+from merge_runner.places import DEFAULT_DB
 
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {
@@ -38,6 +40,8 @@ class Site:
     db: Path
     at: Links = field(default_factory=Links)
     static: bool = False
+    program: str = "merge-runner"
+    """What to type to run this program."""
     shared: dict[str, object] = field(default_factory=dict)
     """What else all templates see."""
     closing: bool = False
@@ -58,6 +62,7 @@ class Site:
         self._environment.globals.update(
             at=self.at,
             pages={name: page for name, page in PAGES.items() if self.at.to(page)},
+            share=self.share,
             shell="static.html" if self.static else "base.html",
             static=self.static,
             study=self.db.name if self.static else str(self.db),
@@ -79,6 +84,11 @@ class Site:
     def beginning(self) -> bool:
         """Whether the trials are being read for the first time."""
         return self._first_reading is not None and self._first_reading.is_alive()
+
+    def share(self, *options: str) -> str:
+        """The command that writes what is shown here as files."""
+        db = () if self.db == DEFAULT_DB else ("--db", str(self.db))
+        return shlex.join([self.program, "view", *db, *options])
 
     def render(self, template: str, **values: object) -> str:
         """A page, or a part of one."""

@@ -77,8 +77,9 @@ def outcome_text(row: Row) -> str:
     if first is None:
         return f"The trial ended after {end}; no vehicle merged first."
     other = "right" if first == "left" else "left"
+    when = "" if row["time_to_merge_s"] is None else f", after {row['time_to_merge_s']:.1f} s"
     gap = "" if row["gap_m"] is None else f", with a gap of {row['gap_m']:.1f} m"
-    return f"The {other} vehicle yielded: the {first} one reached the merge point first{gap}."
+    return f"The {other} vehicle yielded: the {first} one reached the merge point first{when}{gap}."
 
 
 def facts(row: Row) -> list[str]:
@@ -131,6 +132,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
         "label": label(row),
         "status": row["status"],
         "end": trial.end_s,
+        "every": 1 / trial.scenario.prompt_rate_hz,
         "sides": {
             side: {
                 "t": _rounded(samples["time_s"], 3),

@@ -1,10 +1,11 @@
-"""A page follows a sweep that another process plays."""
+"""A page follows a sweep that another process plays, and says when nobody answers it any more."""
 
 from __future__ import annotations
 
 import subprocess
 import time
 
+import pytest
 from conftest import served
 from harness import PROGRAM, environment
 from playwright.sync_api import expect
@@ -33,4 +34,21 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulato
         assert page.evaluate("window.stayed")
         page.get_by_role("link", name="Trials").first.click()
         expect(page.locator("tbody tr")).to_have_count(2)
+        page.goto("about:blank")  # it asks for nothing more before the server ends
     assert sweep.wait() == 0
+
+
+@pytest.mark.parametrize("address", ["/trials", "/trials/emulator/baseline/N_0_0/rep01"])
+def test_a_page_says_when_nobody_answers_it_any_more(browser, study, address):
+    context = browser.new_context()
+    page = context.new_page()
+    with served(study) as site:
+        page.goto(f"{site}{address}")
+        expect(page.locator("footer")).to_contain_text(f"view --db {study} --export")
+        expect(page.locator("#lost")).to_be_hidden()
+    if address == "/trials":
+        page.get_by_label("outcome").select_option("collided")
+    else:
+        page.keyboard.press("]")
+    expect(page.locator("#lost")).to_contain_text("merge-runner view has ended")
+    context.close()

@@ -88,6 +88,37 @@ def test_brackets_go_through_the_decisions_and_escape_goes_back(page):
     page.wait_for_url("**/trials")
 
 
+def test_escape_leads_back_to_the_list_as_it_was_filtered(page):
+    page.goto("/trials?condition=N_0_0&sort=-end")
+    page.locator("tbody a").first.click()
+    page.locator("a.decision.now").first.click()
+    expect(page.locator(".decision-panel")).to_be_visible()
+    page.reload()
+    expect(page.locator("a.decision[aria-current]")).to_have_count(1)
+    page.keyboard.press("Escape")
+    page.keyboard.press("Escape")
+    page.wait_for_url("**/trials?condition=N_0_0&sort=-end")
+
+
+def test_brackets_begin_where_the_replay_was_stopped(page):
+    page.goto(f"{TRIAL}?t=3.4")
+    driven = page.locator("a.decision.now")
+    assert [link.get_attribute("data-n") for link in driven.all()] == ["3", "3"]
+    page.keyboard.press("[")
+    current = page.locator("a.decision[aria-current]")
+    expect(current).to_have_attribute("aria-label", re.compile("right, decision 3"))
+    page.locator("#scrub").fill("1.5")
+    page.keyboard.press("]")
+    expect(current).to_have_attribute("aria-label", re.compile("left, decision 2"))
+    expect(driven.first).to_have_attribute("data-n", "2")
+
+
+def test_the_rows_of_a_trials_tables_are_no_list(page):
+    page.goto(TRIAL)
+    page.keyboard.press("j")
+    expect(page.locator("tr.chosen")).to_have_count(0)
+
+
 def test_an_address_brings_everything_back(page):
     other = "emulator/baseline/N_0_0/rep02"
     page.goto(f"{TRIAL}?t=4.2&side=right&decision=3&compare={other}")

@@ -1,10 +1,17 @@
 "use strict";
 // The replay of a trial: track, charts, ribbons and clock, all of one moment.
 // Where a decision's panel and another trial's data come from; a page without a server has its own.
-window.explorer ??= {
-  panel: async (link) => (await fetch(link.dataset.panel)).text(),
-  data: async (option) => (await fetch(option.dataset.url)).json(),
-};
+window.explorer ??= (() => {
+  const answer = async (address) => {
+    const reply = await fetch(address);
+    if (!reply.ok) throw new Error(`${reply.status}`);
+    return reply;
+  };
+  return {
+    panel: async (link) => (await answer(link.dataset.panel)).text(),
+    data: async (option) => (await answer(option.dataset.url)).json(),
+  };
+})();
 window.startReplay = () => {
   const holder = document.getElementById("replay-data");
   if (!holder) return;
@@ -17,6 +24,8 @@ window.startReplay = () => {
   const times = (trial.sides.left ?? trial.sides.right).t;
   const begin = times[0];
   let now = begin, playing = false, speed = 1, last = 0, ghost = null, selected = null;
+
+  const lost = () => { at("lost").hidden = false; };
 
   // ---- one moment of a trial
 
@@ -154,9 +163,9 @@ window.startReplay = () => {
     const box = charts[0].over.getBoundingClientRect(), base = ribbons.getBoundingClientRect();
     const offset = box.left - base.left, scale = (t) => charts[0].valToPos(t, "x");
     for (const link of decisions) {
-      link.parentElement.style.left = `${offset + scale(Number(link.dataset.t))}px`;
-      const until = Math.min(Number(link.dataset.t) + 1, trial.end);
-      link.parentElement.style.width = `${Math.max(14, scale(until) - scale(Number(link.dataset.t)) - 2)}px`;
+      const from = Number(link.dataset.t), until = Math.min(from + trial.every, trial.end);
+      link.parentElement.style.left = `${offset + scale(from)}px`;
+      link.parentElement.style.width = `${Math.max(14, scale(until) - scale(from) - 2)}px`;
     }
     ribbons.classList.add("placed");
   };
@@ -169,14 +178,24 @@ window.startReplay = () => {
     if (jump) seek(Number(link.dataset.t));
     const panel = document.querySelector("#decision .decision-panel");
     if (panel?.dataset.side !== link.dataset.side || panel?.dataset.n !== link.dataset.n) {
-      explorer.panel(link).then((html) => { if (selected === link) at("decision").innerHTML = html; });
+      explorer.panel(link).then((html) => {
+        at("lost").hidden = true;
+        if (selected === link) at("decision").innerHTML = html;
+      }, lost);
     }
     remember(push);
   };
+  const begins = (link) => Number(link.dataset.t);
+  const drives = (link) => begins(link) <= now + 1e-9 && now < begins(link) + trial.every - 1e-9;
+  // From the one that is shown, or where the clock has left it, from the clock.
   const step = (by) => {
-    const from = selected ? ordered.indexOf(selected) : by > 0 ? -1 : ordered.length;
-    const next = ordered[Math.min(Math.max(from + by, 0), ordered.length - 1)];
-    if (next) select(next);
+    let next = ordered.indexOf(selected) + by;
+    if (!selected || !drives(selected)) {
+      next = by > 0 ? ordered.findIndex((link) => begins(link) >= now - 1e-9)
+        : ordered.findLastIndex((link) => begins(link) <= now + 1e-9);
+      if (next < 0) next = by > 0 ? ordered.length - 1 : 0;
+    }
+    if (ordered.length) select(ordered[Math.min(Math.max(next, 0), ordered.length - 1)]);
   };
 
   // ---- the clock
@@ -193,6 +212,7 @@ window.startReplay = () => {
     const told = ["left", "right"].filter((side) => trial.sides[side]).map((side) =>
       `${side} ${sampled(trial.sides[side].t, trial.sides[side].v, now).toFixed(1)} m/s at ${sampled(trial.sides[side].t, trial.sides[side].x, now).toFixed(1)} m`);
     at("now").textContent = told.join("; ");
+    for (const link of decisions) link.classList.toggle("now", drives(link));
     const nearest = times.reduce((best, t, i) => (Math.abs(t - now) < Math.abs(times[best] - now) ? i : best), 0);
     for (const plot of charts) {
       plot.playhead.style.transform = `translateX(${plot.valToPos(now, "x")}px)`;
@@ -256,8 +276,8 @@ window.startReplay = () => {
   const compare = async (id, push) => {
     const chooser = at("compare");
     const option = [...chooser.options].find((o) => o.value === id && o.dataset.url);
-    ghost = option ? await explorer.data(option) : null;
-    chooser.value = option ? id : "";
+    ghost = option ? await explorer.data(option).catch(lost) ?? null : null;
+    chooser.value = ghost ? id : "";
     at("ghost-key").hidden = !ghost;
     at("ghost-key").textContent = ghost ? `dashed: ${ghost.label}. ${ghost.outcome}` : "";
     drawCharts();
@@ -284,6 +304,11 @@ window.startReplay = () => {
       select(link);
     });
   }
+  // The list that led here, as it was filtered.
+  const list = () => {
+    const from = document.referrer && new URL(document.referrer);
+    return from && from.origin === location.origin && !from.pathname.startsWith("/trials/") ? from.href : at("trial").dataset.back;
+  };
   addEventListener("popstate", recall);
   let width = 0;
   new ResizeObserver(() => {
@@ -307,7 +332,7 @@ window.startReplay = () => {
     else if (event.key === "c") at("compare").focus();
     else if (/^[1-5]$/.test(event.key)) setSpeed(SPEEDS[Number(event.key) - 1]);
     else if (event.key === "Escape" && selected) { select(null); remember(true); at("decision").replaceChildren(); }
-    else if (event.key === "Escape" && at("trial").dataset.list) location.href = at("trial").dataset.list;
+    else if (event.key === "Escape") location.href = list();
     else return;
     event.preventDefault();
   });
