@@ -30,30 +30,37 @@ ORDER BY one.trial_id, one.spec_hash, base.spec_hash
 """
 # What is said of each trial. Texts and prompts stay in the database.
 LISTED = """
+CREATE SEQUENCE numbers;
 CREATE TABLE listed (
-    trial_id VARCHAR, spec_hash VARCHAR, source VARCHAR, model VARCHAR, variant VARCHAR,
-    condition VARCHAR, rep INTEGER, pair VARCHAR, status VARCHAR, merged_first VARCHAR,
-    outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE, error VARCHAR, scripted BOOLEAN,
-    time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE, joint BOOLEAN, decisions BIGINT,
-    invalid BIGINT, fallbacks BIGINT, attempts BIGINT, cost_usd DOUBLE, left_mps FLOAT[],
-    right_mps FLOAT[]
+    number INTEGER DEFAULT nextval('numbers'), trial_id VARCHAR, spec_hash VARCHAR,
+    source VARCHAR, model VARCHAR, variant VARCHAR, condition VARCHAR, rep INTEGER, pair VARCHAR,
+    status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
+    error VARCHAR, scripted BOOLEAN, time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
+    joint BOOLEAN, decisions BIGINT, invalid BIGINT, fallbacks BIGINT, attempts BIGINT,
+    cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[]
 );
-CREATE TABLE members (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
+CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
     fallbacks BIGINT);
 CREATE TABLE paid (trial_id VARCHAR, spec_hash VARCHAR, attempts BIGINT, cost_usd DOUBLE);
 CREATE TABLE tried (trial_id VARCHAR, spec_hash VARCHAR, requested VARCHAR, served VARCHAR,
     answered BOOLEAN, outcome VARCHAR, unpriced BIGINT, times BIGINT);
 CREATE TABLE flaws (trial_id VARCHAR, spec_hash VARCHAR, failure VARCHAR, times BIGINT);
--- What went wrong in a trial, and how often; of an error the words before its particulars.
-CREATE VIEW causes AS
-SELECT trial_id, spec_hash, 'trial: ' || left(regexp_replace(regexp_replace(split_part(
+"""
+# What each sweep has of them; what went wrong in a trial, and how often. Of an error stand the
+# words before its particulars.
+GROUPED = """
+CREATE OR REPLACE TABLE members AS
+    SELECT sweep, number FROM planned JOIN listed USING (trial_id, spec_hash);
+CREATE OR REPLACE TABLE causes AS
+SELECT number, 'trial: ' || left(regexp_replace(regexp_replace(split_part(
         regexp_replace(coalesce(error, 'no reason is known'), '^(left|right): ', ''), ' (', 1),
         '[0-9a-f]{16,}', '…', 'g'), '(^| )[0-9]+', '\\1…', 'g'), 70) AS cause, 1 AS times
 FROM listed WHERE status = 'failed'
-UNION ALL SELECT trial_id, spec_hash, 'plan: ' || failure, times FROM flaws
-UNION ALL SELECT trial_id, spec_hash, 'attempt: ' || outcome, sum(times)
-FROM tried WHERE outcome <> 'ok' GROUP BY ALL;
+UNION ALL SELECT number, 'plan: ' || failure, times
+FROM flaws JOIN listed USING (trial_id, spec_hash)
+UNION ALL SELECT number, 'attempt: ' || tried.outcome, sum(times)::BIGINT
+FROM tried JOIN listed USING (trial_id, spec_hash) WHERE tried.outcome <> 'ok' GROUP BY ALL;
 """
 # A failed trial may be played anew, and a file may be put in the place of another.
 FORGET = """
@@ -63,8 +70,8 @@ DELETE FROM memory.tried WHERE (trial_id, spec_hash) NOT IN
     (SELECT (trial_id, spec_hash) FROM memory.listed);
 DELETE FROM memory.flaws WHERE (trial_id, spec_hash) NOT IN
     (SELECT (trial_id, spec_hash) FROM memory.listed);
-DELETE FROM memory.members;
-INSERT INTO memory.members SELECT DISTINCT * FROM sweep_trials;
+DELETE FROM memory.planned;
+INSERT INTO memory.planned SELECT DISTINCT * FROM sweep_trials;
 DELETE FROM memory.sweeps;
 INSERT INTO memory.sweeps BY NAME FROM sweeps;
 """
@@ -130,7 +137,7 @@ SORTS = {
     "invalid": "invalid",
     "cost": "cost_usd",
 }
-EXPORTED = "* EXCLUDE (left_mps, right_mps)"
+EXPORTED = "* EXCLUDE (number, left_mps, right_mps)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +163,7 @@ class Filter:
         for name in FACETS:
             if (value := getattr(self, name)) and name != leave_out:
                 parts.append(
-                    f"(trial_id, spec_hash) IN (SELECT (trial_id, spec_hash) FROM {SEVERAL[name]} "  # noqa: S608 # constants
-                    f"WHERE {name} = ?)"
+                    f"number IN (SELECT number FROM {SEVERAL[name]} WHERE {name} = ?)"  # noqa: S608 # constants
                     if name in SEVERAL
                     else f"{name} = ?"
                 )
@@ -220,38 +226,25 @@ class Catalogue:
             self._reading(FORGET)
             while self._reading(TAKE):
                 self._connection.execute(LIST)
+            self._connection.execute(GROUPED)
             self._stamp = stamp
             return True
 
     def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
         """Each facet's values with how many trials they would leave, the other facets as wanted."""
         found: dict[str, list[tuple[str, int]]] = {name: [] for name in FACETS}
-        own = [name for name in FACETS if name not in SEVERAL]
-        # Those of which no value is chosen look at the same trials.
-        alike = [name for name in own if not getattr(wanted, name)]
-        for names in (alike, *([name] for name in own if name not in alike)):
-            for name, value, count in self._counts(names, wanted) if names else ():
-                found[name].append((value, count))
-        for name, table in SEVERAL.items():
-            where, values = wanted.where(leave_out=name)
-            found[name] = self._rows(
-                f"SELECT {name}, count(*) FROM listed JOIN {table} USING (trial_id, spec_hash) "  # noqa: S608 # constants
-                f"WHERE {where} AND {name} IS NOT NULL GROUP BY ALL ORDER BY ALL",
-                values,
+        counts, values = [], list[Any]()
+        for name in FACETS:
+            where, wants = wanted.where(leave_out=name)
+            table = f"listed JOIN {SEVERAL[name]} USING (number)" if name in SEVERAL else "listed"
+            counts.append(
+                f"SELECT '{name}', {name} AS value, count(*) FROM {table} "  # noqa: S608 # constants
+                f"WHERE {where} AND value IS NOT NULL GROUP BY ALL"
             )
+            values += wants
+        for name, value, count in self._rows(f"{' UNION ALL '.join(counts)} ORDER BY ALL", values):
+            found[name].append((value, count))
         return found
-
-    def _counts(self, names: list[str], wanted: Filter) -> list[tuple[str, str, int]]:
-        """(facet, value, trials) of facets for which the same trials count."""
-        where, values = wanted.where(leave_out=names[0])
-        cases = " ".join(f"WHEN grouping({name}) = 0 THEN '{name}'" for name in names)
-        sets = ", ".join(f"({name})" for name in names)
-        return self._rows(
-            f"SELECT CASE {cases} END AS facet, coalesce({', '.join(names)}) AS value, count(*) "  # noqa: S608 # constants
-            f"FROM listed WHERE {where} GROUP BY GROUPING SETS ({sets}) "
-            "HAVING value IS NOT NULL ORDER BY ALL",
-            values,
-        )
 
     def totals(self, wanted: Filter) -> Totals:
         """What the trials of a filter come to."""
@@ -268,9 +261,11 @@ class Catalogue:
     def page(self, wanted: Filter, sort: str, number: int) -> list[dict[str, Any]]:
         """The trials of one page, counted from 1; ``-gap`` sorts the largest gap first."""
         where, values = wanted.where()
+        # The speeds of the page's trials alone are taken up.
+        order = order_by(sort)
         return self._records(
-            f"SELECT * FROM listed WHERE {where} ORDER BY {order_by(sort)} "  # noqa: S608 # constants
-            f"LIMIT {PAGE} OFFSET ?",
+            f"SELECT * FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
+            f"ORDER BY {order} LIMIT {PAGE} OFFSET ?) USING (number) ORDER BY {order}",
             [*values, PAGE * (number - 1)],
         )
 

@@ -15,14 +15,14 @@ from merge_runner.audit.expected import ModelFacts
 from merge_runner.progress_file import Standing, read_standing
 
 Row = dict[str, Any]
-OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (trial_id, spec_hash)"
+OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, exit_code, config::VARCHAR AS config,
     coalesce(trials, 0) AS trials, coalesce(failed, 0) AS failed, coalesce(cost_usd, 0) AS cost_usd
 FROM sweeps LEFT JOIN (
     SELECT sweep AS sweep_id, count(*) AS trials, count(*) FILTER (status = 'failed') AS failed,
         sum(cost_usd) AS cost_usd
-    FROM members JOIN listed USING (trial_id, spec_hash) GROUP BY ALL
+    FROM members JOIN listed USING (number) GROUP BY ALL
 ) USING (sweep_id)
 ORDER BY started_at DESC, sweep_id DESC
 """
@@ -33,11 +33,12 @@ SELECT coalesce(variant, '') AS variant, condition,
     sum(invalid)::BIGINT AS invalid, sum(fallbacks)::BIGINT AS fallbacks
 FROM listed {OF_SWEEP} GROUP BY ALL ORDER BY ALL
 """  # noqa: S608 # constants
-TRIED = f"""
+TRIED = """
 SELECT requested, served, answered, outcome, sum(times)::BIGINT AS times,
     sum(unpriced)::BIGINT AS unpriced
-FROM tried {OF_SWEEP} GROUP BY ALL ORDER BY ALL
-"""  # noqa: S608 # constants
+FROM tried SEMI JOIN (FROM planned WHERE sweep = ?) USING (trial_id, spec_hash)
+GROUP BY ALL ORDER BY ALL
+"""
 CAUSES = f"""
 SELECT cause, count(*) AS trials, sum(times)::BIGINT AS times
 FROM causes {OF_SWEEP} GROUP BY ALL ORDER BY trials DESC, cause

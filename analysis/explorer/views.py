@@ -29,16 +29,29 @@ BLOCK_MEANINGS = {
 }
 
 
-def sparkline(row: Row, width: int = 96, height: int = 22) -> dict[str, str]:
-    """The speeds of both vehicles as points of two lines, 6 to 14 m/s from bottom to top."""
+def sparkline(row: Row) -> dict[str, str]:
+    """The speeds of both vehicles: points of two lines, and in words.
+
+    The lines are 96 wide and 22 high, 6 m/s at the bottom and 14 at the top.
+    """
+    left, right = row["left_mps"], row["right_mps"]
     return {
-        side: " ".join(
-            f"{width * i / max(len(speeds) - 1, 1):.1f},"
-            f"{height * (1 - (min(max(v, 6.0), 14.0) - 6) / 8):.1f}"
-            for i, v in enumerate(speeds)
-        )
-        for side, speeds in (("left", row["left_mps"] or []), ("right", row["right_mps"] or []))
+        "left": _spark_points(left),
+        "right": _spark_points(right),
+        "words": f"speed of the left vehicle {min(left):.1f} to {max(left):.1f} m/s, "
+        f"of the right one {min(right):.1f} to {max(right):.1f} m/s",
     }
+
+
+def _spark_points(speeds: Sequence[float]) -> str:
+    step = 96 / max(len(speeds) - 1, 1)
+    heights = [38.5 - 2.75 * speed for speed in speeds]
+    return " ".join(
+        [
+            f"{step * i:.0f},{0.0 if y < 0 else 22.0 if y > 22 else y:.1f}"
+            for i, y in enumerate(heights)
+        ]
+    )
 
 
 def condition_text(name: str) -> str:
