@@ -251,12 +251,14 @@ class Sweep:
         started_at = datetime.now(UTC).replace(tzinfo=None)
         sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
         commit, dirty = git_state()
+        config = self._plan.config(self._endpoints)
+        config["max_cost_usd"] = self._options.limits.max_cost_usd
         self._store.begin_sweep(
             SweepRow(
                 sweep_id=sweep_id,
                 name=self._plan.name,
                 started_at=started_at,
-                config=canonical_json(self._plan.config(self._endpoints)),
+                config=canonical_json(config),
                 git_commit=commit,
                 git_dirty=dirty,
                 versions=canonical_json(versions()),

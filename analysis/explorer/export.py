@@ -152,16 +152,24 @@ def _trial(site: Site, row: Row, beside: list[Row], blocks: Blocks) -> dict[str,
 
 
 def _listing(site: Site, rows: list[Row]) -> str:
+    """The list of trials, whose script filters them by what stands beside each."""
+    of_row = [{name: [row[name]] for name in FACETS if name in row} for row in rows]
+    for name, table in SEVERAL.items():
+        pairs = site.catalogue.ask(f"SELECT number, {name} AS value FROM {table} ORDER BY ALL")  # noqa: S608 # constants
+        values: dict[int, list[str]] = {}
+        for pair in pairs:
+            values.setdefault(pair["number"], []).append(pair["value"])
+        for row, of in zip(rows, of_row, strict=True):
+            of[name] = values.get(row["number"], [])
     facets = {
-        name: sorted(Counter(row[name] for row in rows if row[name] is not None).items())
+        name: sorted(Counter(v for of in of_row for v in of[name] if v is not None).items())
         for name in FACETS
-        if name not in SEVERAL
     }
     return site.render(
         "listing.html",
         here="trials",
         facets=facets,
-        rows=rows,
+        rows=[row | {"facets": of} for row, of in zip(rows, of_row, strict=True)],
         sorts={},
         sort="",
         kept={},

@@ -62,6 +62,7 @@ class Config(BaseModel):
     repetitions: dict[str, int] = {}
     conditions: tuple[str, ...] = ()
     sample_set: int = 0
+    max_cost_usd: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

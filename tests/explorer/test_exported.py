@@ -28,8 +28,8 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     page.context.set_offline(True)
     page.goto(f"file://{exported}/index.html")
     expect(page.locator(".sweep-verdict")).to_contain_text("Finished")
-    page.get_by_role("link", name="Trials", exact=True).click()
-    page.get_by_label("outcome").select_option("collided")
+    page.get_by_role("link", name="collisions").click()
+    expect(page.get_by_label("outcome")).to_have_value("collided")
     expect(page.locator("tbody tr:visible")).to_have_count(1)
     page.locator("tbody tr:visible a").click()
     expect(page.get_by_text("The vehicles collided")).to_be_visible()
@@ -45,6 +45,8 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     expect(page.locator(".decision-panel h2")).to_contain_text("decision 1 at 1.0 s")
     page.locator("#compare").select_option(index=1)
     expect(page.locator("#ghost-key")).to_contain_text("dashed")
+    page.goto(f"file://{exported}/trials.html?sweep=hostile")
+    expect(page.locator("tbody tr:visible")).to_have_count(1)
 
 
 def test_what_a_model_wrote_is_text_there_too(page, exported):

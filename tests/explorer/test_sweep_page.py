@@ -32,6 +32,7 @@ CONFIG = {
     "models": {"o3": {"id": "o3", "provider": "openai", "aliases": ["o3-alias"]}},
     "repetitions": {"baseline": 3},
     "conditions": list(CONDITIONS),
+    "max_cost_usd": 9.0,
 }
 TROUBLE = (
     Said(("refusal",), "refusal"),
@@ -101,7 +102,7 @@ def test_the_page_has_the_numbers_of_the_database(written):
         f"refusals 1 of {attempts} attempts",
         f"another model answered 1 of {sum(row[-1] for row in facts.served)} answers",
         "asked for: o3 → another (1 answers)",
-        "1 attempts of unknown cost are not in it",
+        "its runs could spend at most 9.00 USD; 1 attempts of unknown cost are not in it",
     ):
         assert said in text
     assert (facts.invalid, facts.fallbacks, len(facts.failed)) == (2, 2, 1)

@@ -80,6 +80,11 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         assert done.code == 0, done.err
         (calls,) = await sql(merge_runner, "select count(*) as n from calls")
         assert calls["n"] == server.requests, "nothing was paid for twice"
+        caps = await sql(
+            merge_runner,
+            "select (config->>'max_cost_usd')::double as cap from sweeps order by started_at",
+        )
+        assert [row["cap"] for row in caps] == [ROOM_FOR_SOME, ROOM_FOR_SOME, 50]
     assert done.summary["sweep_cost_usd"] == pytest.approx(bill.usd)
     assert done.summary["cache_cost_usd"] == pytest.approx(bill.usd)
     assert done.summary["set_aside_usd"] == 0

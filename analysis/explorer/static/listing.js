@@ -10,7 +10,7 @@
     let shown = 0;
     for (const row of rows) {
       row.hidden = !wanted.every(([name, value]) =>
-        name === "q" ? row.dataset.name.includes(value.toLowerCase()) : row.dataset[name] === value);
+        name === "q" ? row.dataset.name.includes(value.toLowerCase()) : row.dataset[name].split("\n").includes(value));
       shown += !row.hidden;
     }
     document.getElementById("listed").textContent = shown;
