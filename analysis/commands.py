@@ -6,14 +6,16 @@ Libraries are imported where they are used, so that the runner's commands start 
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from analysis.forms import TableFormat
-from analysis.human.commands import human_app
+from analysis.human.commands import INTERRUPTED, human_app
 from merge_runner.cli import DbOption, app, listed, main, print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
@@ -116,6 +118,15 @@ def _study(db: Path, models: str | None) -> Study:
     return Study(db, listed(models))
 
 
+def watched(things: Sequence[Any], name: str) -> Iterable[Any]:
+    """Show on a terminal how far a loop is."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    return track(things, name, console=console, transient=True, disable=not sys.stderr.isatty())
+
+
 @app.command()
 def view(
     port: Annotated[int, typer.Option(help="0: any free port.", min=0, max=65535)] = 8700,
@@ -156,7 +167,13 @@ def view(
     if single is not None and trials is None:
         raise UsageError("--single FILE.html needs --trials: name some, or all with '*'")
     wanted = listed(trials) or []
-    for path in export_folder(db, export, wanted) if export is not None else ():
-        say(f"wrote {path}")
-    for path in export_page(db, single, wanted) if single is not None else ():
-        say(f"wrote {path}")
+    try:
+        for path in export_folder(db, export, wanted, watched) if export is not None else ():
+            say(f"wrote {path}")
+        for path in export_page(db, single, wanted, watched) if single is not None else ():
+            say(f"wrote {path}")
+    except KeyboardInterrupt:
+        say("interrupted: run the same command again")
+        sys.exit(INTERRUPTED)
+    if export is not None:
+        say(f"open {export / 'index.html'}, or send the folder {export}")

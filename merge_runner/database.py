@@ -130,26 +130,30 @@ def _attached(
 
 
 @contextmanager
-def read_database(path: Path, instance: Instance = SHARED) -> Iterator[duckdb.DuckDBPyConnection]:
+def read_database(
+    path: Path, instance: Instance = SHARED, patience_s: float = PATIENCE_S
+) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open an existing database for reading, of this schema or an older one; raises UsageError."""
     if not path.is_file():
         raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
-    with _current(path, instance) as connection:
+    with _current(path, instance, patience_s) as connection:
         if connection is not None:
             yield connection
             return
     migrate(path)
-    with _current(path, instance) as connection:
+    with _current(path, instance, patience_s) as connection:
         assert connection is not None
         yield connection
 
 
 @contextmanager
-def _current(path: Path, instance: Instance) -> Iterator[duckdb.DuckDBPyConnection | None]:
+def _current(
+    path: Path, instance: Instance, patience_s: float
+) -> Iterator[duckdb.DuckDBPyConnection | None]:
     """The database for reading; None where its schema is older."""
     with (
         unreadable_is_usage(),
-        open_database(path, read_only=True, patience_s=PATIENCE_S, instance=instance) as connection,
+        open_database(path, read_only=True, patience_s=patience_s, instance=instance) as connection,
     ):
         older = schema_version(connection, path) < SCHEMA_VERSION
         yield None if older else connection

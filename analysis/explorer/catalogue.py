@@ -10,9 +10,9 @@ from typing import Any
 
 import duckdb
 
-from analysis.explorer.reading import reading
+from analysis.explorer.reading import PATIENCE_S, reading
 from merge_runner.database import SCHEMA, Instance
-from merge_runner.errors import UsageError
+from merge_runner.errors import StoreLocked, UsageError
 
 PAGE = 100
 # Two are equal where the same trials are listed: unlike a stamp, it stands when tables are kept.
@@ -62,10 +62,10 @@ FROM flaws JOIN listed USING (trial_id, spec_hash)
 UNION ALL SELECT number, 'attempt: ' || tried.outcome, sum(times)::BIGINT
 FROM tried JOIN listed USING (trial_id, spec_hash) WHERE tried.outcome <> 'ok' GROUP BY ALL;
 """
-# A failed trial may be played anew, and a file may be put in the place of another.
+# A failed trial may be played anew, and fail again; a file may be put in the place of another.
 FORGET = """
-DELETE FROM memory.listed WHERE (trial_id, spec_hash, status, end_time_s) NOT IN
-    (SELECT (trial_id, spec_hash, status, end_time_s) FROM trials);
+DELETE FROM memory.listed WHERE status = 'failed' OR (trial_id, spec_hash, status, end_time_s)
+    NOT IN (SELECT (trial_id, spec_hash, status, end_time_s) FROM trials);
 DELETE FROM memory.tried WHERE (trial_id, spec_hash) NOT IN
     (SELECT (trial_id, spec_hash) FROM memory.listed);
 DELETE FROM memory.flaws WHERE (trial_id, spec_hash) NOT IN
@@ -202,32 +202,46 @@ class Totals:
 
 @dataclass(slots=True)
 class Catalogue:
-    """All trials of a database. Threads take turns."""
+    """All trials of a database. Threads take turns.
+
+    ``held``: another program holds the database, and what is listed may be old.
+    """
 
     db: Path
+    held: bool = False
     _connection: duckdb.DuckDBPyConnection | None = None
     _instance: Instance = field(default_factory=Instance)
+    _file: int | None = None
+    """The file that is listed, and no other that took its place."""
     _stamp: tuple[int, ...] | None = None
+    """What was read last, wholly."""
     _lock: threading.RLock = field(default_factory=threading.RLock)
 
     def refresh(self) -> bool:
         """Take in what is new in the database; returns whether anything was.
 
         The file is opened for 2,000 trials at a time, so that a sweep can write in between.
-        Raises UsageError and StoreError.
+        Raises UsageError and StoreError, but not where another program holds what is listed.
         """
         with self._lock:
-            before, stamp = self._stamp, stamp_of(self.db)
-            if stamp == before:
+            stamp = stamp_of(self.db)
+            if stamp == self._stamp:
+                self.held = False
                 return False
-            if self._connection is None or before is None or stamp[0] != before[0]:
-                self._begin()
+            if self._connection is None or stamp[0] != self._file:
+                self._begin(stamp[0])
             assert self._connection is not None
-            self._reading(FORGET)
-            while self._reading(TAKE):
-                self._connection.execute(LIST)
+            try:
+                self._reading(FORGET)
+                while self._reading(TAKE):
+                    self._connection.execute(LIST)
+            except StoreLocked:
+                if self._stamp is None:
+                    raise
+                self.held = True
+                return False
             self._connection.execute(GROUPED)
-            self._stamp = stamp
+            self._stamp, self.held = stamp, False
             return True
 
     def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
@@ -307,8 +321,8 @@ class Catalogue:
     def state(self) -> State:
         """What is listed now, as a number of trials and a sum over their names and ends."""
         (row,) = self._rows(
-            "SELECT count(*), coalesce(sum(hash(trial_id, spec_hash, status, end_time_s)), 0) "
-            "FROM listed",
+            "SELECT count(*), coalesce(sum(hash(trial_id, spec_hash, status, end_time_s, error)), "
+            "0) FROM listed",
             [],
         )
         return int(row[0]), int(row[1])
@@ -333,19 +347,23 @@ class Catalogue:
                 chosen.write_parquet(str(path))
             return path.read_bytes()
 
-    def _begin(self) -> None:
+    def _begin(self, file: int) -> None:
         """Forget everything."""
         self._instance.drop()
         self._connection = self._instance.cursor()
         self._connection.execute(SCHEMA.read_text(encoding="utf-8"))
         self._connection.execute(LISTED)
+        self._file, self._stamp = file, None
 
     def _reading(self, sql: str) -> int:
         """Run statements on the database and ours; returns how many trials wait to be listed."""
-        self._stamp = None  # whatever fails here, begin anew
-        with reading(self.db, self._instance) as connection:
+        # Who found it held once does not wait again.
+        patience_s = 0.0 if self.held else PATIENCE_S
+        with reading(self.db, self._instance, patience_s) as connection:
+            file, self._file = self._file, None  # whatever fails here, begin anew
             connection.execute(sql)
             (waiting,) = connection.execute("SELECT count(*) FROM memory.trials").fetchall()
+            self._file = file
         count: int = waiting[0]
         return count
 

@@ -34,6 +34,8 @@ NAME = 200
 PLAN_TEXT = 200_000  # characters: a part of a plan of execution says little
 CELL_COSTS = 30  # bytes of a cell of the page, beside its text
 LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
+# What Python is told in their place.
+INFINITE = {"9999-12-31 23:59:59.999999": "infinity", "0001-01-01 00:00:00": "-infinity"}
 MEMORY = "needed more memory"  # the explorer says how much there was
 
 
@@ -195,7 +197,8 @@ def text_of(value: object) -> str | None:
         case bytes():
             return f"0x{value.hex()}"
         case datetime():
-            return value.isoformat(" ")
+            text = value.isoformat(" ")
+            return INFINITE.get(text, text)
         case list() | tuple() | dict():
             return json.dumps(_plain(value), ensure_ascii=False)
         case _:

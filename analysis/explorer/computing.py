@@ -66,9 +66,10 @@ class Child:
     """A process that computes; it ends with this one."""
 
     def __init__(self, db: Path) -> None:
-        # In a session of its own: an interrupt is for the server, which then ends it.
+        # In a session of its own: an interrupt is for the server, which then ends it. Not even a
+        # file of our modules' names in the working folder is run (-P).
         self._process = subprocess.Popen(  # noqa: S603 # our own program
-            [sys.executable, "-m", "analysis.explorer.numbers", str(db)],
+            [sys.executable, "-P", "-m", "analysis.explorer.numbers", str(db)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -86,7 +87,7 @@ class Child:
             line = self._process.stdout.readline()
         except (OSError, ValueError):
             line = ""
-        if not line:
+        if not line.endswith("\n"):
             code = self._process.wait()
             raise Ended(
                 f"the computation ended without an answer (exit code {code}); what it said stands "
@@ -133,18 +134,19 @@ class Computing:
                 self._jobs[request] = (made, time.monotonic())
             future, began = self._jobs[request]
         try:
-            result = future.result(timeout=wait_s)
+            failed = future.exception(timeout=wait_s)
         except TimeoutError:
             return Waiting(time.monotonic() - began)
-        except Failure as exc:
-            self._forget(request, future)
-            return Failed(str(exc))
         with self._lock:
+            if self._jobs.get(request, (None,))[0] is future:
+                del self._jobs[request]
+            if isinstance(failed, Failure):
+                return Failed(str(failed))
+            result = future.result()
             self._results.pop(request, None)
             self._results[request] = result
             while len(self._results) > REMEMBERED:
                 del self._results[next(iter(self._results))]
-        self._forget(request, future)
         return result
 
     def close(self) -> None:
@@ -153,11 +155,6 @@ class Computing:
         self._pool.shutdown(wait=False, cancel_futures=True)
         if self._computer is not None:
             self._computer.close()
-
-    def _forget(self, request: Request, future: Future[Result]) -> None:
-        with self._lock:
-            if request in self._jobs and self._jobs[request][0] is future:
-                del self._jobs[request]
 
     def _run(self, request: Request, state: State, since: float) -> Result:
         # A cell is counted in the state of its table, unless a later one is wanted.

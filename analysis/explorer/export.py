@@ -10,11 +10,12 @@ import re
 import tempfile
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 from markupsafe import Markup
 
@@ -31,7 +32,7 @@ from analysis.explorer.sweeps import list_sweeps
 from analysis.explorer.views import sparkline
 from analysis.tables import TABLES
 from merge_runner.errors import UsageError
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.places import PROJECT
 
 STATIC = Path(__file__).with_name("static")
 STYLES = ("vendor/uplot-1.6.32.min.css", "explorer.css")
@@ -43,8 +44,17 @@ _BLOCK = re.compile(r'<div class="block">.*?</div>', re.DOTALL)
 # Where a server would lead on, a file does not.
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 # What is taken for a secret wherever it stands, beside the values of this machine's keys.
-_KEYS = re.compile(r"\b(?:sk-[A-Za-z0-9_-]{16,}|AIza[A-Za-z0-9_-]{30,}|Bearer [A-Za-z0-9._-]{16,})")
+_KEYS = re.compile(
+    r"\b(?:sk-[A-Za-z0-9_-]{16,}|AIza[A-Za-z0-9_-]{30,}|Bearer [A-Za-z0-9._-]{16,}"
+    r"|gh[opsu]_[A-Za-z0-9]{30,}|github_pat_[A-Za-z0-9_]{30,}|hf_[A-Za-z0-9]{30,}"
+    r"|xox[abp]-[A-Za-z0-9-]{16,}|A[KS]IA[A-Z0-9]{16})"
+)
+_SECRET_NAMES = ("_KEY", "_TOKEN", "_SECRET", "_PASSWORD")
+# Whoever's home it is.
+_HOMES = re.compile(r"(?:/home|/Users|[A-Z]:\\Users)[/\\][\w.-]+[/\\]")
 SHORTEST_SECRET = 8
+# By this a page of ours is known.
+TITLE_END = " · merge-runner</title>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,37 +80,56 @@ class Blocks:
         return self.numbers.setdefault(block, len(self.numbers))
 
 
-def export_folder(db: Path, folder: Path, wanted: Sequence[str]) -> Iterator[Path]:
+Watch = Callable[[Sequence[Any], str], Iterable[Any]]
+"""Shows how far a loop is: gets what it goes through, and a name; gives the same to go through."""
+
+
+def unwatched(things: Sequence[Any], _: str) -> Iterable[Any]:
+    """Show nothing."""
+    return things
+
+
+def export_folder(
+    db: Path, folder: Path, wanted: Sequence[str], watch: Watch = unwatched
+) -> Iterator[Path]:
     """Write the list of trials and a page for each condition; yields the paths.
 
-    ``wanted`` are names of trials, in which * stands for anything; none wants all. Nothing is
-    written where a page holds a key or a path of this machine. Raises UsageError.
+    ``wanted`` are names of trials, in which * stands for anything; none wants all, and the pages of
+    the whole study. An earlier export in the folder goes. Nothing is written where a page holds a
+    key or a path of this machine. Raises UsageError.
     """
     with _opened(db, wanted) as (site, rows):
         pages = {site.at.to("trials"): _listing(site, rows)}
-        for condition in CONDITIONS:
-            if mine := [row for row in rows if row["condition"] == condition]:
-                pages[bundle_name(condition)] = bundle_page(site, mine, f"Trials of {condition}")
+        for condition in sorted({row["condition"] for row in rows}):
+            mine = [row for row in rows if row["condition"] == condition]
+            title = f"Trials of {condition}"
+            pages[bundle_name(condition)] = bundle_page(site, watch(mine, title), mine, title)
         if not wanted:
-            pages |= {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site)}
-    yield from _written(folder, {**pages, "index.html": _index(pages)})
+            pages |= {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site, watch)}
+        pages["index.html"] = _index(pages)
+        _refuse_secrets_of(site, pages)
+    _clear(folder, pages)
+    yield from _written(folder, pages)
 
 
-def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Iterator[Path]:
+def export_page(
+    db: Path, file: Path, wanted: Sequence[str], watch: Watch = unwatched
+) -> Iterator[Path]:
     """Write one page with the wanted trials; yields its path. Raises UsageError."""
     with _opened(db, wanted) as (site, rows):
-        page = bundle_page(site, rows, "Trials")
-    yield from _written(file.parent, {file.name: page})
+        pages = {file.name: bundle_page(site, watch(rows, "Trials"), rows, "Trials")}
+        _refuse_secrets_of(site, pages)
+    yield from _written(file.parent, pages)
 
 
-def _study(site: Site) -> Iterator[tuple[str, str]]:
+def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
     """The pages of the whole study: its sweeps, the newest first, and what is computed of it."""
     at = site.at
     for entry in list_sweeps(site.catalogue):
         yield at.sweep(entry.sweep_id), sweep_page(site, entry.sweep_id)
     yield at.to("sweeps"), sweeps_page(site)
     yield at.to("tables"), tables_page(site)
-    for name in TABLES:
+    for name in watch(list(TABLES), "Tables"):
         yield at.table(name), table_page(site, name, {})
     yield at.to("ablations"), ablations_page(site, {})
     yield at.to("humans"), humans_page(site, {})
@@ -113,10 +142,10 @@ def _index(pages: Mapping[str, str]) -> str:
     )
 
 
-def bundle_page(site: Site, rows: list[Row], name: str) -> str:
-    """A page with several trials, of which it shows one."""
+def bundle_page(site: Site, watched: Iterable[Row], rows: Sequence[Row], name: str) -> str:
+    """A page with several trials, of which it shows one; ``watched`` are the same rows."""
     blocks = Blocks()
-    trials = {site.at.data(row): _packed(_trial(site, row, rows, blocks)) for row in rows}
+    trials = {site.at.data(row): _packed(_trial(site, row, rows, blocks)) for row in watched}
     bundle = {"trials": trials, "blocks": _packed(list(blocks.numbers))}
     return site.render(
         "bundle.html",
@@ -128,7 +157,7 @@ def bundle_page(site: Site, rows: list[Row], name: str) -> str:
     )
 
 
-def _trial(site: Site, row: Row, beside: list[Row], blocks: Blocks) -> dict[str, object]:
+def _trial(site: Site, row: Row, beside: Sequence[Row], blocks: Blocks) -> dict[str, object]:
     """What the page needs of one trial."""
     trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
     found = read_decisions(site.db, row["trial_id"], row["spec_hash"])
@@ -145,7 +174,7 @@ def _trial(site: Site, row: Row, beside: list[Row], blocks: Blocks) -> dict[str,
         f"{side}/{number}": rendered(site, row, trial, decision)
         for (side, number), decision in found.items()
     }
-    _refuse_secrets(row["trial_id"], [html, *panels.values()])
+    _refuse_secrets(site, row["trial_id"], [html, *panels.values(), values["data"] or ""])
     data = json.loads(values["data"]) if values["data"] else None
     small = {at: blocks.without(panel) for at, panel in panels.items()}
     return {"html": html, "panels": small, "data": data}
@@ -217,9 +246,16 @@ def _packed(value: object) -> str:
     return base64.b64encode(zlib.compress(text.encode(errors="replace"), 9)).decode()
 
 
-def _written(folder: Path, pages: dict[str, str]) -> Iterator[Path]:
-    for name, text in pages.items():
-        _refuse_secrets(name, [text])
+def _clear(folder: Path, pages: Mapping[str, str]) -> None:
+    """Remove the pages of an earlier export that this one does not replace."""
+    for path in folder.glob("*.html"):
+        with path.open(encoding="utf-8", errors="replace") as file:
+            ours = TITLE_END in file.read(4_000)
+        if ours and path.name not in pages:
+            path.unlink()
+
+
+def _written(folder: Path, pages: Mapping[str, str]) -> Iterator[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in pages.items():
@@ -229,14 +265,20 @@ def _written(folder: Path, pages: dict[str, str]) -> Iterator[Path]:
         raise UsageError(f"{folder} cannot be written: {exc}") from exc
 
 
-def _refuse_secrets(where: str, texts: Sequence[str]) -> None:
+def _refuse_secrets_of(site: Site, pages: Mapping[str, str]) -> None:
+    for name, text in pages.items():
+        _refuse_secrets(site, name, [text])
+
+
+def _refuse_secrets(site: Site, where: str, texts: Sequence[str]) -> None:
     """Raises UsageError where a text holds a key, or a path of this machine."""
+    folders = (Path.home(), Path.cwd(), site.db.resolve().parent, PROJECT, tempfile.gettempdir())
+    paths = {str(folder) for folder in folders} - {"/"}
     secrets = {
         value: name
         for name, value in os.environ.items()
-        if name.endswith(("_API_KEY", "_TOKEN")) and len(value) >= SHORTEST_SECRET
+        if name.endswith(_SECRET_NAMES) and len(value) >= SHORTEST_SECRET
     }
-    paths = {str(Path.home()), str(Path.cwd()), tempfile.gettempdir()} - {"/", "/tmp"}  # noqa: S108 # names
     for text in texts:
         for value, name in secrets.items():
             if value in text:
@@ -245,6 +287,7 @@ def _refuse_secrets(where: str, texts: Sequence[str]) -> None:
             raise UsageError(
                 f"nothing was written: {where} holds what looks like a key: {found[0][:6]}..."
             )
-        for path in sorted(paths):
-            if f"{path}/" in text:
-                raise UsageError(f"nothing was written: {where} names the path {path}")
+        named = [path for path in sorted(paths) if f"{path}/" in text]
+        named += [found[0] for found in _HOMES.finditer(text)]
+        if named:
+            raise UsageError(f"nothing was written: {where} names the path {named[0]}")

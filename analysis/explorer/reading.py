@@ -18,8 +18,14 @@ from merge_runner.database import SHARED, Instance, read_database
 ALONE = threading.RLock()
 
 
+# A sweep that stores its trials holds the file for less; a page has no time for others.
+PATIENCE_S = 2.0
+
+
 @contextmanager
-def reading(db: Path, instance: Instance = SHARED) -> Iterator[duckdb.DuckDBPyConnection]:
+def reading(
+    db: Path, instance: Instance = SHARED, patience_s: float = PATIENCE_S
+) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open the database for reading, for a moment; raises UsageError and StoreError."""
-    with ALONE, read_database(db, instance) as connection:
+    with ALONE, read_database(db, instance, patience_s) as connection:
         yield connection

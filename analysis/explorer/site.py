@@ -92,7 +92,8 @@ class Site:
 
     def render(self, template: str, **values: object) -> str:
         """A page, or a part of one."""
-        return self._environment.get_template(template).render(values)
+        held = self.catalogue.held
+        return self._environment.get_template(template).render({"held": held, **values})
 
     def close(self) -> None:
         """Leave nothing behind."""

@@ -177,17 +177,26 @@ class Sweep:
 
 def list_sweeps(catalogue: Catalogue) -> list[Entry]:
     """All sweeps, the newest first. Raises what ``Catalogue.refresh`` does."""
-    # In this order, for a sweep notes its end in the database before its file goes.
-    told = {
+    before = {
         row["sweep_id"]: read_standing(catalogue.db, row["sweep_id"])
         for row in catalogue.ask(SWEEPS)
         if row["ended_at"] is None
     }
     catalogue.refresh()
     return [
-        Entry(row, config_of(row["config"]), told.get(row["sweep_id"]))
+        Entry(row, config_of(row["config"]), _newest(catalogue, row, before.get(row["sweep_id"])))
         for row in catalogue.ask(SWEEPS)
     ]
+
+
+def _newest(catalogue: Catalogue, row: Row, before: Standing | None) -> Standing | None:
+    """What a sweep says of itself, read also before its row, and after it.
+
+    It notes its end in the database before its file goes; and to read the database takes a while.
+    """
+    if row["ended_at"] is not None:
+        return None
+    return read_standing(catalogue.db, row["sweep_id"]) or before
 
 
 def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> Sweep | None:
@@ -199,7 +208,8 @@ def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> 
     place = next((i for i, row in enumerate(rows) if row["sweep_id"] == sweep_id), None)
     if place is None:
         return None
-    entry = Entry(rows[place], config_of(rows[place]["config"]), standing)
+    row = rows[place]
+    entry = Entry(row, config_of(row["config"]), _newest(catalogue, row, standing))
     stored = catalogue.ask(CELLS, sweep_id)
     tried = catalogue.ask(TRIED, sweep_id)
     mismatches = mismatches_of(entry.config, tried)

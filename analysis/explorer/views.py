@@ -56,7 +56,9 @@ def _spark_points(speeds: Sequence[float]) -> str:
 
 def condition_text(name: str) -> str:
     """A condition in words."""
-    condition = CONDITIONS[name]
+    condition = CONDITIONS.get(name)
+    if condition is None:
+        return "no condition of the experiment"
     headway, velocity = condition.projected_headway_m, condition.relative_velocity_mps
     if headway == 0:
         ahead = "both would reach the merge point together"

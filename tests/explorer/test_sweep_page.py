@@ -223,8 +223,18 @@ async def test_a_stream_ends_when_the_server_does(study, monkeypatch):
     assert [event async for event in events] == []
 
 
-def test_a_stream_is_never_packed(study):
+async def test_a_sweep_that_slept_goes_on_in_the_same_stream(study, monkeypatch):
+    monkeypatch.setattr(page, "LOOK_EVERY_S", 0.02)
     running(study, pid=2**22 + 1)
+    events = page.sweep_events(Site(study), "sweep-1")
+    heard = [await anext(events) for _ in range(2)]
+    assert "event: state\ndata: Stopped without a word" in heard[1]
+    running(study)
+    assert "Running: 2 of 33" in await anext(events)
+
+
+def test_a_stream_is_never_packed(study):
+    Store(study).end_sweep("sweep-1", END, 0)
     reply = browser(study).get(f"{URL}/events", headers={"accept-encoding": "gzip"})
     assert reply.headers["content-type"].startswith("text/event-stream")
     assert "content-encoding" not in reply.headers

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
+from analysis.explorer.asked import seconds
 from analysis.explorer.computing import Request, Result, Waiting, about_s
 from analysis.explorer.links import query_of
 from analysis.explorer.site import Site
@@ -55,7 +56,7 @@ def computed(
         wait_s = EXPORT_S
     elif patient:
         wait_s = PATIENT_S
-    found = site.computing.ask(request, state, since=since_of(asked), wait_s=wait_s)
+    found = site.computing.ask(request, state, since=seconds(asked.get("since", "")), wait_s=wait_s)
     result = found if isinstance(found, Result) else None
     failure = "" if isinstance(found, Result | Waiting) else found.text
     later = {"since": f"{result.at + 0.001:.3f}"} if result else {}
@@ -69,12 +70,3 @@ def computed(
         again=query_of({**asked, **later}),
         here=query_of(asked),
     )
-
-
-def since_of(asked: Mapping[str, str]) -> float:
-    """The time in an address, in s since 1970; 0 where there is none."""
-    text = asked.get("since", "")
-    whole, _, part = text.partition(".")
-    if whole.isascii() and whole.isdigit() and len(text) < 20 and (not part or part.isdigit()):
-        return float(text)
-    return 0.0

@@ -92,6 +92,8 @@ class _Watched:
         alive = standing if standing and standing.alive else None
         if alive and alive.updated_at == self.updated_at:
             return []
+        if not alive and self.state == "lost" and not self.site.catalogue.refresh():
+            return []
         if alive and time.monotonic() - self.read_at < READ_EVERY_S:
             sweep = find_sweep(self.site.catalogue, self.sweep_id, refresh=False)
         else:
@@ -108,7 +110,8 @@ class _Watched:
             # Once per state, and not once a second: it is read out.
             events.append(("state", str(escape(sweep.verdict.text))))
             self.state = sweep.entry.state
-        return events if sweep.entry.live else [*events, ("done", "")]
+        # One that is silent may have slept, and go on.
+        return events if sweep.entry.row["ended_at"] is None else [*events, ("done", "")]
 
 
 def _find(site: Site, sweep_id: str) -> Sweep:

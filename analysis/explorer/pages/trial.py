@@ -9,6 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from analysis.explorer import views
+from analysis.explorer.asked import whole
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.details import Decision, Row, Trial, read_decisions, read_trial
 from analysis.explorer.site import NotThere, Site
@@ -23,9 +24,9 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     """A trial, with the decision that the address names."""
     row = find(site, trial_id, asked)
     trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
-    panel = ""
-    if asked.get("side") in SIDES and asked.get("decision", "").isdigit():
-        panel = decision_panel(site, row, trial, asked["side"], int(asked["decision"]))
+    panel, number = "", whole(asked.get("decision", ""))
+    if asked.get("side") in SIDES and number is not None:
+        panel = decision_panel(site, row, trial, asked["side"], number)
     values = shown(row, trial)
     return site.render(
         "trial.html",
@@ -142,7 +143,7 @@ def _differs(row: Row, other: Row) -> str:
 
 
 def _decision_of(asked: Mapping[str, str]) -> tuple[str, int]:
-    side, number = asked.get("side", ""), asked.get("decision", "")
-    if side not in SIDES or not number.isdigit():
+    side, number = asked.get("side", ""), whole(asked.get("decision", ""))
+    if side not in SIDES or number is None:
         raise NotThere("a decision is named by side=left or side=right, and decision=NUMBER")
-    return side, int(number)
+    return side, number

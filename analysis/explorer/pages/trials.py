@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from analysis.explorer.asked import whole
 from analysis.explorer.catalogue import FACETS, PAGE, SORTS, Filter
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import NotThere, Site
@@ -87,5 +88,4 @@ def sort_of(asked: Mapping[str, str]) -> str:
 
 def page_of(asked: Mapping[str, str]) -> int:
     """The page in an address, from 1."""
-    text = asked.get("page", "1")
-    return max(1, int(text)) if text.isascii() and text.isdigit() and len(text) < 8 else 1
+    return whole(asked.get("page", "")) or 1
