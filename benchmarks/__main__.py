@@ -35,6 +35,7 @@ from benchmarks.cases import (
     resume,
     start,
 )
+from benchmarks.explorer import explorer, explorer_floor
 from benchmarks.goals import judged
 from benchmarks.peers import installed, peer_cached, peer_cold, peer_resume
 from benchmarks.processes import served
@@ -75,6 +76,8 @@ CASES = (
         # What a report of the smaller ones takes the second time says nothing new.
         if (what, heat) != ("report", "warm") or trials == max(STUDIES)
     ),
+    Case("explorer of 11,000", 1, explorer(max(STUDIES))),
+    Case("floor, explorer of 11,000", 1, explorer_floor),
     *PEERS,
 )
 

@@ -339,13 +339,19 @@ def make_study(bench: Bench, trials: int) -> Path:
     return made
 
 
+def study_of(bench: Bench, trials: int, *, anew: bool = False) -> Path:
+    """The study of that size that all cases share; it is made where there is none, or ``anew``."""
+    db = bench.folder / f"study-{trials}.duckdb"
+    if anew or not db.exists():
+        make_study(bench, trials).replace(db)
+    return db
+
+
 def analysis(trials: int, *argv: str, warm: bool) -> Callable[[Bench], Figures]:
     """Tables or a report of a study; cold: nothing of it is stored, of a report but the tables."""
 
     def measure(bench: Bench) -> Figures:
-        db = bench.folder / f"study-{trials}.duckdb"
-        if not db.exists() or (not warm and "tables" in argv):
-            make_study(bench, trials).replace(db)
+        db = study_of(bench, trials, anew=not warm and "tables" in argv)
         out = ["--out", str(bench.fresh("report") / "report.html")] if "report" in argv else []
         return figures_of(run([*PROGRAM, *argv, "--db", str(db), *out]), calls=0)
 

@@ -192,5 +192,23 @@ GOALS = (
         lambda m: m("report of 11,000, warm", "wall_s"),
         unit="s",
     ),
+    Goal(
+        "explorer of 11,000 trials: the list",
+        100,
+        lambda m: m("explorer of 11,000", "list_ms"),
+        unit="ms",
+    ),
+    Goal(
+        "explorer of 11,000 trials: the list, filtered and sorted",
+        100,
+        lambda m: m("explorer of 11,000", "filtered_ms"),
+        unit="ms",
+    ),
+    Goal(
+        "explorer of 11,000 trials: a trial with a decision",
+        150,
+        lambda m: m("explorer of 11,000", "trial_ms"),
+        unit="ms",
+    ),
     Goal("--help", 0.15, lambda m: m("--help", "wall_s"), unit="s"),
 )

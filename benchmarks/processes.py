@@ -128,15 +128,30 @@ class Server:
 
 
 @contextmanager
+def serving(argv: Sequence[str], *, half: int | None = None) -> Iterator[str]:
+    """A server as a process of its own, until the end of this; gives the first line it prints.
+
+    ``half`` are the CPUs that it stays on. Raises RuntimeError where it prints nothing.
+    """
+    with tempfile.TemporaryFile() as errors:
+        with started_on(half):
+            process = subprocess.Popen(
+                argv, cwd=PROJECT, stdout=subprocess.PIPE, stderr=errors, text=True
+            )
+        with process:
+            assert process.stdout is not None
+            try:
+                line = process.stdout.readline().strip()
+                if not line:
+                    errors.seek(0)
+                    raise RuntimeError(f"{' '.join(argv)} served nothing\n{errors.read().decode()}")
+                yield line
+            finally:
+                process.terminate()
+
+
+@contextmanager
 def served() -> Iterator[Server]:
-    """The server as a process of its own, on the other CPUs than what is measured."""
-    with started_on(1):
-        process = subprocess.Popen(
-            [PYTHON, "-m", "benchmarks.server"], cwd=PROJECT, stdout=subprocess.PIPE, text=True
-        )
-    with process:
-        assert process.stdout is not None
-        try:
-            yield Server(int(process.stdout.readline()))
-        finally:
-            process.terminate()
+    """The loopback server, on the other CPUs than what is measured."""
+    with serving([PYTHON, "-m", "benchmarks.server"], half=1) as port:
+        yield Server(int(port))

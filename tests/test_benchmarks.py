@@ -8,8 +8,9 @@ import pytest
 
 from benchmarks.__main__ import CASES, tables
 from benchmarks.cases import Bench, figures_of
+from benchmarks.explorer import explorer, explorer_floor
 from benchmarks.goals import GOALS, judged
-from benchmarks.processes import served, started_on
+from benchmarks.processes import PYTHON, served, serving, started_on
 from benchmarks.recorder import multiply
 from merge_runner.llm.cache import ResponseCache
 
@@ -69,6 +70,23 @@ def test_multiplied_recordings_are_those_of_a_sweep(bench):
     cache = ResponseCache(folder / "responses")
     assert len({entry.attempts[0].reply for entry in cache.entries()}) == 24
     cache.close()
+
+
+def test_the_explorer_is_asked_when_it_has_read_the_trials_and_its_floor_serves_the_same(bench):
+    figures = explorer(110)(bench)
+    kept = {page.name: page.read_text("utf-8") for page in (bench.folder / "pages").iterdir()}
+    assert "o3/A1/N_0_0/rep01" in kept["list"]
+    assert "o3/A1/N_0_0/rep01" in kept["filtered"]
+    assert "I am at step 15." in kept["trial"]
+    assert figures.keys() - explorer_floor(bench).keys() == {"reading_s"}
+
+
+def test_a_server_that_does_not_begin_says_why():
+    with (
+        pytest.raises(RuntimeError, match="there is no"),
+        serving([PYTHON, "-c", "raise SystemExit('there is no database')"]),
+    ):
+        pass
 
 
 def test_what_is_measured_and_the_server_are_kept_apart():

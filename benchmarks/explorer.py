@@ -1,0 +1,83 @@
+"""The pages of the explorer over HTTP, and as their floor the same pages as texts.
+
+``reading_s`` is how long the trials are read before there is a page of them, in s. The others are
+medians in ms, from a request of a keep-alive client to the end of the page: ``list_ms`` of the list
+of trials, ``filtered_ms`` of its third page in one condition, sorted by gap, and ``trial_ms`` of
+trials with a decision shown.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from statistics import median
+
+import httpx
+
+from benchmarks.cases import Bench, Figures, study_of
+from benchmarks.processes import PROGRAM, PYTHON, serving
+from merge_runner.store import query
+
+ASKED, TIMEOUT_S, POLL_S = 20, 60.0, 0.05
+LIST, FILTERED = "trials", "trials?condition=N_0_0&sort=gap&page=3"
+# Trials from everywhere in the study that have the decision.
+SHOWN = f"""
+SELECT trial_id FROM decisions WHERE side = 'left' AND decision = 3
+ORDER BY hash(trial_id) LIMIT {ASKED}
+"""  # noqa: S608 # a constant
+
+
+def explorer(trials: int) -> Callable[[Bench], Figures]:
+    """The explorer of a study; of each kind of page the last is kept for the floor."""
+
+    def measure(bench: Bench) -> Figures:
+        db, kept = study_of(bench, trials), bench.fresh("pages")
+        _, shown = query(db, SHOWN)
+        asked = {
+            "list": [LIST] * ASKED,
+            "filtered": [FILTERED] * ASKED,
+            "trial": [f"trials/{trial}?side=left&decision=3" for (trial,) in shown],
+        }
+        with _client([*PROGRAM, "view", "--db", str(db), "--port", "0"]) as client:
+            figures = {"reading_s": _until_read(client)}
+            for name, addresses in asked.items():
+                figures[f"{name}_ms"], last = _ask(client, addresses)
+                (kept / name).write_bytes(last)
+        return figures
+
+    return measure
+
+
+def explorer_floor(bench: Bench) -> Figures:
+    """The pages of the last ``explorer`` as texts, from the same kind of server."""
+    kept = bench.folder / "pages"
+    with _client([PYTHON, "-m", "benchmarks.pages", str(kept)]) as client:
+        return {
+            f"{name}_ms": _ask(client, [name] * ASKED)[0] for name in ("list", "filtered", "trial")
+        }
+
+
+@contextmanager
+def _client(server: Sequence[str]) -> Iterator[httpx.Client]:
+    """A client of a server that is there until the end of this."""
+    with serving(server) as address, httpx.Client(base_url=address, timeout=TIMEOUT_S) as client:
+        yield client
+
+
+def _until_read(client: httpx.Client) -> float:
+    """How long it takes, in s, until a page is no longer one that is to be asked for again."""
+    began = time.perf_counter()
+    while "refresh" in client.get("trials").raise_for_status().headers:
+        time.sleep(POLL_S)
+    return time.perf_counter() - began
+
+
+def _ask(client: httpx.Client, addresses: list[str]) -> tuple[float, bytes]:
+    """Ask for one after another: the median in ms, and the last page."""
+    taken_ms = []
+    for address in addresses:
+        began = time.perf_counter()
+        page = client.get(address).raise_for_status()
+        taken_ms.append(1000 * (time.perf_counter() - began))
+    return median(taken_ms), page.content
