@@ -107,14 +107,18 @@ def _trial_routes(site: Site) -> list[Route]:
     def of_trial(render: Callable[[Site, str, Mapping[str, str]], str]) -> Callable[..., Response]:
         return _page(site, lambda r: render(site, r.path_params["trial"], r.query_params))
 
+    def page_of_all(_: Request) -> Response:
+        return RedirectResponse(site.at.to("trials"))
+
     listing = _page(site, lambda r: trials.trials_page(site, r.query_params, **_patience(r)))
     return [
         Route("/trials", listing),
+        Route("/trials/", page_of_all),
         Route("/trials.{form}", export),
         Route("/trials/{trial:path}", of_trial(trial.trial_page)),
         Route("/decisions/{trial:path}", of_trial(trial.decision_fragment)),
-        Route("/data/{trial:path}", data),
-        Route("/raw/{trial:path}", raw),
+        Route("/data/{trial:path}", _page(site, data)),
+        Route("/raw/{trial:path}", _page(site, raw)),
     ]
 
 

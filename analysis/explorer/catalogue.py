@@ -310,7 +310,7 @@ class Catalogue:
             "SELECT * EXCLUDE (left_mps, right_mps) FROM listed "  # noqa: S608 # constants
             f"WHERE {where} AND (trial_id, spec_hash) <> (?, ?) QUALIFY row_number() OVER ("
             "PARTITION BY model, variant, spec_hash ORDER BY rep <> ?, trial_id) <= ? "
-            "ORDER BY model, variant, trial_id",
+            "ORDER BY model, variant, trial_id, spec_hash",
             [*values, row["trial_id"], row["spec_hash"], row["rep"], limit],
         )
 

@@ -23,9 +23,15 @@ SELECT side, list(time_s ORDER BY step) AS time_s, list(position_m ORDER BY step
     list(acceleration_mps2 ORDER BY step) AS acceleration_mps2
 FROM states WHERE {OF_TRIAL} GROUP BY ALL
 """  # noqa: S608 # constants
+# Where a call got no answer there is no decision, of neither driver, and the trial ended.
 DECISIONS = f"""
-SELECT decision, time_s, side, valid, failure, tactical, plan, applied, fallback, rationale
-FROM decisions WHERE {OF_TRIAL} ORDER BY decision, side
+SELECT decision, time_s, side, valid, failure, tactical, plan, applied, fallback, rationale,
+    false AS lost
+FROM decisions WHERE {OF_TRIAL}
+UNION ALL BY NAME
+SELECT DISTINCT decision, side, false AS valid, false AS fallback, true AS lost
+FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) WHERE {OF_TRIAL}
+ORDER BY decision, side
 """  # noqa: S608 # constants
 SPEC = "SELECT spec FROM specs WHERE spec_hash = $spec"
 # Of one decision with the one before it, or of all.
@@ -77,6 +83,9 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
         spec = _records(connection, SPEC, {"spec": spec_hash})
     told = json.loads(spec[0]["spec"]) if spec else {}
     scenario = Scenario.model_validate(told.get("scenario", {}))
+    for row in decisions:
+        if row["lost"]:
+            row["time_s"] = row["decision"] / scenario.prompt_rate_hz
     ordered = {side: states[side] for side in SIDES if side in states}
     return Trial(trial_id, spec_hash, scenario, ordered, decisions)
 

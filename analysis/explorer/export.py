@@ -40,7 +40,7 @@ PLAIN = ("keys.js",)
 LISTING = ("keys.js", "listing.js")
 BUNDLE = ("keys.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
 # A block of a prompt in a decision's panel: the same ones come again and again.
-_BLOCK = re.compile(r'<div class="block">.*?</div>', re.DOTALL)
+_BLOCK = re.compile(r'<details class="block".*?</details>', re.DOTALL)
 # Where a server would lead on, a file does not.
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 # What is taken for a secret wherever it stands, beside the values of this machine's keys.
@@ -98,7 +98,8 @@ def export_folder(
     the whole study. An earlier export in the folder goes. Nothing is written where a page holds a
     key or a path of this machine. Raises UsageError.
     """
-    with _opened(db, wanted) as (site, rows):
+    links = StaticLinks(["trials"]) if wanted else StaticLinks()
+    with _opened(db, wanted, links) as (site, rows):
         pages = {site.at.to("trials"): _listing(site, rows)}
         for condition in sorted({row["condition"] for row in rows}):
             mine = [row for row in rows if row["condition"] == condition]
@@ -116,7 +117,7 @@ def export_page(
     db: Path, file: Path, wanted: Sequence[str], watch: Watch = unwatched
 ) -> Iterator[Path]:
     """Write one page with the wanted trials; yields its path. Raises UsageError."""
-    with _opened(db, wanted) as (site, rows):
+    with _opened(db, wanted, StaticLinks(alone=file.name)) as (site, rows):
         pages = {file.name: bundle_page(site, watch(rows, "Trials"), rows, "Trials")}
         _refuse_secrets_of(site, pages)
     yield from _written(file.parent, pages)
@@ -177,7 +178,7 @@ def _trial(site: Site, row: Row, beside: Sequence[Row], blocks: Blocks) -> dict[
     _refuse_secrets(site, row["trial_id"], [html, *panels.values(), values["data"] or ""])
     data = json.loads(values["data"]) if values["data"] else None
     small = {at: blocks.without(panel) for at, panel in panels.items()}
-    return {"html": html, "panels": small, "data": data}
+    return {"html": _LINK_TO_NOWHERE.sub(r"\1", html), "panels": small, "data": data}
 
 
 def _listing(site: Site, rows: list[Row]) -> str:
@@ -222,9 +223,11 @@ def inlined(scripts: Sequence[str]) -> Inlined:
 
 
 @contextmanager
-def _opened(db: Path, wanted: Sequence[str]) -> Iterator[tuple[Site, list[Row]]]:
+def _opened(
+    db: Path, wanted: Sequence[str], links: StaticLinks
+) -> Iterator[tuple[Site, list[Row]]]:
     """A site of files and the wanted trials, by name; raises UsageError where there is none."""
-    site = Site(db, StaticLinks(), static=True, shared={"inlined": inlined(PLAIN)})
+    site = Site(db, links, static=True, shared={"inlined": inlined(PLAIN)})
     site.catalogue.refresh()
     every = site.catalogue.every(Filter())
     rows = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 from urllib.parse import quote, urlencode
 
@@ -52,21 +52,28 @@ class Links:
         return f"/static/{name}"
 
 
-# The pages that an export has, each as a file of this name.
+# The pages that the export of a whole study has beside the trials, each as a file of this name.
 EXPORTED = ("sweeps", "trials", "tables", "ablations", "humans")
 
 
 class StaticLinks(Links):
-    """Addresses of an exported study: files beside each other, a page of trials a condition."""
+    """Addresses of an exported study: files beside each other, a page of trials a condition.
+
+    ``pages`` are those that there are; ``alone`` is the file that has all trials and nothing beside.
+    """
+
+    def __init__(self, pages: Collection[str] = EXPORTED, alone: str = "") -> None:
+        self._pages = () if alone else pages
+        self._alone = alone
 
     def to(self, name: str, /, **state: object) -> str:
         """A page, or nothing where only a server has it."""
-        return f"{name}.html" + query_of(state) if name in EXPORTED else ""
+        return f"{name}.html" + query_of(state) if name in self._pages else ""
 
     def trial(self, row: Mapping[str, Any], **state: object) -> str:
         """A trial on the page of its condition."""
         named = {"trial": row["trial_id"], "spec": row["spec_hash"], **state}
-        return bundle_name(row["condition"]) + query_of(named)
+        return (quote(self._alone) or bundle_name(row["condition"])) + query_of(named)
 
     def decision(self, row: Mapping[str, Any], side: str, number: int) -> str:
         """Nothing: the page has it."""

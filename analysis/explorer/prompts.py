@@ -23,6 +23,11 @@ class Part:
     name: str
     pieces: tuple[tuple[Change, str], ...]
 
+    @property
+    def changed(self) -> bool:
+        """Whether anything in it is new, or gone."""
+        return any(change != "same" for change, _ in self.pieces)
+
 
 def parts_of(prompt: str, before: str | None) -> list[Part]:
     """The parts of a prompt, each compared with the same block of the one before.

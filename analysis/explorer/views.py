@@ -79,11 +79,11 @@ def prompt_text(variant: str | None) -> str:
     return "the whole prompt" if not without else f"the prompt without {', '.join(without)}"
 
 
-def outcome_text(row: Row) -> str:
+def outcome_text(row: Row, scenario: Scenario) -> str:
     """How a trial ended, in a sentence."""
     end = f"{row['end_time_s']:.1f} s"
     if row["status"] == "collided":
-        return f"The vehicles collided after {end}."
+        return f"The vehicles collided after {end}: {collision_text(scenario)}."
     if row["status"] == "failed":
         return f"The trial failed after {end}: {row['error']}."
     if row["status"] == "timeout":
@@ -95,6 +95,16 @@ def outcome_text(row: Row) -> str:
     when = "" if row["time_to_merge_s"] is None else f", after {row['time_to_merge_s']:.1f} s"
     gap = "" if row["gap_m"] is None else f", with a gap of {row['gap_m']:.1f} m"
     return f"The {other} vehicle yielded: the {first} one reached the merge point first{when}{gap}."
+
+
+def collision_text(scenario: Scenario) -> str:
+    """What the scenario takes for a collision."""
+    length = f"{scenario.vehicle_length_m:g} m"
+    return {
+        "euclid2d": f"their centres came closer than {length}, a vehicle's length",
+        "shared_lane": f"past the merge point one was less than {length} behind the other",
+        "rectangle": "their outlines overlapped",
+    }[scenario.collision_rule]
 
 
 def facts(row: Row) -> list[str]:
@@ -130,10 +140,12 @@ def summary(row: Row, trial: Trial) -> list[str]:
         mine = [d for d in trial.decisions if d["side"] == side]
         if mine:
             letters = " ".join(d["tactical"] or "–" for d in mine)
-            bad = [str(d["decision"]) for d in mine if not d["valid"]]
+            bad = [str(d["decision"]) for d in mine if not d["valid"] and not d["lost"]]
+            lost = [str(d["decision"]) for d in mine if d["lost"]]
             lines.append(
                 f"Decisions of the {side} driver: {letters}"
-                + (f"; without a valid plan: {', '.join(bad)}." if bad else ".")
+                + (f"; without a valid plan: {', '.join(bad)}" if bad else "")
+                + (f"; the trial ended before {', '.join(lost)} was driven." if lost else ".")
             )
     return lines
 
@@ -143,7 +155,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
     return {
         "id": row["trial_id"],
         "spec": row["spec_hash"],
-        "outcome": outcome_text(row),
+        "outcome": outcome_text(row, trial.scenario),
         "label": label(row),
         "status": row["status"],
         "end": trial.end_s,

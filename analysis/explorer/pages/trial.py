@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from analysis.explorer import views
 from analysis.explorer.asked import whole
@@ -17,7 +18,7 @@ from analysis.explorer.texts import shortened
 from merge_runner.records import SIDES
 
 # So many trials of a kind are offered to compare with.
-OFFERED = 30
+OFFERED = 100
 
 
 def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
@@ -26,7 +27,10 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
     panel, number = "", whole(asked.get("decision", ""))
     if asked.get("side") in SIDES and number is not None:
-        panel = decision_panel(site, row, trial, asked["side"], number)
+        try:
+            panel = decision_panel(site, row, trial, asked["side"], number)
+        except NotThere as exc:
+            panel = str(escape(exc))
     values = shown(row, trial)
     return site.render(
         "trial.html",
@@ -45,12 +49,15 @@ def shown(row: Row, trial: Trial) -> dict[str, Any]:
     }
     return {
         "row": row,
-        "outcome": views.outcome_text(row),
+        "outcome": views.outcome_text(row, trial.scenario),
         "facts": views.facts(row),
         "data": embedded(views.replay_data(row, trial)) if trial.states else None,
         "lines": views.summary(row, trial),
         "samples": views.sample_table(trial),
         "trial_decisions": decided,
+        "last_words": [
+            said[-1] for mine in decided.values() if (said := [d for d in mine if d["tactical"]])
+        ],
     }
 
 
@@ -116,10 +123,17 @@ def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
 
 
 def alternatives(site: Site, row: Row) -> dict[str, list[Row]]:
-    """Trials to compare with, by what they differ in."""
+    """Trials to compare with, by what they differ in.
+
+    ``key`` names one in an address: by its name, and its spec where that name has several.
+    """
     same = Filter(condition=row["condition"])
+    found = site.catalogue.near(same, row, OFFERED)
+    times = Counter(other["trial_id"] for other in found)
     kinds: dict[str, list[Row]] = {}
-    for other in site.catalogue.near(same, row, OFFERED):
+    for other in found:
+        name = other["trial_id"]
+        other["key"] = name if times[name] == 1 else f"{name}@{other['spec_hash']}"
         kinds.setdefault(_differs(row, other), []).append(other)
     return dict(sorted(kinds.items()))
 

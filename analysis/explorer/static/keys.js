@@ -1,6 +1,8 @@
 "use strict";
 // Keys that work on every page; off while something is typed.
 (() => {
+  // With AltGr some keyboards write brackets, and it looks like Ctrl and Alt.
+  window.isCommand = (event) => (event.ctrlKey || event.metaKey || event.altKey) && !event.getModifierState("AltGraph");
   const typing = (target) => target.matches("input:not([type=range]), select, textarea, [contenteditable]");
   const help = document.getElementById("help");
   document.getElementById("help-button").addEventListener("click", () => help.showModal());
@@ -18,7 +20,7 @@
   document.addEventListener("htmx:afterSwap", () => { chosen = -1; });
 
   document.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || typing(event.target)) {
+    if (isCommand(event) || typing(event.target)) {
       if (event.key === "Escape") event.target.blur();
       return;
     }

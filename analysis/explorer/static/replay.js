@@ -17,15 +17,24 @@ window.startReplay = () => {
   if (!holder) return;
   const at = (id) => document.getElementById(id);
   const trial = JSON.parse(holder.textContent);
-  const COLOURS = { left: "#0072b2", right: "#d55e00" };
+  const style = getComputedStyle(document.documentElement);
+  const COLOURS = { left: style.getPropertyValue("--left"), right: style.getPropertyValue("--right") };
+  const HEIGHT = 130, PAPER = 660; // of a chart, and the width of one in print, in pixels
   const SPEEDS = [0.25, 0.5, 1, 2, 4];
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
   const road = trial.track;
-  const times = (trial.sides.left ?? trial.sides.right).t;
-  const begin = times[0];
+  const own = (trial.sides.left ?? trial.sides.right).t;
+  const begin = own[0];
+  // With a second trial the time goes on to the end of the later one.
+  let times = own;
+  const unread = at("decision").innerHTML;
   let now = begin, playing = false, speed = 1, last = 0, ghost = null, selected = null;
 
-  const lost = () => { at("lost").hidden = false; };
+  const end = () => Math.max(trial.end, ghost?.end ?? 0);
+  const lost = () => {
+    at("lost").hidden = false;
+    at("decision").replaceChildren();
+  };
 
   // ---- one moment of a trial
 
@@ -80,11 +89,13 @@ window.startReplay = () => {
       for (const side of ["left", "right"]) {
         const group = draw("g", { class: `vehicle ${name} ${side}` }, track);
         draw("rect", { x: -road.length / 2, y: -road.width / 2, width: road.length, height: road.width, rx: 0.5 }, group);
-        draw("text", { x: 0, y: 0.62 }, group, side === "left" ? "L" : "R");
+        draw("text", { x: 0, y: side === "left" ? -1.7 : 3.9 }, group, side === "left" ? "L" : "R");
         vehicles[name][side] = group;
       }
     }
-    vehicles.crash = draw("text", { class: "crash", y: 9 }, track, "✸ collision");
+    vehicles.crash = draw("g", { class: "crash" }, track);
+    vehicles.between = draw("line", {}, vehicles.crash);
+    vehicles.crashed = draw("text", { y: 9.5 }, vehicles.crash);
   };
   const move = (name, run) => {
     for (const side of ["left", "right"]) {
@@ -123,7 +134,7 @@ window.startReplay = () => {
   });
   const chart = (id, heading, unit, own, others, { scales, ...extra } = {}) => {
     const plot = new uPlot({
-      title: heading, width: at("charts").clientWidth, height: 150, legend: { live: true },
+      title: heading, width: at("charts").clientWidth, height: HEIGHT, legend: { live: true },
       cursor: { sync: { key: "replay" }, drag: { x: false, y: false } },
       scales: { x: { time: false }, ...scales },
       axes: [{ size: 24, gap: 2, values: (_, ticks) => ticks.map((t) => `${t} s`) }, { size: 54, label: unit, labelSize: 18, labelGap: 0 }],
@@ -137,19 +148,24 @@ window.startReplay = () => {
   };
   const drawCharts = () => {
     for (const plot of charts.splice(0)) plot.destroy();
+    times = [...own, ...(ghost ? (ghost.sides.left ?? ghost.sides.right).t : []).filter((t) => t > trial.end + 1e-9)];
+    at("scrub").max = end();
     const dashed = { dash: [4, 4], width: 1.2 };
     const lines = (run, what, note, extra) => ["left", "right"].map((side) =>
       [series(`${side}${note}`, COLOURS[side], extra), resampled(run, side, what)]);
     const both = (id, heading, unit, what, extra, options) => chart(id, heading, unit,
       lines(trial, what, "", extra), ghost ? lines(ghost, what, ", other", { ...dashed, ...extra }) : [], options);
     both("chart-v", "Velocity", "m/s", "v", {});
+    const banded = { width: 0.5, value: (_, v) => (v ? v.toFixed(2) : "–") };
     // A sample's acceleration is that of the step before it.
     both("chart-a", "Acceleration", "m/s²", "a", { paths: uPlot.paths.stepped({ align: -1 }) },
       { scales: { y: { range: (_, low, high) => [Math.min(low, -road.hardest), Math.max(high, road.hardest)] } } });
-    const bound = trial.bounds, lower = bound.map((b) => (b === null ? null : -b));
+    // Where none is, the band has no width.
+    const bound = times.map((t, i) => (inside(trial, t) && trial.bounds.length ? trial.bounds[i] ?? 0 : null));
+    const lower = bound.map((b) => (b === null ? null : -b));
     chart("chart-h", "Headway: how far the left vehicle is ahead; shaded: collision", "m",
       [[series("headway", "#000"), headways(trial)],
-        [series("collision below", "#999", { width: 0.5 }), bound], [series("and above", "#999", { width: 0.5 }), lower]],
+        [series("collision below", "#999", banded), bound], [series("and above", "#999", banded), lower]],
       ghost ? [[series("headway, other", "#000", dashed), headways(ghost)]] : [],
       { bands: [{ series: [2, 3], fill: "rgba(204, 121, 167, .35)" }] });
   };
@@ -205,10 +221,15 @@ window.startReplay = () => {
     move("ghost", ghost);
     const over = trial.status === "collided" && now >= trial.end - 1e-9;
     vehicles.crash.setAttribute("display", over ? "inline" : "none");
-    if (over) vehicles.crash.setAttribute("x", place("left", sampled(trial.sides.left.t, trial.sides.left.x, now))[0]);
+    if (over) {
+      const [[x1, y1], [x2, y2]] = ["left", "right"].map((side) => place(side, trial.sides[side].x.at(-1)));
+      for (const [name, value] of Object.entries({ x1, y1, x2, y2 })) vehicles.between.setAttribute(name, value);
+      vehicles.crashed.setAttribute("x", (x1 + x2) / 2);
+      vehicles.crashed.textContent = `✸ collision, ${Math.hypot(x1 - x2, y1 - y2).toFixed(1)} m between the centres`;
+    }
     at("scrub").value = now;
     at("scrub").setAttribute("aria-valuetext", `${now.toFixed(1)} s`);
-    at("clock").textContent = `${now.toFixed(1)} s of ${trial.end.toFixed(1)} s`;
+    at("clock").textContent = `${now.toFixed(1)} s of ${end().toFixed(1)} s`;
     const told = ["left", "right"].filter((side) => trial.sides[side]).map((side) =>
       `${side} ${sampled(trial.sides[side].t, trial.sides[side].v, now).toFixed(1)} m/s at ${sampled(trial.sides[side].t, trial.sides[side].x, now).toFixed(1)} m`);
     at("now").textContent = told.join("; ");
@@ -220,12 +241,12 @@ window.startReplay = () => {
     }
   };
   const seek = (t, keep = false) => {
-    now = Math.min(Math.max(t, begin), trial.end);
+    now = Math.min(Math.max(t, begin), end());
     show();
     if (keep) remember(false);
   };
   const play = (on) => {
-    if (on && now >= trial.end - 1e-9) now = begin;
+    if (on && now >= end() - 1e-9) now = begin;
     playing = on;
     at("play").textContent = on ? "Pause" : "Play";
     at("play").setAttribute("aria-pressed", String(on));
@@ -241,7 +262,7 @@ window.startReplay = () => {
       last = moment;
       seek(now + passed);
     }
-    if (now >= trial.end - 1e-9) play(false);
+    if (now >= end() - 1e-9) play(false);
     else requestAnimationFrame(tick);
   };
   const setSpeed = (value) => {
@@ -254,7 +275,7 @@ window.startReplay = () => {
   const remember = (push) => {
     if (push === null) return; // what the address says is being done
     const address = new URL(location.href);
-    const state = { t: now > begin ? now.toFixed(1) : "", side: selected?.dataset.side, decision: selected?.dataset.n, compare: ghost?.id };
+    const state = { t: now > begin ? now.toFixed(1) : "", side: selected?.dataset.side, decision: selected?.dataset.n, compare: ghost?.named };
     for (const [name, value] of Object.entries(state)) {
       if (value) address.searchParams.set(name, value);
       else address.searchParams.delete(name);
@@ -266,7 +287,8 @@ window.startReplay = () => {
     const asked = new URL(location.href).searchParams;
     const link = decisions.find((d) => d.dataset.side === asked.get("side") && d.dataset.n === asked.get("decision"));
     select(link ?? null, { push: null, jump: !asked.has("t") });
-    if ((asked.get("compare") ?? "") !== (ghost?.id ?? "")) await compare(asked.get("compare") ?? "", null);
+    if (!link) at("decision").innerHTML = unread;
+    if ((asked.get("compare") ?? "") !== (ghost?.named ?? "")) await compare(asked.get("compare") ?? "", null);
     if (asked.has("t")) seek(Number(asked.get("t")) || begin);
     else if (!link) seek(begin);
   };
@@ -277,9 +299,10 @@ window.startReplay = () => {
     const chooser = at("compare");
     const option = [...chooser.options].find((o) => o.value === id && o.dataset.url);
     ghost = option ? await explorer.data(option).catch(lost) ?? null : null;
+    if (ghost) ghost.named = id;
     chooser.value = ghost ? id : "";
-    at("ghost-key").hidden = !ghost;
-    at("ghost-key").textContent = ghost ? `dashed: ${ghost.label}. ${ghost.outcome}` : "";
+    at("ghost-key").hidden = !ghost && !id;
+    at("ghost-key").textContent = ghost ? `dashed: ${ghost.label}. ${ghost.outcome}` : `${id} is not there to compare with`;
     drawCharts();
     show();
     remember(push);
@@ -289,14 +312,14 @@ window.startReplay = () => {
 
   drawTrack();
   at("scrub").min = begin;
-  at("scrub").max = trial.end;
   at("scrub").addEventListener("input", (event) => seek(Number(event.target.value)));
   at("scrub").addEventListener("change", () => remember(false));
   at("play").addEventListener("click", () => play(!playing));
   at("back").addEventListener("click", () => seek(now - 0.1, true));
   at("on").addEventListener("click", () => seek(now + 0.1, true));
-  at("speed").addEventListener("change", (event) => setSpeed(Number(event.target.value)));
-  at("compare").addEventListener("change", (event) => compare(event.target.value, true));
+  // What is chosen is done with: the keys are the replay's again.
+  at("speed").addEventListener("change", (event) => { setSpeed(Number(event.target.value)); event.target.blur(); });
+  at("compare").addEventListener("change", (event) => { compare(event.target.value, true); event.target.blur(); });
   for (const link of decisions) {
     link.addEventListener("click", (event) => {
       if (event.ctrlKey || event.metaKey || event.shiftKey) return;
@@ -309,18 +332,28 @@ window.startReplay = () => {
     const from = document.referrer && new URL(document.referrer);
     return from && from.origin === location.origin && !from.pathname.startsWith("/trials/") ? from.href : at("trial").dataset.back;
   };
+  at("decision").addEventListener("click", (event) => {
+    const last = event.target.closest("a.last");
+    const link = last && decisions.find((d) => d.dataset.side === last.dataset.side && d.dataset.n === last.dataset.n);
+    if (!link || event.ctrlKey || event.metaKey || event.shiftKey) return;
+    event.preventDefault();
+    select(link);
+  });
   addEventListener("popstate", recall);
   let width = 0;
-  new ResizeObserver(() => {
-    if (at("charts").clientWidth === width) return;
-    width = at("charts").clientWidth;
-    for (const plot of charts) plot.setSize({ width, height: 150 });
+  const fit = (wanted) => {
+    if (wanted === width) return;
+    width = wanted;
+    for (const plot of charts) plot.setSize({ width, height: HEIGHT });
     placeRibbons();
     show();
-  }).observe(at("charts"));
+  };
+  new ResizeObserver(() => fit(at("charts").clientWidth)).observe(at("charts"));
+  addEventListener("beforeprint", () => fit(PAPER));
+  addEventListener("afterprint", () => fit(at("charts").clientWidth));
 
   document.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+    if (isCommand(event) || document.querySelector("dialog[open]")) return;
     const target = event.target;
     if (target.matches("input:not([type=range]), select, textarea")) return;
     const by = event.shiftKey ? 1 : 0.1;
@@ -331,8 +364,8 @@ window.startReplay = () => {
     else if (event.key === "[") step(-1);
     else if (event.key === "c") at("compare").focus();
     else if (/^[1-5]$/.test(event.key)) setSpeed(SPEEDS[Number(event.key) - 1]);
-    else if (event.key === "Escape" && selected) { select(null); remember(true); at("decision").replaceChildren(); }
-    else if (event.key === "Escape") location.href = list();
+    else if (event.key === "Escape" && selected) { select(null); remember(true); at("decision").innerHTML = unread; }
+    else if (event.key === "Escape" && list()) location.href = list();
     else return;
     event.preventDefault();
   });
