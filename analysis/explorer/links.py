@@ -59,7 +59,7 @@ EXPORTED = ("sweeps", "trials", "tables", "ablations", "humans")
 class StaticLinks(Links):
     """Addresses of an exported study: files beside each other, a page of trials a condition.
 
-    ``pages`` are those that there are; ``alone`` is the file that has all trials and nothing beside.
+    ``pages`` are those that there are; ``alone`` is the only file.
     """
 
     def __init__(self, pages: Collection[str] = EXPORTED, alone: str = "") -> None:

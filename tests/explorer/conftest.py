@@ -9,10 +9,12 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import duckdb
 import pytest
 import uvicorn
 from harness import RECORDING
 from hostile import hostile_trial
+from studies import Drive, Said, played
 
 from analysis.explorer.app import explorer
 from analysis.explorer.server import listen
@@ -33,12 +35,20 @@ def pytest_runtest_setup(item):
 
 @pytest.fixture(scope="session")
 def study(prepare, tmp_path_factory):
-    """Recorded trials of two conditions, one of which collides, and a hostile one."""
+    """Recorded trials, one of which collides, and a hostile, a failed and a human one."""
     folder = tmp_path_factory.mktemp("study")
     sweep = ("replay", "baseline", "--recording", RECORDING, "--db", "study.duckdb")
     run = prepare(folder, *sweep, "--reps", 3, "--conditions", "L_4_0,N_0_0")
     assert run.code == 0, run.err
-    Store(folder / "study.duckdb").write("hostile", [hostile_trial()], patience_s=5)
+    lost = Drive("o4", "baseline", "L_4_0", 1, (0.4,), (-0.4,), {2: Said(("timeout",), lost=True)})
+    human = Drive("human", "baseline", "N_0_0", 1, (0.4, 0.4), (-0.4, -0.4))
+    made = [hostile_trial(), played(lost), played(human)]
+    Store(folder / "study.duckdb").write("hostile", made, patience_s=5)
+    with duckdb.connect(str(folder / "study.duckdb")) as connection:
+        connection.execute(
+            "UPDATE trials SET source = 'human', pair = 'P1', variant = NULL, model_left = NULL, "
+            "model_right = NULL WHERE trial_id LIKE 'human/%'"
+        )
     return folder / "study.duckdb"
 
 

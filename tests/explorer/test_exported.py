@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 import shutil
+import zlib
 
 import duckdb
 import pytest
+from axe import serious
 from playwright.sync_api import expect
 
 from analysis.explorer.export import export_folder, export_page
@@ -46,7 +50,45 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     page.locator("#compare").select_option(index=1)
     expect(page.locator("#ghost-key")).to_contain_text("dashed")
     page.goto(f"file://{exported}/trials.html?sweep=hostile")
-    expect(page.locator("tbody tr:visible")).to_have_count(1)
+    expect(page.locator("tbody tr:visible")).to_have_count(3)
+
+
+def test_no_link_of_an_export_leads_nowhere(page, exported):
+    there = {path.name for path in exported.iterdir()}
+    for name in sorted(there):
+        page.goto(f"file://{exported}/{name}")
+        if name.startswith("trials-"):
+            expect(page.locator("#track")).to_be_visible()
+        addresses = page.eval_on_selector_all(
+            "a", "links => links.map(a => a.getAttribute('href'))"
+        )
+        files = {address.partition("?")[0].partition("#")[0] for address in addresses}
+        of_tables = {file for file in files if file.startswith("table-")}
+        assert files - {""} - of_tables <= there, name
+        assert "" not in addresses, name
+
+
+def test_a_page_of_its_own_leads_nowhere_else_and_is_accessible(page, study, tmp_path):
+    file = tmp_path / "one two.html"
+    list(export_page(study, file, ["emulator/baseline/N_0_0/*"]))
+    page.goto(f"file://{file}")
+    expect(page.locator("#track")).to_be_visible()
+    assert serious(page) == []
+    expect(page.locator("header nav a")).to_have_count(0)
+    addresses = page.eval_on_selector_all("a", "links => links.map(a => a.getAttribute('href'))")
+    assert {address.partition("?")[0] for address in addresses} <= {"#main", "one%20two.html"}
+    page.keyboard.press("Escape")
+    expect(page.locator("#track")).to_be_visible()
+
+
+def test_an_earlier_export_in_the_folder_goes_and_nothing_else(study, tmp_path):
+    (tmp_path / "mine.html").write_text("<title>mine</title>")
+    list(export_folder(study, tmp_path, ["emulator/baseline/*"]))
+    assert (tmp_path / "trials-N_0_0.html").exists()
+    list(export_folder(study, tmp_path, ["emulator/baseline/L_4_0/*"]))
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("index.html", "mine.html", "trials.html", "trials-L_4_0.html")
+    }
 
 
 def test_what_a_model_wrote_is_text_there_too(page, exported):
@@ -67,19 +109,22 @@ def test_a_page_of_chosen_trials_holds_these_alone(page, study, tmp_path):
 
 
 def test_equal_blocks_of_prompts_are_there_once(study, tmp_path):
-    three, one = tmp_path / "three.html", tmp_path / "one.html"
-    list(export_page(study, three, ["emulator/baseline/N_0_0/*"]))
-    list(export_page(study, one, ["emulator/baseline/N_0_0/rep01"]))
-    frame = one.stat().st_size
-    prompts = sum(len(p) for (p,) in _prompts(study))
-    assert three.stat().st_size - frame < prompts / 2
+    file = tmp_path / "three.html"
+    list(export_page(study, file, ["emulator/baseline/N_0_0/*"]))
+    text = file.read_text(encoding="utf-8")
+    bundle = json.loads(re.search(r'id="bundle">(.*?)</script>', text)[1])
 
+    def unpacked(packed):
+        return json.loads(zlib.decompress(base64.b64decode(packed)))
 
-def _prompts(study):
-    with duckdb.connect(str(study), read_only=True) as connection:
-        return connection.execute(
-            "SELECT prompt FROM decisions WHERE trial_id LIKE 'emulator/baseline/N_0_0/%'"
-        ).fetchall()
+    blocks = unpacked(bundle["blocks"])
+    assert len(blocks) == len(set(blocks))
+    assert sum("You drive a car" in block for block in blocks) > 3
+    panels = [
+        p for packed in bundle["trials"].values() for p in unpacked(packed)["panels"].values()
+    ]
+    assert len(panels) > 30
+    assert all("You drive a car" not in panel for panel in panels)
 
 
 @pytest.mark.parametrize(
@@ -88,6 +133,8 @@ def _prompts(study):
         ("my-dummy-secret-key", "the value of OPENAI_API_KEY"),
         ("sk-proj-abcdefghijklmnop0123", "what looks like a key: sk-pro"),
         ("{cwd}/notes.txt", "names the path"),
+        ("ghp_abcdefghijklmnopqrstuvwxyz0123456789", "what looks like a key: ghp_ab"),
+        ("/home/somebody/notes.txt", "names the path /home/somebody/"),
     ],
 )
 def test_a_secret_or_a_path_in_a_reply_stops_the_export(study, tmp_path, monkeypatch, said, told):
@@ -105,5 +152,5 @@ def test_a_secret_or_a_path_in_a_reply_stops_the_export(study, tmp_path, monkeyp
 
 
 def test_names_that_fit_no_trial_are_told(study, tmp_path):
-    with pytest.raises(UsageError, match="holds no trial called o4/"):
-        list(export_page(study, tmp_path / "one.html", ["o4/*"]))
+    with pytest.raises(UsageError, match="holds no trial called o5/"):
+        list(export_page(study, tmp_path / "one.html", ["o5/*"]))

@@ -6,6 +6,7 @@ import subprocess
 import time
 
 import pytest
+from axe import serious
 from conftest import served
 from harness import PROGRAM, environment
 from playwright.sync_api import expect
@@ -29,6 +30,7 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulato
         page.goto(address)
         verdict = page.locator(".sweep-verdict")
         expect(verdict).to_contain_text("Running")
+        assert serious(page) == []
         page.evaluate("window.stayed = true")
         expect(verdict).to_contain_text("Finished: all 2 trials ended", timeout=30_000)
         assert page.evaluate("window.stayed")

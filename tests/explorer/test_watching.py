@@ -56,6 +56,9 @@ def test_time_moves_by_play_scrub_and_keys(page):
     assert clock(page) == pytest.approx(stopped + 1.1, abs=0.051)
     page.locator("#scrub").fill("2.5")
     assert clock(page) == 2.5
+    page.keyboard.press("ArrowLeft")
+    assert clock(page) == 2.4
+    page.keyboard.press("ArrowRight")
     left = page.locator("#chart-v .playhead").bounding_box()["x"]
     page.keyboard.press("Shift+ArrowRight")
     assert page.locator("#chart-v .playhead").bounding_box()["x"] > left
@@ -194,3 +197,89 @@ def test_who_wants_no_motion_gets_pictures(browser, site):
     context_seen = page.evaluate("seen.size")
     context.close()
     assert 1 <= context_seen <= 4
+
+
+def test_figures_choose_the_speed_and_c_the_other_trial(page):
+    page.goto(TRIAL)
+    for key, speed in zip("12345", ("0.25", "0.5", "1", "2", "4"), strict=True):
+        page.keyboard.press(key)
+        expect(page.locator("#speed")).to_have_value(speed)
+    page.keyboard.press("c")
+    expect(page.locator("#compare")).to_be_focused()
+    page.locator("#compare").select_option("human/baseline/N_0_0/rep01")
+    expect(page.locator("#ghost-key")).to_contain_text("human P1")
+    page.keyboard.press(" ")
+    expect(page.locator("#play")).to_have_text("Pause")
+
+
+def test_the_other_trial_goes_on_where_this_one_ended(page):
+    page.goto(f"{COLLIDED}?compare=emulator/baseline/N_0_0/rep01")
+    expect(page.locator("#ghost-key")).to_contain_text("dashed")
+    own = float(page.locator(".outcome-text").inner_text().split("after ")[1].split()[0])
+    page.locator("#scrub").fill(str(own + 1))
+    assert clock(page) == pytest.approx(own + 1)
+    expect(page.locator("#track .crash")).to_contain_text("between the centres")
+    before = page.locator("#track .ghost.left").get_attribute("transform")
+    page.keyboard.press("Shift+ArrowRight")
+    assert page.locator("#track .ghost.left").get_attribute("transform") != before
+    assert "after" in page.locator("#ghost-key").inner_text()
+
+
+def test_a_trial_that_is_not_there_to_compare_with_is_said(page):
+    page.goto(f"{TRIAL}?compare=emulator/baseline/L_4_0/rep01")
+    expect(page.locator("#ghost-key")).to_contain_text("is not there to compare with")
+    expect(page.locator("#compare")).to_have_value("")
+
+
+def test_a_call_without_an_answer_can_be_read(page):
+    page.goto("/trials/o4/baseline/L_4_0/rep01")
+    lost = page.get_by_role("link", name="left, decision 2 at 2.0 s")
+    expect(lost).to_have_attribute("aria-label", re.compile("never driven"))
+    lost.click()
+    panel = page.locator(".decision-panel")
+    expect(panel).to_contain_text("The call got no answer")
+    expect(panel.locator("tbody")).to_contain_text("timeout")
+    page.get_by_role("link", name="right, decision 2 at 2.0 s").click()
+    expect(panel).to_contain_text("Yes: a plan of 20 numbers")
+    expect(panel.locator("li")).to_have_text("The trial ended.")
+
+
+def test_the_last_words_of_both_lead_to_their_decisions(page):
+    page.goto(COLLIDED)
+    words = page.locator("#decision article")
+    expect(words).to_have_count(2)
+    expect(words.first).to_contain_text("I take the gap")
+    words.last.get_by_role("link").click()
+    expect(page.locator(".decision-panel h2")).to_contain_text("right decision")
+    expect(page.locator("a.decision[aria-current]")).to_have_count(1)
+    page.go_back()
+    expect(words).to_have_count(2)
+
+
+def test_a_block_that_did_not_change_is_folded(page):
+    page.goto(f"{TRIAL}?side=left&decision=2")
+    blocks = page.locator("details.block")
+    expect(blocks.first).to_have_attribute("open", "")
+    same = page.locator("details.block", has_text="as before").first
+    expect(same.locator("pre")).to_be_hidden()
+
+
+def test_nothing_that_is_typed_into_the_search_is_lost(page):
+    page.goto("/trials")
+    page.locator("#search").press_sequentially("n_0_0/rep0", delay=260)
+    expect(page.locator("#search")).to_have_value("n_0_0/rep0")
+    expect(page.locator("tbody tr").first).to_contain_text("N_0_0")
+    page.wait_for_url("**/trials?q=n_0_0%2Frep0")
+
+
+def test_who_filters_by_keyboard_stays_where_he_was(page):
+    page.goto("/trials")
+    page.get_by_label("outcome").focus()
+    page.get_by_label("outcome").select_option("collided")
+    expect(page.locator("tbody tr")).to_have_count(1)
+    expect(page.get_by_label("outcome")).to_be_focused()
+    page.go_back()
+    expect(page.locator("tbody tr")).not_to_have_count(1)
+    page.locator("main").focus()
+    page.keyboard.press("?")
+    expect(page.locator("#help")).to_be_visible()

@@ -224,7 +224,8 @@ window.startReplay = () => {
     if (over) {
       const [[x1, y1], [x2, y2]] = ["left", "right"].map((side) => place(side, trial.sides[side].x.at(-1)));
       for (const [name, value] of Object.entries({ x1, y1, x2, y2 })) vehicles.between.setAttribute(name, value);
-      vehicles.crashed.setAttribute("x", (x1 + x2) / 2);
+      // Beside the signs, and within the picture.
+      vehicles.crashed.setAttribute("x", Math.min(Math.max((x1 + x2) / 2, 97), 115));
       vehicles.crashed.textContent = `✸ collision, ${Math.hypot(x1 - x2, y1 - y2).toFixed(1)} m between the centres`;
     }
     at("scrub").value = now;
