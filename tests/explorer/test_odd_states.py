@@ -1,0 +1,151 @@
+"""Addresses, rows and databases that are not as they should be cost no other page anything."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+
+import duckdb
+import pytest
+from starlette.testclient import TestClient
+
+from analysis.explorer.app import explorer
+from analysis.explorer.computing import Child, Computing, Result
+from analysis.explorer.site import Site
+
+HOST = "127.0.0.1:8700"
+TRIAL = "/trials/emulator/baseline/N_0_0/rep01"
+
+
+@pytest.fixture
+def db(study, tmp_path):
+    """A copy of the study, to change it."""
+    return shutil.copy(study, tmp_path / "study.duckdb")
+
+
+def ask(site, address):
+    return TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}").get(address)
+
+
+def change(db, sql):
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(sql)
+
+
+@pytest.mark.parametrize(
+    ("address", "code"),
+    [
+        (f"{TRIAL}?side=left&decision=²", 200),
+        (f"{TRIAL}?side=left&decision=٣", 200),
+        (f"{TRIAL}?side=left&decision={'9' * 5000}", 200),
+        (f"{TRIAL}?side=left&decision=99", 200),
+        ("/decisions/emulator/baseline/N_0_0/rep01?side=left&decision=²", 404),
+        ("/raw/emulator/baseline/N_0_0/rep01?side=left&decision=99", 404),
+        ("/trials?page=٣", 200),
+        ("/trials?page=99999999999", 200),
+        ("/trials?sort=drop", 200),
+        ("/trials/?q=x", 200),
+        ("/trials.exe", 404),
+        ("/trials/no/such/trial", 404),
+        ("/sweeps/none", 404),
+    ],
+)
+def test_an_odd_address_is_no_fault(study, address, code):
+    reply = ask(Site(study), address)
+    assert reply.status_code == code
+    assert "A fault" not in reply.text
+
+
+def test_a_decision_that_is_not_there_is_said_on_the_page_of_its_trial(study):
+    text = ask(Site(study), f"{TRIAL}?side=left&decision=99").text
+    assert "has no decision 99 of the left driver" in text
+    assert 'id="track"' in text
+
+
+def test_odd_rows_cost_no_other_row_its_page(db):
+    change(
+        db,
+        "UPDATE trials SET condition = 'X_1_1' WHERE trial_id LIKE 'o4/%';"
+        "DELETE FROM states WHERE side = 'right' AND trial_id LIKE '%N_0_0/rep01'",
+    )
+    site = Site(db)
+    assert "no condition of the experiment" in ask(site, "/trials/o4/baseline/L_4_0/rep01").text
+    assert ask(site, "/trials?condition=N_0_0").text.count('<th scope="row">') == 4
+    assert ask(site, TRIAL).status_code == 200
+
+
+def test_a_trial_that_failed_again_shows_its_new_error(db):
+    site = Site(db)
+    site.catalogue.refresh()
+    state = site.catalogue.state()
+    change(db, "UPDATE trials SET error = 'left: another one' WHERE trial_id LIKE 'o4/%'")
+    assert "another one" in ask(site, "/trials/o4/baseline/L_4_0/rep01").text
+    assert site.catalogue.find("o4/baseline/L_4_0/rep01")["error"] == "left: another one"
+    assert site.catalogue.state() != state
+
+
+def test_while_another_program_holds_the_database_the_last_list_is_shown(db):
+    site = Site(db)
+    assert "holds the database" not in ask(site, "/trials").text
+    holder = subprocess.Popen(
+        [
+            *(sys.executable, "-c"),
+            "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True);"
+            "sys.stdin.read()",
+            str(db),
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert holder.stdout.readline() == b"held\n"
+    os.utime(db)  # something has changed
+    try:
+        for address in ("/trials", "/trials?condition=N_0_0", "/sweeps", "/tables"):
+            reply = ask(site, address)
+            assert reply.status_code == 200
+            assert "Another program holds the database" in reply.text
+    finally:
+        holder.communicate()
+    assert "holds the database" not in ask(site, "/trials").text
+
+
+async def test_a_port_that_is_taken_is_said_in_a_line(merge_runner, study):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        run = await merge_runner("view", "--db", study, "--port", port)
+    assert run.code == 2
+    assert f"nothing can listen at port {port} of 127.0.0.1" in run.err
+    assert len(run.err.splitlines()) == 1
+
+
+def test_a_file_of_the_users_own_is_not_taken_for_ours(study, tmp_path, monkeypatch):
+    (tmp_path / "analysis.py").write_text("print('MINE')")
+    monkeypatch.chdir(tmp_path)
+    child = Child(study)
+    try:
+        assert child.ask(("tables", "attempts"))["counted"] > 0
+    finally:
+        child.close()
+
+
+def test_a_fault_in_a_computation_does_not_stay(study):
+    answers = iter([ValueError("a fault"), {"counted": 1}])
+
+    class Faulty:
+        def ask(self, request):
+            answer = next(answers)
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+
+        def close(self):
+            pass
+
+    computing = Computing(study, start=lambda _: Faulty())
+    with pytest.raises(ValueError, match="a fault"):
+        computing.ask(("tables",), (1, 1), wait_s=5)
+    assert isinstance(computing.ask(("tables",), (1, 1), wait_s=5), Result)
+    computing.close()
