@@ -164,13 +164,18 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
     def said(heading: str, text: str, code: int) -> Response:
         return HTMLResponse(site.render("message.html", heading=heading, text=text, here=""), code)
 
+    def absent(_: Request, exc: Exception) -> Response:
+        reply = said("Not there", str(exc), 404)
+        reply.headers["hx-refresh"] = "true"  # a page that waited for it is loaded anew, to say so
+        return reply
+
     def fault(request: Request, exc: Exception) -> Response:
         LOG.error("%s: a fault of the explorer: %r", request.url.path, exc)
         LOG.debug("where it happened", exc_info=exc)
         return said("A fault", f"A fault of the explorer: {exc!r}. The other pages go on.", 500)
 
     return {
-        NotThere: lambda _, exc: said("Not there", str(exc), 404),
+        NotThere: absent,
         404: lambda request, _: said("Not there", f"there is no page {request.url.path}", 404),
         MergeRunnerError: lambda _, exc: said("Not now", str(exc), 503),
         Exception: fault,

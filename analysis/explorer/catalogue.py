@@ -48,7 +48,8 @@ CREATE TABLE tried (trial_id VARCHAR, spec_hash VARCHAR, requested VARCHAR, serv
 CREATE TABLE flaws (trial_id VARCHAR, spec_hash VARCHAR, failure VARCHAR, times BIGINT);
 """
 # What each sweep has of them; what went wrong in a trial, and how often. Of an error stand the
-# words before its particulars.
+# words before its particulars. That another model answered than was asked for is no fault where a
+# sweep declares it as an alias.
 GROUPED = """
 CREATE OR REPLACE TABLE members AS
     SELECT sweep, number FROM planned JOIN listed USING (trial_id, spec_hash);
@@ -60,7 +61,10 @@ FROM listed WHERE status = 'failed'
 UNION ALL SELECT number, 'plan: ' || failure, times
 FROM flaws JOIN listed USING (trial_id, spec_hash)
 UNION ALL SELECT number, 'attempt: ' || tried.outcome, sum(times)::BIGINT
-FROM tried JOIN listed USING (trial_id, spec_hash) WHERE tried.outcome <> 'ok' GROUP BY ALL;
+FROM tried JOIN listed USING (trial_id, spec_hash) WHERE tried.outcome <> 'ok' GROUP BY ALL
+UNION ALL SELECT number, 'model: ' || requested || ' → ' || served, sum(times)::BIGINT
+FROM tried JOIN listed USING (trial_id, spec_hash)
+WHERE answered AND served <> requested GROUP BY ALL;
 """
 # A failed trial may be played anew, and fail again; a file may be put in the place of another.
 FORGET = """
@@ -96,6 +100,7 @@ INSERT INTO memory.flaws
     SELECT trial_id, spec_hash, failure, count(*) FROM decisions
     SEMI JOIN memory.trials USING (trial_id, spec_hash) WHERE failure IS NOT NULL GROUP BY ALL;
 """
+# After an invalid reply there is always a fallback, and no other time: the audit sees to that.
 # A sparkline has about 24 points.
 LIST = """
 INSERT INTO listed BY NAME
@@ -105,7 +110,7 @@ SELECT trials.trial_id, trials.spec_hash, source,
     variant, condition, rep, pair, status, merged_first, end_time_s, error, scripted,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
-        WHEN fallbacks > 0 THEN 'fallbacks' WHEN invalid > 0 THEN 'invalid'
+        WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'
         ELSE 'all valid' END AS validity,
     time_to_merge_s, gap_m, rmse_mps, joint, coalesce(decisions, 0) AS decisions,
     coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,

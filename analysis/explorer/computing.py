@@ -23,7 +23,10 @@ LONG_S = {"who-first": 8, "gap": 13, "indicators": 15, "ablation-qualitative": 1
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """An answer, the state of the database that it was made in, and when (s since 1970)."""
+    """An answer, the state of the database that it was made in, and when (s since 1970).
+
+    It may be that what is asked for is ``absent``.
+    """
 
     content: dict[str, Any]
     state: State
@@ -127,7 +130,7 @@ class Computing:
         """
         with self._lock:
             found = self._results.get(request)
-            if found is not None and found.at >= since:
+            if found is not None and found.at >= since and self._stands(found):
                 return found
             if request not in self._jobs:
                 made = self._pool.submit(self._run, request, state, since)
@@ -155,6 +158,10 @@ class Computing:
         self._pool.shutdown(wait=False, cancel_futures=True)
         if self._computer is not None:
             self._computer.close()
+
+    def _stands(self, result: Result) -> bool:
+        """What is absent may be there in the state of another process."""
+        return "absent" not in result.content or result.state == self._state
 
     def _run(self, request: Request, state: State, since: float) -> Result:
         # A cell is counted in the state of its table, unless a later one is wanted.

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import hmac
+import ipaddress
+import re
 from collections.abc import Collection
-from http.cookies import SimpleCookie
 from urllib.parse import parse_qs, urlencode
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-COOKIE = "merge-runner"
+# One for each port: a browser sends the cookies of a host to all its ports.
+COOKIE = "merge-runner-{port}"
 # Scripts and styles are files of ours. What a model wrote could not run even if it were let in.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -35,11 +37,21 @@ def from_elsewhere(headers: Headers) -> bool:
     return headers.get("sec-fetch-site") in {"cross-site", "same-site"}
 
 
+def is_address(name: str) -> bool:
+    """Whether a host is an IP address, and no name that somebody's server resolves."""
+    try:
+        ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
+    except ValueError:
+        return False
+    return True
+
+
 class Guard:
     """Lets in requests to one of ``hosts`` (``NAME:PORT``) that no other site's page makes.
 
-    With a ``token`` also any other host, for those who know it: from ``?token=`` it goes into a
-    cookie. A name that an attacker's server resolves to this machine is no host of ours.
+    ``0.0.0.0`` or ``[::]`` among them stands for any IP address. A name that an attacker's server
+    resolves to this machine is no host of ours. With a ``token`` only those who know it come in:
+    from ``?token=`` it goes into a cookie.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], token: str | None = None) -> None:
@@ -71,7 +83,10 @@ class Guard:
     def _refusal(self, scope: Scope) -> str | RedirectResponse | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        if self._token is None and host not in self._hosts:
+        named = host if re.search(r":\d+$", host) else f"{host}:80"  # which browsers leave out
+        name, _, port = named.rpartition(":")
+        anywhere = {f"0.0.0.0:{port}", f"[::]:{port}"}
+        if named not in self._hosts and (self._hosts.isdisjoint(anywhere) or not is_address(name)):
             return "this host name is not served here"
         origin = headers.get("origin")
         if origin not in {None, f"http://{host}"}:
@@ -80,17 +95,28 @@ class Guard:
             return "another site's page may not ask here"
         if self._token is None:
             return None
-        return self._without_token(scope, headers, self._token)
+        return _without_token(scope, headers, COOKIE.format(port=port), self._token)
 
-    @staticmethod
-    def _without_token(scope: Scope, headers: Headers, token: str) -> str | RedirectResponse | None:
-        cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-        if cookie is not None and hmac.compare_digest(cookie.value, token):
-            return None
-        query = parse_qs(scope["query_string"].decode(errors="replace"))
-        if not hmac.compare_digest(query.pop("token", [""])[0].encode(), token.encode()):
-            return "open the address that `merge-runner view` printed, with its token"
-        rest = urlencode(query, doseq=True)
-        reply = RedirectResponse(scope["path"] + (f"?{rest}" if rest else ""), 303)
-        reply.set_cookie(COOKIE, token, httponly=True, samesite="strict")
-        return reply
+
+def _without_token(
+    scope: Scope, headers: Headers, cookie: str, token: str
+) -> str | RedirectResponse | None:
+    if any(_equal(value, token) for value in _values(headers.get("cookie", ""), cookie)):
+        return None
+    query = parse_qs(scope["query_string"].decode(errors="replace"))
+    if not _equal(query.pop("token", [""])[0], token):
+        return "open the address that `merge-runner view` printed, with its token"
+    rest = urlencode(query, doseq=True)
+    reply = RedirectResponse(scope["path"] + (f"?{rest}" if rest else ""), 303)
+    reply.set_cookie(cookie, token, httponly=True, samesite="strict")
+    return reply
+
+
+def _values(cookies: str, name: str) -> list[str]:
+    """What a cookie holds; no parser of cookies takes all that other programs write into theirs."""
+    pairs = [cookie.strip().partition("=") for cookie in cookies.split(";")]
+    return [value for key, _, value in pairs if key == name]
+
+
+def _equal(given: str, token: str) -> bool:
+    return hmac.compare_digest(given.encode(), token.encode())

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from analysis.kept import finished, keep_finished
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
-from analysis.tables.model import Column, Row, Table, from_text, options_text, to_text
+from analysis.tables.model import Table, from_text, options_text, to_text
 from merge_runner.database import read_database
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.simulator.conditions import CONDITIONS
@@ -37,6 +37,8 @@ class Numbers:
 
     def answer(self, request: Sequence[str]) -> dict[str, Any]:
         """What is asked for, with ``counted``: how many trials it was made of.
+
+        Where no table has the cell, the answer says so as ``absent``.
 
         ``tables NAME...``, ``cell TABLE ROW COLUMN``, or ``humans``. Raises MergeRunnerError.
         """
@@ -91,7 +93,13 @@ class Numbers:
         from analysis.explain import sources_of, sql_command
 
         table = self._finished([name])[name]
-        row, column = find_cell(table, row_id, column_name)
+        rows = {row.id: row for row in table.rows}
+        columns = {column.name: column for column in table.columns}
+        if row_id not in rows:
+            return {"absent": f"the table {name} has no row {row_id!r}"}
+        if column_name not in columns:
+            return {"absent": f"the table {name} has no column {column_name!r}"}
+        row, column = rows[row_id], columns[column_name]
         specs = {group.id: group.spec_hash for group in self.study.groups}
         return self._counted() | {
             "value": shown_value(column, row.values.get(column.name)),
@@ -110,16 +118,6 @@ class Numbers:
                 for source in sources_of(self.study, table, row, column)
             ],
         }
-
-
-def find_cell(table: Table, row_id: str, column_name: str) -> tuple[Row, Column]:
-    """A cell's row and column; raises UsageError."""
-    row = next((row for row in table.rows if row.id == row_id), None)
-    column = next((column for column in table.columns if column.name == column_name), None)
-    if row is None or column is None:
-        what = f"row {row_id!r}" if row is None else f"column {column_name!r}"
-        raise UsageError(f"the table {table.name} has no {what}")
-    return row, column
 
 
 def human_panels(study: Study) -> dict[str, Any]:

@@ -17,6 +17,8 @@ from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
 
 LOOPBACK = "127.0.0.1"
+# Who listens at all addresses is at this one, too.
+EVERYWHERE = {"0.0.0.0": LOOPBACK, "::": "::1"}  # noqa: S104 # compared, not bound
 
 
 def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
@@ -26,13 +28,23 @@ def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
         pass  # what is wrong with it is said at once
     listener = listen(bind, port)
     site.begin()
-    port = listener.getsockname()[1]
+    address, port = listener.getsockname()[:2]
     token = None if bind == LOOPBACK else secrets.token_urlsafe(24)
-    hosts = {f"{LOOPBACK}:{port}", f"localhost:{port}"}
-    shown = LOOPBACK if bind == "0.0.0.0" else bind  # noqa: S104 # compared, not bound
-    say(f"http://{shown}:{port}/" + (f"?token={token}" if token else ""))
+    hosts = [f"{name}:{port}" for name in names_of(bind, address)]
+    say(f"http://{hosts[0]}/" + (f"?token={token}" if token else ""))
     config = uvicorn.Config(explorer(site, hosts, token), log_level="critical", ws="none")
     _Server(config, site).run(sockets=[listener])
+
+
+def names_of(bind: str, address: str) -> list[str]:
+    """What a browser may call who listens at ``address``, as ``bind`` says; the first is shown."""
+    reached = EVERYWHERE.get(address, address)
+    names = [bind if reached == address else reached, address]
+    if reached in EVERYWHERE.values():
+        names.append("localhost")
+    if reached != address:
+        names += [socket.gethostname(), socket.getfqdn()]
+    return [f"[{name}]" if ":" in name else name for name in map(str.lower, names)]
 
 
 def _program() -> str:

@@ -41,7 +41,8 @@ GROUP BY ALL ORDER BY ALL
 """
 CAUSES = f"""
 SELECT cause, count(*) AS trials, sum(times)::BIGINT AS times
-FROM causes {OF_SWEEP} GROUP BY ALL ORDER BY trials DESC, cause
+FROM causes {OF_SWEEP} WHERE NOT starts_with(cause, 'model: ')
+GROUP BY ALL ORDER BY trials DESC, cause
 """  # noqa: S608 # constants
 # Why a run ended early, by its exit code.
 REASONS = {
@@ -217,7 +218,7 @@ def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> 
         entry=entry,
         verdict=verdict_of(entry, _later(entry, rows[:place]), sum(mismatches.values())),
         cells=cells_of(entry, stored),
-        rates=rates_of(stored, tried, sum(mismatches.values()), sweep_id),
+        rates=rates_of(stored, tried, mismatches, sweep_id),
         mismatches=mismatches,
         causes=catalogue.ask(CAUSES, sweep_id),
         unpriced=sum(row["unpriced"] for row in tried),
@@ -258,7 +259,9 @@ def cells_of(entry: Entry, stored: list[Row]) -> dict[tuple[str, str], Cell]:
     return cells
 
 
-def rates_of(stored: list[Row], tried: list[Row], other: int, sweep_id: str) -> list[Rate]:
+def rates_of(
+    stored: list[Row], tried: list[Row], mismatches: dict[str, int], sweep_id: str
+) -> list[Rate]:
     """How often what happened that may cost trust, each with what it is counted over."""
     sums = Counter[str]()
     for row in stored:
@@ -267,6 +270,9 @@ def rates_of(stored: list[Row], tried: list[Row], other: int, sweep_id: str) -> 
     for row in tried:
         outcomes[row["outcome"]] += row["times"]
     answers = sum(row["times"] for row in tried if row["answered"])
+    # A list is of one cause; several have theirs below, each in its own line.
+    pair = next(iter(mismatches)) if len(mismatches) == 1 else ""
+    other = {"cause": f"model: {pair}"} if pair else {}
     played, attempts = sums["ended"] + sums["failed"], outcomes.total()
     return [
         Rate(name, count, of, things, meaning, {"sweep": sweep_id, **state} if state else {})
@@ -277,15 +283,15 @@ def rates_of(stored: list[Row], tried: list[Row], other: int, sweep_id: str) -> 
              "a call got no answer; the trial has no outcome and can be played anew",
              {"outcome": "failed"}),
             ("invalid replies", sums["invalid"], sums["decisions"], "decisions",
-             "the reply held no valid plan", {}),
+             "the reply held no valid plan", {"validity": "fallbacks"}),
             ("fallbacks", sums["fallbacks"], sums["decisions"], "decisions",
              "an older plan was driven on, or none", {"validity": "fallbacks"}),
             ("refusals", outcomes["refusal"], attempts, "attempts",
              "the model, or a filter before it, declined", {"cause": "attempt: refusal"}),
             ("truncated replies", outcomes["truncated"], attempts, "attempts",
              "the reply was cut off at its longest", {"cause": "attempt: truncated"}),
-            ("another model answered", other, answers, "answers",
-             "it is neither the one asked for nor a declared alias of it", {}),
+            ("another model answered", sum(mismatches.values()), answers, "answers",
+             "it is neither the one asked for nor a declared alias of it", other),
         )
     ]  # fmt: skip
 

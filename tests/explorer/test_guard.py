@@ -8,7 +8,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
-from analysis.explorer.guard import COOKIE
+from analysis.explorer.server import names_of
 from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
 
@@ -63,16 +63,101 @@ def test_what_is_not_there_is_said_and_no_markup_of_the_address_is_kept(client):
     assert "<b>nowhere" not in reply.text
 
 
-def test_at_another_address_one_needs_the_token(study):
-    app = explorer(Site(study), {HOST}, token="the-token")
-    with TestClient(app, base_url="http://10.0.0.5:8700", follow_redirects=False) as client:
-        assert client.get("/trials").status_code == 403
-        assert client.get("/trials?token=another").status_code == 403
-        told = client.get("/trials?token=the-token&model=o3")
-        assert (told.status_code, told.headers["location"]) == (303, "/trials?model=o3")
-        assert "httponly" in told.headers["set-cookie"].lower()
-        client.cookies.set(COOKIE, "the-token")
-        assert client.get("/trials").status_code == 200
+@pytest.fixture
+def with_token(study):
+    """What answers at one address of many, or with ``0.0.0.0`` at all, to who has the token."""
+
+    def client(host, *hosts):
+        app = explorer(Site(study), hosts or {host}, token="the-token")
+        return TestClient(app, base_url=f"http://{host}", follow_redirects=False)
+
+    return client
+
+
+def test_at_another_address_one_needs_the_token(with_token):
+    client = with_token("10.0.0.5:8700")
+    assert client.get("/trials").status_code == 403
+    assert client.get("/trials?token=another").status_code == 403
+    assert client.get("/trials?token=anöther").status_code == 403
+    told = client.get("/trials?token=the-token&model=o3")
+    assert (told.status_code, told.headers["location"]) == (303, "/trials?model=o3")
+    assert "httponly" in told.headers["set-cookie"].lower()
+    assert client.get("/trials").status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("cookie", "code"),
+    [
+        (b"merge-runner-8700=the-token", 200),
+        (b'bad(=1; {"a": "b=c"}; n\xf6; x="y;merge-runner-8700=the-token', 200),
+        (b"merge-runner-8700=old; merge-runner-8700=the-token", 200),
+        (b"merge-runner-8700=th\xe9-token", 403),
+        (b"merge-runner-8700", 403),
+        (b"merge-runner-8701=the-token", 403),
+        (b"not-merge-runner-8700=the-token", 403),
+        (b"a=merge-runner-8700=the-token", 403),
+    ],
+)
+def test_the_cookie_is_found_among_those_of_other_programs(with_token, cookie, code):
+    client = with_token("10.0.0.5:8700")
+    assert client.get("/trials", headers={b"cookie": cookie}).status_code == code
+
+
+def test_two_explorers_on_one_host_keep_their_cookies_apart(with_token):
+    said = [
+        with_token(f"10.0.0.5:{port}").get("/?token=the-token").headers["set-cookie"]
+        for port in (8700, 8701)
+    ]
+    assert [cookie.partition("=")[0] for cookie in said] == [
+        "merge-runner-8700",
+        "merge-runner-8701",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("hosts", "asked", "answered"),
+    [
+        (["10.0.0.5:8700"], "10.0.0.5:8700", True),
+        (["10.0.0.5:8700"], "10.0.0.6:8700", False),
+        (["10.0.0.5:8700"], "evil.example:8700", False),
+        (["10.0.0.5:8700"], "10.0.0.5:8701", False),
+        (["10.0.0.5:8700"], "10.0.0.5", False),
+        (["10.0.0.5:80"], "10.0.0.5", True),
+        (["[::1]:80"], "[::1]", True),
+        (["0.0.0.0:8700", "box:8700"], "10.0.0.5:8700", True),
+        (["0.0.0.0:8700", "box:8700"], "box:8700", True),
+        (["0.0.0.0:8700", "box:8700"], "evil.example:8700", False),
+        (["0.0.0.0:8700", "box:8700"], "10.0.0.5.evil.example:8700", False),
+        (["0.0.0.0:8700", "box:8700"], "10.0.0.5:8701", False),
+        (["0.0.0.0:80"], "10.0.0.5", True),
+        (["[::]:8700"], "[fe80::1]:8700", True),
+        (["[::]:8700"], "evil.example:8700", False),
+    ],
+)
+def test_with_the_token_too_the_host_is_one_of_ours(with_token, hosts, asked, answered):
+    reply = with_token(asked, *hosts).get("/trials?token=the-token")
+    assert reply.status_code == (303 if answered else 403)
+    assert answered or "this host name" in reply.text
+
+
+@pytest.mark.parametrize(
+    ("bind", "address", "names"),
+    [
+        ("127.0.0.1", "127.0.0.1", ["127.0.0.1", "localhost"]),
+        ("localhost", "127.0.0.1", ["localhost", "127.0.0.1"]),
+        ("::1", "::1", ["[::1]", "localhost"]),
+        ("10.0.0.5", "10.0.0.5", ["10.0.0.5"]),
+        ("Box", "10.0.0.5", ["box", "10.0.0.5"]),
+        ("FE80::5", "fe80::5", ["[fe80::5]"]),
+        ("0.0.0.0", "0.0.0.0", ["127.0.0.1", "0.0.0.0", "localhost", "box", "box.lan"]),
+        ("", "0.0.0.0", ["127.0.0.1", "0.0.0.0", "localhost", "box", "box.lan"]),
+        ("::", "::", ["[::1]", "[::]", "localhost", "box", "box.lan"]),
+    ],
+)
+def test_the_names_are_those_under_which_it_is_reached(monkeypatch, bind, address, names):
+    monkeypatch.setattr("socket.gethostname", lambda: "Box")
+    monkeypatch.setattr("socket.getfqdn", lambda: "box.lan")
+    assert list(dict.fromkeys(names_of(bind, address))) == names
 
 
 def test_a_database_that_is_not_there_is_told(tmp_path):

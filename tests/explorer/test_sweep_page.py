@@ -130,6 +130,54 @@ def test_every_cell_and_every_cause_leads_to_the_trials_that_it_counts(written):
     }
 
 
+def test_every_rate_that_may_cost_trust_leads_to_its_trials(written):
+    site = Site(written)
+    shown = page_of(site)
+    links = dict(re.findall(r'id="((?:rate|model)-\d)" href="([^"]*)"', shown))
+    trials = {}
+    for name, url in links.items():
+        asked = {k: v[0] for k, v in parse_qs(urlsplit(html.unescape(url)).query).items()}
+        assert asked["sweep"] == "sweep-1"
+        trials[name] = [row["trial_id"] for row in site.catalogue.every(filter_of(asked))]
+    with duckdb.connect(str(written), read_only=True) as connection:
+        invalid = connection.execute(
+            "SELECT DISTINCT trial_id FROM decisions WHERE NOT valid ORDER BY ALL"
+        ).fetchall()
+        other = connection.execute(
+            "SELECT DISTINCT trial_id FROM calls WHERE model_served = 'another'"
+        ).fetchall()
+    assert (len(invalid), len(other)) == (2, 1)
+    assert trials["rate-3"] == trials["rate-4"] == [name for (name,) in invalid]
+    assert trials["rate-7"] == trials["model-1"] == [name for (name,) in other]
+
+
+def test_an_alias_is_a_cause_to_look_for_and_nothing_that_went_wrong(study):
+    site = Site(study)
+    shown = html.unescape(page_of(site))
+    assert "o3 → o3-alias" not in shown
+    alias = site.catalogue.every(filter_of({"cause": "model: o3 → o3-alias"}))
+    assert len(alias) == 1
+    assert site.catalogue.totals(filter_of({"cause": "model: o3 → o3"})).trials == 0
+    with duckdb.connect(str(study)) as connection:
+        connection.execute("UPDATE calls SET outcome = 'ok'")
+        connection.execute("UPDATE decisions SET failure = NULL, valid = true, fallback = false")
+        connection.execute("UPDATE trials SET status = 'finished' WHERE status = 'failed'")
+    assert "no trial failed, and no reply lacked a valid plan" in page_of(Site(study))
+
+
+def test_two_other_models_have_a_line_and_a_list_each(study):
+    with duckdb.connect(str(study)) as connection:
+        connection.execute("UPDATE calls SET model_served = 'third' WHERE trial_id LIKE '%N_0_0%'")
+    site = Site(study)
+    shown = page_of(site)
+    assert re.search(r'<th scope="row">another model answered</th>', shown)
+    for number, name in enumerate(("another", "third"), 1):
+        link = html.unescape(re.search(f'id="model-{number}" href="([^"]*)"', shown)[1])
+        asked = {k: v[0] for k, v in parse_qs(urlsplit(link).query).items()}
+        assert asked["cause"] == f"model: o3 → {name}"
+        assert site.catalogue.totals(filter_of(asked)).trials > 0
+
+
 def page_of(site):
     site.catalogue.refresh()
     return page.sweep_page(site, "sweep-1")

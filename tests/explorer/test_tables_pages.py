@@ -138,10 +138,94 @@ def test_facets_sorting_and_exports_keep_the_cell(ask):
 
 
 def test_a_cell_that_is_none_says_so(ask):
-    assert "has no row" in ask("/trials?cell=attempts/nobody:n")
+    for address in ("/trials", "/trials.csv"):
+        row = unescape(ask(f"{address}?cell=attempts/nobody:n", 404))
+        assert "<p>the table attempts has no row 'nobody'</p>" in row
+        column = unescape(ask(f"{address}?cell=attempts/o3/A1:nothing", 404))
+        assert "<p>the table attempts has no column 'nothing'</p>" in column
     assert "TABLE/ROW:COLUMN" in ask("/trials?cell=nothing", 404)
     assert "who-first" in ask("/tables/nothing", 404)
     assert set(ABOUT) == set(TABLES)
+
+
+def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at_once(db):
+    asked = []
+
+    class Counting(InProcess):
+        def ask(self, request):
+            asked.append(request)
+            return super().ask(request)
+
+    site = Site(db)
+    site.computing = Computing(db, Counting)
+    client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
+    address = "/trials?cell=attempts/nobody:n"
+    while (waited := client.get(address, headers={"hx-request": "true"})).status_code == 200:
+        pass
+    assert (waited.status_code, waited.headers["hx-refresh"]) == (404, "true")
+    assert client.get(address).status_code == 404
+    assert len(asked) == 1
+    site.computing.close()
+
+
+def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_in(db):
+    found = {(1, 1): {"absent": "no such row"}, (2, 2): {"value": "7"}}
+
+    class Once(InProcess):
+        def ask(self, request):
+            return found[computing._state]
+
+    computing = Computing(db, Once)
+    cell, table = ("cell", "attempts", "o3/A9", "n"), ("tables", "attempts")
+    assert computing.ask(cell, (1, 1), wait_s=5).content == found[1, 1]
+    assert computing.ask(cell, (2, 2), wait_s=5).content == found[1, 1]
+    computing.ask(table, (2, 2), wait_s=5)
+    assert computing.ask(cell, (2, 2), wait_s=5).content == found[2, 2]
+    computing.close()
+
+
+def test_the_trials_of_a_rate_that_are_in_no_pair_are_counted(tmp_path):
+    """A baseline of two repetitions, the second with collisions, and a variant of one."""
+    baseline = [
+        replace(drive, left=(0.0,), right=(0.0,)) if drive.rep == 2 and drive.left[0] < 0 else drive
+        for drive in yielding("o3", reps=2)
+    ]
+    db = write_study(tmp_path / "t.duckdb", [*baseline, *yielding("o3", "A1", reps=1)])
+    site = Site(db)
+    client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
+    with duckdb.connect(str(db), read_only=True) as connection:
+        collided = connection.execute(
+            "SELECT trial_id FROM trials WHERE status = 'collided' ORDER BY ALL"
+        ).fetchall()
+        joint = connection.execute(
+            "SELECT trial_id FROM trials JOIN trial_metrics USING (trial_id, spec_hash) "
+            "WHERE joint AND trial_id LIKE '%rep02' ORDER BY ALL"
+        ).fetchall()
+    assert collided
+    assert joint
+    for by, alone in (("outcome", collided), ("joint", joint)):
+        text = client.get(f"/discordant?model=o3 [k]&variant=A1&by={by}").text
+        assert "<strong>0</strong> of 11 pairs differ" in text
+        rows = re.search(r'<table[^>]*id="alone">.*?</table>', text, re.DOTALL)[0]
+        base, own = rows.split("<tr>")[2:]
+        assert [urlsplit(a).path for a in Addresses(base).to if "/trials/" in a] == [
+            f"/trials/{name}" for (name,) in alone
+        ]
+        assert re.findall(r">(\d+)<", base)[::2] == ["22", "11"]
+        assert int(re.search(r"<summary>(\d+)<", base)[1]) == len(alone)
+        assert re.findall(r">(\d+)<", own)[::3] == ["11", "0"]
+        for link, count in re.findall(r'href="(/trials\?[^"]*)">(\d+)<', rows):
+            assert listed(client.get(unescape(link)).text) == int(count)
+    even = write_study(
+        tmp_path / "even.duckdb", [*yielding("o3", reps=1), *yielding("o3", "A1", 1)]
+    )
+    text = (
+        TestClient(explorer(Site(even), {HERE}), base_url=f"http://{HERE}")
+        .get("/discordant?model=o3&variant=A1")
+        .text
+    )
+    assert "0</strong> of 11 pairs differ" in text
+    assert "without a partner" not in text
 
 
 def test_discordant_trials_are_the_pairs_that_differ(ask, db):

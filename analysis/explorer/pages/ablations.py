@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from analysis.explorer import views
+from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.reading import reading
 from analysis.explorer.site import NotThere, Site
@@ -19,6 +20,8 @@ BASELINE = "baseline"
 # Rates are decided trial by trial, and differ in single trials. Collisions are outcomes.
 FATES = {"collided_percent": "outcome", "joint_percent": "joint"}
 JOINT = {True: "joint", False: "not joint"}
+# What the rates count of it.
+COUNTED: dict[str, str | bool] = {"outcome": "collided", "joint": True}
 # A difference is drawn so wide, in units of its picture.
 WIDTH = 120.0
 
@@ -60,6 +63,17 @@ class Driver:
     name: str
     variants: dict[str, list[Cell]]
     widest: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """The trials of a variant, those of them that count in the rate, and those in no pair."""
+
+    variant: str
+    trials: int
+    counted: int
+    alone: int
+    counted_alone: list[dict[str, Any]]
 
 
 def ablations_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
@@ -199,10 +213,13 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
     if not model or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
     # A mark tells apart drivers that ran under several settings of the task.
-    found = site.catalogue.pairs(model, variant, fate) or site.catalogue.pairs(
-        model.partition(" [")[0], variant, fate
-    )
+    name, found = model, site.catalogue.pairs(model, variant, fate)
+    if not found:
+        name = model.partition(" [")[0]
+        found = site.catalogue.pairs(name, variant, fate)
     pairs = of_equal_tasks(site, found)
+    own = {(pair["trial_id"], pair["spec_hash"]) for pair in pairs}
+    base = {(pair["base_id"], pair["base_hash"]) for pair in pairs}
     differing = [pair for pair in pairs if pair["fate"] != pair["base_fate"]]
     kinds: dict[tuple[str, str], int] = {}
     for pair in differing:
@@ -212,15 +229,30 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
         "discordant.html",
         here="ablations",
         model=model,
+        name=name,
         variant=variant,
         left_out=left_out(variant),
         by=fate,
         said=_fate,
         pairs=pairs,
         differing=differing,
+        counted=_fate(COUNTED[fate]),
+        sides=[side_of(site, name, BASELINE, fate, base), side_of(site, name, variant, fate, own)],
         kinds=sorted(kinds.items(), key=lambda item: (-item[1], item[0])),
         settings=sorted({(pair["spec_hash"], pair["base_hash"]) for pair in pairs}),
     )
+
+
+def side_of(
+    site: Site, model: str, variant: str, fate: str, paired: Collection[tuple[str, str]]
+) -> Side:
+    """What a rate counts on one side, and what of it is in none of the pairs."""
+    trials = site.catalogue.every(Filter(model=model, variant=variant))
+    alone = [row for row in trials if (row["trial_id"], row["spec_hash"]) not in paired]
+    counted, counted_alone = (
+        [row for row in rows if row[fate] == COUNTED[fate]] for rows in (trials, alone)
+    )
+    return Side(variant, len(trials), len(counted), len(alone), counted_alone)
 
 
 def of_equal_tasks(site: Site, pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from datetime import datetime
 from analysis.explorer.asked import seconds
 from analysis.explorer.computing import Request, Result, Waiting, about_s
 from analysis.explorer.links import query_of
-from analysis.explorer.site import Site
+from analysis.explorer.site import NotThere, Site
 
 # What is kept in the database comes within the first; the second is for a page that shows a clock.
 AT_ONCE_S = 0.3
@@ -50,7 +50,10 @@ def computed(
     patient: bool = False,
     wait_s: float = AT_ONCE_S,
 ) -> Computed:
-    """Ask for something; a ``patient`` page has said already that it takes a while."""
+    """Ask for something; a ``patient`` page has said already that it takes a while.
+
+    Raises NotThere where the tables do not hold it.
+    """
     state = site.catalogue.state()
     if site.static:
         wait_s = EXPORT_S
@@ -58,6 +61,8 @@ def computed(
         wait_s = PATIENT_S
     found = site.computing.ask(request, state, since=seconds(asked.get("since", "")), wait_s=wait_s)
     result = found if isinstance(found, Result) else None
+    if result is not None and "absent" in result.content:
+        raise NotThere(result.content["absent"])
     failure = "" if isinstance(found, Result | Waiting) else found.text
     later = {"since": f"{result.at + 0.001:.3f}"} if result else {}
     return Computed(
