@@ -278,7 +278,7 @@ def rates_of(
         Rate(name, count, of, things, meaning, {"sweep": sweep_id, **state} if state else {})
         for name, count, of, things, meaning, state in (
             ("collisions", sums["collided"], sums["ended"], "ended trials",
-             "the vehicles came closer than the rule for a collision allows", {"outcome": "collided"}),
+             "the vehicles came closer than the collision rule allows", {"outcome": "collided"}),
             ("failed trials", sums["failed"], played, "stored trials",
              "a call got no answer; the trial has no outcome and can be played anew",
              {"outcome": "failed"}),
