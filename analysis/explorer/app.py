@@ -107,8 +107,8 @@ def _trial_routes(site: Site) -> list[Route]:
     def of_trial(render: Callable[[Site, str, Mapping[str, str]], str]) -> Callable[..., Response]:
         return _page(site, lambda r: render(site, r.path_params["trial"], r.query_params))
 
-    def page_of_all(_: Request) -> Response:
-        return RedirectResponse(site.at.to("trials"))
+    def page_of_all(request: Request) -> Response:
+        return RedirectResponse(site.at.to("trials", **request.query_params))
 
     listing = _page(site, lambda r: trials.trials_page(site, r.query_params, **_patience(r)))
     return [

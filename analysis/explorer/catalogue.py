@@ -237,17 +237,19 @@ class Catalogue:
                 self._begin(stamp[0])
             assert self._connection is not None
             try:
-                self._reading(FORGET)
-                while self._reading(TAKE):
+                # What is forgotten is taken again before anybody else can hold the file.
+                waiting = self._reading(FORGET + TAKE)
+                while waiting:
                     self._connection.execute(LIST)
+                    waiting = self._reading(TAKE)
             except StoreLocked:
                 if self._stamp is None:
                     raise
                 self.held = True
-                return False
+            else:
+                self._stamp, self.held = stamp, False
             self._connection.execute(GROUPED)
-            self._stamp, self.held = stamp, False
-            return True
+            return not self.held
 
     def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
         """Each facet's values with how many trials they would leave, the other facets as wanted."""

@@ -23,7 +23,7 @@ SELECT side, list(time_s ORDER BY step) AS time_s, list(position_m ORDER BY step
     list(acceleration_mps2 ORDER BY step) AS acceleration_mps2
 FROM states WHERE {OF_TRIAL} GROUP BY ALL
 """  # noqa: S608 # constants
-# Where a call got no answer there is no decision, of neither driver, and the trial ended.
+# Where a call got no answer the trial ended, and what the other driver decided is never driven.
 DECISIONS = f"""
 SELECT decision, time_s, side, valid, failure, tactical, plan, applied, fallback, rationale,
     false AS lost
@@ -83,11 +83,13 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
         spec = _records(connection, SPEC, {"spec": spec_hash})
     told = json.loads(spec[0]["spec"]) if spec else {}
     scenario = Scenario.model_validate(told.get("scenario", {}))
+    ordered = {side: states[side] for side in SIDES if side in states}
+    trial = Trial(trial_id, spec_hash, scenario, ordered, decisions)
     for row in decisions:
         if row["lost"]:
-            row["time_s"] = row["decision"] / scenario.prompt_rate_hz
-    ordered = {side: states[side] for side in SIDES if side in states}
-    return Trial(trial_id, spec_hash, scenario, ordered, decisions)
+            row["time_s"] = trial.end_s
+        row["driven"] = row["time_s"] < trial.end_s
+    return trial
 
 
 def read_decisions(

@@ -21,7 +21,7 @@ from markupsafe import Markup
 
 from analysis.explorer.catalogue import FACETS, SEVERAL, Filter
 from analysis.explorer.details import Row, read_decisions, read_trial
-from analysis.explorer.links import StaticLinks, bundle_name
+from analysis.explorer.links import EXPORTED, StaticLinks, bundle_name
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
@@ -51,10 +51,12 @@ _KEYS = re.compile(
 )
 _SECRET_NAMES = ("_KEY", "_TOKEN", "_SECRET", "_PASSWORD")
 # Whoever's home it is.
-_HOMES = re.compile(r"(?:/home|/Users|[A-Z]:\\Users)[/\\][\w.-]+[/\\]")
+_HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\]")
 SHORTEST_SECRET = 8
-# By this a page of ours is known.
-TITLE_END = " · merge-runner</title>"
+# What an export is made of, and its names alone.
+_OURS = re.compile(rf"(?:index|{'|'.join(EXPORTED)}|(?:sweep|table|trials)-.*)\.html")
+# Packed trials, which are searched before they are packed: their letters spell anything.
+_PACKED = re.compile(r'<script type="application/json" id="bundle">.*?</script>', re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +106,12 @@ def export_folder(
         for condition in sorted({row["condition"] for row in rows}):
             mine = [row for row in rows if row["condition"] == condition]
             title = f"Trials of {condition}"
-            pages[bundle_name(condition)] = bundle_page(site, watch(mine, title), mine, title)
+            pages[bundle_name(condition)] = bundle_page(site, mine, title, watch)
         if not wanted:
             pages |= {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site, watch)}
         pages["index.html"] = _index(pages)
         _refuse_secrets_of(site, pages)
-    _clear(folder, pages)
-    yield from _written(folder, pages)
+    yield from _written(folder, pages, _OURS)
 
 
 def export_page(
@@ -118,7 +119,7 @@ def export_page(
 ) -> Iterator[Path]:
     """Write one page with the wanted trials; yields its path. Raises UsageError."""
     with _opened(db, wanted, StaticLinks(alone=file.name)) as (site, rows):
-        pages = {file.name: bundle_page(site, watch(rows, "Trials"), rows, "Trials")}
+        pages = {file.name: bundle_page(site, rows, "Trials", watch)}
         _refuse_secrets_of(site, pages)
     yield from _written(file.parent, pages)
 
@@ -143,10 +144,12 @@ def _index(pages: Mapping[str, str]) -> str:
     )
 
 
-def bundle_page(site: Site, watched: Iterable[Row], rows: Sequence[Row], name: str) -> str:
-    """A page with several trials, of which it shows one; ``watched`` are the same rows."""
+def bundle_page(site: Site, rows: Sequence[Row], name: str, watch: Watch) -> str:
+    """A page with several trials, of which it shows one."""
     blocks = Blocks()
-    trials = {site.at.data(row): _packed(_trial(site, row, rows, blocks)) for row in watched}
+    trials = {
+        site.at.data(row): _packed(_trial(site, row, rows, blocks)) for row in watch(rows, name)
+    }
     bundle = {"trials": trials, "blocks": _packed(list(blocks.numbers))}
     return site.render(
         "bundle.html",
@@ -168,9 +171,7 @@ def _trial(site: Site, row: Row, beside: Sequence[Row], blocks: Blocks) -> dict[
         kind: [other for other in kin if (other["trial_id"], other["spec_hash"]) in there]
         for kind, kin in alternatives(site, row).items()
     }
-    html = site.render(
-        "_trial.html", here="trials", **values, alternatives=others, chosen_other="", panel=""
-    )
+    html = site.render("_trial.html", here="trials", **values, alternatives=others, panel="")
     panels = {
         f"{side}/{number}": rendered(site, row, trial, decision)
         for (side, number), decision in found.items()
@@ -249,18 +250,15 @@ def _packed(value: object) -> str:
     return base64.b64encode(zlib.compress(text.encode(errors="replace"), 9)).decode()
 
 
-def _clear(folder: Path, pages: Mapping[str, str]) -> None:
-    """Remove the pages of an earlier export that this one does not replace."""
-    for path in folder.glob("*.html"):
-        with path.open(encoding="utf-8", errors="replace") as file:
-            ours = TITLE_END in file.read(4_000)
-        if ours and path.name not in pages:
-            path.unlink()
-
-
-def _written(folder: Path, pages: Mapping[str, str]) -> Iterator[Path]:
+def _written(
+    folder: Path, pages: Mapping[str, str], replaced: re.Pattern[str] | None = None
+) -> Iterator[Path]:
+    """Write pages; of others in the folder, those whose names are ``replaced`` go."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        for path in folder.iterdir():
+            if replaced and replaced.fullmatch(path.name) and path.name not in pages:
+                path.unlink()
         for name, text in pages.items():
             (folder / name).write_text(text, encoding="utf-8")
             yield folder / name
@@ -270,7 +268,7 @@ def _written(folder: Path, pages: Mapping[str, str]) -> Iterator[Path]:
 
 def _refuse_secrets_of(site: Site, pages: Mapping[str, str]) -> None:
     for name, text in pages.items():
-        _refuse_secrets(site, name, [text])
+        _refuse_secrets(site, name, [_PACKED.sub("", text)])
 
 
 def _refuse_secrets(site: Site, where: str, texts: Sequence[str]) -> None:

@@ -50,8 +50,8 @@ def names_of(bind: str, address: str) -> list[str]:
 def _program() -> str:
     """What was typed to run this, by ``make`` too: the shell may not find the program elsewhere."""
     typed = sys.argv[0]
-    found = Path(typed).name != "merge-runner" or shutil.which("merge-runner") == typed
-    return "merge-runner" if found else typed
+    plain = Path(typed).name != "merge-runner" or shutil.which("merge-runner") == typed
+    return "merge-runner" if plain else typed
 
 
 class _Server(uvicorn.Server):

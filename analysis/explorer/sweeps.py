@@ -92,6 +92,11 @@ class Entry:
         return self.standing if self.state in {"running", "checking"} else None
 
     @property
+    def followed(self) -> bool:
+        """Whether there may be news of it: one that is silent may have slept, and go on."""
+        return self.row["ended_at"] is None and self.standing is not None
+
+    @property
     def planned(self) -> int:
         """How many trials it wants; 0 where nobody says."""
         return sum(self.config.repetitions.values()) * len(self.config.conditions)

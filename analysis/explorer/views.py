@@ -141,7 +141,7 @@ def summary(row: Row, trial: Trial) -> list[str]:
         if mine:
             letters = " ".join(d["tactical"] or "–" for d in mine)
             bad = [str(d["decision"]) for d in mine if not d["valid"] and not d["lost"]]
-            lost = [str(d["decision"]) for d in mine if d["lost"]]
+            lost = [str(d["decision"]) for d in mine if not d["driven"]]
             lines.append(
                 f"Decisions of the {side} driver: {letters}"
                 + (f"; without a valid plan: {', '.join(bad)}" if bad else "")
@@ -250,22 +250,22 @@ def _rounded(values: Sequence[float], digits: int) -> list[float]:
     return [round(value, digits) for value in values]
 
 
-def plan_chart(decision: Decision, scenario: Scenario) -> dict[str, Any] | None:
+def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
     """A plan as steps over its horizon, beside what the plan before had in mind for that time.
 
     None where there is no plan.
     """
-    row, before = decision.row, decision.before
+    row, before, scenario = decision.row, decision.before, trial.scenario
     if row["lost"]:
         return None
-    executed = len(row["applied"] or [])
+    applied = (row["applied"] or []) if row["time_s"] < trial.end_s else []
     old = (before["plan"] or [])[len(before["applied"]) :] if before else []
-    if not (row["plan"] or old or executed):
+    if not (row["plan"] or old or applied):
         return None
     return {
         "plan": row["plan"] or [],
         "before": old,
-        "applied": row["applied"] or [],
+        "applied": applied,
         "step_s": scenario.step_s,
         "most_mps2": scenario.max_acceleration_mps2,
         "steps": scenario.plan_actions,

@@ -53,9 +53,9 @@ def study(prepare, tmp_path_factory):
 
 
 @contextmanager
-def served(db: Path):
+def served(db: Path, port: int = 0):
     """The explorer of a database in a thread of its own; gives its address."""
-    listener = listen("127.0.0.1", 0)
+    listener = listen("127.0.0.1", port)
     host = f"127.0.0.1:{listener.getsockname()[1]}"
     server = uvicorn.Server(
         uvicorn.Config(explorer(Site(db), {host}), log_level="warning", ws="none")

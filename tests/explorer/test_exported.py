@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import zlib
+from pathlib import Path
 
 import duckdb
 import pytest
@@ -85,10 +86,22 @@ def test_an_earlier_export_in_the_folder_goes_and_nothing_else(study, tmp_path):
     (tmp_path / "mine.html").write_text("<title>mine</title>")
     list(export_folder(study, tmp_path, ["emulator/baseline/*"]))
     assert (tmp_path / "trials-N_0_0.html").exists()
+    list(export_page(study, tmp_path / "one.html", ["emulator/baseline/N_0_0/rep01"]))
     list(export_folder(study, tmp_path, ["emulator/baseline/L_4_0/*"]))
     assert {path.name for path in tmp_path.iterdir()} == {
-        *("index.html", "mine.html", "trials.html", "trials-L_4_0.html")
+        *("index.html", "mine.html", "one.html", "trials.html", "trials-L_4_0.html")
     }
+
+
+def test_packed_trials_are_not_taken_for_paths(study, tmp_path, monkeypatch):
+    file = tmp_path / "one.html"
+    list(export_page(study, file, ["emulator/baseline/N_0_0/*"]))
+    before, packed = file.read_text(encoding="utf-8").split('id="bundle">')
+    packed, after = packed.split("</script>", 1)
+    found = re.findall(r"/[A-Za-z0-9+]{1,3}/", packed)
+    spelt = next(path for path in found if path not in before + after)
+    monkeypatch.setattr("analysis.explorer.export.Path.home", lambda: Path(spelt))
+    assert list(export_page(study, file, ["emulator/baseline/N_0_0/*"])) == [file]
 
 
 def test_what_a_model_wrote_is_text_there_too(page, exported):

@@ -53,4 +53,11 @@ def test_a_page_says_when_nobody_answers_it_any_more(browser, study, address):
     else:
         page.keyboard.press("]")
     expect(page.locator("#lost")).to_contain_text("merge-runner view has ended")
+    expect(page.locator(".decision-panel")).to_have_count(0)
+    with served(study, int(site.rpartition(":")[2])):
+        if address == "/trials":
+            page.get_by_label("outcome").select_option("left first")
+        else:
+            page.keyboard.press("]")
+        expect(page.locator("#lost")).to_be_hidden()
     context.close()

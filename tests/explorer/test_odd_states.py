@@ -47,7 +47,6 @@ def change(db, sql):
         ("/trials?page=٣", 200),
         ("/trials?page=99999999999", 200),
         ("/trials?sort=drop", 200),
-        ("/trials/?q=x", 200),
         ("/trials.exe", 404),
         ("/trials/no/such/trial", 404),
         ("/sweeps/none", 404),
@@ -57,6 +56,10 @@ def test_an_odd_address_is_no_fault(study, address, code):
     reply = ask(Site(study), address)
     assert reply.status_code == code
     assert "A fault" not in reply.text
+
+
+def test_a_list_with_a_stroke_behind_it_is_the_list(study):
+    assert ask(Site(study), "/trials/?q=rep01").url.query == b"q=rep01"
 
 
 def test_a_decision_that_is_not_there_is_said_on_the_page_of_its_trial(study):

@@ -99,6 +99,8 @@ def test_escape_leads_back_to_the_list_as_it_was_filtered(page):
     page.reload()
     expect(page.locator("a.decision[aria-current]")).to_have_count(1)
     page.keyboard.press("Escape")
+    expect(page.locator(".decision-panel")).to_have_count(0)
+    expect(page.locator("#decision")).to_contain_text("What they said last")
     page.keyboard.press("Escape")
     page.wait_for_url("**/trials?condition=N_0_0&sort=-end")
 
@@ -223,6 +225,8 @@ def test_the_other_trial_goes_on_where_this_one_ended(page):
     page.keyboard.press("Shift+ArrowRight")
     assert page.locator("#track .ghost.left").get_attribute("transform") != before
     assert "after" in page.locator("#ghost-key").inner_text()
+    page.locator("#compare").select_option("")
+    expect(page.locator("#clock")).to_have_text(f"{own:.1f} s of {own:.1f} s")
 
 
 def test_a_trial_that_is_not_there_to_compare_with_is_said(page):
@@ -234,12 +238,15 @@ def test_a_trial_that_is_not_there_to_compare_with_is_said(page):
 def test_a_call_without_an_answer_can_be_read(page):
     page.goto("/trials/o4/baseline/L_4_0/rep01")
     lost = page.get_by_role("link", name="left, decision 2 at 2.0 s")
-    expect(lost).to_have_attribute("aria-label", re.compile("never driven"))
+    expect(lost).to_have_attribute("aria-label", re.compile("no answer, never driven"))
+    expect(page.locator(".in-words")).to_contain_text("the trial ended before 2 was driven")
     lost.click()
     panel = page.locator(".decision-panel")
     expect(panel).to_contain_text("The call got no answer")
     expect(panel.locator("tbody")).to_contain_text("timeout")
-    page.get_by_role("link", name="right, decision 2 at 2.0 s").click()
+    other = page.get_by_role("link", name="right, decision 2 at 2.0 s")
+    expect(other).to_have_attribute("aria-label", re.compile("decision, never driven"))
+    other.click()
     expect(panel).to_contain_text("Yes: a plan of 20 numbers")
     expect(panel.locator("li")).to_have_text("The trial ended.")
 
@@ -270,6 +277,10 @@ def test_nothing_that_is_typed_into_the_search_is_lost(page):
     expect(page.locator("#search")).to_have_value("n_0_0/rep0")
     expect(page.locator("tbody tr").first).to_contain_text("N_0_0")
     page.wait_for_url("**/trials?q=n_0_0%2Frep0")
+    page.keyboard.press("Enter")
+    page.wait_for_timeout(300)
+    assert page.url.endswith("/trials?q=n_0_0%2Frep0")
+    expect(page.locator("#search")).to_be_focused()
 
 
 def test_who_filters_by_keyboard_stays_where_he_was(page):

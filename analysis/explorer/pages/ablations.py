@@ -247,7 +247,11 @@ def side_of(
     site: Site, model: str, variant: str, fate: str, paired: Collection[tuple[str, str]]
 ) -> Side:
     """What a rate counts on one side, and what of it is in none of the pairs."""
-    trials = site.catalogue.every(Filter(model=model, variant=variant))
+    trials = [
+        row
+        for row in site.catalogue.every(Filter(model=model, variant=variant))
+        if row["status"] != "failed" and row[fate] is not None
+    ]
     alone = [row for row in trials if (row["trial_id"], row["spec_hash"]) not in paired]
     counted, counted_alone = (
         [row for row in rows if row[fate] == COUNTED[fate]] for rows in (trials, alone)

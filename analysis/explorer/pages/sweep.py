@@ -85,33 +85,37 @@ class _Watched:
     updated_at: datetime | None = None
     read_at: float = 0.0
     state: str = ""
+    shown: str = ""
 
     def news(self) -> list[tuple[str, str]]:
         """The events since the last look."""
+        catalogue = self.site.catalogue
         standing = read_standing(self.site.db, self.sweep_id)
         alive = standing if standing and standing.alive else None
         if alive and alive.updated_at == self.updated_at:
             return []
-        if not alive and self.state == "lost" and not self.site.catalogue.refresh():
+        due = time.monotonic() - self.read_at >= READ_EVERY_S
+        if self.state == "lost" and not alive and not due:
             return []
-        if alive and time.monotonic() - self.read_at < READ_EVERY_S:
-            sweep = find_sweep(self.site.catalogue, self.sweep_id, refresh=False)
-        else:
-            try:
-                sweep = find_sweep(self.site.catalogue, self.sweep_id)
-            except MergeRunnerError:
-                return []  # somebody else holds the database: there is a next time
+        try:
+            sweep = find_sweep(catalogue, self.sweep_id, refresh=due or not alive)
+        except MergeRunnerError:
+            return []  # the database is not there now: there is a next time
+        if due or not alive:
             self.read_at = time.monotonic()
         if sweep is None:
             return [("done", "")]
+        if catalogue.held and not alive:
+            return []  # how it ended cannot be read yet
         self.updated_at = alive.updated_at if alive else None
-        events = [("sweep", self.site.render("_sweep.html", **_values(sweep)))]
+        shown = self.site.render("_sweep.html", **_values(sweep))
+        events = [("sweep", shown)] if shown != self.shown else []
+        self.shown = shown
         if sweep.entry.state != self.state:
             # Once per state, and not once a second: it is read out.
             events.append(("state", str(escape(sweep.verdict.text))))
             self.state = sweep.entry.state
-        # One that is silent may have slept, and go on.
-        return events if sweep.entry.row["ended_at"] is None else [*events, ("done", "")]
+        return events if sweep.entry.followed else [*events, ("done", "")]
 
 
 def _find(site: Site, sweep_id: str) -> Sweep:

@@ -37,7 +37,6 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
         here="trials",
         **values,
         alternatives=alternatives(site, row),
-        chosen_other=asked.get("compare", ""),
         panel=Markup(panel),  # noqa: S704 # rendered by a template of ours, which escapes
     )
 
@@ -90,7 +89,7 @@ def rendered(site: Site, row: Row, trial: Trial, found: Decision) -> str:
         attempts=found.attempts,
         reply=None if body is None else {"text": text, "more": more},
         raw=site.at.raw(row, found.row["side"], found.row["decision"]),
-        chart=views.plan_chart(found, trial.scenario),
+        chart=views.plan_chart(found, trial),
         points=views.step_points,
         aftermath=views.aftermath(trial, found),
     )

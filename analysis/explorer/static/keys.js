@@ -17,7 +17,11 @@
     rows[chosen].querySelector("a")?.focus({ preventScroll: true });
     rows[chosen].scrollIntoView({ block: "nearest" });
   };
-  document.addEventListener("htmx:afterSwap", () => { chosen = -1; });
+  document.addEventListener("htmx:afterSwap", (event) => {
+    // What a running sweep sends has the same rows; an answer has others.
+    if (event.detail.xhr) chosen = -1;
+    else document.querySelectorAll("[data-list] tbody tr")[chosen]?.classList.add("chosen");
+  });
 
   document.addEventListener("keydown", (event) => {
     if (isCommand(event) || typing(event.target)) {

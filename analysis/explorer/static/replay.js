@@ -27,14 +27,10 @@ window.startReplay = () => {
   const begin = own[0];
   // With a second trial the time goes on to the end of the later one.
   let times = own;
-  const unread = at("decision").innerHTML;
   let now = begin, playing = false, speed = 1, last = 0, ghost = null, selected = null;
 
   const end = () => Math.max(trial.end, ghost?.end ?? 0);
-  const lost = () => {
-    at("lost").hidden = false;
-    at("decision").replaceChildren();
-  };
+  const lost = () => { at("lost").hidden = false; };
 
   // ---- one moment of a trial
 
@@ -66,8 +62,8 @@ window.startReplay = () => {
 
   const track = at("track");
   const vehicles = {};
+  const [mergeX] = place("left", road.merge);
   const drawTrack = () => {
-    const [mergeX] = place("left", road.merge);
     const [endX] = place("left", road.end);
     for (const kind of ["kerb", "lane"]) {
       for (const side of ["left", "right"]) {
@@ -173,15 +169,16 @@ window.startReplay = () => {
   // ---- ribbons of decisions, on the same axis
 
   const decisions = [...document.querySelectorAll("a.decision")];
+  const begins = (link) => Number(link.dataset.t);
+  const until = (link) => Math.min(begins(link) + trial.every, trial.end);
   const placeRibbons = () => {
     const ribbons = at("ribbons");
     if (!ribbons || !charts.length) return;
     const box = charts[0].over.getBoundingClientRect(), base = ribbons.getBoundingClientRect();
     const offset = box.left - base.left, scale = (t) => charts[0].valToPos(t, "x");
     for (const link of decisions) {
-      const from = Number(link.dataset.t), until = Math.min(from + trial.every, trial.end);
-      link.parentElement.style.left = `${offset + scale(from)}px`;
-      link.parentElement.style.width = `${Math.max(14, scale(until) - scale(from) - 2)}px`;
+      link.parentElement.style.left = `${offset + scale(begins(link))}px`;
+      link.parentElement.style.width = `${Math.max(14, scale(until(link)) - scale(begins(link)) - 2)}px`;
     }
     ribbons.classList.add("placed");
   };
@@ -197,12 +194,14 @@ window.startReplay = () => {
       explorer.panel(link).then((html) => {
         at("lost").hidden = true;
         if (selected === link) at("decision").innerHTML = html;
-      }, lost);
+      }, () => {
+        lost();
+        if (selected === link) at("decision").replaceChildren();
+      });
     }
     remember(push);
   };
-  const begins = (link) => Number(link.dataset.t);
-  const drives = (link) => begins(link) <= now + 1e-9 && now < begins(link) + trial.every - 1e-9;
+  const drives = (link) => begins(link) <= now + 1e-9 && now < until(link) - 1e-9;
   // From the one that is shown, or where the clock has left it, from the clock.
   const step = (by) => {
     let next = ordered.indexOf(selected) + by;
@@ -225,7 +224,7 @@ window.startReplay = () => {
       const [[x1, y1], [x2, y2]] = ["left", "right"].map((side) => place(side, trial.sides[side].x.at(-1)));
       for (const [name, value] of Object.entries({ x1, y1, x2, y2 })) vehicles.between.setAttribute(name, value);
       // Beside the signs, and within the picture.
-      vehicles.crashed.setAttribute("x", Math.min(Math.max((x1 + x2) / 2, 97), 115));
+      vehicles.crashed.setAttribute("x", Math.min(Math.max((x1 + x2) / 2, mergeX - 3), mergeX + 15));
       vehicles.crashed.textContent = `✸ collision, ${Math.hypot(x1 - x2, y1 - y2).toFixed(1)} m between the centres`;
     }
     at("scrub").value = now;
@@ -288,7 +287,7 @@ window.startReplay = () => {
     const asked = new URL(location.href).searchParams;
     const link = decisions.find((d) => d.dataset.side === asked.get("side") && d.dataset.n === asked.get("decision"));
     select(link ?? null, { push: null, jump: !asked.has("t") });
-    if (!link) at("decision").innerHTML = unread;
+    if (!link) at("decision").innerHTML = at("unread").innerHTML;
     if ((asked.get("compare") ?? "") !== (ghost?.named ?? "")) await compare(asked.get("compare") ?? "", null);
     if (asked.has("t")) seek(Number(asked.get("t")) || begin);
     else if (!link) seek(begin);
@@ -298,14 +297,19 @@ window.startReplay = () => {
 
   const compare = async (id, push) => {
     const chooser = at("compare");
-    const option = [...chooser.options].find((o) => o.value === id && o.dataset.url);
+    // A name alone stands for the first of its specs, NAME@SPEC for one.
+    const options = [...chooser.options].filter((o) => o.dataset.url);
+    const option = id && (options.find((o) => o.value === id) ?? options.find((o) => o.value.startsWith(`${id}@`) || id.startsWith(`${o.value}@`)));
     ghost = option ? await explorer.data(option).catch(lost) ?? null : null;
-    if (ghost) ghost.named = id;
-    chooser.value = ghost ? id : "";
-    at("ghost-key").hidden = !ghost && !id;
+    if (ghost) {
+      ghost.named = option.value;
+      at("lost").hidden = true;
+    }
+    chooser.value = ghost?.named ?? "";
+    at("ghost-key").hidden = !ghost && (!id || option);
     at("ghost-key").textContent = ghost ? `dashed: ${ghost.label}. ${ghost.outcome}` : `${id} is not there to compare with`;
     drawCharts();
-    show();
+    seek(now);
     remember(push);
   };
 
@@ -321,25 +325,18 @@ window.startReplay = () => {
   // What is chosen is done with: the keys are the replay's again.
   at("speed").addEventListener("change", (event) => { setSpeed(Number(event.target.value)); event.target.blur(); });
   at("compare").addEventListener("change", (event) => { compare(event.target.value, true); event.target.blur(); });
-  for (const link of decisions) {
-    link.addEventListener("click", (event) => {
-      if (event.ctrlKey || event.metaKey || event.shiftKey) return;
-      event.preventDefault();
-      select(link);
-    });
-  }
-  // The list that led here, as it was filtered.
-  const list = () => {
-    const from = document.referrer && new URL(document.referrer);
-    return from && from.origin === location.origin && !from.pathname.startsWith("/trials/") ? from.href : at("trial").dataset.back;
-  };
-  at("decision").addEventListener("click", (event) => {
-    const last = event.target.closest("a.last");
-    const link = last && decisions.find((d) => d.dataset.side === last.dataset.side && d.dataset.n === last.dataset.n);
+  at("trial").addEventListener("click", (event) => {
+    const asked = event.target.closest("a.decision, a.last");
+    const link = asked && decisions.find((d) => d.dataset.side === asked.dataset.side && d.dataset.n === asked.dataset.n);
     if (!link || event.ctrlKey || event.metaKey || event.shiftKey) return;
     event.preventDefault();
     select(link);
   });
+  // The list that led here, as it was filtered.
+  const list = () => {
+    const from = document.referrer && new URL(document.referrer);
+    return from && from.origin === location.origin && from.pathname !== location.pathname && !from.pathname.startsWith("/trials/") ? from.href : at("trial").dataset.back;
+  };
   addEventListener("popstate", recall);
   let width = 0;
   const fit = (wanted) => {
@@ -365,7 +362,7 @@ window.startReplay = () => {
     else if (event.key === "[") step(-1);
     else if (event.key === "c") at("compare").focus();
     else if (/^[1-5]$/.test(event.key)) setSpeed(SPEEDS[Number(event.key) - 1]);
-    else if (event.key === "Escape" && selected) { select(null); remember(true); at("decision").innerHTML = unread; }
+    else if (event.key === "Escape" && selected) { select(null); remember(true); at("decision").innerHTML = at("unread").innerHTML; }
     else if (event.key === "Escape" && list()) location.href = list();
     else return;
     event.preventDefault();
