@@ -23,6 +23,7 @@ from analysis.explorer.catalogue import FACETS, SEVERAL, Filter
 from analysis.explorer.details import Row, read_decisions, read_trial
 from analysis.explorer.links import EXPORTED, StaticLinks, bundle_name
 from analysis.explorer.pages.ablations import ablations_page
+from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
 from analysis.explorer.pages.tables import table_page, tables_page
@@ -37,8 +38,8 @@ from merge_runner.places import PROJECT
 STATIC = Path(__file__).with_name("static")
 STYLES = ("vendor/uplot-1.6.32.min.css", "explorer.css")
 PLAIN = ("keys.js",)
-LISTING = ("keys.js", "listing.js")
-BUNDLE = ("keys.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
+LISTING = ("keys.js", "unpacked.js", "listing.js")
+BUNDLE = ("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
 # A block of a prompt in a decision's panel: the same ones come again and again.
 _BLOCK = re.compile(r'<details class="block".*?</details>', re.DOTALL)
 # Where a server would lead on, a file does not.
@@ -55,8 +56,10 @@ _HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\
 SHORTEST_SECRET = 8
 # What an export is made of, and its names alone.
 _OURS = re.compile(rf"(?:index|{'|'.join(EXPORTED)}|(?:sweep|table|trials)-.*)\.html")
-# Packed trials, which are searched before they are packed: their letters spell anything.
-_PACKED = re.compile(r'<script type="application/json" id="bundle">.*?</script>', re.DOTALL)
+# Packed data, which are searched before they are packed: their letters spell anything.
+_PACKED = re.compile(
+    r'<script type="application/json" id="(?:bundle|cells)">.*?</script>', re.DOTALL
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +69,14 @@ class Inlined:
     styles: list[Markup]
     scripts: list[Markup]
     hashes: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Behind:
+    """The set of each cell of the tables by its name; sets of places in the list of trials."""
+
+    cells: dict[str, int]
+    sets: list[list[int]]
 
 
 @dataclass(slots=True)
@@ -102,7 +113,9 @@ def export_folder(
     """
     links = StaticLinks(["trials"]) if wanted else StaticLinks()
     with _opened(db, wanted, links) as (site, rows):
-        pages = {site.at.to("trials"): _listing(site, rows)}
+        behind = _Behind({}, []) if wanted else _behind(site, rows)
+        links.behind = behind.cells
+        pages = {site.at.to("trials"): _listing(site, rows, behind)}
         for condition in sorted({row["condition"] for row in rows}):
             mine = [row for row in rows if row["condition"] == condition]
             title = f"Trials of {condition}"
@@ -182,7 +195,21 @@ def _trial(site: Site, row: Row, beside: Sequence[Row], blocks: Blocks) -> dict[
     return {"html": _LINK_TO_NOWHERE.sub(r"\1", html), "panels": small, "data": data}
 
 
-def _listing(site: Site, rows: list[Row]) -> str:
+def _behind(site: Site, rows: list[Row]) -> _Behind:
+    """Which trials of the list are behind the numbers of all tables."""
+    found = computed(site, ("cells", *TABLES), {})
+    if found.result is None:
+        return _Behind({}, [])  # the pages of the tables say why there are none
+    places = {(row["trial_id"], row["spec_hash"]): i for i, row in enumerate(rows)}
+    # A sweep may have stored more since the list was made.
+    sets = [
+        [places[trial, spec] for trial, spec in one if (trial, spec) in places]
+        for one in found.result.content["sets"]
+    ]
+    return _Behind(found.result.content["cells"], sets)
+
+
+def _listing(site: Site, rows: list[Row], behind: _Behind) -> str:
     """The list of trials, whose script filters them by what stands beside each."""
     of_row = [{name: [row[name]] for name in FACETS if name in row} for row in rows]
     for name, table in SEVERAL.items():
@@ -205,6 +232,7 @@ def _listing(site: Site, rows: list[Row]) -> str:
         sort="",
         kept={},
         sparkline=sparkline,
+        cells=embedded(_packed({"cells": behind.cells, "sets": behind.sets})),
         inlined=inlined(LISTING),
     )
 

@@ -59,12 +59,14 @@ EXPORTED = ("sweeps", "trials", "tables", "ablations", "humans")
 class StaticLinks(Links):
     """Addresses of an exported study: files beside each other, a page of trials a condition.
 
-    ``pages`` are those that there are; ``alone`` is the only file.
+    ``pages`` are those that there are; ``alone`` is the only file. ``behind`` gets the cells whose
+    trials the list knows.
     """
 
     def __init__(self, pages: Collection[str] = EXPORTED, alone: str = "") -> None:
         self._pages = () if alone else pages
         self._alone = alone
+        self.behind: Collection[str] = ()
 
     def to(self, name: str, /, **state: object) -> str:
         """A page, or nothing where only a server has it."""
@@ -92,8 +94,9 @@ class StaticLinks(Links):
         return f"table-{name}.html"
 
     def cell(self, table: str, row: str, column: str) -> str:
-        """Nothing: a server finds the trials behind a cell."""
-        return ""
+        """The trials behind a cell, where there are any."""
+        known = f"{table}/{row}:{column}" in self.behind
+        return super().cell(table, row, column) if known else ""
 
     def sweep(self, sweep_id: str) -> str:
         """A sweep's page."""

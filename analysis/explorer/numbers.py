@@ -40,13 +40,16 @@ class Numbers:
 
         Where no table has the cell, the answer says so as ``absent``.
 
-        ``tables NAME...``, ``cell TABLE ROW COLUMN``, or ``humans``. Raises MergeRunnerError.
+        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``. Raises
+        MergeRunnerError.
         """
         match list(request):
             case ["tables", *names]:
                 return self._tables(names)
             case ["cell", table, row, column]:
                 return self._cell(table, row, column)
+            case ["cells", *names]:
+                return self._counted() | self._cells(names)
             case ["humans"]:
                 return self._counted() | human_panels(self.study) | self._tables(["contrasts"])
         raise UsageError(f"nothing answers {request!r}")
@@ -118,6 +121,30 @@ class Numbers:
                 for source in sources_of(self.study, table, row, column)
             ],
         }
+
+    def _cells(self, names: Sequence[str]) -> dict[str, Any]:
+        """The trials behind every number of some tables.
+
+        ``sets`` are lists of (trial, spec), ``cells`` has the number of one by TABLE/ROW:COLUMN.
+        """
+        from analysis.explain import sources_of
+
+        specs = {group.id: group.spec_hash for group in self.study.groups}
+        sets: dict[tuple[tuple[str, str | None], ...], int] = {}
+        cells = {}
+        for name, table in self._finished(names).items():
+            for row in table.rows:
+                for column in table.columns:
+                    if column.kind == "text" or row.values.get(column.name) is None:
+                        continue
+                    behind = tuple(
+                        (trial, specs[source.group])
+                        for source in sources_of(self.study, table, row, column)
+                        for trial in source.trials
+                    )
+                    if behind:
+                        cells[f"{name}/{row.id}:{column.name}"] = sets.setdefault(behind, len(sets))
+        return {"cells": cells, "sets": list(sets)}
 
 
 def human_panels(study: Study) -> dict[str, Any]:

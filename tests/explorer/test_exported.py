@@ -54,6 +54,24 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     expect(page.locator("tbody tr:visible")).to_have_count(3)
 
 
+def test_a_number_of_a_table_leads_to_its_trials(page, exported, study):
+    with duckdb.connect(str(study), read_only=True) as connection:
+        (row,) = connection.execute(
+            "SELECT count(DISTINCT trial_id), count(*) FROM calls WHERE trial_id LIKE 'emulator/%'"
+        ).fetchall()
+    page.goto(f"file://{exported}/table-attempts.html")
+    line = page.locator("tbody tr", has_text="emulator")
+    line.get_by_role("link", name=str(row[1]), exact=True).first.click()
+    expect(page.locator("#behind")).to_contain_text("The trials behind attempts/emulator")
+    expect(page.locator("tbody tr:visible")).to_have_count(row[0])
+    page.get_by_label("outcome").select_option("collided")
+    expect(page.locator("tbody tr:visible")).to_have_count(1)
+    page.reload()
+    expect(page.locator("tbody tr:visible")).to_have_count(1)
+    page.get_by_role("link", name="Show all").click()
+    expect(page.locator("#behind")).to_be_hidden()
+
+
 def test_no_link_of_an_export_leads_nowhere(page, exported):
     there = {path.name for path in exported.iterdir()}
     for name in sorted(there):

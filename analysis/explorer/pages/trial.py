@@ -137,7 +137,7 @@ def alternatives(site: Site, row: Row) -> dict[str, list[Row]]:
     return dict(sorted(kinds.items()))
 
 
-def embedded(data: dict[str, Any]) -> Markup:
+def embedded(data: dict[str, Any] | str) -> Markup:
     """Data for a script, as JSON that no HTML can end."""
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     for character in "<>&":

@@ -2,11 +2,6 @@
 // An exported page holds many trials, each compressed by itself; the address names the one shown.
 (async () => {
   const bundle = JSON.parse(document.getElementById("bundle").textContent);
-  const unpacked = async (text) => {
-    const bytes = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-    return JSON.parse(await new Response(stream).text());
-  };
   const blocks = await unpacked(bundle.blocks);
   const whole = (html) => html.replace(/\u0001(\d+);/g, (_, number) => blocks[number]);
   const chooser = document.getElementById("chooser");

@@ -1,21 +1,29 @@
 "use strict";
 // The list of trials of an exported study: filtered here, where no server does it.
-(() => {
+(async () => {
   const form = document.getElementById("listing");
   const rows = [...document.querySelectorAll("[data-list] tbody tr")];
   const asked = new URL(location.href).searchParams;
   for (const [name, value] of asked) if (form.elements[name]) form.elements[name].value = value;
+  const cell = asked.get("cell");
+  let behind = null;
+  if (cell) {
+    const known = await unpacked(JSON.parse(document.getElementById("cells").textContent));
+    behind = new Set(known.sets[known.cells[cell]]);
+    const note = document.getElementById("behind");
+    note.querySelector("strong").textContent = cell;
+    note.hidden = false;
+  }
+  const fits = (row, name, value) => name === "q"
+    ? row.dataset.name.includes(value.toLowerCase()) : row.dataset[name].split("\n").includes(value);
   const filter = () => {
     const wanted = [...new FormData(form)].filter(([, value]) => value);
-    let shown = 0;
-    for (const row of rows) {
-      row.hidden = !wanted.every(([name, value]) =>
-        name === "q" ? row.dataset.name.includes(value.toLowerCase()) : row.dataset[name].split("\n").includes(value));
-      shown += !row.hidden;
-    }
-    document.getElementById("listed").textContent = shown;
+    rows.forEach((row, i) => {
+      row.hidden = (behind && !behind.has(i)) || !wanted.every(([name, value]) => fits(row, name, value));
+    });
+    document.getElementById("listed").textContent = rows.filter((row) => !row.hidden).length;
     const address = new URL(location.href);
-    address.search = new URLSearchParams(wanted);
+    address.search = new URLSearchParams(cell ? [...wanted, ["cell", cell]] : wanted);
     if (address.href !== location.href) history.replaceState(null, "", address);
   };
   form.addEventListener("input", filter);
