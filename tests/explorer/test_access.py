@@ -16,9 +16,8 @@ PAGES = (
     "/humans",
     "/sql?q=select+1",
     "/trials",
-    "/trials?outcome=collided",
-    "/trials/emulator/baseline/N_0_0/rep01?side=left&decision=2",
-    "/trials/emulator/baseline/N_0_0/rep01?compare=emulator/baseline/N_0_0/rep02",
+    "/trials/emulator/baseline/N_0_0/rep01?side=left&decision=2"
+    "&compare=emulator/baseline/N_0_0/rep02",
 )
 
 
