@@ -63,6 +63,7 @@ class Site:
             at=self.at,
             pages={name: page for name, page in PAGES.items() if self.at.to(page)},
             share=self.share,
+            program=self.program,
             shell="static.html" if self.static else "base.html",
             static=self.static,
             study=self.db.name if self.static else str(self.db),

@@ -74,7 +74,7 @@ window.startReplay = () => {
     for (const side of ["left", "right"]) {
       const [x0, y0] = place(side, 0), [x1, y1] = place(side, road.tunnel);
       draw("line", { class: "tunnel", x1: x0, y1: y0, x2: x1, y2: y1 }, track);
-      draw("text", { class: "sign", x: x1, y: y1 + (side === "left" ? -3.4 : 5.2) }, track, "tunnel exit");
+      draw("text", { class: "sign", x: x1, y: y1 + (side === "left" ? -5.8 : 7.6) }, track, "tunnel exit");
       draw("text", { class: "sign side", x: 0, y: 0.9, transform: `translate(${place(side, 4).join(" ")}) rotate(${turned(side, 4)})` }, track, `${side} tunnel`);
     }
     draw("line", { class: "merge", x1: mergeX, y1: -4, x2: mergeX, y2: 4 }, track);
