@@ -118,15 +118,6 @@ def _study(db: Path, models: str | None) -> Study:
     return Study(db, listed(models))
 
 
-def watched(things: Sequence[Any], name: str) -> Iterable[Any]:
-    """Show on a terminal how far a loop is."""
-    from rich.console import Console
-    from rich.progress import track
-
-    console = Console(stderr=True)
-    return track(things, name, console=console, transient=True, disable=not sys.stderr.isatty())
-
-
 @app.command()
 def view(
     port: Annotated[int, typer.Option(help="0: any free port.", min=0, max=65535)] = 8700,
@@ -149,31 +140,47 @@ def view(
     if export is None and single is None:
         if trials is not None:
             raise UsageError("--trials goes with --export DIR or --single FILE.html")
-        try:
-            from analysis.explorer.server import serve
-        except ModuleNotFoundError as exc:
-            raise UsageError(
-                f"the explorer needs {exc.name}: pip install 'merge-runner[view]'"
-            ) from exc
+        _serve(db, port, bind)
+    elif single is not None and trials is None:
+        raise UsageError("--single FILE.html needs --trials: name some, or all with '*'")
+    else:
+        _export(db, export, single, listed(trials) or [])
 
-        def told(address: str) -> None:
-            print_out(address)
-            say("open this address in a browser; Ctrl-C ends the explorer")
 
-        serve(db, port, bind, told)
-        return
+def _serve(db: Path, port: int, bind: str) -> None:
+    try:
+        from analysis.explorer.server import serve
+    except ModuleNotFoundError as exc:
+        raise UsageError(
+            f"the explorer needs {exc.name}: pip install 'merge-runner[view]'"
+        ) from exc
+
+    def told(address: str) -> None:
+        print_out(address)
+        say("open this address in a browser; Ctrl-C ends the explorer")
+
+    serve(db, port, bind, told)
+
+
+def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[str]) -> None:
     from analysis.explorer.export import export_folder, export_page
 
-    if single is not None and trials is None:
-        raise UsageError("--single FILE.html needs --trials: name some, or all with '*'")
-    wanted = listed(trials) or []
     try:
-        for path in export_folder(db, export, wanted, watched) if export is not None else ():
+        for path in export_folder(db, folder, wanted, _watched) if folder is not None else ():
             say(f"wrote {path}")
-        for path in export_page(db, single, wanted, watched) if single is not None else ():
+        for path in export_page(db, file, wanted, _watched) if file is not None else ():
             say(f"wrote {path}")
     except KeyboardInterrupt:
         say("interrupted: run the same command again")
         sys.exit(INTERRUPTED)
-    if export is not None:
-        say(f"open {export / 'index.html'}, or send the folder {export}")
+    if folder is not None:
+        say(f"open {folder / 'index.html'}, or send the folder {folder}")
+
+
+def _watched(things: Sequence[Any], name: str) -> Iterable[Any]:
+    """Show on a terminal how far a loop is."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    return track(things, name, console=console, transient=True, disable=not sys.stderr.isatty())
