@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-import threading
-import time
-from contextlib import contextmanager
-from pathlib import Path
 
 import duckdb
 import pytest
-import uvicorn
 from harness import RECORDING
 from hostile import hostile_trial
+from serving import served
 from studies import Drive, Said, played
 
-from analysis.explorer.app import explorer
-from analysis.explorer.server import listen
-from analysis.explorer.site import Site
 from merge_runner.store import Store
 
 HERE = ("http://127.0.0.1:", "file:", "data:", "blob:")
@@ -50,25 +43,6 @@ def study(prepare, tmp_path_factory):
             "model_right = NULL WHERE trial_id LIKE 'human/%'"
         )
     return folder / "study.duckdb"
-
-
-@contextmanager
-def served(db: Path, port: int = 0):
-    """The explorer of a database in a thread of its own; gives its address."""
-    listener = listen("127.0.0.1", port)
-    host = f"127.0.0.1:{listener.getsockname()[1]}"
-    server = uvicorn.Server(
-        uvicorn.Config(explorer(Site(db), {host}), log_level="warning", ws="none")
-    )
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    try:
-        while not server.started:
-            time.sleep(0.01)
-        yield f"http://{host}"
-    finally:
-        server.should_exit = True
-        thread.join()
 
 
 @pytest.fixture(scope="session")

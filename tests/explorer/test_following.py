@@ -7,9 +7,9 @@ import time
 
 import pytest
 from axe import serious
-from conftest import served
 from harness import PROGRAM, environment
 from playwright.sync_api import expect
+from serving import served
 
 
 def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulator_url):

@@ -1,0 +1,33 @@
+"""An explorer in a thread of the tests' own process."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import uvicorn
+
+from analysis.explorer.app import explorer
+from analysis.explorer.server import listen
+from analysis.explorer.site import Site
+
+
+@contextmanager
+def served(db: Path, port: int = 0):
+    """The explorer of a database in a thread of its own; gives its address."""
+    listener = listen("127.0.0.1", port)
+    host = f"127.0.0.1:{listener.getsockname()[1]}"
+    server = uvicorn.Server(
+        uvicorn.Config(explorer(Site(db), {host}), log_level="warning", ws="none")
+    )
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        while not server.started:
+            time.sleep(0.01)
+        yield f"http://{host}"
+    finally:
+        server.should_exit = True
+        thread.join()
