@@ -178,7 +178,7 @@ def test_a_secret_or_a_path_in_a_reply_stops_the_export(study, tmp_path, monkeyp
             "UPDATE decisions SET rationale = ? WHERE decision = 2", [said.format(cwd=tmp_path)]
         )
     with pytest.raises(UsageError, match=re.escape(told)):
-        list(export_folder(db, tmp_path / "pages", []))
+        list(export_folder(db, tmp_path / "pages", ["emulator/baseline/N_0_0/*"]))
     assert not (tmp_path / "pages").exists()
 
 
