@@ -251,6 +251,14 @@ def test_a_call_without_an_answer_can_be_read(page):
     expect(panel.locator("li")).to_have_text("The trial ended.")
 
 
+def test_of_a_decision_that_is_not_there_the_panel_says_so(page):
+    page.goto(f"{TRIAL}?side=left&decision=99")
+    expect(page.locator("#track .own.left")).to_be_visible()
+    expect(page.locator("#decision")).to_contain_text("has no decision 99 of the left driver")
+    page.keyboard.press("]")
+    expect(page.locator(".decision-panel h2")).to_contain_text("left decision 0")
+
+
 def test_the_last_words_of_both_lead_to_their_decisions(page):
     page.goto(COLLIDED)
     words = page.locator("#decision article")

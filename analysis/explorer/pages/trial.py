@@ -30,7 +30,7 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
         try:
             panel = decision_panel(site, row, trial, asked["side"], number)
         except NotThere as exc:
-            panel = str(escape(exc))
+            panel = f"<p>{escape(exc)}</p>"
     values = shown(row, trial)
     return site.render(
         "trial.html",

@@ -287,7 +287,8 @@ window.startReplay = () => {
     const asked = new URL(location.href).searchParams;
     const link = decisions.find((d) => d.dataset.side === asked.get("side") && d.dataset.n === asked.get("decision"));
     select(link ?? null, { push: null, jump: !asked.has("t") });
-    if (!link) at("decision").innerHTML = at("unread").innerHTML;
+    // Of one that is not there the page says so already.
+    if (!asked.has("decision")) at("decision").innerHTML = at("unread").innerHTML;
     if ((asked.get("compare") ?? "") !== (ghost?.named ?? "")) await compare(asked.get("compare") ?? "", null);
     if (asked.has("t")) seek(Number(asked.get("t")) || begin);
     else if (!link) seek(begin);
