@@ -18,7 +18,7 @@ import duckdb
 from merge_runner.errors import StoreError, StoreLocked, UsageError
 from merge_runner.texts import first_line, quoted
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 SCHEMA = Path(__file__).with_name("schema.sql")
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
@@ -269,5 +269,7 @@ def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
     for (table,) in new:
         if table in old and table != "meta":
             connection.execute(f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table}")  # noqa: S608 # our tables
+    # Before version 4 the provider alone told who was a stand-in.
+    connection.execute("UPDATE copied.calls SET scripted = true WHERE provider = 'emulator'")
     connection.execute("INSERT INTO copied.meta VALUES (?)", [SCHEMA_VERSION])
     connection.execute("DETACH copied")

@@ -79,7 +79,7 @@ class Attempt:
     ``outcome`` is ``ok``, ``refusal``, ``truncated`` or ``empty`` for an answer, ``unknown`` where
     nobody knows what became of the attempt, else the named reason of the failure. ``reply`` is
     the body as received, None if there was none.
-    ``started_at`` is UTC in ISO 8601.
+    ``started_at`` is UTC in ISO 8601. ``scripted`` says that a scripted stand-in answered.
     """
 
     number: int
@@ -93,6 +93,7 @@ class Attempt:
     reply: str | None = None
     error: str | None = None
     cost_usd: float | None = None
+    scripted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,3 +231,10 @@ class TrialRecord:
     states: tuple[StateRow, ...]
     decisions: tuple[DecisionRow, ...]
     failed_calls: tuple[FailedCall, ...] = ()
+
+    @property
+    def scripted(self) -> bool:
+        """Whether a scripted stand-in drove on a side, or answered any call."""
+        replies = (row.decision.reply for row in self.decisions if row.decision.reply)
+        calls = (*replies, *self.failed_calls)
+        return self.spec.scripted or any(a.scripted for call in calls for a in call.attempts)

@@ -47,7 +47,7 @@ def trial_row(record: TrialRecord) -> Row:
         record.merged_first,
         record.end_time_s,
         record.error,
-        spec.scripted,
+        record.scripted,
     )
 
 
@@ -133,6 +133,7 @@ def _call_row(
         request.body,
         _as_json(attempt.reply),
         attempt.error,
+        attempt.scripted or request.provider == "emulator",
     )
 
 

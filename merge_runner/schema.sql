@@ -43,7 +43,7 @@ CREATE TABLE IF NOT EXISTS trials (
     merged_first VARCHAR,             -- left, right, NULL: collided, failed, or nobody merged
     end_time_s DOUBLE NOT NULL,
     error VARCHAR,
-    scripted BOOLEAN NOT NULL,        -- the emulator drives on a side: a stand-in, no model
+    scripted BOOLEAN NOT NULL,        -- a scripted stand-in answered on a side, and no model
     PRIMARY KEY (trial_id, spec_hash)
 );
 
@@ -99,14 +99,31 @@ CREATE TABLE IF NOT EXISTS calls (
     finish_reason VARCHAR,
     request JSON,
     reply JSON,
-    error VARCHAR
+    error VARCHAR,
+    scripted BOOLEAN NOT NULL DEFAULT false -- a scripted stand-in answered, whoever was asked
+);
+
+-- How a driver is named: by its model, and by its endpoint where that is not the provider's own.
+CREATE MACRO IF NOT EXISTS driver_name(model, endpoint) AS
+    model || coalesce(' at ' || nullif(regexp_extract(endpoint, '://([^/]+)', 1), ''), '');
+
+-- Who drove: two different drivers are joined by a plus, another sample set has its number.
+CREATE VIEW IF NOT EXISTS trial_drivers AS
+SELECT trial_id, spec_hash,
+    if(left_driver = right_driver, left_driver, left_driver || '+' || right_driver)
+        || if(sample_set > 0, '/set' || sample_set, '') AS driver
+FROM (
+    SELECT trial_id, spec_hash, sample_set,
+        driver_name(model_left, spec->>'$.left.endpoint') AS left_driver,
+        driver_name(model_right, spec->>'$.right.endpoint') AS right_driver
+    FROM trials LEFT JOIN specs USING (spec_hash)
 );
 
 -- The ledger of attempts: what became of each. retried: another one followed; driven: its plan was;
 -- fallback: it gave no valid plan (see failure), so that an older plan or 0 was driven; lost: its
 -- call ended without an answer, and with it the trial.
 CREATE VIEW IF NOT EXISTS attempts AS
-SELECT calls.*, source, variant, condition, sample_set, scripted,
+SELECT calls.*, source, variant, condition, sample_set,
     if(side = 'left', model_left, model_right) AS model,
     failure,
     CASE WHEN attempt < max(attempt) OVER call THEN 'retried'
