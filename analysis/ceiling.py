@@ -63,6 +63,7 @@ class Ceiling:
     robust: dict[str, float]
 
 
+@cache
 def published_humans() -> Population:
     """The humans as far as they are published: counts, and the regression of their gaps."""
     return Population(left=_by_condition(human_outcomes(), _left(human_outcomes())))

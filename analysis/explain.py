@@ -94,16 +94,18 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
 def query_of(group: Group, predicate: str) -> str:
     """The query that lists the trials of a group which a value rests on, with their measures."""
     variant = f" AND variant = '{group.setting}'" if group.setting else ""
+    narrowed = f" AND {group.narrowed}" if group.narrowed else ""
     return (
         "SELECT trials.trial_id, condition, status, merged_first, "  # noqa: S608 # ours
         "trial_metrics.* EXCLUDE (trial_id, spec_hash) FROM trials "
         "JOIN trial_metrics USING (trial_id, spec_hash) "
-        f"WHERE trials.spec_hash = '{group.spec_hash}'{variant} AND {predicate} ORDER BY ALL"
+        f"WHERE trials.spec_hash = '{group.spec_hash}'{variant}{narrowed} AND {predicate} "
+        "ORDER BY ALL"
     )
 
 
 def _resampled(study: Study) -> Source:
-    source = "imported trials" if study.calibrated else "published counts and regression"
+    source = "imported trials" if study.complete else "published counts and regression"
     return Source("human", f"data sets resampled from the {source}, not trials", "", ())
 
 

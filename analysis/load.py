@@ -13,9 +13,16 @@ from merge_runner.places import DEFAULT_DB
 from merge_runner.store import query
 
 TRIALS = (
-    "SELECT trials.*, trial_metrics.* EXCLUDE (trial_id, spec_hash) "
-    "FROM trials JOIN trial_metrics USING (trial_id, spec_hash) ORDER BY trial_id, spec_hash"
+    "SELECT trials.*, driver, trial_metrics.* EXCLUDE (trial_id, spec_hash) "
+    "FROM trials JOIN trial_drivers USING (trial_id, spec_hash) "
+    "JOIN trial_metrics USING (trial_id, spec_hash) ORDER BY trial_id, spec_hash"
 )
+# Of each driven trial that ended a hash of its states: equal ones went the same way.
+TRACES = """
+SELECT trial_id, spec_hash, sum(hash(step, side, position_m, velocity_mps))::VARCHAR AS trace
+FROM states SEMI JOIN (FROM trials WHERE source <> 'human' AND status <> 'failed')
+USING (trial_id, spec_hash) GROUP BY ALL
+"""
 # One row a finished trial of humans or with the baseline prompt: the left vehicle's speeds.
 LEFT_SPEEDS = (
     "SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s, "

@@ -73,10 +73,13 @@ LEFT_FIRST = Measure(
 def counts(group: Group, measure: Measure) -> tuple[int, int]:
     """Successes and n of a rate."""
     if measure.column is None:
-        return int((group.ended["status"] == "collided").sum()), len(group.ended)
-    known = group.finished[measure.column].dropna()
+        ended = group.outcomes[group.outcomes["status"] != "failed"]
+        return int((ended["status"] == "collided").sum()), len(ended)
     if measure is LEFT_FIRST:
-        return int((known == "left").sum()), len(known)
+        finished = group.outcomes[group.outcomes["status"] == "finished"]
+        first = finished["merged_first"].dropna()
+        return int((first == "left").sum()), len(first)
+    known = group.finished[measure.column].dropna()
     return int(known.astype(bool).sum()), len(known)
 
 

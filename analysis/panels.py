@@ -31,7 +31,7 @@ def left_first(group: Group, velocity_mps: float) -> list[Point]:
     """Panel C: how often the left vehicle merges first, of finished trials."""
     return [
         Point(headway, proportion(int((known == "left").sum()), len(known)))
-        for headway, trials in _conditions(group, velocity_mps)
+        for headway, trials in _conditions(group.outcomes, velocity_mps)
         if len(known := trials["merged_first"].dropna())
     ]
 
@@ -42,7 +42,7 @@ def gaps(group: Group, velocity_mps: float) -> list[Point]:
         return []
     return [
         Point(headway, mean(trials["gap_m"].to_numpy(float)))
-        for headway, trials in _conditions(group, velocity_mps)
+        for headway, trials in _conditions(group.trials, velocity_mps)
         if trials["gap_m"].notna().any()
     ]
 
@@ -53,7 +53,7 @@ def deviations(group: Group, velocity_mps: float) -> list[Point]:
         return []
     return [
         Point(headway, mean(both))
-        for headway, trials in _conditions(group, velocity_mps)
+        for headway, trials in _conditions(group.trials, velocity_mps)
         if len(both := trials[["rmse_left_mps", "rmse_right_mps"]].to_numpy(float).ravel())
     ]
 
@@ -76,10 +76,11 @@ def left_traces(study: Study, group: Group, first: str) -> list[Array]:
     ]
 
 
-def _conditions(group: Group, velocity_mps: float) -> Iterator[tuple[float, pd.DataFrame]]:
+def _conditions(every: pd.DataFrame, velocity_mps: float) -> Iterator[tuple[float, pd.DataFrame]]:
     """The finished trials of each condition with this relative velocity, by headway."""
+    finished = every[every["status"] == "finished"]
     chosen = [c for c in CONDITIONS.values() if c.relative_velocity_mps == velocity_mps]
     for condition in sorted(chosen, key=lambda c: c.projected_headway_m):
-        trials = group.finished[group.finished["condition"] == condition.name]
+        trials = finished[finished["condition"] == condition.name]
         if len(trials):
             yield condition.projected_headway_m, trials

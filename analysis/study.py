@@ -4,23 +4,36 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 
 import pandas as pd
 
-from analysis.load import LEFT_SPEEDS, PLANS, SHARED, SPECS, TRIALS, Calls, load_calls, load_each
+from analysis.imported import Imported, imported
+from analysis.load import (
+    LEFT_SPEEDS,
+    PLANS,
+    SHARED,
+    SPECS,
+    TRACES,
+    TRIALS,
+    Calls,
+    load_calls,
+    load_each,
+)
 from analysis.published import human_outcomes
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
 from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.texts import quoted
 
 HUMAN = "human"
 BASELINE = "baseline"
-# So many human trials in every condition make a reference; fewer are shown, but not drawn from.
+# So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
+EMULATOR = "emulator"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,19 +42,43 @@ class Group:
 
     ``trials`` are rows of ``load_trials``; for humans before an import only the outcomes that are
     published, and ``measured`` is False. ``setting`` is the prompt variant, empty for humans.
+    ``label`` is how tables name the driver, ``model`` the name that was asked for. Of a driver
+    without chance, whose repetitions are the same trial again, only the first are ``trials``, and
+    ``repeated`` counts the others. ``narrowed`` is what tells them in SQL from other trials of
+    their spec and variant, empty where there are none. ``published_outcomes`` stand in the place
+    of the trials' outcomes where these are a part of the published ones.
     """
 
     driver: str
     setting: str
     spec_hash: str | None
     trials: pd.DataFrame
+    label: str
+    model: str
     measured: bool = True
     scripted: bool = False
+    repeated: int = 0
+    narrowed: str = ""
+    published_outcomes: pd.DataFrame | None = None
 
     @property
     def id(self) -> str:
         """``o3/A2``, or ``human``."""
         return f"{self.driver}/{self.setting}" if self.setting else self.driver
+
+    @property
+    def outcomes(self) -> pd.DataFrame:
+        """The trials that count for collisions and for who merged first."""
+        return self.trials if self.published_outcomes is None else self.published_outcomes
+
+    def part(self, wanted: Callable[[pd.DataFrame], pd.Series]) -> Group:
+        """The group with only those trials, and outcomes, of which ``wanted`` holds."""
+        outcomes = self.published_outcomes
+        return replace(
+            self,
+            trials=self.trials[wanted(self.trials)],
+            published_outcomes=None if outcomes is None else outcomes[wanted(outcomes)],
+        )
 
     @cached_property
     def ended(self) -> pd.DataFrame:
@@ -55,8 +92,9 @@ class Group:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many trials ended in each condition, in the order of CONDITIONS."""
-        counts = self.ended["condition"].value_counts()
+        """How many outcomes there are in each condition, in the order of CONDITIONS."""
+        ended = self.outcomes[self.outcomes["status"] != "failed"]
+        counts = ended["condition"].value_counts()
         return tuple(int(counts.get(name, 0)) for name in CONDITIONS)
 
     @cached_property
@@ -77,10 +115,12 @@ class Study:
     def __init__(self, db: Path | str = DEFAULT_DB, models: Sequence[str] | None = None) -> None:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
         self.db = Path(db)
-        found = load_each({"trials": TRIALS, "specs": SPECS}, self.db)
-        trials = found["trials"]
-        self.human = _human_group(trials[trials["source"] == HUMAN])
-        every = _model_groups(trials[trials["source"] != HUMAN], _tasks(found["specs"]))
+        found = load_each({"trials": TRIALS, "specs": SPECS, "traces": TRACES}, self.db)
+        trials = found["trials"].merge(found["traces"], on=["trial_id", "spec_hash"], how="left")
+        recorded = trials["source"] == HUMAN
+        self.imported = imported(trials[recorded]) if recorded.any() else None
+        self.human = _human_group(trials[recorded], self.imported)
+        every = _model_groups(trials[~recorded], _tasks(found["specs"]))
         valid = [HUMAN, *dict.fromkeys(group.driver for group in every)]
         wanted = valid if models is None else list(models)
         unknown = [name for name in wanted if name not in valid]
@@ -93,8 +133,14 @@ class Study:
 
     @property
     def calibrated(self) -> bool:
-        """Whether enough human traces are imported to draw ceilings and limits from them."""
-        return self.human.measured and min(self.human.sizes) >= ENOUGH_PER_CONDITION
+        """Whether there are human traces enough of every condition to compare others with."""
+        counts = self.human.ended["condition"].value_counts().reindex(CONDITIONS, fill_value=0)
+        return self.human.measured and bool(counts.min() >= ENOUGH_PER_CONDITION)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the human traces are all there, so that whole trials can be drawn from them."""
+        return self.imported is not None and self.imported.complete
 
     @property
     def baselines(self) -> list[Group]:
@@ -145,16 +191,24 @@ def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.Data
     return frame[near].merge(keys, on=["trial_id", "spec_hash"])
 
 
-def _human_group(trials: pd.DataFrame) -> Group:
-    if len(trials):
-        return Group(HUMAN, "", str(trials["spec_hash"].iloc[0]), trials)
-    return _published_group()
+def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
+    if known is None:
+        return _published_group()
+    return Group(
+        HUMAN,
+        "",
+        str(trials["spec_hash"].iloc[0]),
+        trials,
+        label=known.label,
+        model=HUMAN,
+        published_outcomes=None if known.complete else human_outcomes(),
+    )
 
 
 @cache
 def _published_group() -> Group:
     """One object for all studies: what is computed from it is computed once."""
-    return Group(HUMAN, "", None, human_outcomes(), measured=False)
+    return Group(HUMAN, "", None, human_outcomes(), label=HUMAN, model=HUMAN, measured=False)
 
 
 def _tasks(specs: pd.DataFrame) -> dict[str, str]:
@@ -169,32 +223,76 @@ def _tasks(specs: pd.DataFrame) -> dict[str, str]:
 
 
 def _model_groups(trials: pd.DataFrame, tasks: dict[str, str]) -> list[Group]:
-    """Groups by driver and variant.
+    """Groups by driver and variant, scripted stand-ins last.
 
     Where a driver was run under several settings of the task, all but the most frequent carry a
-    mark, the same for a baseline and its variants; likewise where a prompt was changed.
+    mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
+    a stand-in answered some of its trials.
     """
     if trials.empty:
         return []
-    names = trials["trial_id"].str.split("/").str[0]
-    sets = trials["sample_set"].map(lambda number: f"/set{number}" if number else "")
     task = trials["spec_hash"].map(lambda spec_hash: tasks.get(spec_hash, spec_hash[:8]))
-    keyed = trials.assign(driver=names + sets, task=task)
+    keyed = trials.assign(task=task)
     keyed["driver"] += _marks(keyed, ["driver"], "task")
     keyed["driver"] += _marks(keyed, ["driver", "variant"], "spec_hash")
+    both = keyed.groupby("driver")["scripted"].transform("nunique") > 1
+    keyed.loc[both & keyed["scripted"], "driver"] += " [scripted]"
     groups = [
-        Group(
-            driver,
-            variant,
-            spec_hash,
-            rows.drop(columns=["driver", "task"]),
-            scripted=bool(rows["scripted"].any()),
-        )
+        _model_group(driver, variant, spec_hash, rows, both[rows.index].any())
         for (driver, variant, spec_hash), rows in keyed.groupby(["driver", "variant", "spec_hash"])
     ]
     return sorted(
-        groups, key=lambda group: (group.driver, group.setting != BASELINE, group.setting)
+        groups,
+        key=lambda group: (
+            group.scripted,
+            group.driver,
+            group.setting != BASELINE,
+            group.setting,
+        ),
     )
+
+
+def _model_group(
+    driver: str, variant: str, spec_hash: str, rows: pd.DataFrame, told_apart: bool
+) -> Group:
+    model = str(rows["trial_id"].iloc[0]).split("/", maxsplit=1)[0]
+    scripted = bool(rows["scripted"].any())
+    distinct = _distinct(rows)
+    narrowed = [f"scripted = {str(scripted).lower()}"] if told_apart else []
+    if len(distinct) < len(rows):
+        names = ", ".join(quoted(trial_id) for trial_id in distinct["trial_id"])
+        narrowed.append(f"trials.trial_id IN ({names})")
+    return Group(
+        driver,
+        variant,
+        spec_hash,
+        distinct.drop(columns=["driver", "task", "trace"]),
+        label=f"{driver} ({stand_in(model)})" if scripted else driver,
+        model=model,
+        scripted=scripted,
+        repeated=len(rows) - len(distinct),
+        narrowed=" AND ".join(narrowed),
+    )
+
+
+def stand_in(model: str) -> str:
+    """What is said of a scripted stand-in that answered in a model's name."""
+    return f"scripted stand-in, {'no language model' if model == EMULATOR else f'not {model}'}"
+
+
+def _distinct(rows: pd.DataFrame) -> pd.DataFrame:
+    """The trials without the repetitions of a driver that has no chance in it.
+
+    That is a program, and a model that in every condition went the same way each time. Of a driver
+    that samples, two equal trials are two samples.
+    """
+    ended = rows[rows["trace"].notna()].sort_values("rep", kind="stable")
+    again = ended.index[ended.duplicated(["condition", "trace"])]
+    ways = ended.groupby("condition")["trace"].agg(["size", "nunique"])
+    repeated = ways[ways["size"] > 1]
+    no_chance = len(repeated) > 1 and bool((repeated["nunique"] == 1).all())
+    programs = bool((rows["source"] == "driver").all())
+    return rows.drop(index=again) if no_chance or programs else rows
 
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:

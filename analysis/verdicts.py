@@ -35,7 +35,7 @@ class Fits:
 @cache
 def fits(group: Group) -> Fits:
     """Fit a group's trials; without gaps the linear fits say so."""
-    logit, firth = who_first_logit(group.trials), who_first_firth(group.trials)
+    logit, firth = who_first_logit(group.outcomes), who_first_firth(group.outcomes)
     if not group.measured:
         missing = Regression(0, {}, PUBLISHED)
         return Fits(logit, firth, missing, missing)
@@ -125,7 +125,7 @@ def piecewise_verdict(study: Study, group: Group) -> Verdict:
 def population(study: Study) -> Population:
     """The humans from whom the ceilings are drawn."""
     human = study.human
-    if not study.calibrated:
+    if not study.complete:
         return published_humans()
     passes = piecewise_trials(study, human)
     return imported_humans(human.ended, human.ended["trial_id"].map(passes).astype(float))

@@ -235,6 +235,6 @@ class TrialRecord:
     @property
     def scripted(self) -> bool:
         """Whether a scripted stand-in drove on a side, or answered any call."""
-        replies = (row.decision.reply for row in self.decisions if row.decision.reply)
-        calls = (*replies, *self.failed_calls)
-        return self.spec.scripted or any(a.scripted for call in calls for a in call.attempts)
+        replies = [row.decision.reply for row in self.decisions if row.decision.reply]
+        tried = [call.attempts for call in self.failed_calls] + [r.attempts for r in replies]
+        return self.spec.scripted or any(a.scripted for attempts in tried for a in attempts)

@@ -12,7 +12,7 @@ import queue
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -173,7 +173,7 @@ def human_panels(study: Study) -> dict[str, Any]:
         "groups": [
             {
                 "id": group.id,
-                "driver": group.driver,
+                "driver": group.label,
                 "scripted": group.scripted,
                 "conditions": {name: _in_condition(group, name) for name in CONDITIONS},
             }
@@ -186,7 +186,7 @@ def _in_condition(group: Group, condition: str) -> dict[str, Any]:
     """The trials of a group in one condition: counts, and estimates with 95 % intervals."""
     from analysis.measures import LEFT_FIRST, counts, estimate, known
 
-    part = replace(group, trials=group.trials[group.trials["condition"] == condition])
+    part = group.part(lambda trials: trials["condition"] == condition)
     found: dict[str, Any] = {"all": len(part.trials), "ended": len(part.ended)}
     for measure in (LEFT_FIRST, *map(_measure, ("gap_m", "rmse_mps", "collided_percent"))):
         # Who merged first is published, gaps and speeds are not.

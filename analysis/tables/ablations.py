@@ -104,7 +104,7 @@ def _key_columns() -> tuple[Column, ...]:
 
 def _keys(group: Group) -> dict[str, Value]:
     return {
-        "driver": group.driver,
+        "driver": group.label,
         "setting": group.setting,
         "n": len(group.ended),
     }

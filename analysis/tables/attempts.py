@@ -104,7 +104,7 @@ def _other_model(study: Study) -> str:
 
 def _row(group: Group, found: Tally, reasons: tuple[str, ...]) -> Row:
     values: dict[str, Value] = {
-        "driver": group.driver,
+        "driver": group.label,
         "setting": group.setting,
         "trials": found.trials,
         "failed": found.failed,

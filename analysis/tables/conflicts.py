@@ -73,7 +73,7 @@ def criticality(study: Study) -> Table:
 
 
 def _resolution(group: Group, condition: str) -> Row:
-    key: dict[str, Value] = {"condition": condition, "driver": group.driver}
+    key: dict[str, Value] = {"condition": condition, "driver": group.label}
     row = f"{group.id}/{condition}"
     where = f"condition = '{condition}' AND conflict_resolution_s IS NOT NULL"
     if not group.measured:
@@ -93,7 +93,7 @@ def _resolution(group: Group, condition: str) -> Row:
 
 
 def _criticality(group: Group) -> Row:
-    values: dict[str, Value] = {"driver": group.driver, "setting": group.setting}
+    values: dict[str, Value] = {"driver": group.label, "setting": group.setting}
     missing = []
     for name, (heading, _) in CRITICALITY.items():
         known = group.finished[name].astype(float).dropna()

@@ -88,7 +88,7 @@ def _corrected(pairs: list[tuple[Group, Group]], measure: Measure, reference: st
             f"{group.id}/{reference}/{measure.name}",
             (group.id, other.id),
             {
-                "driver": group.driver,
+                "driver": group.label,
                 "setting": group.setting,
                 "reference": reference,
                 "measure": measure.heading,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from analysis.indicators import INDICATORS, TESTED, Verdict, paper_verdicts, robust_verdicts
 from analysis.intervals import Estimate
 from analysis.measures import LEFT_FIRST, MEASURES, Measure, estimate
@@ -98,7 +96,7 @@ def without_fallbacks(study: Study, group: Group) -> Group:
     had = set(own.loc[own["fallback"], "trial_id"])
     if not had:
         return group
-    return replace(group, trials=group.trials[~group.trials["trial_id"].isin(had)])
+    return group.part(lambda trials: ~trials["trial_id"].isin(had))
 
 
 def _why(group: Group, kept: Group) -> str:
@@ -178,4 +176,4 @@ def _judged(found: Fits, name: str) -> tuple[Verdict, Verdict]:
 
 
 def _keys(group: Group, measure: str) -> dict[str, Value]:
-    return {"driver": group.driver, "setting": group.setting, "measure": measure}
+    return {"driver": group.label, "setting": group.setting, "measure": measure}

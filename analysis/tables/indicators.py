@@ -99,7 +99,7 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
         (group.id,),
         {
             "indicator": name,
-            "driver": group.driver,
+            "driver": group.label,
             **verdict_values(found, name),
             "ceiling_paper": percent(found.ceiling.paper.get(name)),
             "ceiling_robust": percent(found.ceiling.robust.get(name)),
@@ -118,7 +118,7 @@ def _total_row(study: Study, group: Group) -> Row:
         (group.id,),
         {
             "indicator": f"Score, of {len(INDICATORS)}",
-            "driver": group.driver,
+            "driver": group.label,
             "paper": paper,
             "robust": robust,
             "ceiling_paper": percent(found.ceiling.paper["I1-I4"]),
@@ -130,7 +130,7 @@ def _total_row(study: Study, group: Group) -> Row:
 
 
 def _measure_row(group: Group, measure: Measure) -> Row:
-    key: dict[str, Value] = {"indicator": measure.heading, "driver": group.driver}
+    key: dict[str, Value] = {"indicator": measure.heading, "driver": group.label}
     row = f"{group.id}/{measure.name}"
     if not known(group, measure):
         source = f"published value, no human traces are imported ({citation(SOURCE)})"

@@ -48,7 +48,7 @@ def ceiling_notes(study: Study) -> list[str]:
     """What the human ceiling is drawn from."""
     source = (
         "whole trials are resampled from the imported recordings"
-        if study.calibrated
+        if study.complete
         else "outcomes from the published counts, gaps from the published regression with "
         f"residuals of SD {HUMAN_GAP_SD_M} m"
     )

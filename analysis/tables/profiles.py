@@ -53,7 +53,7 @@ def velocity_profiles(study: Study) -> Table:
 
 def _row(study: Study, group: Group) -> Row:
     values: dict[str, Value] = {
-        "driver": group.driver,
+        "driver": group.label,
         "setting": group.setting or None,
         "n": len(group.finished),
     }

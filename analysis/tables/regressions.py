@@ -38,7 +38,7 @@ def who_first(study: Study) -> Table:
                     (group.id,),
                     {
                         "term": TERM_NAMES[term],
-                        "driver": group.driver,
+                        "driver": group.label,
                         "n": fit.logit.n,
                         **_wald(fit.logit, term, "z"),
                         **_firth(fit.firth, term),
@@ -80,7 +80,7 @@ def gap(study: Study) -> Table:
                     (group.id,),
                     {
                         "term": TERM_NAMES[term],
-                        "driver": group.driver,
+                        "driver": group.label,
                         "n": fit.ols.n,
                         **_wald(fit.ols, term, "t"),
                         **_hc3(fit.hc3, term),
@@ -171,7 +171,7 @@ def _mixed_rows(group: Group, term: str, statistic: str) -> list[Row]:
             (group.id,),
             {
                 "term": TERM_NAMES[term],
-                "driver": f"{group.driver}, {label}",
+                "driver": f"{group.label}, {label}",
                 "n": fit.n,
                 **_wald(fit, term, statistic),
             },
@@ -225,7 +225,7 @@ def _published_gap(group: Group, term: str) -> Row:
         (group.id,),
         {
             "term": TERM_NAMES[term],
-            "driver": group.driver,
+            "driver": group.label,
             "n": int(values["n"]),
             "b": float(values["b"]),
             "se": float(values["se"]),

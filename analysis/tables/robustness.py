@@ -57,7 +57,7 @@ def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
         collided, n = int(counts.get("collided", 0)), len(chosen)
         share = proportion(collided, n)
         values: dict[str, Value] = {
-            "driver": group.driver,
+            "driver": group.label,
             "setting": group.setting,
             "rule": rule,
             "n": n,

@@ -51,7 +51,7 @@ def _row(study: Study, group: Group, window: str) -> Row:
         f"{group.id}/{window}",
         (group.id,),
         {
-            "driver": group.driver,
+            "driver": group.label,
             "setting": group.setting,
             "window": WINDOWS[window],
             "n": rmse.n,

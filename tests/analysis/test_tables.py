@@ -184,7 +184,7 @@ TROUBLE = {
             for n in CONDITIONS
             for r in (1, 2)
         ],
-        "the right vehicle merged first in all 22 trials",
+        "the right vehicle merged first in all 11 trials",
     ),
     "only a variant": (yielding("o3", "A3", reps=1), "o3/A3"),
 }

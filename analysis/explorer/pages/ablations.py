@@ -120,13 +120,14 @@ def ablations(quantitative: Table, contrasts: Table) -> list[Driver]:
     compared = {row.id: row for row in contrasts.rows}
     # The baseline's n stands beside every difference from it.
     of_baseline = {
-        (f"{row.values['driver']}/{BASELINE}", row.id.rpartition("/")[2]): row.values["n_reference"]
+        (row.groups[1], row.id.rpartition("/")[2]): row.values["n_reference"]
         for row in contrasts.rows
         if row.values["reference"] == BASELINE
     }
     drivers: dict[str, Driver] = {}
     for row in quantitative.rows:
-        name, setting = str(row.values["driver"]), str(row.values["setting"])
+        setting = str(row.values["setting"])
+        name = row.groups[0].removesuffix(f"/{setting}")
         if setting:
             variants = drivers.setdefault(name, Driver(name, {})).variants
             variants[setting] = [
