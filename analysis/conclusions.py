@@ -1,15 +1,17 @@
-"""In plain words: what the results of a study show, and what they cannot show."""
+"""In plain words: what the results of a study show, and what they cannot show.
+
+Each sentence is made of the numbers that it talks about. Scripted stand-ins are in none.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass
-
+from analysis.alarms import mismatch
 from analysis.contrasts import contrast_rates
-from analysis.indicators import ALPHA, INDICATORS, TESTED, Verdict
-from analysis.measures import MEASURES, counts, estimate
-from analysis.provenance import Mismatch, Provenance, tally
-from analysis.study import Group, Study
+from analysis.indicators import ALPHA, INDICATORS, Verdict
+from analysis.measures import MEASURES, counts, estimate, known, published_human
+from analysis.provenance import Provenance
+from analysis.published import HUMAN_TRIALS
+from analysis.study import Group, Study, stand_in
 from analysis.verdicts import Score, score
 
 COLLISIONS, GAP = MEASURES[0], MEASURES[1]
@@ -20,204 +22,205 @@ NAMES = {
     "I4": "the gap does not depend on the relative velocity",
     "I5": "speeds are piecewise linear",
 }
-LOW_POWER = 0.8
-MANY_FALLBACKS = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class Alarm:
-    """What a reader must know before any number."""
-
-    title: str
-    text: str
-
-
-def alarms(study: Study, origin: Provenance) -> list[Alarm]:
-    """What puts the results of a study in doubt, the worst first."""
-    found = [Alarm("Another model answered", _mismatch(one)) for one in origin.mismatches]
-    for title, parts, rest in (
-        (
-            "Trials failed",
-            [_failed(group) for group in study.models if len(group.trials) > len(group.ended)],
-            "They are in no measure; the same sweep again plays them anew.",
-        ),
-        (
-            "Many fallbacks",
-            _fallbacks(study),
-            "There the older plan was driven, or none: the table fallbacks shows whether that "
-            "changes the results.",
-        ),
-        (
-            "Attempts of unknown fate",
-            _unknown(study),
-            "A run was killed before their reply was seen: they may have been paid for.",
-        ),
-        (
-            "Several settings under one name",
-            _mixed(study),
-            "They are never pooled: all but the most frequent carry a mark.",
-        ),
-    ):
-        if parts:
-            found.append(Alarm(title, f"{'; '.join(parts)}. {rest}"))
-    return found
-
-
-def _mismatch(one: Mismatch) -> str:
-    answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
-    sweeps = f"sweep{'s' * (len(one.sweeps) != 1)} {', '.join(one.sweeps) or 'unknown'}"
-    return (
-        f"{one.requested} was asked for, {one.served} answered: {answers}, {sweeps}. "
-        "These trials are not what they claim to be."
-    )
-
-
-def _failed(group: Group) -> str:
-    failed = group.trials[group.trials["status"] == "failed"]
-    reasons = failed["error"].fillna("no reason is stored").value_counts()
-    more = ", among other reasons" if len(reasons) > 1 else ""
-    return f"{len(failed)} of {len(group.trials)} of {group.id} ({reasons.index[0]}{more})"
-
-
-def _fallbacks(study: Study) -> list[str]:
-    return [
-        f"{found.fallbacks} of {found.decisions} decisions of {group.id} "
-        f"({100 * found.fallbacks / found.decisions:.1f} %)"
-        for group in study.models
-        for found in [tally(study, group)]
-        if found.fallbacks > MANY_FALLBACKS * found.decisions
-    ]
-
-
-def _unknown(study: Study) -> list[str]:
-    return [
-        f"{found.unknown} of {found.attempts} of {group.id}"
-        for group in study.models
-        for found in [tally(study, group)]
-        if found.unknown
-    ]
-
-
-def _mixed(study: Study) -> list[str]:
-    drivers = dict.fromkeys(group.driver for group in study.models)
-    bare = Counter(driver.split(" [")[0] for driver in drivers)
-    return [
-        ", ".join(driver for driver in drivers if driver.split(" [")[0] == name)
-        for name, count in bare.items()
-        if count > 1
-    ]
+# So many of the human data sets of a study's size that have a mark make its lack strong evidence,
+# and at most so many weak evidence.
+STRONG, WEAK = 0.95, 0.8
+HUMAN_PAIRS = 9
 
 
 def shown(study: Study) -> list[str]:
-    """What the baseline of each driver shows, one sentence or two a driver."""
-    return [text for group in study.baselines if group.setting for text in _shown(study, group)]
+    """What the baseline of each driver shows, some sentences a driver."""
+    return [text for group in _concluded(study) for text in _shown(study, group)]
 
 
 def not_shown(study: Study, origin: Provenance) -> list[str]:
     """What cannot be concluded, and why."""
-    models = [group for group in study.baselines if group.setting]
-    texts = [text for group in models for text in _limits(study, group)]
-    texts += [f"Another model answered: {_mismatch(one)}" for one in origin.mismatches]
-    if not models:
-        texts.append("There is no baseline trial of a driver to show: nothing can be concluded.")
-    if not study.human.measured:
-        texts.append(
-            "The human recordings are not imported: human gaps, speed deviations and profiles are "
-            "those that were published, I5 is not calibrated, and the human ceiling rests on a "
-            "normal approximation of the gaps."
-        )
-    texts.append(
-        "The prompt is a reconstruction, the original wording is not public; results hold for this "
-        "wording, this scenario and the default sampling temperature."
-    )
-    texts.append(
-        "Trials of humans come from nine pairs who differ: tests that pool them, as the paper's, "
-        "understate the human uncertainty."
-    )
+    texts = [text for group in _concluded(study) for text in _limits(study, group)]
+    texts += [
+        f"{group.id}: {stand_in(group.model)}: its rows say nothing about a language model."
+        for group in study.baselines
+        if group.scripted
+    ]
+    texts += [f"Another model answered: {mismatch(one)}" for one in origin.mismatches]
+    if not _concluded(study):
+        texts.append("There is no baseline trial of a driver to judge: nothing can be concluded.")
+    texts += _human_limits(study)
+    texts += [text for group in study.baselines for text in _asked(group, origin)]
     return texts
 
 
+def nothing(study: Study) -> str:
+    """Why there is nothing to conclude, where ``shown`` is empty."""
+    if study.empty:
+        return "Nothing yet: there is no trial of a driver. `make sweep` plays some."
+    if any(group.setting and group.scripted for group in study.baselines):
+        return "Nothing: with the baseline prompt only scripted stand-ins drove."
+    return "Nothing yet: no driver was played with the baseline prompt."
+
+
+def _concluded(study: Study) -> list[Group]:
+    """The baselines that conclusions are about."""
+    return [group for group in study.baselines if group.setting and not group.scripted]
+
+
 def _shown(study: Study, group: Group) -> list[str]:
+    if not len(group.ended):
+        return [f"{group.driver}: no trial ended ({group.left_out})."]
     if not len(group.finished):
         return [
             f"{group.driver}: no trial finished ({group.left_out}).",
             _collisions(study, group),
         ]
+    return [*_marks(study, group), _collisions(study, group), _gap(study, group)]
+
+
+def _marks(study: Study, group: Group) -> list[str]:
+    """Which indicators hold, which do not, and what the lack of one says."""
     found = score(study, group)
-    agreed = [NAMES[n] for n in INDICATORS if found.paper[n].passed and found.robust[n].passed]
-    failed = [NAMES[n] for n in TESTED if found.paper[n].passed is False is found.robust[n].passed]
+    both = {name: (found.paper[name].passed, found.robust[name].passed) for name in INDICATORS}
+    agreed = [NAMES[name] for name, verdicts in both.items() if verdicts == (True, True)]
+    failed = [name for name, verdicts in both.items() if verdicts == (False, False)]
     mixed = [
         f"{NAMES[name]} (paper's rule: {_word(found.paper[name])}, "
         f"robust: {_word(found.robust[name])})"
-        for name in TESTED
-        if None not in {found.paper[name].passed, found.robust[name].passed}
-        and found.paper[name].passed != found.robust[name].passed
+        for name, verdicts in both.items()
+        if (False in verdicts and name not in failed) or set(verdicts) == {True, None}
     ]
     texts = [f"{group.driver} shows, by both rules: {_listed(agreed)}."] if agreed else []
-    if failed:
-        texts.append(f"{group.driver} does not show: {_listed(failed)}.")
+    texts += [
+        f"{group.driver} does not show that {NAMES[name]}: {_weight(found, name)}."
+        for name in failed
+    ]
     if mixed:
         texts.append(f"{group.driver}, by one rule alone: {_listed(mixed)}.")
-    return [*texts, _collisions(study, group), _gap(study, group)]
+    return texts
+
+
+def _weight(found: Score, name: str) -> str:
+    """What the lack of a mark says, from how often humans have it in studies of this size."""
+    share = found.ceiling.robust.get(name)
+    if share is None:
+        return "how often humans would in a study of this size is not known"
+    strength = "strong" if share >= STRONG else "weak" if share < WEAK else "some"
+    return (
+        f"{100 * share:.0f} % of human data sets of this size do by the robust tests, "
+        f"{100 * found.ceiling.paper[name]:.0f} % by the paper's, so that this is {strength} "
+        "evidence against the driver"
+    )
 
 
 def _collisions(study: Study, group: Group) -> str:
     found, human = estimate(group, COLLISIONS), estimate(study.human, COLLISIONS)
     contrast = contrast_rates(counts(group, COLLISIONS), counts(study.human, COLLISIONS))
+    assert contrast.low is not None
+    assert contrast.high is not None
     verdict = (
-        "a difference that chance does not explain"
+        "a difference that chance alone seldom makes"
         if contrast.p < ALPHA
-        else "no difference can be shown; a small one is not excluded"
+        else f"no difference is shown, and one from {100 * contrast.low:+.1f} to "
+        f"{100 * contrast.high:+.1f} percentage points is compatible with these trials"
     )
     return (
-        f"{group.driver} collided in {found.value:.1f} % of {found.n} trials "
-        f"(95 % CI {found.low:.1f} to {found.high:.1f}), humans in {human.value:.1f} % "
-        f"({human.low:.1f} to {human.high:.1f}); Fisher's exact p {_p(contrast.p)}: {verdict}."
+        f"{group.driver} collided in {found.value:.1f} % of {_trials(found.n)} "
+        f"(95 % CI {found.low:.1f} to {found.high:.1f}), humans in {human.value:.1f} % of "
+        f"{human.n} ({human.low:.1f} to {human.high:.1f}); Fisher's exact p {_p(contrast.p)}: "
+        f"{verdict}."
     )
 
 
 def _gap(study: Study, group: Group) -> str:
     found = estimate(group, GAP)
-    human = estimate(study.human, GAP) if study.human.measured else None
     if found.value is None:
         return f"{group.driver} has no gap at the merge point."
     interval = "" if found.low is None else f" (95 % CI {found.low:.2f} to {found.high:.2f})"
-    reference = (
-        f"{human.value:.2f} m in the recordings"
-        if human is not None and human.value is not None
-        else "3.85 m as published"
+    return (
+        f"{group.driver} leaves {found.value:.2f} m on average of {_trials(found.n)}{interval}; "
+        f"humans {_human_gap(study)}."
     )
-    return f"{group.driver} leaves {found.value:.2f} m on average{interval}; humans {reference}."
+
+
+def _human_gap(study: Study) -> str:
+    if not known(study.human, GAP):
+        return f"{published_human(GAP):.2f} m as published"
+    human = estimate(study.human, GAP)
+    if human.value is None:
+        return "have none in the imported trials"
+    return f"{human.value:.2f} m in {human.n} imported trials"
 
 
 def _limits(study: Study, group: Group) -> list[str]:
     found, texts = score(study, group), []
-    if group.scripted:
+    if len(group.finished):
         texts.append(
-            f"{group.driver} is a scripted stand-in: its rows say nothing about a language model."
+            f"{group.driver}: of human data sets with as many trials in each condition "
+            f"({sum(group.sizes)} in all), {100 * found.ceiling.paper['I1-I4']:.0f} % pass I1 to "
+            f"I4 together by the paper's tests, {100 * found.ceiling.robust['I1-I4']:.0f} % by the "
+            "robust ones."
         )
-    chance = found.ceiling.paper["I1-I4"]
-    if chance < LOW_POWER and len(group.finished):
-        texts.append(
-            f"{group.driver}: with {len(group.ended)} trials a perfect copy of the humans would "
-            f"pass I1 to I4 together in {100 * chance:.0f} % of studies by the paper's tests, in "
-            f"{100 * found.ceiling.robust['I1-I4']:.0f} % by the robust ones. A missing mark is "
-            "weak evidence against the driver."
-        )
-    if found.paper["I4"].passed and not found.robust["I4"].passed:
+    if found.paper["I4"].passed and found.robust["I4"].passed is False:
         texts.append(
             f"{group.driver}: that the gap does not depend on relative velocity is not shown; the "
             "effect is not significant, but one of 1 m is not excluded either."
         )
-    texts += [
-        f"{group.driver}: {name} cannot be judged by the paper's rule: {verdict.why}."
-        for name in TESTED
-        for verdict in [found.paper[name]]
-        if verdict.why
+    return texts + [
+        f"{group.driver}: {name} cannot be judged {rule}: {verdicts[name].why}."
+        for name in INDICATORS
+        for rule, verdicts in (("by the paper's test", found.paper), ("robustly", found.robust))
+        if verdicts[name].passed is None and verdicts[name].why
     ]
-    if Score.total(found.paper) is None:
-        texts.append(f"{group.driver}: no score, as not all indicators can be judged.")
+
+
+def _human_limits(study: Study) -> list[str]:
+    """What the humans' side rests on."""
+    texts = []
+    if study.imported is None:
+        texts.append(
+            "The human recordings are not imported: human gaps, speed deviations and profiles are "
+            "those that were published, the speed profiles have nothing to be compared with, and "
+            "the human ceiling rests on a normal approximation of the gaps."
+        )
+    elif not study.complete:
+        texts.append(
+            f"{study.imported.trials} human trials of {HUMAN_TRIALS} are imported, of "
+            f"{study.imported.pairs} pairs: gaps, speeds and profiles are theirs, collisions and "
+            "who merged first are the published ones."
+        )
+    if study.imported is not None and study.imported.contradicting:
+        texts.append(
+            "The imported human trials are no part of the published ones ("
+            f"{'; '.join(study.imported.contradicting)}): they are another data set."
+        )
+    pairs = study.imported.pairs if study.complete and study.imported else HUMAN_PAIRS
+    texts.append(
+        f"Trials of humans come from {pairs} pairs who differ: tests that pool them, as the "
+        "paper's, understate the human uncertainty."
+    )
     return texts
+
+
+def _asked(group: Group, origin: Provenance) -> list[str]:
+    """What the results of a baseline are bound to: the wording, and what was sent with it."""
+    if not group.setting or group.scripted:
+        return []
+    if (group.trials["source"] == "driver").all():
+        return [f"{group.driver} is a program: it reads no prompt, and samples nothing."]
+    sent = origin.sent.get(group.spec_hash or "") or {"": {}}
+    return [
+        f"{group.driver}: results hold for the wording of the prompt, which is a reconstruction "
+        f"(the original is not public), and for what was sent with it: {text}."
+        for text in dict.fromkeys(_parameters(parameters) for parameters in sent.values())
+    ]
+
+
+def _parameters(sent: dict[str, object]) -> str:
+    if not sent:
+        return "no parameter is on record"
+    listed = ", ".join(f"{name} = {value}" for name, value in sent.items())
+    return listed if "temperature" in sent else f"{listed}, and no temperature"
+
+
+def _trials(n: int) -> str:
+    return f"{n} trial" if n == 1 else f"{n} trials"
 
 
 def _p(p: float) -> str:
@@ -225,7 +228,7 @@ def _p(p: float) -> str:
 
 
 def _word(verdict: Verdict) -> str:
-    return "yes" if verdict.passed else "no"
+    return "not judged" if verdict.passed is None else "yes" if verdict.passed else "no"
 
 
 def _listed(items: list[str]) -> str:

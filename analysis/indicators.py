@@ -71,9 +71,7 @@ def equivalence_p(b: float, se: float, freedom: int) -> float:
 
 def _signed(fit: Regression, name: str, sign: int) -> Verdict:
     if fit.problem:
-        # A separated fit has a reason and no test; by a Wald test nothing is shown.
-        separated = fit.problem.startswith("separation")
-        return Verdict(False if separated else None, None, fit.problem)
+        return Verdict(None, None, fit.problem)
     term = fit.terms[name]
     return Verdict(bool(term.b * sign > 0 and term.p < ALPHA), term.p)
 

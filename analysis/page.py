@@ -9,7 +9,8 @@ from pathlib import Path
 import jinja2
 import pandas as pd
 
-from analysis.conclusions import alarms, not_shown, shown
+from analysis.alarms import alarms
+from analysis.conclusions import not_shown, nothing, shown
 from analysis.explain import Source, sources_of, sql_command
 from analysis.figures import FIGURES
 from analysis.provenance import provenance
@@ -54,6 +55,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         alarms=alarms(study, origin),
         shown=shown(study),
         not_shown=not_shown(study, origin),
+        nothing=nothing(study),
         figures=[
             {"name": name, "caption": FIGURES[name][1], "data": data}
             for name, data in figures.items()

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from analysis.load import ALIASES, load_each
 from analysis.study import Group, Study, of_group
+from merge_runner.audit.replies import answers_alike
 from merge_runner.config import Scenario
+from merge_runner.database import read_database
+from merge_runner.records import SIDES
 
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
@@ -43,8 +48,9 @@ FROM (
 GROUP BY provider, model_requested, model_served ORDER BY ALL
 """
 SPECS = """
-SELECT DISTINCT split_part(trial_id, '/', 1) AS driver, variant, spec_hash, spec
-FROM specs JOIN trials USING (spec_hash) WHERE source <> 'human' ORDER BY ALL
+SELECT DISTINCT driver, variant, spec_hash, spec
+FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE source <> 'human' ORDER BY ALL
 """
 # Answers by another model than was asked for, by either name.
 SERVED = """
@@ -60,15 +66,29 @@ SELECT sweep_id, name, sweep_costs.* EXCLUDE (sweep_id)
 FROM sweeps JOIN sweep_costs USING (sweep_id) ORDER BY started_at, sweep_id
 """
 MODEL_COSTS = """
-SELECT split_part(trial_id, '/', 1) AS driver, count(*) AS trials,
+SELECT driver, count(*) AS trials,
     sum(calls) AS calls, sum(attempts) AS attempts,
     sum(input_tokens) AS input_tokens, sum(cached_input_tokens) AS cached_input_tokens,
     sum(output_tokens) AS output_tokens, sum(reasoning_tokens) AS reasoning_tokens,
     sum(cost_usd) AS cost_usd, sum(paid_usd) AS paid_usd,
     sum(attempts_of_unknown_cost) AS attempts_of_unknown_cost
 FROM trials JOIN trial_costs USING (trial_id, spec_hash)
+JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
 """
+# Trials that are looked through for answers that repeat each other, of a driver at a time.
+OF_DRIVER = """
+CREATE OR REPLACE TEMP TABLE audited AS
+SELECT trial_id, spec_hash, model_left, model_right
+FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE driver = ? AND NOT scripted
+"""
+DRIVERS = """
+SELECT DISTINCT driver FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE source = 'llm' AND NOT scripted ORDER BY ALL
+"""
+# What of a request's body is no parameter.
+NO_PARAMETERS = frozenset({"messages", "input", "contents", "model"})
 # Failures with an own column of the tables; the others are malformed answers.
 ANSWERS = ("refusal", "truncated", "empty")
 
@@ -90,6 +110,9 @@ class Provenance:
     ``sweeps``, ``calls``, ``sweep_costs`` and ``model_costs`` are rows of the queries here;
     ``switches`` holds, by driver, variant and spec_hash, the settings of the driving task that
     differ from the defaults; ``mismatches`` says where another model answered than was asked for.
+    ``alike`` has the drivers all of whose answers to a prompt that was asked before are word for
+    word as before, with their number. ``sent`` holds what was sent to the models beside the
+    prompt, by spec_hash and side.
     """
 
     sweeps: pd.DataFrame
@@ -98,6 +121,8 @@ class Provenance:
     model_costs: pd.DataFrame
     switches: dict[str, str]
     mismatches: list[Mismatch]
+    alike: dict[str, int]
+    sent: dict[str, dict[str, dict[str, object]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +180,8 @@ def provenance(db: Path) -> Provenance:
         model_costs=found["model_costs"],
         switches=_switches(found["specs"]),
         mismatches=_mismatches(found["served"], found["aliases"]),
+        alike=_alike(db),
+        sent={row.spec_hash: _sent(json.loads(row.spec)) for row in found["specs"].itertuples()},
     )
 
 
@@ -196,6 +223,35 @@ def _switches(specs: pd.DataFrame) -> dict[str, str]:
         changed = [f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v]
         found[f"{row.driver}/{row.variant} ({row.spec_hash})"] = ", ".join(changed) or "defaults"
     return found
+
+
+def _alike(db: Path) -> dict[str, int]:
+    with read_database(db) as connection:
+        found = {}
+        for (driver,) in connection.execute(DRIVERS).fetchall():
+            connection.execute(OF_DRIVER, [driver])
+            found[driver] = answers_alike(connection)
+    return {driver: repeated for driver, repeated in found.items() if repeated}
+
+
+def _sent(spec: Mapping[str, Any]) -> dict[str, dict[str, object]]:
+    """The parameters of the model on each side of a spec, by the last part of their names.
+
+    A program on a side has none, and is left out.
+    """
+    bodies = {side: spec[side]["body"] for side in SIDES if "body" in spec.get(side, {})}
+    return {
+        side: dict(_leaves({k: v for k, v in body.items() if k not in NO_PARAMETERS}))
+        for side, body in bodies.items()
+    }
+
+
+def _leaves(values: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value)
+        else:
+            yield name, value
 
 
 def _mismatches(served: pd.DataFrame, aliases: pd.DataFrame) -> list[Mismatch]:

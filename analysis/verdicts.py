@@ -59,11 +59,23 @@ class Score:
         """The human ceiling for the group's size."""
         return ceiling(self.humans, self.sizes)
 
-    @staticmethod
-    def total(verdicts: dict[str, Verdict]) -> int | None:
-        """How many indicators hold; None where one of them cannot be judged."""
-        passed = [verdict.passed for verdict in verdicts.values()]
-        return None if None in passed else sum(map(bool, passed))
+
+@dataclass(frozen=True, slots=True)
+class Total:
+    """How many indicators hold, of those that can be judged; ``open`` names the others."""
+
+    passed: int
+    judged: int
+    open: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.passed} of {self.judged}"
+
+
+def total(verdicts: dict[str, Verdict]) -> Total:
+    """The score of a group by one rule."""
+    known = {name: v.passed for name, v in verdicts.items() if v.passed is not None}
+    return Total(sum(known.values()), len(known), tuple(n for n in verdicts if n not in known))
 
 
 @cache

@@ -10,12 +10,14 @@ from analysis.tables.indicators import (
     RULES,
     SOURCE,
     percent,
+    score_note,
+    score_text,
     verdict_note,
     verdict_values,
 )
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import ceiling_notes, piecewise_notes, sample_notes
-from analysis.verdicts import Score, score
+from analysis.verdicts import score
 
 
 def ablation_qualitative(study: Study) -> Table:
@@ -36,8 +38,18 @@ def ablation_qualitative(study: Study) -> Table:
         ]
     columns = [c for c in columns if c.name not in {"i5_robust", "i5_differ"}]
     columns += [
-        Column("score_paper", "S", "count", 0, "indicators that hold by the paper's rule"),
-        Column("score_robust", "S rob.", "count", 0, "indicators that hold by the robust rule"),
+        Column(
+            "score_paper",
+            "S",
+            meaning="indicators that hold by the paper's rule, of those that it can judge",
+            optional=True,
+        ),
+        Column(
+            "score_robust",
+            "S rob.",
+            meaning="indicators that hold by the robust rule, of those that it can judge",
+            optional=True,
+        ),
         Column(
             "ceiling_paper",
             "humans I1-I4 (%)",
@@ -116,12 +128,13 @@ def _qualitative_row(study: Study, group: Group) -> Row:
     for name in INDICATORS:
         values |= verdict_values(found, name, f"{name.lower()}_")
     values |= {
-        "score_paper": Score.total(found.paper),
-        "score_robust": Score.total(found.robust),
+        "score_paper": score_text(found.paper),
+        "score_robust": score_text(found.robust),
         "ceiling_paper": percent(found.ceiling.paper["I1-I4"]),
         "ceiling_robust": percent(found.ceiling.robust["I1-I4"]),
     }
-    return Row(group.id, (group.id,), values, verdict_note(found, *INDICATORS))
+    notes = filter(None, (verdict_note(found, *INDICATORS), score_note(found)))
+    return Row(group.id, (group.id,), values, "; ".join(notes))
 
 
 def _quantitative_row(group: Group) -> Row:

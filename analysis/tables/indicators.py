@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from analysis.indicators import INDICATORS
+from analysis.indicators import INDICATORS, Verdict
 from analysis.measures import MEASURES, Measure, estimate, known, published_human
 from analysis.published import citation
 from analysis.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import ceiling_notes, piecewise_notes, sample_notes
-from analysis.verdicts import Score, score
+from analysis.verdicts import Score, score, total
 
 SOURCE = "paper_ablation_quantitative"
+PAPER_RULE, ROBUST_RULE = "by the paper's test", "by the robust tests"
 RULES = (
     "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
     "Firth's fit (I1, I2), HC3 errors (I3), equivalence (I4)"
@@ -85,11 +86,30 @@ def verdict_note(found: Score, *names: str) -> str:
     """Why a verdict is missing or rests on something else than a test."""
     reasons = [
         f"{name} {verdict.why}"
+        if verdict.passed is not None
+        else f"{name} cannot be judged {rule}: {verdict.why}"
         for name in names
-        for verdict in (found.paper[name], found.robust[name])
+        for rule, verdict in ((PAPER_RULE, found.paper[name]), (ROBUST_RULE, found.robust[name]))
         if verdict.why
     ]
     return "; ".join(dict.fromkeys(reasons))
+
+
+def score_text(verdicts: dict[str, Verdict]) -> str | None:
+    """``3 of 4``, or None where no indicator can be judged."""
+    found = total(verdicts)
+    return str(found) if found.judged else None
+
+
+def score_note(found: Score) -> str:
+    """Which indicators are in no score."""
+    parts = [
+        f"{', '.join(one.open)} {'is' if len(one.open) == 1 else 'are'} in neither number of the "
+        f"score {rule}"
+        for rule, verdicts in ((PAPER_RULE, found.paper), (ROBUST_RULE, found.robust))
+        if (one := total(verdicts)).open
+    ]
+    return "; ".join(parts)
 
 
 def _verdict_row(study: Study, group: Group, name: str) -> Row:
@@ -111,21 +131,19 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
 
 def _total_row(study: Study, group: Group) -> Row:
     found = score(study, group)
-    paper, robust = Score.total(found.paper), Score.total(found.robust)
-    missing = [name for name in INDICATORS if found.paper[name].passed is None]
     return Row(
         f"{group.id}/score",
         (group.id,),
         {
-            "indicator": f"Score, of {len(INDICATORS)}",
+            "indicator": "Score",
             "driver": group.label,
-            "paper": paper,
-            "robust": robust,
+            "paper": score_text(found.paper),
+            "robust": score_text(found.robust),
             "ceiling_paper": percent(found.ceiling.paper["I1-I4"]),
             "ceiling_robust": percent(found.ceiling.robust["I1-I4"]),
             "n": len(group.finished),
         },
-        f"no score: {', '.join(missing)} cannot be judged" if missing else "",
+        score_note(found),
     )
 
 

@@ -25,8 +25,16 @@ def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
         notes.append(f"{study.db} holds no trial of a model; `make sweep` plays some")
     if study.human in study.groups:
         notes += _human_notes(study)
-    scripted = dict.fromkeys(group.driver for group in shown if group.scripted)
-    return [*notes, *(f"{driver} is a scripted stand-in, no language model" for driver in scripted)]
+    return [*notes, *(f"{group.id}: {repeated_note(group)}" for group in shown if group.repeated)]
+
+
+def repeated_note(group: Group) -> str:
+    """That a driver without chance repeats its trials."""
+    every = len(group.trials) + group.repeated
+    return (
+        f"{group.repeated} of {every} trials repeat an earlier one to the last state, as of a "
+        "driver without chance: they are left out, and n counts the others"
+    )
 
 
 @cache

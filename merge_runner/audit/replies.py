@@ -80,6 +80,7 @@ WHERE (a.name, a.spec_hash) < (b.name, b.spec_hash)
         OR b.spec_hash IN (SELECT spec_hash FROM audited))
 GROUP BY ALL ORDER BY ALL
 """
+MANY_REPEATED = 5
 # Of the answers to a prompt that was asked before, those that are word for word like another.
 ALIKE = """
 WITH answers AS (
@@ -151,11 +152,17 @@ def calls_in_common(connection: duckdb.DuckDBPyConnection) -> Iterator[Sharing]:
         yield Sharing("calls", first, second, count)
 
 
-def answers_alike(connection: duckdb.DuckDBPyConnection) -> tuple[int, int]:
-    """How many answers were to a prompt that was asked before, and how many only repeat another."""
+def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:
+    """How many answers to prompts that were asked before are word for word as before, if all are.
+
+    A model that samples never gives only answers that it has given before. A proxy that caches and
+    gives each reply a new id does, and so does a model at temperature 0: in both cases the
+    repetitions are no samples. 0 also where a few answers alone were to such prompts.
+    """
     row = connection.execute(ALIKE).fetchone()
     assert row is not None
-    return row[0], row[1]
+    repeated, alike = row
+    return alike if alike == repeated >= MANY_REPEATED else 0
 
 
 def _place(slot: tuple[str, str, int]) -> str:

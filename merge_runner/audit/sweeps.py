@@ -80,7 +80,6 @@ LOOSE_TEXTS = {
     "trials": "no sweep has this trial",
     "sweep_trials": "it is a trial of a sweep that is not stored",
 }
-MANY_REPEATED = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,14 +256,9 @@ def _taken_over(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> Iterabl
 
 
 def _alike_notes(connection: duckdb.DuckDBPyConnection) -> Iterable[str]:
-    """A model that samples never gives only answers that it has given before.
-
-    A proxy that caches and gives each reply a new id does, and so does a model at temperature 0:
-    in both cases the repetitions are no samples. The emulator has a few phrases.
-    """
-    repeated, alike = answers_alike(connection)
+    """What is no sample; the emulator has a few phrases."""
     scripted = _counts(connection, "SELECT count(*) AS trials FROM audited WHERE scripted")
-    if alike == repeated >= MANY_REPEATED and not scripted["trials"]:
+    if (repeated := answers_alike(connection)) and not scripted["trials"]:
         yield (
             f"all {repeated} answers to prompts that were asked before are word for word as "
             "before: are they samples?"

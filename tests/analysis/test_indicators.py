@@ -16,6 +16,7 @@ from analysis.indicators import (
     robust_verdicts,
 )
 from analysis.regressions import Regression, Term
+from analysis.verdicts import total
 from merge_runner.simulator.conditions import CONDITIONS
 
 SEPARATED = "separation: no finite estimate of projected_headway; see Firth's fit"
@@ -122,10 +123,16 @@ def test_a_large_p_alone_shows_no_equivalence():
     assert robust_verdicts(who_first(), vague)["I4"].passed is False
 
 
-def test_a_separated_fit_fails_i1_and_i2_for_its_reason():
+def test_a_separated_fit_is_neither_a_pass_nor_a_failure_of_i1_and_i2():
     found = paper_verdicts(Regression(110, {}, SEPARATED), gap())
-    assert found["I1"] == found["I2"] == Verdict(False, None, SEPARATED)
+    assert found["I1"] == found["I2"] == Verdict(None, None, SEPARATED)
     assert found["I3"].passed is True
+
+
+def test_a_score_counts_only_what_can_be_judged_and_names_the_rest():
+    found = total(paper_verdicts(Regression(110, {}, SEPARATED), gap((0.2, 0.2))))
+    assert (str(found), found.open) == ("1 of 2", ("I1", "I2"))
+    assert str(total({"I1": Verdict(None, None, "too few")})) == "0 of 0"
 
 
 @BOTH

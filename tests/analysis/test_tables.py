@@ -86,8 +86,12 @@ def test_the_score_counts_the_marks_beside_it(tables):
     for row in table.rows:
         for rule in ("paper", "robust"):
             marks = [row.values.get(f"i{i}_{rule}") for i in range(1, 6)]
-            expected = None if None in marks else sum(marks)
-            assert row.values.get(f"score_{rule}") == expected, (row.id, rule)
+            known = [mark for mark in marks if mark is not None]
+            assert row.values[f"score_{rule}"] == f"{sum(known)} of {len(known)}", (row.id, rule)
+            left_out = (
+                f"neither number of the score by the {'robust' if rule == 'robust' else 'paper'}"
+            )
+            assert (left_out in row.note) == (None in marks), (row.id, rule)
 
 
 def test_disagreeing_rules_are_marked(study, tables):
