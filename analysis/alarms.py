@@ -81,7 +81,7 @@ def mismatch(one: Mismatch) -> str:
 
 def _posing(study: Study) -> list[Group]:
     """Stand-ins that answered in a model's name; the emulator has one of its own."""
-    return [group for group in study.models if group.scripted and group.model != EMULATOR]
+    return [g for g in study.models if g.scripted and EMULATOR not in g.model.split("+")]
 
 
 def _repeated(group: Group) -> str:

@@ -163,11 +163,20 @@ def _limits(study: Study, group: Group) -> list[str]:
             "effect is not significant, but one of 1 m is not excluded either."
         )
     return texts + [
-        f"{group.driver}: {name} cannot be judged {rule}: {verdicts[name].why}."
-        for name in INDICATORS
-        for rule, verdicts in (("by the paper's test", found.paper), ("robustly", found.robust))
-        if verdicts[name].passed is None and verdicts[name].why
+        f"{group.driver}: {', '.join(names)} cannot be judged {' or '.join(rules)}: {why}."
+        for why, (names, rules) in _unjudged(found).items()
     ]
+
+
+def _unjudged(found: Score) -> dict[str, tuple[list[str], list[str]]]:
+    """Why indicators have no verdict: which, and by which rules."""
+    reasons: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
+    for name in INDICATORS:
+        for rule, verdicts in (("by the paper's test", found.paper), ("robustly", found.robust)):
+            if verdicts[name].passed is None and (why := verdicts[name].why):
+                names, rules = reasons.setdefault(why, ({}, {}))
+                names[name] = rules[rule] = None
+    return {why: (list(names), list(rules)) for why, (names, rules) in reasons.items()}
 
 
 def _human_limits(study: Study) -> list[str]:

@@ -26,6 +26,7 @@ from analysis.load import (
 from analysis.published import human_outcomes
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
+from merge_runner.plan import PROGRAMS
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.texts import quoted
 
@@ -277,7 +278,10 @@ def _model_group(
 
 def stand_in(model: str) -> str:
     """What is said of a scripted stand-in that answered in a model's name."""
-    return f"scripted stand-in, {'no language model' if model == EMULATOR else f'not {model}'}"
+    asked = [name for name in model.split("+") if name not in {EMULATOR, *PROGRAMS}]
+    if not asked:
+        return "scripted stand-in, no language model"
+    return f"scripted stand-in, not {'+'.join(asked)}"
 
 
 def _distinct(rows: pd.DataFrame) -> pd.DataFrame:

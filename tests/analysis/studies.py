@@ -140,14 +140,24 @@ def answered(drive: Drive, side: Side, number: int, decision: Decision) -> Decis
 
 
 def write_study(
-    path: Path, drives: Iterable[Drive], scenario: Scenario = SCENARIO, config: object = None
+    path: Path,
+    drives: Iterable[Drive],
+    scenario: Scenario = SCENARIO,
+    config: object = None,
+    asked: Mapping[str, object] | None = None,
 ) -> Path:
-    """Write the trials of a sweep, which was configured so, into a new database."""
+    """Write the trials of a sweep, which was configured so, into a new database.
+
+    ``asked`` is what the specs say of both drivers: the endpoint, and the body of a request.
+    """
     records = [played(drive, scenario) for drive in drives]
     path.write_bytes(_empty())
     store = Store(path)
     specs = {
-        record.spec.spec_hash: json.dumps({"scenario": scenario.model_dump()}) for record in records
+        record.spec.spec_hash: json.dumps(
+            {"scenario": scenario.model_dump()} | ({"left": asked, "right": asked} if asked else {})
+        )
+        for record in records
     }
     sweep = SweepRow(
         "sweep-1",

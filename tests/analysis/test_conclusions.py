@@ -124,7 +124,7 @@ def test_a_separated_fit_is_not_judged_and_the_robust_verdict_stands(tmp_path):
     drives = [d for d in yielding("o3", reps=4) if d.condition != "N_0_0"]
     study = Study(write_study(tmp_path / "t.duckdb", drives))
     said, limits = texts(study)
-    assert "o3: I1 cannot be judged by the paper's test: separation" in limits
+    assert "o3: I1, I2 cannot be judged by the paper's test: separation" in limits
     assert (
         "by one rule alone: going first becomes likelier with a projected headway advantage "
         "(paper's rule: not judged, robust: yes)" in said

@@ -1,0 +1,168 @@
+"""Odd databases of every kind, each with its report and its pages, to be looked at.
+
+``python tests/analysis/odd_databases.py DIR`` makes them all; test_odd_databases.py reads what
+they say.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+if __name__ == "__main__":  # else pytest has set them
+    tests = Path(__file__).resolve().parents[1]
+    sys.path[:0] = [str(tests.parent), str(tests), str(tests / "analysis")]
+
+from recordings import drive, write_folder
+from studies import Said, write_study, yielding
+
+from analysis.explorer.export import export_folder
+from analysis.human.archive import open_files
+from analysis.human.load import import_trials, sort_files
+from analysis.report import write_report
+from merge_runner.config import Scenario
+from merge_runner.database import open_database
+from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.store import Store
+
+OWN = {"endpoint": "openai", "body": {"model": "o3", "messages": [], "reasoning_effort": "medium"}}
+IMPORTED = 129
+
+
+def two_trials(db: Path) -> None:
+    """Two trials of one condition each."""
+    write_study(db, yielding("o3", reps=1)[:2], asked=OWN)
+
+
+def stand_in_behind_o3(db: Path) -> None:
+    """The emulator at OPENAI_BASE_URL, asked for o3."""
+    url = {"OPENAI_BASE_URL": f"{_emulator()}/v1", "OPENAI_API_KEY": "no-key"}
+    _sweep(db, "--model", "o3", "--reps", "2", "--yes", **url)
+
+
+def another_endpoint(db: Path) -> None:
+    """A model that was asked at a gateway."""
+    asked = OWN | {"endpoint": "http://localhost:8080/v1"}
+    write_study(db, yielding("o3", reps=3), asked=asked)
+
+
+def partial_import(db: Path) -> None:
+    """A driver beside 129 human trials of five pairs."""
+    write_study(db, yielding("o3", reps=5), asked=OWN)
+    files = {}
+    for number in range(IMPORTED):
+        experiment = (4, 5, 6, 8, 9)[number % 5]
+        condition = list(CONDITIONS.values())[number // 5 % len(CONDITIONS)]
+        ahead = condition.projected_headway_m - condition.relative_velocity_mps
+        yields = "right" if ahead > 0 or (ahead == 0 and number % 2) else "left"
+        name = f"experiment_{experiment}/experiment_{experiment}_iter_{number + 1}.csv"
+        files[name] = drive(condition.name, yields=yields).csv()
+    with open_files(write_folder(db.parent / "recordings", files)) as found:
+        import_trials(sort_files(found).trials, Store(db))
+
+
+def other_vehicle_length(db: Path) -> None:
+    """Vehicles of 8 m."""
+    write_study(db, yielding("o3", reps=3), Scenario(vehicle_length_m=8.0), asked=OWN)
+
+
+def temperature(db: Path) -> None:
+    """A model that was sent a temperature of 0.2."""
+    body = {"model": "gpt", "messages": [], "temperature": 0.2, "max_tokens": 4000}
+    write_study(db, yielding("gpt", reps=3), asked={"endpoint": "openai", "body": body})
+
+
+def programs(db: Path) -> None:
+    """Drivers that are programs, each with repetitions, and one against the emulator."""
+    for model in ("projected-order", "constant", "emulator+constant"):
+        _sweep(db, "--model", model, "--reps", "2")
+
+
+def only_failed(db: Path) -> None:
+    """Every trial failed for want of an answer."""
+    drives = yielding("o3", reps=1)
+    write_study(
+        db, [replace(d, said={1: Said(("timeout",), lost=True)}) for d in drives], asked=OWN
+    )
+
+
+def killed(db: Path) -> None:
+    """A sweep that was killed: two trials, and no end."""
+    write_study(db, yielding("o3", reps=1)[5:7], asked=OWN)
+    with open_database(db, read_only=False, patience_s=5) as connection:
+        connection.execute("UPDATE sweeps SET ended_at = NULL, exit_code = NULL")
+
+
+def word_for_word(db: Path) -> None:
+    """A model that goes the same way each time."""
+    once = [drive for drive in yielding("o3", reps=2) if drive.rep == 1]
+    drives = [replace(drive, rep=rep, said={}) for drive in once for rep in (1, 2, 3)]
+    write_study(db, drives, asked=OWN)
+
+
+KINDS: dict[str, Callable[[Path], None]] = {
+    make.__name__: make
+    for make in (
+        two_trials,
+        stand_in_behind_o3,
+        another_endpoint,
+        partial_import,
+        other_vehicle_length,
+        temperature,
+        programs,
+        only_failed,
+        killed,
+        word_for_word,
+    )
+}
+
+
+def made(folder: Path, kind: str) -> Path:
+    """The database of a kind, in a folder of its own."""
+    db = folder / kind / "merge.duckdb"
+    db.parent.mkdir(parents=True)
+    KINDS[kind](db)
+    return db
+
+
+def _emulator() -> str:
+    """The URL of an emulator, which ends with this process."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "merge_runner", "emulate", "--port", "0", "--until-stdin-closes"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+def _sweep(db: Path, *arguments: str, **environment: str) -> None:
+    program = (sys.executable, "-m", "merge_runner", "sweep", "baseline")
+    subprocess.run(
+        [*program, *arguments, "--db", db.name, "--cache", "cache"],
+        cwd=db.parent,
+        env={**os.environ, **environment},
+        check=True,
+        capture_output=True,
+    )
+
+
+def main() -> None:
+    """Make all of them in the folder that is named, and say what they are."""
+    folder = Path(sys.argv[1])
+    for kind, make in KINDS.items():
+        db = made(folder, kind)
+        for _ in write_report(db, None, db.with_name("report.html"), db.with_name("files")):
+            pass
+        for _ in export_folder(db, db.with_name("pages"), []):
+            pass
+        sys.stdout.write(f"{db.parent}: {make.__doc__}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""What is said of odd databases is true of them."""
+
+from __future__ import annotations
+
+import html
+import re
+
+import pytest
+from odd_databases import KINDS, made
+
+from analysis.page import report_html
+from analysis.study import Study
+from analysis.tables import make_tables
+
+# What the report of a kind says, and what it must not say.
+SAID = {
+    "two_trials": (
+        ["o3 collided in 0.0 % of 2 trials (95 % CI 0.0 to 65.8)", "in too few conditions"],
+        ["evidence against the driver"],
+    ),
+    "stand_in_behind_o3": (
+        [
+            "A scripted stand-in answered",
+            "(scripted stand-in, not o3)",
+            "Nothing: with the baseline prompt only scripted stand-ins drove.",
+        ],
+        ["o3 collided", "o3 leaves", "o3 shows", ">o3</td>"],
+    ),
+    "another_endpoint": (["o3 at localhost:8080 collided in"], [">o3</td>"]),
+    "partial_import": (
+        ["humans (129 of 990 imported)", "of 5 pairs", "humans in 2.8 % of 990"],
+        ["The human recordings are not imported"],
+    ),
+    "other_vehicle_length": (["vehicle_length_m = 8.0"], []),
+    "temperature": (["temperature = 0.2"], ["no temperature", "default sampling temperature"]),
+    "programs": (
+        [
+            "11 of 22 trials of projected-order/baseline repeat an earlier one",
+            "projected-order collided in 0.0 % of 11 trials",
+            "projected-order is a program",
+            "emulator+constant (scripted stand-in, no language model)",
+        ],
+        ["temperature", "A scripted stand-in answered"],
+    ),
+    "only_failed": (["o3: no trial ended (11 failed).", "Trials failed"], ["o3 collided"]),
+    "killed": (["o3 collided in 0.0 % of 2 trials"], ["evidence against the driver"]),
+    "word_for_word": (
+        ["22 of 33 trials of o3/baseline repeat an earlier one", "0.0 % of 11 trials"],
+        ["% of 33 trials"],
+    ),
+}
+
+
+def test_every_kind_is_looked_at():
+    assert list(SAID) == list(KINDS)
+
+
+@pytest.mark.usefixtures("few_draws")
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_report_of_an_odd_database_says_what_is_true_of_it(kind, tmp_path):
+    study = Study(made(tmp_path, kind))
+    page = html.unescape(report_html(study, make_tables(study, ["ablation-quantitative"]), {}))
+    said, unsaid = SAID[kind]
+    text = re.sub(r"\s+", " ", page)
+    assert [words for words in said if words not in text] == []
+    assert [words for words in unsaid if words in text] == []
