@@ -54,8 +54,12 @@ def test_a_size_that_a_spec_does_not_say_is_that_of_the_experiment(database, spe
 def test_the_bounds_of_the_experiments_vehicles_are_the_known_ones(database):
     found = of_size(database, 4.5, 1.8)
     expected = {
-        **{"front_m": 97.75, "rear_m": 102.25, "contact_m": 90.6065, "contact_high_m": 95.1065},
-        **{"merge_low_m": 95.3471, "merge_high_m": 104.5949},
+        "front_m": 97.75,
+        "rear_m": 102.25,
+        "contact_m": 90.6065,
+        "contact_high_m": 95.1065,
+        "merge_low_m": 95.3471,
+        "merge_high_m": 104.5949,
     }
     assert {name: round(found[name], 4) for name in expected} == expected
 
