@@ -481,7 +481,7 @@ def test_a_status_that_the_states_contradict_is_found(long_vehicles, tmp_path):
     ended = statuses(db)
     collided = [trial for trial, status in ended.items() if status == "collided"]
     finished = [trial for trial, status in ended.items() if status == "finished"]
-    # One went on after its collision, one did not collide, and two only say something else.
+    # Two say something else, one goes on after its collision, one had another that it ignores.
     late, apart = f"trial_id = '{collided[1]}'", f"trial_id = '{finished[1]}'"
     damage(
         db,
