@@ -79,6 +79,8 @@ FROM sweeps, json_each(config, '$.models') ORDER BY ALL
 """
 
 SPECS = "SELECT spec_hash, spec FROM specs"
+# The size of a spec's vehicles in words.
+SIZES = "SELECT spec_hash, format('{:g} m x {:g} m', length_m, width_m) AS size FROM geometry"
 
 
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:

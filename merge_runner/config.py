@@ -59,11 +59,12 @@ class Scenario(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
     ``collision_rule``: ``euclid2d`` (centres closer than a vehicle length), ``rectangle`` (the
-    oriented 4.5 x 1.8 m boxes of the human experiment overlap) or ``shared_lane`` (|s_L - s_R|
-    below a vehicle length once either has passed the merge point).
+    vehicles' oriented boxes overlap, as in the human experiment) or ``shared_lane``
+    (|s_L - s_R| below a vehicle length once either has passed the merge point).
     ``control_start``: ``both_exits`` starts where both vehicles are out of their tunnels,
     ``own_exit`` at the earlier exit, the other vehicle cruising until its own.
-    ``resistance``: ``human`` adds the drag of the human simulator, 0.5 + 0.005 v^2 in m/s^2.
+    ``resistance``: ``human`` adds the drag of the human simulator, 0.5 + 0.005 v^2 in m/s^2;
+    drivers are not told, and a plan of zeros then slows by 1 m/s per second at 10 m/s.
     ``history_start``: before t = 0 the history shows ``cruise`` (a = 0, constant speeds) or is
     ``empty``. ``fallback``: after an invalid reply the last valid plan ``continue``s where it
     was left, or ``restart``s at its first action. ``straight_after``: the prompt says "straight"

@@ -157,6 +157,58 @@ SELECT sweep_id, count(*) AS trials, sum(calls) AS calls, sum(attempts) AS attem
 FROM (SELECT DISTINCT * FROM sweep_trials) JOIN trial_costs USING (trial_id, spec_hash)
 GROUP BY ALL;
 
+-- The track, as in simulator/track.py and conditions.py, which tests hold these numbers against.
+CREATE MACRO IF NOT EXISTS merge_point_m() AS 100::DOUBLE;
+CREATE MACRO IF NOT EXISTS track_end_m() AS 150::DOUBLE;
+CREATE MACRO IF NOT EXISTS branch_sine() AS 0.125::DOUBLE;
+CREATE MACRO IF NOT EXISTS mean_speed_mps() AS 10::DOUBLE;
+
+-- One row a spec: its vehicles' size, in a human recording that of the experiment, and where their
+-- boxes overlap (collision.py). With half lengths l, half widths w and each branch at the angle phi
+-- from the centreline, the four separating axes are along and across either vehicle. Two vehicles
+-- u and v before the merge point are apart in their sums
+--     |v - u cos 2phi|, |u - v cos 2phi| < along2 = l (1 + cos 2phi) + w sin 2phi
+--     u sin 2phi, v sin 2phi < across2 = w (1 + cos 2phi) + l sin 2phi
+-- and one u before it, the other d behind it, with along and across likewise of phi, in
+--     u + d cos phi, u cos phi + d < along;  u sin phi, d sin phi < across
+-- The contact point is the first at which two vehicles touch that are both before the merge point.
+CREATE VIEW IF NOT EXISTS geometry AS
+WITH sizes AS (
+    SELECT spec_hash,
+        coalesce((spec -> 'scenario' ->> 'vehicle_length_m')::DOUBLE, 4.5) AS length_m,
+        coalesce((spec -> 'scenario' ->> 'vehicle_width_m')::DOUBLE, 1.8) AS width_m
+    FROM specs
+), angles AS (
+    SELECT *,
+        branch_sine() AS sin1, sqrt(1 - sin1 ** 2) AS cos1,
+        2 * sin1 * cos1 AS sin2, 1 - 2 * sin1 ** 2 AS cos2
+    FROM sizes
+), reaches AS (
+    SELECT *,
+        (length_m * (1 + cos1) + width_m * sin1) / 2 AS along,
+        (width_m * (1 + cos1) + length_m * sin1) / 2 AS across,
+        (length_m * (1 + cos2) + width_m * sin2) / 2 AS along2,
+        (width_m * (1 + cos2) + length_m * sin2) / 2 / sin2 AS contact
+    FROM angles
+)
+SELECT spec_hash, length_m, width_m,
+    merge_point_m() - length_m / 2 AS front_m,
+    merge_point_m() + length_m / 2 AS rear_m,
+    -- A vehicle at contact_m overlaps the other from there to contact_high_m, one at the merge point
+    -- from merge_low_m to merge_high_m.
+    merge_point_m() - contact AS contact_m,
+    if(contact < along, merge_point_m() + (along - contact) / cos1, contact_m + length_m)
+        AS contact_high_m,
+    merge_point_m() - least(along2, contact) AS merge_low_m,
+    merge_point_m() + least(along, across / sin1) AS merge_high_m
+FROM reaches;
+
+-- On a collision course for a point: when a vehicle will be there at its present speed, the other
+-- will be within the bounds in which their boxes overlap (Siebinga et al., conflict_signal.py).
+CREATE MACRO IF NOT EXISTS on_course(at_m, low_m, high_m, own_m, own_mps, other_m, other_mps) AS
+    coalesce(own_m < at_m AND own_mps > 0
+        AND other_m + other_mps * (at_m - own_m) / own_mps BETWEEN low_m AND high_m, false);
+
 -- When a vehicle passes a level: linear within the step in which it does, else NULL.
 CREATE MACRO IF NOT EXISTS passing_s(level_m, before_m, now_m, before_s, now_s) AS
     CASE WHEN before_m < level_m AND now_m >= level_m
@@ -179,20 +231,20 @@ SELECT *,
     lag(right_m) OVER trial AS right_before_m
 FROM pairs WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step);
 
--- When each vehicle's centre reaches the merge point (100 m), when its front does, and when its
--- rear has left it (vehicles are 4.5 m long); NULL: never.
+-- When each vehicle's centre reaches the merge point, when its front does, and when its rear has
+-- left it; NULL: never.
 CREATE VIEW IF NOT EXISTS merge_times AS
 SELECT *,
     least(left_s, right_s) AS first_s,
     if(left_s IS NULL OR right_s IS NULL, NULL, greatest(left_s, right_s)) AS both_s
 FROM (SELECT trial_id, spec_hash,
-    min(passing_s(100, left_before_m, left_m, time_before_s, time_s)) AS left_s,
-    min(passing_s(100, right_before_m, right_m, time_before_s, time_s)) AS right_s,
-    min(passing_s(97.75, left_before_m, left_m, time_before_s, time_s)) AS left_front_s,
-    min(passing_s(97.75, right_before_m, right_m, time_before_s, time_s)) AS right_front_s,
-    min(passing_s(102.25, left_before_m, left_m, time_before_s, time_s)) AS left_rear_s,
-    min(passing_s(102.25, right_before_m, right_m, time_before_s, time_s)) AS right_rear_s
-FROM vehicle_pairs GROUP BY ALL);
+    min(passing_s(merge_point_m(), left_before_m, left_m, time_before_s, time_s)) AS left_s,
+    min(passing_s(merge_point_m(), right_before_m, right_m, time_before_s, time_s)) AS right_s,
+    min(passing_s(front_m, left_before_m, left_m, time_before_s, time_s)) AS left_front_s,
+    min(passing_s(front_m, right_before_m, right_m, time_before_s, time_s)) AS right_front_s,
+    min(passing_s(rear_m, left_before_m, left_m, time_before_s, time_s)) AS left_rear_s,
+    min(passing_s(rear_m, right_before_m, right_m, time_before_s, time_s)) AS right_rear_s
+FROM vehicle_pairs LEFT JOIN geometry USING (spec_hash) GROUP BY ALL);
 
 -- RMSE of each vehicle's speed from its initial speed, over four readings of "the interaction
 -- window": from the start of control to the first vehicle's merge, to the second's, to the end,
@@ -203,8 +255,8 @@ SELECT *,
     (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
     least(rmse_left_mps, rmse_right_mps) >= 0.5 AS joint
 FROM (SELECT trial_id, spec_hash, time_window,
-    sqrt(avg((left_mps - (10 + relative_velocity_mps / 2)) ** 2)) AS rmse_left_mps,
-    sqrt(avg((right_mps - (10 - relative_velocity_mps / 2)) ** 2)) AS rmse_right_mps
+    sqrt(avg((left_mps - (mean_speed_mps() + relative_velocity_mps / 2)) ** 2)) AS rmse_left_mps,
+    sqrt(avg((right_mps - (mean_speed_mps() - relative_velocity_mps / 2)) ** 2)) AS rmse_right_mps
 FROM vehicle_pairs
 JOIN trials USING (trial_id, spec_hash)
 JOIN merge_times USING (trial_id, spec_hash)
@@ -220,53 +272,51 @@ GROUP BY ALL);
 -- One row a trial. What a trial has no value for is NULL: gaps, speed deviations and joint are
 -- those of finished trials (arXiv 2604.09609, sec. II-G).
 CREATE VIEW IF NOT EXISTS trial_metrics AS
-WITH gaps AS (
+WITH distances AS (
     SELECT trial_id, spec_hash,
         abs(left_before_m - right_before_m
             + (first_s - time_before_s) / (time_s - time_before_s)
-            * (left_m - left_before_m - right_m + right_before_m)) - 4.5 AS gap_m
+            * (left_m - left_before_m - right_m + right_before_m)) AS merge_m
     FROM vehicle_pairs JOIN merge_times USING (trial_id, spec_hash)
     WHERE time_before_s < first_s AND first_s <= time_s
-), sampled_gaps AS (
+), sampled_distances AS (
     SELECT trial_id, spec_hash,
-        arg_min(abs(left_m - right_m), step) FILTER (greatest(left_m, right_m) >= 100) - 4.5
-            AS gap_first_sample_m,
-        arg_min(abs(left_m - right_m), step) FILTER (left_m + right_m >= 200) - 4.5
-            AS gap_mean100_m,
+        arg_min(abs(left_m - right_m), step)
+            FILTER (greatest(left_m, right_m) >= merge_point_m()) AS first_sample_m,
+        arg_min(abs(left_m - right_m), step)
+            FILTER (left_m + right_m >= 2 * merge_point_m()) AS mean_at_merge_m,
         max(hardest_mps2) FILTER (time_s > 0) AS max_acceleration_mps2
     FROM vehicle_pairs GROUP BY ALL
 ), collision_times AS (
-    SELECT trial_id, spec_hash, min((abs(left_m - right_m) - 4.5) / closing_mps) AS min_ttc_s
+    SELECT trial_id, spec_hash, min((abs(left_m - right_m) - length_m) / closing_mps) AS min_ttc_s
     FROM (
         SELECT *, if(left_m > right_m, right_mps - left_mps, left_mps - right_mps) AS closing_mps
-        FROM vehicle_pairs WHERE greatest(left_m, right_m) >= 100
-    )
-    WHERE closing_mps > 0 AND abs(left_m - right_m) > 4.5
+        FROM vehicle_pairs WHERE greatest(left_m, right_m) >= merge_point_m()
+    ) JOIN geometry USING (spec_hash)
+    WHERE closing_mps > 0 AND abs(left_m - right_m) > length_m
     GROUP BY ALL
 ), resolutions AS (
-    -- On a collision course for a point: when one vehicle will be there at its present speed, the
-    -- other will be within the bounds in which their boxes overlap. Points: first possible contact,
-    -- merge point, end of the track (Siebinga et al., conflict_signal.py).
     SELECT trial_id, spec_hash, min(time_s) AS conflict_resolution_s
-    FROM (
-        SELECT trial_id, spec_hash, step, time_s, bool_or(coalesce(
-            left_m < at_m AND left_mps > 0 AND right_m + right_mps * (at_m - left_m) / left_mps
-                BETWEEN low_m AND high_m
-            OR right_m < at_m AND right_mps > 0 AND left_m + left_mps * (at_m - right_m) / right_mps
-                BETWEEN low_m AND high_m, false)) AS on_course
-        FROM vehicle_pairs CROSS JOIN (VALUES
-            (90.6065, 90.6065, 95.1065), (100, 95.3471, 104.5949), (150, 145.5, 154.5)
-        ) AS points (at_m, low_m, high_m)
-        WHERE time_s >= 0 GROUP BY ALL
-    )
-    WHERE NOT on_course GROUP BY ALL
+    FROM vehicle_pairs JOIN geometry USING (spec_hash)
+    WHERE time_s >= 0 AND NOT (
+        on_course(contact_m, contact_m, contact_high_m, left_m, left_mps, right_m, right_mps)
+        OR on_course(contact_m, contact_m, contact_high_m, right_m, right_mps, left_m, left_mps)
+        OR on_course(merge_point_m(), merge_low_m, merge_high_m,
+            left_m, left_mps, right_m, right_mps)
+        OR on_course(merge_point_m(), merge_low_m, merge_high_m,
+            right_m, right_mps, left_m, left_mps)
+        OR on_course(track_end_m(), track_end_m() - length_m, track_end_m() + length_m,
+            left_m, left_mps, right_m, right_mps)
+        OR on_course(track_end_m(), track_end_m() - length_m, track_end_m() + length_m,
+            right_m, right_mps, left_m, left_mps))
+    GROUP BY ALL
 )
 SELECT
     trials.trial_id,
     trials.spec_hash,
-    if(finished, gap_m, NULL) AS gap_m,
-    if(finished, gap_first_sample_m, NULL) AS gap_first_sample_m,
-    if(finished, gap_mean100_m, NULL) AS gap_mean100_m,
+    if(finished, merge_m - length_m, NULL) AS gap_m,
+    if(finished, first_sample_m - length_m, NULL) AS gap_first_sample_m,
+    if(finished, mean_at_merge_m - length_m, NULL) AS gap_mean100_m,
     rmse_left_mps,
     rmse_right_mps,
     rmse_mps,
@@ -281,8 +331,9 @@ SELECT
     if(status = 'collided', NULL, conflict_resolution_s) AS conflict_resolution_s
 FROM (SELECT *, status = 'finished' AS finished FROM trials) AS trials
 LEFT JOIN merge_times USING (trial_id, spec_hash)
-LEFT JOIN gaps USING (trial_id, spec_hash)
-LEFT JOIN sampled_gaps USING (trial_id, spec_hash)
+LEFT JOIN geometry USING (spec_hash)
+LEFT JOIN distances USING (trial_id, spec_hash)
+LEFT JOIN sampled_distances USING (trial_id, spec_hash)
 LEFT JOIN (FROM speed_deviations WHERE time_window = 'first_merge') USING (trial_id, spec_hash)
 LEFT JOIN collision_times USING (trial_id, spec_hash)
 LEFT JOIN resolutions USING (trial_id, spec_hash);

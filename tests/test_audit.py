@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sqlite3
 from dataclasses import dataclass, replace
@@ -434,6 +435,72 @@ def test_each_damage_of_a_slot_is_found_there_and_nothing_else(db, damages, slot
     assert told.keys() == expected.keys()
     for where, text in expected.items():
         assert text in told[where]
+
+
+LONG = """
+conditions = ["L_4_0", "R_-4_8", "N_0_0"]
+repetitions = {baseline = 2}
+scenario = {vehicle_length_m = 8.0, collision_rule = "rectangle"}
+"""
+# The view as it was when every vehicle had 4.5 m.
+SHORT = "CREATE OR REPLACE VIEW geometry AS SELECT * REPLACE (4.5 AS length_m) FROM sizes"
+
+
+@pytest.fixture(scope="module")
+def long_vehicles(prepare, tmp_path_factory):
+    """A database of vehicles of 8 m; those that keep their speed collide."""
+    folder = tmp_path_factory.mktemp("long")
+    (folder / "long.toml").write_text(LONG)
+    for model in ("emulator", "constant"):
+        assert prepare(folder, "sweep", "long.toml", "--model", model).code == 0
+    return folder / "results/merge.duckdb"
+
+
+def statuses(db: Path) -> dict[str, str]:
+    with duckdb.connect(str(db), read_only=True) as connection:
+        return dict(connection.execute("SELECT trial_id, status FROM trials").fetchall())
+
+
+def test_a_view_with_another_vehicle_length_than_the_spec_is_found(long_vehicles, tmp_path):
+    db = shutil.copy(long_vehicles, tmp_path / "copy.duckdb")
+    assert audit("--db", db).code == 0
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("CREATE TABLE sizes AS FROM geometry")
+        connection.execute(SHORT)
+    found = audit("--db", db)
+    assert found.kinds == {"gap"}
+    finished = {trial for trial, status in statuses(db).items() if status == "finished"}
+    assert {finding["trial"] for finding in found.findings} == finished != set()
+    for finding in found.findings:
+        stated, computed = re.findall(r"(-?\d+\.\d+) m", finding["text"])
+        assert float(stated) - float(computed) == pytest.approx(3.5, abs=0.002)
+
+
+def test_a_status_that_the_states_contradict_is_found(long_vehicles, tmp_path):
+    db = shutil.copy(long_vehicles, tmp_path / "copy.duckdb")
+    ended = statuses(db)
+    collided = [trial for trial, status in ended.items() if status == "collided"]
+    finished = [trial for trial, status in ended.items() if status == "finished"]
+    # Two say something else, one goes on after its collision, one had another that it ignores.
+    late, apart = f"trial_id = '{collided[1]}'", f"trial_id = '{finished[1]}'"
+    damage(
+        db,
+        f"UPDATE trials SET status = 'finished' WHERE trial_id = '{collided[0]}'",
+        f"INSERT INTO states SELECT * REPLACE (step + 1 AS step, time_s + 0.2 AS time_s) "
+        f"FROM states WHERE {late} AND step = (SELECT max(step) FROM states WHERE {late})",
+        f"UPDATE trials SET end_time_s = end_time_s + 0.2 WHERE {late}",
+        f"UPDATE trials SET status = 'collided', merged_first = NULL WHERE trial_id = "
+        f"'{finished[0]}'",
+        f"UPDATE states SET position_m = 99 WHERE {apart} AND step = 20",
+    )
+    found = audit("--db", db)
+    told = {(f["trial"], f["text"].partition(" after ")[0]) for f in found.findings}
+    assert {
+        (collided[0], "it is finished"),
+        (collided[1], "it is collided"),
+        (finished[0], "it is collided, and its states never are by the rule rectangle"),
+        (finished[1], "it is finished"),
+    } <= told
 
 
 def test_a_finding_names_sweep_trial_side_and_decision(db):

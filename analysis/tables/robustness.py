@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import pandas as pd
 
 from analysis.intervals import proportion
+from analysis.load import SIZES, load_each
 from analysis.robustness import RULES, UNDECIDED, outcomes
 from analysis.study import Group, Study, of_group
 from analysis.tables.model import Column, Row, Table, Value
@@ -37,15 +40,28 @@ def robustness(study: Study) -> Table:
         ),
         rows,
         (
-            "euclid2d: centres closer than 4.5 m in the plane; rectangle: the 4.5 x 1.8 m boxes "
-            "overlap, the rule of the human experiment; shared_lane: closer than 4.5 m along the "
-            "track once either vehicle has passed the merge point",
+            "euclid2d: centres closer than a vehicle's length in the plane; rectangle: the "
+            "vehicles' boxes overlap, the rule of the human experiment; shared_lane: closer than a "
+            "vehicle's length along the track once either vehicle has passed the merge point",
+            *_size_notes(study, measured),
             "undecided: the trial ended in a collision that this rule does not see, and the last "
             "plans, or the human trace, end before it is decided",
             *([] if rows else ["there is no measured trial to show"]),
             *sample_notes(study, measured),
         ),
     )
+
+
+def _size_notes(study: Study, groups: Iterable[Group]) -> Iterator[str]:
+    """The vehicles that are judged, with the groups that drove them."""
+    found = load_each({"sizes": SIZES}, study.db)["sizes"].set_index("spec_hash")["size"]
+    driven: dict[str, list[str]] = {}
+    for group in groups:
+        for size in found.reindex(group.trials["spec_hash"].unique()).dropna().unique():
+            driven.setdefault(size, []).append(group.id)
+    for size, ids in driven.items():
+        of = f"{', '.join(ids)}: " if len(driven) > 1 else ""
+        yield f"{of}the vehicles are {size}"
 
 
 def _rows(group: Group, found: pd.DataFrame) -> list[Row]:

@@ -23,6 +23,7 @@ from merge_runner.audit.replies import (
     check_sharing,
 )
 from merge_runner.audit.slots import Slots, check_slots
+from merge_runner.audit.traces import GAPS, check_traces, reach_m
 from merge_runner.database import read_database
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.llm.keys import canonical_json
@@ -30,7 +31,7 @@ from merge_runner.records import SIDES
 
 TABLES = """
 CREATE OR REPLACE TEMP TABLE rules (spec_hash VARCHAR, executed INTEGER, plan_actions INTEGER,
-    timeout_steps INTEGER, restarts BOOLEAN);
+    timeout_steps INTEGER, restarts BOOLEAN, reach_m DOUBLE);
 CREATE OR REPLACE TEMP TABLE drivers (spec_hash VARCHAR, side VARCHAR, endpoint VARCHAR,
     body VARCHAR, between_body_and_slot VARCHAR);
 CREATE OR REPLACE TEMP TABLE done AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
@@ -156,6 +157,7 @@ def _audit(
     findings = [
         *slots.findings,
         *_rule_findings(connection),
+        *check_traces(connection, specs),
         *check_hashes(connection),
         *check_sharing(connection),
     ]
@@ -218,6 +220,7 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
                 scenario.plan_actions,
                 scenario.timeout_steps,
                 scenario.fallback == "restart",
+                reach_m(scenario),
             )
             for spec in specs.values()
             if (scenario := spec.scenario) is not None
@@ -240,6 +243,7 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
     )
     connection.execute(REPLY_IDS)
     connection.execute(USED)
+    connection.execute(GAPS)
     return specs
 
 

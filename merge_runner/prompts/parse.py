@@ -1,13 +1,20 @@
 """A reply's text as a validated plan; what is ambiguous is refused by name, nothing is evaluated.
 
-The reasons: ``no_array``, ``several_arrays`` (different ones), ``wrong_length``,
-``not_a_number`` (an entry is no number literal), ``not_finite`` and ``out_of_range``.
+A reply should "contain a length-N array" (arXiv 2604.09609): one valid array is enough, whatever
+other lists stand beside it. It is looked for in the code blocks, and where none there is valid, in
+the prose. Different valid arrays in the same of these two are ambiguous; equal ones are one.
+
+The reasons: ``no_array``, ``several_arrays`` (different valid ones) or, where none is valid, what
+is wrong with the array that comes nearest to a plan, one of the wanted length before any other:
+``out_of_range``, ``wrong_length``, ``not_finite`` and ``not_a_number`` (an entry is no number
+literal).
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from merge_runner.records import Tactical
@@ -23,6 +30,8 @@ _NOT_FINITE = re.compile(
     r"|float\((['\"])[+-]?(?:nan|inf|infinity)\1\)",
     re.IGNORECASE,
 )
+# From the array that comes nearest to a plan to the one that is farthest from it.
+_FAILURES = ("out_of_range", "wrong_length", "not_finite", "not_a_number")
 _SIGN_APART = re.compile(r"^([+-])\s+")
 _COMMENT = re.compile(r"#[^\n]*")
 _TOKEN_LINE = re.compile(
@@ -46,42 +55,54 @@ class ParsedReply:
 
 
 def parse_reply(text: str, plan_actions: int) -> ParsedReply:
-    """Read a reply that should hold one list of ``plan_actions`` numbers in [-1, 1]."""
+    """Read a reply that should hold a list of ``plan_actions`` numbers in [-1, 1]."""
     # Half a surrogate pair, which JSON can spell, is a character that no table can hold.
     text = text.encode(errors="replace").decode().replace("\r\n", "\n")
-    prose, code = _split(text)
-    plan, failure = _plan(code, plan_actions)
+    prose, places = _split(text)
+    plan, failure = _plan(places, plan_actions)
     tactical, rationale = _tactical(prose.strip())
     return ParsedReply(plan, tactical, rationale, failure)
 
 
-def _split(text: str) -> tuple[str, str]:
-    """Prose and code; a reply without a code fence is searched for an array as a whole."""
+def _split(text: str) -> tuple[str, tuple[str, ...]]:
+    """The prose, and where to look for a plan, one place after the other."""
     parts = text.split("```")
     if len(parts) > 1:
-        return "\n".join(part.strip() for part in parts[0::2]).strip(), "\n".join(parts[1::2])
-    return _ARRAY.sub("", text), text
+        prose = "\n".join(part.strip() for part in parts[0::2]).strip()
+        return prose, ("\n".join(parts[1::2]), prose)
+    return _ARRAY.sub("", text), (text,)
 
 
-def _plan(code: str, plan_actions: int) -> tuple[tuple[float, ...] | None, str | None]:
-    arrays = {_entries(inside) for inside in dict.fromkeys(_ARRAY.findall(_COMMENT.sub("", code)))}
-    if not arrays:
+def _plan(places: Iterable[str], plan_actions: int) -> tuple[tuple[float, ...] | None, str | None]:
+    failures: list[tuple[bool, int]] = []
+    for place in places:
+        arrays = set(map(_entries, dict.fromkeys(_ARRAY.findall(_COMMENT.sub("", place)))))
+        valid = []
+        for array in arrays:
+            failure = _failure(array, plan_actions)
+            if failure is None:
+                valid.append(tuple(map(float, array)))
+            else:
+                failures.append((len(array) != plan_actions, _FAILURES.index(failure)))
+        if valid:
+            return (valid[0], None) if len(valid) == 1 else (None, "several_arrays")
+    if not failures:
         return None, "no_array"
-    if len(arrays) > 1:
-        return None, "several_arrays"
-    entries = arrays.pop()
-    numbers = tuple(entry for entry in entries if isinstance(entry, float))
-    words = [entry for entry in entries if isinstance(entry, str)]
+    return None, _FAILURES[min(failures)[1]]
+
+
+def _failure(array: tuple[float | str, ...], plan_actions: int) -> str | None:
+    """Why an array is no plan; None: it is one."""
+    numbers = [entry for entry in array if isinstance(entry, float)]
+    words = [entry for entry in array if isinstance(entry, str)]
     # A literal can be too large for a float.
     if any(_NOT_FINITE.fullmatch(word) for word in words) or not all(map(math.isfinite, numbers)):
-        return None, "not_finite"
+        return "not_finite"
     if words:
-        return None, "not_a_number"
+        return "not_a_number"
     if len(numbers) != plan_actions:
-        return None, "wrong_length"
-    if not all(-1 <= number <= 1 for number in numbers):
-        return None, "out_of_range"
-    return numbers, None
+        return "wrong_length"
+    return None if all(-1 <= number <= 1 for number in numbers) else "out_of_range"
 
 
 def _entries(inside: str) -> tuple[float | str, ...]:

@@ -11,6 +11,8 @@ from studies import Drive, write_study
 
 from analysis.load import load, load_trials
 from analysis.robustness import RULES, UNDECIDED, outcomes, redrive
+from analysis.study import Study
+from analysis.tables.robustness import robustness
 from merge_runner.config import Scenario
 from merge_runner.records import StateRow, TrialRecord, TrialSpec
 from merge_runner.simulator.conditions import CONDITIONS
@@ -287,3 +289,11 @@ def test_human_traces_are_judged_as_they_are(humans):
     for rule, rows in by_rule(found).items():
         merged = rows["merged_first"].astype(object).where(rows["merged_first"].notna(), None)
         assert list(zip(rows["status"], merged, strict=True)) == expected[rule]
+
+
+def test_the_table_says_how_long_the_vehicles_are_that_it_judges(tmp_path):
+    drive = Drive("long", "baseline", "L_4_0", 1, (0.8, 0.8), (-0.8, -0.8))
+    db = write_study(tmp_path / "long.duckdb", [drive], Scenario(vehicle_length_m=8.0))
+    notes = robustness(Study(db)).notes
+    assert "the vehicles are 8 m x 1.8 m" in notes
+    assert not any("4.5" in note for note in notes)

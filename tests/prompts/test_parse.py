@@ -11,6 +11,8 @@ from merge_runner.prompts.parse import parse_reply
 N = 20
 PLAN = tuple(round(0.05 * k - 0.5, 2) for k in range(N))
 LIST = str(list(PLAN))
+OTHER = str([-0.5] * N)
+TIMES = str([round(0.2 * k, 1) for k in range(N)])  # out of range
 REFUSALS = {
     "no_array",
     "several_arrays",
@@ -79,9 +81,20 @@ def test_a_sloppily_written_list_is_read(code):
         f"M\n```\n{LIST}\n```\nI stay ahead by about 5 m [see above].",
         f"M\nThe [other] car, at [0.1, 0.2], is behind.\n```python\n{LIST}\n```",
         f"```python\n{LIST}\n```\nAgain:\n```python\n{LIST}\n```",
+        f"[a safe gap] {LIST}",
+        f"{fenced(LIST)}\n{fenced('[0.0]')}",
+        f"{fenced('headways = [4.5, 9.1]')}\n{fenced(LIST)}",
+        fenced(f"times = {TIMES}\nplan = {LIST}"),
+        fenced(f"[{TIMES}, {LIST}]"),
+        fenced("") + LIST,
+        f"{LIST}\nIn a terminal, run\n```sh\nls [a-z]*\n```",
+        # What stands in code comes before what stands in prose.
+        f"An array like {list(range(20))} is asked for.\n{fenced(LIST)}",
+        f"An array like {[0] * 20} would keep my speed.\n{fenced(LIST)}",
+        f"{fenced(LIST)}\nI could also have braked: {OTHER}.",
     ],
 )
-def test_the_list_is_found_wherever_it_is_unambiguous(reply):
+def test_one_valid_list_is_enough_wherever_it_stands(reply):
     assert parse_reply(reply, N).plan == PLAN
 
 
@@ -108,11 +121,20 @@ def test_the_length_that_is_wanted_is_the_callers():
         (fenced("0.1, 0.2"), "no_array"),
         (fenced("(" + LIST[1:-1] + ")"), "no_array"),
         (fenced(LIST[:-1]), "no_array"),  # cut off in the middle of the list
-        (fenced("") + LIST, "no_array"),  # there is a code block, and the list is not in it
         (fenced(LIST + LIST.replace("0.45", "0.46")), "several_arrays"),
-        (f"{fenced(LIST)}\n{fenced('[0.0]')}", "several_arrays"),
-        (f"[a safe gap] {LIST}", "several_arrays"),
-        (fenced("[0.5] * 5 + [0.0] * 15"), "several_arrays"),
+        (f"{fenced(LIST)}\n{fenced(OTHER)}", "several_arrays"),
+        (f"Either {LIST} or {OTHER}.", "several_arrays"),
+        (f"Either {LIST} or {OTHER}.\n{fenced('[0.0]')}", "several_arrays"),
+        (f"{fenced(f'[{LIST}, {OTHER}]')}\nI take {LIST}.", "several_arrays"),
+        # Of several lists that are no plan, the one that comes nearest says what is wrong.
+        (fenced("[0.5] * 5 + [0.0] * 15"), "wrong_length"),
+        (f"[a safe gap] {[0.0] * 19}", "wrong_length"),
+        (fenced(f"[x for x in y] {[0.0] * 19} {TIMES}"), "out_of_range"),
+        (f"{fenced(str([0.0] * 19))}\nAt {TIMES} s.", "out_of_range"),
+        (f"[0.1] {with_first('None')}", "not_a_number"),
+        (f"[0.1] {with_first('nan')} {with_first('None')}", "not_finite"),
+        (fenced(str([[0.1]] * N)), "wrong_length"),
+        (fenced(f"[{[0.1] * 10}, {[0.2] * 10}]"), "wrong_length"),
         (fenced("[]"), "wrong_length"),
         (fenced("[0.1]*20"), "wrong_length"),
         (fenced(str([0.0] * 19)), "wrong_length"),
@@ -151,7 +173,7 @@ def test_the_length_that_is_wanted_is_the_callers():
         (fenced(LIST.replace(", ", "; ")), "not_a_number"),
     ],
 )
-def test_what_is_not_one_plan_is_refused_by_name(reply, failure):
+def test_what_holds_not_one_plan_is_refused_by_name(reply, failure):
     parsed = parse_reply(reply, N)
     assert (parsed.plan, parsed.failure) == (None, failure)
 

@@ -77,6 +77,7 @@ MODEL_LIKE = [
     f"Y\n\n### Rationale\n- I brake.\n\n```python\nimport numpy as np\nnp.array([{PLAN}])\n```",
     f"M \u2014 ich \U0001f697 zuerst.\r\n\r\n```\r\n[{PLAN.replace('0.05', '-.5e-1')}]\r\n```",
     f"(M)\nAs [0.1, 0.2] shows, I lead.\n```python\n[\n  {PLAN.replace(', ', ',  # 2.5')},\n]\n```",
+    f"M\n```python\n[{PLAN}]\n```\nOr:\n```python\n[{PLAN.replace('0.05', '0.5')}]\n```",
     "M\n```python\n[round(0.1 * k, 2) for k in range(20)]\n```",
     "I cannot help with that.",
     "",

@@ -1,0 +1,94 @@
+"""Whether collisions and gaps are those of the stored states, computed apart from the views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import hypot
+
+import duckdb
+
+from merge_runner.audit.expected import Spec
+from merge_runner.audit.findings import Finding
+from merge_runner.config import Scenario
+from merge_runner.simulator.collision import collided
+from merge_runner.simulator.track import FORWARD, LATERAL, MERGE_POINT_M
+
+TOLERANCE_M = 1e-6
+GAPS = "CREATE OR REPLACE TEMP TABLE gaps AS SELECT trial_id, spec_hash, gap_m FROM trial_metrics"
+# A trial's samples before and after the first arrival at the merge point, and all those at which
+# the centres may be within reach of each other, along the road and across it.
+TRACES = f"""
+WITH samples AS (
+    SELECT trial_id, spec_hash, step,
+        max(position_m) FILTER (side = 'left') AS left_m,
+        max(position_m) FILTER (side = 'right') AS right_m
+    FROM states SEMI JOIN audited USING (trial_id, spec_hash) GROUP BY ALL
+), traces AS (
+    SELECT trial_id, spec_hash, max(step) AS last_step,
+        arg_max([left_m, right_m], step) FILTER (greatest(left_m, right_m) < {MERGE_POINT_M})
+            AS before_m,
+        arg_min([left_m, right_m], step) FILTER (greatest(left_m, right_m) >= {MERGE_POINT_M})
+            AS after_m,
+        coalesce(list((step, left_m, right_m) ORDER BY step) FILTER (
+            abs(left_m - right_m) < reach_m / {FORWARD}
+            AND left_m + right_m > 2 * {MERGE_POINT_M} - reach_m / {LATERAL}), []) AS close
+    FROM samples JOIN rules USING (spec_hash)
+    WHERE left_m IS NOT NULL AND right_m IS NOT NULL GROUP BY ALL
+)
+SELECT trial_id, spec_hash, status, last_step, close, before_m, after_m, gap_m
+FROM traces JOIN audited USING (trial_id, spec_hash) LEFT JOIN gaps USING (trial_id, spec_hash)
+ORDER BY ALL
+"""  # noqa: S608 # constants
+
+
+def reach_m(scenario: Scenario) -> float:
+    """A distance of the centres from which on no rule sees a collision, with room for rounding."""
+    return hypot(scenario.vehicle_length_m, scenario.vehicle_width_m) + TOLERANCE_M
+
+
+def check_traces(
+    connection: duckdb.DuckDBPyConnection, specs: Mapping[str, Spec]
+) -> Iterator[Finding]:
+    """Judge the audited trials anew, each by the rule and the vehicles of its own spec."""
+    for row in connection.execute(TRACES).fetchall():
+        trial_id, spec_hash, status, last_step, close, before_m, after_m, gap_m = row
+        scenario = specs[spec_hash].scenario
+        assert scenario is not None  # a row of rules stands for it
+        text = _collision(scenario, status, last_step, close)
+        if text is not None:
+            yield Finding("outcome", text, trial=trial_id)
+        finished = status == "finished" and before_m is not None and after_m is not None
+        found_m = _gap_m(before_m, after_m, scenario.vehicle_length_m) if finished else None
+        if not _same(gap_m, found_m):
+            text = f"it is {_metres(gap_m)} in trial_metrics, and by its states {_metres(found_m)}"
+            yield Finding("gap", text, trial=trial_id)
+
+
+def _collision(
+    scenario: Scenario, status: str, last_step: int, close: Iterable[tuple[int, float, float]]
+) -> str | None:
+    """What contradicts the status; a trial ends with its first collision."""
+    first = next((step for step, *both in close if collided(scenario, *both)), None)
+    if first is None and status == "collided":
+        return f"it is collided, and its states never are by the rule {scenario.collision_rule}"
+    if first is not None and (status != "collided" or first < last_step):
+        return f"it is {status} after {last_step} steps, and its states collide after {first}"
+    return None
+
+
+def _gap_m(before_m: Sequence[float], after_m: Sequence[float], length_m: float) -> float:
+    """The net gap at the first arrival at the merge point, linear within the step."""
+    steps = list(zip(before_m, after_m, strict=True))
+    share = min((MERGE_POINT_M - a) / (b - a) for a, b in steps if b >= MERGE_POINT_M)
+    left_m, right_m = (a + share * (b - a) for a, b in steps)
+    return abs(left_m - right_m) - length_m
+
+
+def _same(one_m: float | None, other_m: float | None) -> bool:
+    if one_m is None or other_m is None:
+        return one_m is other_m
+    return abs(one_m - other_m) <= TOLERANCE_M
+
+
+def _metres(value: float | None) -> str:
+    return "missing" if value is None else f"{value:.3f} m"
