@@ -23,7 +23,7 @@ from merge_runner.prompts.blocks import VARIANTS, block_digests
 from merge_runner.records import Side, TrialSpec
 from merge_runner.simulator.conditions import CONDITIONS
 
-SPEC_VERSION = 1
+SPEC_VERSION = 2  # since then one valid array in a reply is enough
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 PROMPTS_PER_DRIVER = 10.5
 # The programs that drive, with the parameters of their rules.
