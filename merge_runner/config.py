@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -267,6 +268,15 @@ def endpoint_identity(
     if entry.provider == "emulator":
         return "emulator"
     return entry.provider if base_url == normalised_url(provider.base_url) else base_url
+
+
+def driver_name(model: str, endpoint: str | None) -> str:
+    """How a driver is named: with its endpoint where that is not the provider's own.
+
+    The macro of this name in schema.sql says the same.
+    """
+    host = re.search("://([^/]+)", endpoint or "")
+    return f"{model} at {host[1]}" if host else model
 
 
 def key_status(

@@ -12,6 +12,7 @@ from merge_runner.config import (
     ModelEntry,
     Scenario,
     SweepFile,
+    driver_name,
     load_models,
     load_sweep,
 )
@@ -94,6 +95,11 @@ class Plan:
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
         return any(entry.provider == "emulator" for entry in self.entries.values())
+
+    def driver(self, endpoints: Mapping[str, str]) -> str:
+        """Who drives, as the view ``trial_drivers`` names it but for the sample set."""
+        left, right = (driver_name(name, endpoints.get(name)) for name in self.sides.values())
+        return left if left == right else f"{left}+{right}"
 
     def specs(self, endpoints: Mapping[str, str]) -> dict[str, str]:
         """Variant to the canonical JSON that its spec hash covers."""

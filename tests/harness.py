@@ -61,8 +61,11 @@ class Watched:
 
 
 @asynccontextmanager
-async def watched(middle: Middle | None = None, faults=None):
-    """Serve the emulator on loopback; ``middle`` may answer in its place."""
+async def watched(middle: Middle | None = None, faults=None, *, honest: bool = True):
+    """Serve the emulator on loopback; ``middle`` may answer in its place.
+
+    Unless it is ``honest``, no header says that a stand-in answers.
+    """
     seen = Watched()
 
     @web.middleware
@@ -74,6 +77,8 @@ async def watched(middle: Middle | None = None, faults=None):
 
     app = Emulator(faults).app
     app.middlewares.append(watch)
+    if not honest:
+        app.on_response_prepare.clear()
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
     await runner.setup()
     await web.TCPSite(runner, HOST, 0).start()

@@ -35,7 +35,7 @@ FROM listed {OF_SWEEP} GROUP BY ALL ORDER BY ALL
 """  # noqa: S608 # constants
 TRIED = """
 SELECT requested, served, answered, outcome, sum(times)::BIGINT AS times,
-    sum(unpriced)::BIGINT AS unpriced
+    sum(unpriced)::BIGINT AS unpriced, answered AND (requested, served) IN (FROM others) AS other
 FROM tried SEMI JOIN (FROM planned WHERE sweep = ?) USING (trial_id, spec_hash)
 GROUP BY ALL ORDER BY ALL
 """
@@ -218,7 +218,7 @@ def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> 
     entry = Entry(row, config_of(row["config"]), _newest(catalogue, row, standing))
     stored = catalogue.ask(CELLS, sweep_id)
     tried = catalogue.ask(TRIED, sweep_id)
-    mismatches = mismatches_of(entry.config, tried)
+    mismatches = mismatches_of(tried)
     return Sweep(
         entry=entry,
         verdict=verdict_of(entry, _later(entry, rows[:place]), sum(mismatches.values())),
@@ -301,14 +301,12 @@ def rates_of(
     ]  # fmt: skip
 
 
-def mismatches_of(config: Config, tried: list[Row]) -> dict[str, int]:
-    """Requested and served model, where the latter is neither the id nor an alias."""
-    accepted = {model.id: set(model.accepted) for model in config.models.values()}
+def mismatches_of(tried: list[Row]) -> dict[str, int]:
+    """Requested and served model, where another one answered, with how often."""
     others = Counter[str]()
     for row in tried:
-        asked, served = row["requested"], row["served"]
-        if row["answered"] and served is not None and served not in accepted.get(asked, {asked}):
-            others[f"{asked} → {served}"] += row["times"]
+        if row["other"]:
+            others[f"{row['requested']} → {row['served']}"] += row["times"]
     return dict(others)
 
 
