@@ -6,7 +6,7 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
@@ -277,6 +277,12 @@ def driver_name(model: str, endpoint: str | None) -> str:
     """
     host = re.search("://([^/]+)", endpoint or "")
     return f"{model} at {host[1]}" if host else model
+
+
+def pair_name(sides: Iterable[str], endpoints: Mapping[str, str]) -> str:
+    """Who drives left and right, as the view ``trial_drivers`` names it but for the sample set."""
+    left, right = (driver_name(model, endpoints.get(model)) for model in sides)
+    return left if left == right else f"{left}+{right}"
 
 
 def key_status(

@@ -12,9 +12,9 @@ from merge_runner.config import (
     ModelEntry,
     Scenario,
     SweepFile,
-    driver_name,
     load_models,
     load_sweep,
+    pair_name,
 )
 from merge_runner.drivers import projected_order
 from merge_runner.errors import UsageError
@@ -97,9 +97,8 @@ class Plan:
         return any(entry.provider == "emulator" for entry in self.entries.values())
 
     def driver(self, endpoints: Mapping[str, str]) -> str:
-        """Who drives, as the view ``trial_drivers`` names it but for the sample set."""
-        left, right = (driver_name(name, endpoints.get(name)) for name in self.sides.values())
-        return left if left == right else f"{left}+{right}"
+        """Who drives, and where he is asked; see ``pair_name``."""
+        return pair_name(self.sides.values(), endpoints)
 
     def specs(self, endpoints: Mapping[str, str]) -> dict[str, str]:
         """Variant to the canonical JSON that its spec hash covers."""
