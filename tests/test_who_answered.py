@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from dataclasses import replace
 from urllib.parse import urlsplit
 
 import duckdb
 import pytest
-from harness import FAST
+from aiohttp import web
+from harness import FAST, PROJECT, watched
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -105,25 +108,57 @@ def test_what_a_model_writes_does_not_make_it_a_stand_in(reply, scripted):
     assert is_scripted(replace(request, provider="emulator"), attempt)
 
 
-async def test_a_stand_in_and_another_effort_do_not_change_what_a_model_is_estimated_at(
-    merge_runner, emulator_url, tmp_path
-):
-    async def cost(**changes):
+@pytest.fixture
+def estimated(merge_runner):
+    """What a whole sweep of o3 is estimated at, and whose earlier answers were measured."""
+
+    async def estimate(**changes):
         run = await merge_runner("sweep", "baseline", "--model", "o3", "--dry-run", "--json",
                                  **{"OPENAI_API_KEY": "x", **changes})  # fmt: skip
         assert run.code == 0, run.err
         return run.summary["cost_usd"], run.summary["measured"]
 
-    before = await cost()
+    return estimate
+
+
+async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
+    merge_runner, emulator_url, estimated
+):
+    before = await estimated()
     pointed = pointed_at(emulator_url, "o3")
     run = await merge_runner("sweep", "baseline", "--model", "o3", *SMALL, *FAST, "--yes",
                              **pointed)  # fmt: skip
     assert run.code == 0, run.err
-    assert await cost() == before == (before[0], [])
-    # Also not where it answers at that very address.
-    pointed_now, measured = await cost(**pointed)
+    assert await estimated() == before
+    assert before[1] == []
+    # Nor at the very address where it answers, but that some of it is recorded now.
+    there, measured = await estimated(**pointed)
     assert measured == []
-    assert 0.9 * before[0] < pointed_now < before[0], "some of it is recorded"
+    assert 0.9 * before[0] < there < before[0]
+
+
+async def test_answers_at_another_effort_or_place_do_not_change_it_either(
+    merge_runner, estimated, tmp_path
+):
+    async def as_a_model(request, handler):
+        body = json.loads((await handler(request)).body)
+        del body[SCRIPTED_FIELD]
+        return web.json_response(body)
+
+    async with watched(as_a_model, honest=False) as server:
+        there = pointed_at(f"{server.url}/v1", "o3")
+        run = await merge_runner("sweep", "baseline", "--model", "o3", *SMALL, *FAST, "--yes",
+                                 **there)  # fmt: skip
+    assert run.code == 0, run.err
+    assert marks(tmp_path / "results/merge.duckdb") == [(False, False, 200)]
+    driver = f"o3 at {urlsplit(server.url).netloc}"
+    assert (await estimated(**there))[1] == [driver], "of these there is something to measure"
+    assert (await estimated())[1] == []
+    registry = (PROJECT / "experiments/models.toml").read_text()
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/models.toml").write_text(registry.replace('"medium"', '"high"'))
+    shutil.copy(PROJECT / "experiments/baseline.toml", tmp_path / "experiments")
+    assert (await estimated(**there))[1] == []
 
 
 async def test_a_summary_says_who_answered_and_where(merge_runner, emulator_url, tmp_path):
