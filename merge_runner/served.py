@@ -19,7 +19,8 @@ SELECT DISTINCT model_requested, model_served FROM calls
 WHERE model_requested IS NOT NULL AND model_served IS NOT NULL ORDER BY ALL
 """
 ALIASES = """
-SELECT DISTINCT value->>'id' AS model_requested, unnest((value->'aliases')::VARCHAR[]) AS alias
+SELECT DISTINCT value->>'id' AS model_requested,
+    unnest(try_cast(value->'aliases' AS VARCHAR[])) AS alias
 FROM sweeps, json_each(config, '$.models') ORDER BY ALL
 """
 

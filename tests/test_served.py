@@ -59,6 +59,15 @@ def test_all_that_tell_of_other_models_tell_the_same(db):
     assert [c for c in causes if c.startswith("model: ")] == [f"model: o3 → {n}" for n in OTHERS]
 
 
+def test_a_configuration_that_declares_nonsense_declares_nothing(db):
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(
+            "UPDATE sweeps SET config = ? WHERE sweep_id = 'sweep-2'",
+            ['{"models": {"o3": {"id": "o3", "aliases": 5}, "x": [], "y": null}}'],
+        )
+    assert sorted(served for _, served in load_calls(db).others) == [*OTHERS, "o3-2026"]
+
+
 def test_the_table_and_the_trials_behind_its_cell_agree(db):
     study = Study(db)
     (group,) = study.models

@@ -69,6 +69,8 @@ async def test_the_emulator_behind_a_models_name_is_stored_as_what_it_is(
     export_recording(tmp_path / "untold.parquet", stripped,
                      [entry.request.key for entry in with_flags], {})  # fmt: skip
     for recording in ("told", "untold"):
+        info = (await merge_runner("recording", "info", f"{recording}.parquet")).summary
+        assert info["scripted"] == info["calls"] == len(with_flags)
         replay = await merge_runner(
             "replay", "baseline", "--model", model, *SMALL, "--cache", "empty",
             "--recording", f"{recording}.parquet", "--db", f"{recording}.duckdb",
