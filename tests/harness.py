@@ -14,7 +14,7 @@ from pathlib import Path
 from aiohttp import web
 
 from merge_runner.emulator.server import HOST, Emulator
-from merge_runner.records import SLOT_HEADER
+from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 
 PROJECT = Path(__file__).parent.parent
 PROGRAM = Path(sys.executable).with_name("merge-runner")
@@ -58,6 +58,13 @@ class Watched:
     @property
     def requests(self) -> int:
         return self.asked.total()
+
+
+async def as_a_model(request: web.Request, handler) -> web.StreamResponse:
+    """Answer without the field that says that a stand-in does."""
+    body = json.loads((await handler(request)).body)
+    del body[SCRIPTED_FIELD]
+    return web.json_response(body)
 
 
 @asynccontextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -10,8 +9,7 @@ from urllib.parse import urlsplit
 
 import duckdb
 import pytest
-from aiohttp import web
-from harness import FAST, PROJECT, watched
+from harness import FAST, PROJECT, as_a_model, watched
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -142,11 +140,6 @@ async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
 async def test_answers_at_another_effort_or_place_do_not_change_it_either(
     merge_runner, estimated, tmp_path
 ):
-    async def as_a_model(request, handler):
-        body = json.loads((await handler(request)).body)
-        del body[SCRIPTED_FIELD]
-        return web.json_response(body)
-
     async with watched(as_a_model, honest=False) as server:
         there = pointed_at(f"{server.url}/v1", "o3")
         run = await merge_runner("sweep", "baseline", "--model", "o3", *SMALL, *FAST, "--yes",
