@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from merge_runner.database import read_database
 from merge_runner.places import DEFAULT_DB
+from merge_runner.served import ALIASES, PAIRS, Pair, others_among
 from merge_runner.store import query
 
 TRIALS = (
@@ -72,11 +74,6 @@ DECISIONS = """
 SELECT trial_id, spec_hash, fallback, count(*) AS decisions
 FROM decisions GROUP BY ALL ORDER BY ALL
 """
-# Names under which a model may answer, as the sweeps were configured.
-ALIASES = """
-SELECT DISTINCT value->>'id' AS model_requested, unnest((value->'aliases')::VARCHAR[]) AS alias
-FROM sweeps, json_each(config, '$.models') ORDER BY ALL
-"""
 
 SPECS = "SELECT spec_hash, spec FROM specs"
 # The size of a spec's vehicles in words.
@@ -110,18 +107,25 @@ class Calls:
     """What became of the calls.
 
     ``attempts``: one row a trial and kind of attempt, with the number of these; ``decisions``: one
-    row a trial, its fallbacks apart; ``aliases``: pairs of a model's id and another name under
-    which it may answer.
+    row a trial, its fallbacks apart; ``others``: pairs of a model's id and another model that
+    answered in its place.
     """
 
     attempts: pd.DataFrame
     decisions: pd.DataFrame
-    aliases: set[tuple[str, str]]
+    others: frozenset[Pair]
+
+
+def rows(frame: pd.DataFrame) -> list[Any]:
+    """The rows of a frame as tuples."""
+    return list(frame.itertuples(index=False, name=None))
 
 
 def load_calls(db: Path | str = DEFAULT_DB) -> Calls:
     """Read what became of the calls; the columns have their types also where there is none."""
-    found = load_each({"attempts": ATTEMPTS, "decisions": DECISIONS, "aliases": ALIASES}, db)
+    found = load_each(
+        {"attempts": ATTEMPTS, "decisions": DECISIONS, "pairs": PAIRS, "aliases": ALIASES}, db
+    )
     keys = ("trial_id", "spec_hash")
     texts = (*keys, "fate", "outcome", "failure", "model_requested", "model_served")
     return Calls(
@@ -129,5 +133,5 @@ def load_calls(db: Path | str = DEFAULT_DB) -> Calls:
         found["decisions"].astype(
             dict.fromkeys(keys, "string") | {"fallback": bool, "decisions": int}
         ),
-        set(found["aliases"].itertuples(index=False, name=None)),
+        frozenset(others_among(rows(found["pairs"]), rows(found["aliases"]))),
     )

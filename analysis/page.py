@@ -19,7 +19,7 @@ from analysis.study import Study
 from analysis.tables.against import PAPER, against, in_paper
 from analysis.tables.formats import table_view
 from analysis.tables.model import Column, Row, Table
-from merge_runner.provenance import git_state
+from merge_runner.provenance import program
 
 TEMPLATES = Path(__file__).with_name("templates")
 LISTED = 300
@@ -70,7 +70,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         records=_records,
         readings=_records(published("readings")),
         sources_cited=_records(published("sources")),
-        program=git_state(),
+        program=program(),
     )
 
 

@@ -12,12 +12,13 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.load import ALIASES, load_each
+from analysis.load import load_each, rows
 from analysis.study import Group, Study, of_group
 from merge_runner.audit.replies import answers_alike
 from merge_runner.config import Scenario
 from merge_runner.database import read_database
 from merge_runner.records import SIDES
+from merge_runner.served import ALIASES, others_among
 
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
@@ -52,13 +53,13 @@ SELECT DISTINCT driver, variant, spec_hash, spec
 FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE source <> 'human' ORDER BY ALL
 """
-# Answers by another model than was asked for, by either name.
+# Answers by each model that answered.
 SERVED = """
 SELECT model_requested, model_served,
     count(DISTINCT (trial_id, spec_hash, side, decision)) AS answers,
     list_sort(list(DISTINCT sweep_id) FILTER (sweep_id IS NOT NULL)) AS sweeps
 FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
-WHERE fate IN ('driven', 'fallback') AND model_served <> model_requested
+WHERE fate IN ('driven', 'fallback') AND model_served IS NOT NULL
 GROUP BY ALL ORDER BY ALL
 """
 SWEEP_COSTS = """
@@ -209,10 +210,7 @@ def tally(study: Study, group: Group) -> Tally:
 
 def _other_model(study: Study, answered: pd.DataFrame) -> list[bool]:
     pairs = zip(answered["model_requested"], answered["model_served"], strict=True)
-    return [
-        not pd.isna(served) and served != asked and (asked, served) not in study.calls.aliases
-        for asked, served in pairs
-    ]
+    return [pair in study.calls.others for pair in pairs]
 
 
 def _switches(specs: pd.DataFrame) -> dict[str, str]:
@@ -255,9 +253,10 @@ def _leaves(values: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
 
 
 def _mismatches(served: pd.DataFrame, aliases: pd.DataFrame) -> list[Mismatch]:
-    declared = set(aliases.itertuples(index=False, name=None))
-    return [
-        Mismatch(row.model_requested, row.model_served, row.answers, tuple(row.sweeps or ()))
+    found = {
+        (row.model_requested, row.model_served): Mismatch(
+            row.model_requested, row.model_served, row.answers, tuple(row.sweeps or ())
+        )
         for row in served.itertuples()
-        if (row.model_requested, row.model_served) not in declared
-    ]
+    }
+    return [found[pair] for pair in others_among(found, rows(aliases))]

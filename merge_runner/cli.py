@@ -447,8 +447,8 @@ def _confirm(plan: Plan, prepared: Sweep, options: Options, *, yes: bool) -> Est
     expected = estimate(plan, asyncio.run(prepared.rehearse()), options.limits)
     cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
     say(
-        f"{expected.trials} trials, about {expected.calls} calls that are not recorded yet, "
-        f"{cost}, {expected.minutes} minutes or more"
+        f"{expected.driver}: {expected.trials} trials, about {expected.calls} calls that are not "
+        f"recorded yet, {cost}, {expected.minutes} minutes or more"
     )
     if yes:
         return expected
@@ -470,6 +470,7 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         return
     cost = "unknown" if expected.cost_usd is None else f"{expected.cost_usd:.2f} USD"
     for name, text in (
+        ("driver", expected.driver),
         ("trials", f"{expected.trials} that have not ended yet"),
         ("calls", f"about {expected.calls} that are not recorded yet"),
         (

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
@@ -268,6 +269,21 @@ def endpoint_identity(
     if entry.provider == "emulator":
         return "emulator"
     return entry.provider if base_url == normalised_url(provider.base_url) else base_url
+
+
+def driver_name(model: str, endpoint: str | None) -> str:
+    """How a driver is named: with its endpoint where that is not the provider's own.
+
+    The macro of this name in schema.sql says the same.
+    """
+    host = re.search("://([^/]+)", endpoint or "")
+    return f"{model} at {host[1]}" if host else model
+
+
+def pair_name(sides: Iterable[str], endpoints: Mapping[str, str]) -> str:
+    """Who drives left and right, as the view ``trial_drivers`` names it but for the sample set."""
+    left, right = (driver_name(model, endpoints.get(model)) for model in sides)
+    return left if left == right else f"{left}+{right}"
 
 
 def key_status(

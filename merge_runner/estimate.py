@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from merge_runner.config import ModelEntry
-from merge_runner.llm.cache import ModelFacts
+from merge_runner.config import ModelEntry, driver_name
+from merge_runner.llm.cache import Totals
 from merge_runner.llm.prices import pricing
 from merge_runner.plan import Limits, Plan
 from merge_runner.prompts.render import render_prompt
@@ -24,21 +24,24 @@ class Missing:
     """What a live run has yet to do.
 
     ``trials`` have ended nowhere; ``calls`` are about how many each model has yet to answer;
-    ``facts`` is what the cache knows of each model's earlier answers.
+    ``facts`` is what the cache knows of each model's earlier answers to requests like these, at
+    its endpoint.
     """
 
     trials: int
     calls: Mapping[str, float]
-    facts: Mapping[str, ModelFacts]
+    facts: Mapping[str, Totals]
+    endpoints: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Trials, calls, tokens, USD (None: a price is unknown) and minutes of a live run.
+    """Who drives, trials, calls, tokens, USD (None: a price is unknown) and minutes of a live run.
 
-    ``measured`` lists the models whose tokens and latency are those of their earlier answers.
+    ``measured`` lists the drivers whose tokens and latency are those of their earlier answers.
     """
 
+    driver: str
     trials: int
     calls: int
     input_tokens: int
@@ -73,7 +76,7 @@ def estimate(plan: Plan, missing: Missing, limits: Limits) -> Estimate:
         input_tokens += made * tokens_in
         output_tokens += made * tokens_out
         cost = None if cost is None or price is None else cost + made * price
-        measured += [name] if each.measured else []
+        measured += [driver_name(name, missing.endpoints[name])] if each.measured else []
         at_once = min(limits.connections, 2 * max(missing.trials, 1))
         slowest_s = max(
             slowest_s,
@@ -81,6 +84,7 @@ def estimate(plan: Plan, missing: Missing, limits: Limits) -> Estimate:
             _limited_s(entry, limits, made, each),
         )
     return Estimate(
+        driver=plan.driver(missing.endpoints),
         trials=missing.trials,
         calls=calls,
         input_tokens=input_tokens,
@@ -107,7 +111,7 @@ def worst_trial_usd(plan: Plan) -> float:
     )
 
 
-def _per_call(plan: Plan, entry: ModelEntry, facts: ModelFacts) -> _PerCall:
+def _per_call(plan: Plan, entry: ModelEntry, facts: Totals) -> _PerCall:
     if facts.measured:
         usage = Usage(
             input_tokens=round(facts.input_tokens / facts.measured),

@@ -14,6 +14,7 @@ from merge_runner.config import (
     SweepFile,
     load_models,
     load_sweep,
+    pair_name,
 )
 from merge_runner.drivers import projected_order
 from merge_runner.errors import UsageError
@@ -94,6 +95,10 @@ class Plan:
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
         return any(entry.provider == "emulator" for entry in self.entries.values())
+
+    def driver(self, endpoints: Mapping[str, str]) -> str:
+        """Who drives, and where he is asked; see ``pair_name``."""
+        return pair_name(self.sides.values(), endpoints)
 
     def specs(self, endpoints: Mapping[str, str]) -> dict[str, str]:
         """Variant to the canonical JSON that its spec hash covers."""

@@ -164,7 +164,11 @@ class Progress:
 
     def _warnings(self) -> list[str]:
         others = sum((meter.mismatches for meter in self.meters), Counter[str]())
-        return [f"another model answers: {pair}" for pair in sorted(others)]
+        meters = self.crew.meters.items() if self.crew else ()
+        return [
+            *(f"another model answers: {pair}" for pair in sorted(others)),
+            *(f"a scripted stand-in answers, not {name}" for name, m in meters if m.stand_ins),
+        ]
 
     def _left_s(self, elapsed: float, calls: int) -> float | None:
         if self.ended == self.total or not (self.ended or calls):

@@ -28,7 +28,7 @@ from merge_runner.database import Settings, in_memory
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, Entry, ResponseCache
 from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
-from merge_runner.records import SIDES, Attempt, ChatRequest, Slot
+from merge_runner.records import SIDES, Attempt, ChatRequest, Slot, is_scripted
 from merge_runner.texts import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 1"
@@ -67,9 +67,13 @@ DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a recording holds. ``cost_usd`` is what its replies cost when they were made."""
+    """What a recording holds: calls, of which a scripted stand-in answered some, and the rest.
+
+    ``cost_usd`` is what its replies cost when they were made.
+    """
 
     calls: int
+    scripted: int
     attempts: int
     cost_usd: float
     models_requested: dict[str, int]
@@ -165,10 +169,11 @@ def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
 def summarise(file: Path) -> Summary:
     """Verify a recording and count what it holds."""
     requested, served, endpoints, outcomes = (Counter[str]() for _ in range(4))
-    calls = attempts = 0
+    calls = attempts = scripted = 0
     cost = 0.0
     for entry in read_recording(file):
         calls += 1
+        scripted += is_scripted(entry.request, entry.attempts[-1])
         attempts += len(entry.attempts)
         cost += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
         requested[entry.request.model] += 1
@@ -177,6 +182,7 @@ def summarise(file: Path) -> Summary:
         outcomes[entry.attempts[-1].outcome] += 1
     return Summary(
         calls=calls,
+        scripted=scripted,
         attempts=attempts,
         cost_usd=round(cost, 6),
         models_requested=dict(requested),

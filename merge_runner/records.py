@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,6 +18,9 @@ SIDES: tuple[Side, Side] = ("left", "right")
 # Tell the slot and the attempt to our own emulator, and to nobody else.
 SLOT_HEADER = "x-merge-runner-slot"
 ATTEMPT_HEADER = "x-merge-runner-attempt"
+# A scripted stand-in says what it is in every reply: by this header, and by this field of the body.
+SCRIPTED_HEADER = "x-merge-runner-scripted"
+SCRIPTED_FIELD = "merge_runner_scripted"
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,6 +239,28 @@ class TrialRecord:
     @property
     def scripted(self) -> bool:
         """Whether a scripted stand-in drove on a side, or answered any call."""
-        replies = [row.decision.reply for row in self.decisions if row.decision.reply]
-        tried = [call.attempts for call in self.failed_calls] + [r.attempts for r in replies]
-        return self.spec.scripted or any(a.scripted for attempts in tried for a in attempts)
+        replies = (row.decision.reply for row in self.decisions if row.decision.reply)
+        calls: tuple[ChatReply | FailedCall, ...] = (*replies, *self.failed_calls)
+        return self.spec.scripted or any(
+            is_scripted(call.request, attempt) for call in calls for attempt in call.attempts
+        )
+
+
+def is_scripted(request: ChatRequest, attempt: Attempt) -> bool:
+    """Whether a scripted stand-in answered, whatever base URL or model name was used.
+
+    The body of a reply tells it also where a recording has lost what its header said.
+    """
+    return attempt.scripted or request.provider == "emulator" or says_scripted(attempt.reply or "")
+
+
+def says_scripted(body: str) -> bool:
+    """Whether a body has the field at its top; what a model writes in its answer is no field."""
+    if SCRIPTED_FIELD not in body:
+        return False
+    try:
+        payload = json.loads(body)
+    except (ValueError, RecursionError):
+        return False
+    parts = payload if isinstance(payload, list) else [payload]
+    return any(isinstance(part, dict) and SCRIPTED_FIELD in part for part in parts)

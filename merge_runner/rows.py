@@ -9,7 +9,14 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Any
 
-from merge_runner.records import Attempt, ChatRequest, DecisionRow, FailedCall, TrialRecord
+from merge_runner.records import (
+    Attempt,
+    ChatRequest,
+    DecisionRow,
+    FailedCall,
+    TrialRecord,
+    is_scripted,
+)
 from merge_runner.simulator.conditions import CONDITIONS
 
 Row = tuple[Any, ...]
@@ -133,7 +140,7 @@ def _call_row(
         request.body,
         _as_json(attempt.reply),
         attempt.error,
-        attempt.scripted or request.provider == "emulator",
+        is_scripted(request, attempt),
     )
 
 

@@ -29,6 +29,7 @@ from merge_runner.database import (
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.records import TrialRecord
 from merge_runner.rows import Row, rows_of, state_rows, trial_row
+from merge_runner.served import other_models, sql_of
 from merge_runner.texts import first_line
 
 TrialKey = tuple[str, str]
@@ -295,17 +296,24 @@ class SweepFacts:
     """What the database says of one sweep.
 
     ``outcomes`` holds (variant, condition, status, merged_first, had a fallback, trials),
-    ``ledger`` (model, variant, fate, outcome, attempts) as the view ``attempts`` names them,
-    ``failed`` (trial_id, error), ``served`` (model requested, model served, answers).
+    ``ledger`` (driver, variant, fate, outcome, attempts) as the view ``attempts`` names them,
+    ``failed`` (trial_id, error), ``others`` (model requested, model served, answers) where another
+    model answered, ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
+    scripted stand-in did.
     """
 
     outcomes: list[tuple[str, str, str, str | None, bool, int]]
     ledger: list[tuple[str, str, str, str, int]]
     failed: list[tuple[str, str]]
-    served: list[tuple[str, str | None, int]]
+    others: list[tuple[str, str, int]]
+    stand_ins: list[tuple[str, str, str, int, int]]
     decisions: int
     invalid: int
     fallbacks: int
+
+
+# Who was asked, in a row of the view ``attempts`` with its spec.
+DRIVER = "driver_name(model, spec->>('$.' || side || '.endpoint'))"
 
 
 def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
@@ -333,16 +341,25 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 "GROUP BY ALL ORDER BY ALL",
             ),
             ledger=rows(
-                "SELECT model, variant, fate, if(outcome = 'ok', coalesce(failure, outcome), "
-                "outcome), count(*) FROM attempts",
+                f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
+                "if(outcome = 'ok', coalesce(failure, outcome), outcome), count(*) "
+                "FROM attempts LEFT JOIN specs USING (spec_hash)",
                 "GROUP BY ALL ORDER BY ALL",
             ),
             failed=rows(
                 "SELECT trial_id, error FROM trials", "WHERE status = 'failed' ORDER BY ALL"
             ),
-            served=rows(
+            others=rows(
                 "SELECT model_requested, model_served, count(*) FROM calls",
-                "WHERE http_status = 200 GROUP BY ALL ORDER BY ALL",
+                f"WHERE http_status = 200 AND {sql_of(other_models(connection))} "
+                "GROUP BY ALL ORDER BY ALL",
+            ),
+            stand_ins=rows(
+                f"SELECT {DRIVER}, model, provider, "  # noqa: S608 # constants
+                "count(*) FILTER (scripted), count(*) "
+                "FROM attempts LEFT JOIN specs USING (spec_hash)",
+                "WHERE fate IN ('driven', 'fallback') GROUP BY ALL HAVING bool_or(scripted) "
+                "ORDER BY ALL",
             ),
             decisions=decisions[0],
             invalid=decisions[1],

@@ -34,7 +34,8 @@ class Summary:
             "sweep_id": outcome.sweep_id,
             "name": self.plan.name,
             "model": self.plan.model,
-            "scripted": self.plan.scripted,
+            "driver": outcome.driver,
+            "scripted": bool(facts.stand_ins) if facts else self.plan.scripted,
             "exit_code": outcome.exit_code,
             "messages": outcome.messages,
             "db": str(self.options.db),
@@ -84,9 +85,8 @@ class Summary:
             yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
         for pair, answers in self.mismatches().items():
             yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
-        if self.plan.scripted:
-            yield "The model `emulator` is a scripted stand-in, no language model."
         if facts is not None:
+            yield from (_stand_in(*found) for found in facts.stand_ins)
             audit = outcome.audit
             if audit is not None:
                 checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
@@ -148,15 +148,9 @@ class Summary:
             )
 
     def mismatches(self) -> dict[str, int]:
-        """Requested and served model, where the latter is neither the id nor an alias."""
-        accepted = {entry.id: {entry.id, *entry.aliases} for entry in self.plan.entries.values()}
-        return {
-            f"{requested} -> {served}": answers
-            for requested, served, answers in (
-                self.outcome.facts.served if self.outcome.facts else ()
-            )
-            if served is not None and served not in accepted.get(requested, {requested})
-        }
+        """Requested and served model, where another one answered, with how often."""
+        others = self.outcome.facts.others if self.outcome.facts else ()
+        return {f"{requested} -> {served}": answers for requested, served, answers in others}
 
     def _table(self, facts: SweepFacts) -> Iterator[str]:
         """Counts per condition, and per variant where there are several."""
@@ -172,6 +166,14 @@ class Summary:
             yield _row("variant", COLUMNS)
             for variant in self.plan.repetitions:
                 yield _row(variant, _named(by_variant.get(variant, Counter())).values())
+
+
+def _stand_in(driver: str, model: str, provider: str, scripted: int, answers: int) -> str:
+    """That a stand-in answered in a model's name, or was asked for as what it is."""
+    if provider == "emulator":
+        return f"The model `{model}` is a scripted stand-in, no language model."
+    part = "" if scripted == answers else f" in {scripted} of {answers} answers"
+    return f"{driver}: a scripted stand-in answered, not {model}{part}"
 
 
 def _cells(facts: SweepFacts) -> dict[tuple[str, str], Counter[str]]:

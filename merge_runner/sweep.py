@@ -28,8 +28,9 @@ from merge_runner.errors import (
 from merge_runner.estimate import Missing, worst_trial_usd
 from merge_runner.flusher import Flusher
 from merge_runner.interrupt import on_interrupt
-from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.keys import canonical_json
+from merge_runner.llm.cache import Entry, ResponseCache, Totals
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.keys import canonical_json, manner
 from merge_runner.llm.ledger import Ledger, Spending
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.misses import Miss, explain, misses_of
@@ -82,6 +83,7 @@ class Outcome:
     """
 
     sweep_id: str
+    driver: str
     trials: int
     stored_before: int
     exit_code: int = 0
@@ -138,15 +140,16 @@ class Sweep:
         self._ledger = Ledger(self._cache, plan.ledger)
         self._outages: dict[str, Outage] = {}
         self._suspended: list[TrialSuspended] = []
+        driver = plan.driver(self._endpoints)
         self._progress = Progress(
-            title=f"{plan.name}: {plan.model}" + (" (scripted stand-in)" if plan.scripted else ""),
+            title=f"{plan.name}: {driver}" + (" (scripted stand-in)" if plan.scripted else ""),
             total=len(self._todo),
             expected_calls=round(len(self._todo) * plan.llm_sides * PROMPTS_PER_DRIVER),
             cap_usd=options.limits.max_cost_usd,
             ledger=self._ledger,
             stored_before=len(self._stored),
             name=plan.name,
-            model=plan.model,
+            model=driver,
             planned=Counter(spec.cell for spec in specs.values()),
             stored=Counter(specs[key].cell for key in self._stored),
         )
@@ -170,7 +173,12 @@ class Sweep:
 
     async def _run(self, sweep_id: str) -> Outcome:
         """Play what is missing and store it."""
-        outcome = Outcome(sweep_id, self._plan.trials, len(self._stored))
+        outcome = Outcome(
+            sweep_id,
+            self._plan.driver(self._endpoints),
+            self._plan.trials,
+            len(self._stored),
+        )
         async with AsyncExitStack() as stack:
             stack.callback(self._cache.close)
             crew = await self._crew(stack)
@@ -228,8 +236,14 @@ class Sweep:
                     calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
 
         await Players(self._plan, clients, in_flight=1).play(self._todo, ended)
-        facts = {name: self._cache.facts(e.id) for name, e in self._plan.entries.items()}
-        return Missing(trials, calls, facts)
+        facts = {name: self._measured(name, entry) for name, entry in self._plan.entries.items()}
+        return Missing(trials, calls, facts, self._endpoints)
+
+    def _measured(self, name: str, entry: ModelEntry) -> Totals:
+        """What is known of answers to requests like those of this sweep."""
+        sent = FORMATS[entry.format].request(entry, "")
+        asked = manner(sent.path, canonical_json(sent.body))
+        return self._cache.facts(entry.id).of(self._endpoints[name], asked)
 
     def close(self) -> None:
         """Close what was opened, where the sweep is not run."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from aiohttp import web
 
 from merge_runner.emulator.server import HOST, Emulator
-from merge_runner.records import SLOT_HEADER
+from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 
 PROJECT = Path(__file__).parent.parent
 PROGRAM = Path(sys.executable).with_name("merge-runner")
@@ -60,9 +60,19 @@ class Watched:
         return self.asked.total()
 
 
+async def as_a_model(request: web.Request, handler) -> web.StreamResponse:
+    """Answer without the field that says that a stand-in does."""
+    body = json.loads((await handler(request)).body)
+    del body[SCRIPTED_FIELD]
+    return web.json_response(body)
+
+
 @asynccontextmanager
-async def watched(middle: Middle | None = None, faults=None):
-    """Serve the emulator on loopback; ``middle`` may answer in its place."""
+async def watched(middle: Middle | None = None, faults=None, *, honest: bool = True):
+    """Serve the emulator on loopback; ``middle`` may answer in its place.
+
+    Unless it is ``honest``, no header says that a stand-in answers.
+    """
     seen = Watched()
 
     @web.middleware
@@ -74,6 +84,8 @@ async def watched(middle: Middle | None = None, faults=None):
 
     app = Emulator(faults).app
     app.middlewares.append(watch)
+    if not honest:
+        app.on_response_prepare.clear()
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
     await runner.setup()
     await web.TCPSite(runner, HOST, 0).start()

@@ -23,6 +23,7 @@ from merge_runner.errors import StoreError
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.keys import make_request
 from merge_runner.recording import export_recording, read_recording
+from merge_runner.records import SCRIPTED_FIELD
 from merge_runner.simulator.conditions import CONDITIONS
 
 FAULTS = """
@@ -243,8 +244,7 @@ WIDER = {
     ),
     "the sweep says another model": (
         ["UPDATE sweeps SET config = replace(config::VARCHAR, 'scripted-driver', 'other')"],
-        {"spec": "in left model", "model": "the sweep names other of emulator",
-         "served": "scripted-driver -> scripted-driver"},
+        {"spec": "in left model", "model": "the sweep names other of emulator"},
     ),
     "the sweep is gone": (
         ["DELETE FROM sweeps WHERE sweep_id = (SELECT sweep_id FROM sweep_trials "
@@ -360,7 +360,8 @@ VALID = {
     ),
     "another model was asked": (
         ["UPDATE calls SET model_requested = 'gpt-0' WHERE {slot}"],
-        {"model": "1 attempts asked for gpt-0 of emulator, the sweep names scripted-driver"},
+        {"model": "1 attempts asked for gpt-0 of emulator, the sweep names scripted-driver",
+         "served": "gpt-0 -> scripted-driver: another model answered"},
     ),
     "another model answered": (
         ["UPDATE calls SET model_served = 'gpt-0' WHERE {slot}"],
@@ -566,12 +567,13 @@ def test_the_one_id_of_all_replies_of_earlier_emulators_tells_nothing(db):
 
 
 def caching(kept: dict[str, dict], **changes: object):
-    """A proxy that answers what it was asked before with the old reply."""
+    """A proxy that answers what it was asked before with the old reply, as a model's."""
 
     async def middle(request, handler):
         asked = await request.text()
         if asked not in kept:
             kept[asked] = json.loads((await handler(request)).body)
+            kept[asked].pop(SCRIPTED_FIELD)
         return web.json_response(kept[asked] | {name: make() for name, make in changes.items()})
 
     return middle
@@ -599,7 +601,8 @@ async def test_a_proxy_that_caches_is_found_in_repetitions_and_in_a_fresh_set_of
 
 async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tmp_path):
     numbers = count()
-    async with watched(caching({}, id=lambda: f"new-{next(numbers)}")) as server:
+    new_ids = caching({}, id=lambda: f"new-{next(numbers)}")
+    async with watched(new_ids, honest=False) as server:
         env = {"OPENAI_BASE_URL": f"{server.url}/v1", "OPENAI_API_KEY": "k"}
         part = ("--model", "o3", "--conditions", "L_4_8", "--reps", 2, "--yes", *FAST)
         assert (await merge_runner("sweep", "baseline", *part, **env)).code == 0

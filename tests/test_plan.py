@@ -8,7 +8,7 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner.estimate import Missing, estimate
-from merge_runner.llm.cache import ModelFacts
+from merge_runner.llm.cache import Totals
 from merge_runner.plan import PROGRAMS, Choice, Limits, make_plan
 
 EMULATOR = {"emulator": "emulator"}
@@ -143,7 +143,9 @@ def test_what_is_named_twice_is_played_once():
 )
 def test_the_estimate_takes_the_limits_into_account(limits, minutes):
     plan = make_plan(Choice("baseline", "o3"))
-    nothing_recorded = Missing(plan.trials, {"o3": plan.trials * 21}, {"o3": ModelFacts()})
+    nothing_recorded = Missing(
+        plan.trials, {"o3": plan.trials * 21}, {"o3": Totals()}, {"o3": "openai"}
+    )
     expected = estimate(plan, nothing_recorded, limits)
     assert expected.minutes == pytest.approx(minutes, rel=0.08)
     assert expected.calls == 2310

@@ -13,6 +13,7 @@ import duckdb
 from analysis.explorer.reading import PATIENCE_S, reading
 from merge_runner.database import SCHEMA, Instance
 from merge_runner.errors import StoreLocked, UsageError
+from merge_runner.served import ALIASES, others_among
 
 PAGE = 100
 # Two are equal where the same trials are listed: unlike a stamp, it stands when tables are kept.
@@ -45,11 +46,11 @@ CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, inv
 CREATE TABLE paid (trial_id VARCHAR, spec_hash VARCHAR, attempts BIGINT, cost_usd DOUBLE);
 CREATE TABLE tried (trial_id VARCHAR, spec_hash VARCHAR, requested VARCHAR, served VARCHAR,
     answered BOOLEAN, outcome VARCHAR, unpriced BIGINT, times BIGINT);
+CREATE TABLE others (requested VARCHAR, served VARCHAR);
 CREATE TABLE flaws (trial_id VARCHAR, spec_hash VARCHAR, failure VARCHAR, times BIGINT);
 """
 # What each sweep has of them; what went wrong in a trial, and how often. Of an error stand the
-# words before its particulars. That another model answered than was asked for is no fault where a
-# sweep declares it as an alias.
+# words before its particulars.
 GROUPED = """
 CREATE OR REPLACE TABLE members AS
     SELECT sweep, number FROM planned JOIN listed USING (trial_id, spec_hash);
@@ -63,8 +64,8 @@ FROM flaws JOIN listed USING (trial_id, spec_hash)
 UNION ALL SELECT number, 'attempt: ' || tried.outcome, sum(times)::BIGINT
 FROM tried JOIN listed USING (trial_id, spec_hash) WHERE tried.outcome <> 'ok' GROUP BY ALL
 UNION ALL SELECT number, 'model: ' || requested || ' → ' || served, sum(times)::BIGINT
-FROM tried JOIN listed USING (trial_id, spec_hash)
-WHERE answered AND served <> requested GROUP BY ALL;
+FROM tried JOIN listed USING (trial_id, spec_hash) SEMI JOIN others USING (requested, served)
+WHERE answered GROUP BY ALL;
 """
 # A failed trial may be played anew, and fail again; a file may be put in the place of another.
 FORGET = """
@@ -84,6 +85,8 @@ TAKE = """
 INSERT INTO memory.trials BY NAME
     FROM trials ANTI JOIN memory.listed USING (trial_id, spec_hash)
     ORDER BY trial_id, spec_hash LIMIT 2000;
+INSERT OR IGNORE INTO memory.specs
+    FROM specs SEMI JOIN memory.trials USING (spec_hash);
 INSERT INTO memory.states BY NAME
     FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
 INSERT INTO memory.decided
@@ -105,8 +108,7 @@ INSERT INTO memory.flaws
 LIST = """
 INSERT INTO listed BY NAME
 SELECT trials.trial_id, trials.spec_hash, source,
-    if(source = 'human', 'human', split_part(trials.trial_id, '/', 1)
-        || if(sample_set > 0, '/set' || sample_set, '')) AS model,
+    if(source = 'human', 'human', driver) AS model,
     variant, condition, rep, pair, status, merged_first, end_time_s, error, scripted,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
@@ -117,6 +119,7 @@ SELECT trials.trial_id, trials.spec_hash, source,
     coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps
 FROM trials
 JOIN trial_metrics USING (trial_id, spec_hash)
+JOIN trial_drivers USING (trial_id, spec_hash)
 LEFT JOIN decided USING (trial_id, spec_hash)
 LEFT JOIN paid USING (trial_id, spec_hash)
 LEFT JOIN (
@@ -248,6 +251,7 @@ class Catalogue:
                 self.held = True
             else:
                 self._stamp, self.held = stamp, False
+            self._note_others()
             self._connection.execute(GROUPED)
             return not self.held
 
@@ -373,6 +377,15 @@ class Catalogue:
             self._file = file
         count: int = waiting[0]
         return count
+
+    def _note_others(self) -> None:
+        """Find out where another model answered, by the aliases of all sweeps."""
+        pairs = self._rows("SELECT DISTINCT requested, served FROM tried WHERE answered", [])
+        others = others_among(pairs, self._rows(ALIASES, []))
+        assert self._connection is not None
+        self._connection.execute("TRUNCATE others")
+        if others:
+            self._connection.executemany("INSERT INTO others VALUES (?, ?)", others)
 
     def _rows(self, sql: str, values: list[Any]) -> list[Any]:
         assert self._connection is not None, "it was never refreshed"

@@ -12,16 +12,18 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from analysis.explorer.catalogue import Catalogue
 from merge_runner.audit.expected import ModelFacts
+from merge_runner.config import pair_name
 from merge_runner.progress_file import Standing, read_standing
 
 Row = dict[str, Any]
 OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, exit_code, config::VARCHAR AS config,
-    coalesce(trials, 0) AS trials, coalesce(failed, 0) AS failed, coalesce(cost_usd, 0) AS cost_usd
+    coalesce(trials, 0) AS trials, coalesce(failed, 0) AS failed,
+    coalesce(cost_usd, 0) AS cost_usd, coalesce(scripted, false) AS scripted
 FROM sweeps LEFT JOIN (
     SELECT sweep AS sweep_id, count(*) AS trials, count(*) FILTER (status = 'failed') AS failed,
-        sum(cost_usd) AS cost_usd
+        sum(cost_usd) AS cost_usd, bool_or(scripted) AS scripted
     FROM members JOIN listed USING (number) GROUP BY ALL
 ) USING (sweep_id)
 ORDER BY started_at DESC, sweep_id DESC
@@ -35,7 +37,7 @@ FROM listed {OF_SWEEP} GROUP BY ALL ORDER BY ALL
 """  # noqa: S608 # constants
 TRIED = """
 SELECT requested, served, answered, outcome, sum(times)::BIGINT AS times,
-    sum(unpriced)::BIGINT AS unpriced
+    sum(unpriced)::BIGINT AS unpriced, answered AND (requested, served) IN (FROM others) AS other
 FROM tried SEMI JOIN (FROM planned WHERE sweep = ?) USING (trial_id, spec_hash)
 GROUP BY ALL ORDER BY ALL
 """
@@ -60,10 +62,17 @@ class Config(BaseModel):
 
     model: str = ""
     models: dict[str, ModelFacts] = {}
+    endpoints: dict[str, str] = {}
     repetitions: dict[str, int] = {}
     conditions: tuple[str, ...] = ()
     sample_set: int = 0
     max_cost_usd: float | None = None
+
+    @property
+    def driver(self) -> str:
+        """Who drives, and where he is asked."""
+        left, _, right = self.model.partition("+")
+        return pair_name((left, right or left), self.endpoints)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +87,12 @@ class Entry:
     def sweep_id(self) -> str:
         """Its name, which no other sweep has."""
         return str(self.row["sweep_id"])
+
+    @property
+    def scripted(self) -> bool:
+        """Whether a scripted stand-in answers, as its trials say, or before there are any."""
+        asked = {model.provider for model in self.config.models.values()}
+        return bool(self.row["scripted"]) or "emulator" in asked
 
     @property
     def state(self) -> str:
@@ -218,7 +233,7 @@ def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> 
     entry = Entry(row, config_of(row["config"]), _newest(catalogue, row, standing))
     stored = catalogue.ask(CELLS, sweep_id)
     tried = catalogue.ask(TRIED, sweep_id)
-    mismatches = mismatches_of(entry.config, tried)
+    mismatches = mismatches_of(tried)
     return Sweep(
         entry=entry,
         verdict=verdict_of(entry, _later(entry, rows[:place]), sum(mismatches.values())),
@@ -301,14 +316,12 @@ def rates_of(
     ]  # fmt: skip
 
 
-def mismatches_of(config: Config, tried: list[Row]) -> dict[str, int]:
-    """Requested and served model, where the latter is neither the id nor an alias."""
-    accepted = {model.id: set(model.accepted) for model in config.models.values()}
+def mismatches_of(tried: list[Row]) -> dict[str, int]:
+    """Requested and served model, where another one answered, with how often."""
     others = Counter[str]()
     for row in tried:
-        asked, served = row["requested"], row["served"]
-        if row["answered"] and served is not None and served not in accepted.get(asked, {asked}):
-            others[f"{asked} → {served}"] += row["times"]
+        if row["other"]:
+            others[f"{row['requested']} → {row['served']}"] += row["times"]
     return dict(others)
 
 

@@ -6,6 +6,7 @@ from analysis.provenance import ANSWERS, Tally, tally
 from analysis.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
+from merge_runner.served import sql_of
 from merge_runner.texts import quoted
 
 NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
@@ -95,11 +96,7 @@ def _failed(reason: str) -> str:
 
 
 def _other_model(study: Study) -> str:
-    declared = "".join(
-        f" AND NOT (model_requested = {quoted(asked)} AND model_served = {quoted(alias)})"
-        for asked, alias in sorted(study.calls.aliases)
-    )
-    return _with(f"fate IN ('driven', 'fallback') AND model_served <> model_requested{declared}")
+    return _with(f"fate IN ('driven', 'fallback') AND {sql_of(sorted(study.calls.others))}")
 
 
 def _row(group: Group, found: Tally, reasons: tuple[str, ...]) -> Row:

@@ -2,7 +2,8 @@
 
 They read the tables of a database and the temporary ones that sweeps.py makes: ``audited`` (the
 trials), ``rules`` (numbers of a spec's scenario), ``drivers`` (per spec and side the endpoint and
-the body of an empty request, NULL for a program) and ``entries`` (the models of the sweep).
+the body of an empty request, NULL for a program), ``entries`` (the models of the sweep) and
+``other_models`` (who answered in place of whom).
 """
 
 from __future__ import annotations
@@ -196,10 +197,8 @@ SELECT min_by(trial_id, place), min_by(side, place), min_by(decision, place),
         model_requested, model_served, count(*))
 FROM (
     SELECT *, (trial_id, decision, side) AS place
-    FROM calls JOIN audited USING (trial_id, spec_hash)
-    JOIN entries ON name = if(side = 'left', model_left, model_right)
-    WHERE http_status = 200 AND model_served IS NOT NULL
-        AND NOT list_contains(accepted, model_served)
+    FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
+    SEMI JOIN other_models USING (model_requested, model_served) WHERE http_status = 200
 )
 GROUP BY model_requested, model_served
 """

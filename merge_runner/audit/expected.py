@@ -30,11 +30,6 @@ class ModelFacts(_Facts):
     parameters: dict[str, JsonValue] = {}
     path: str | None = None
 
-    @property
-    def accepted(self) -> list[str]:
-        """The names under which the model may answer."""
-        return [self.id, *self.aliases]
-
 
 @dataclass(frozen=True, slots=True)
 class Cell:

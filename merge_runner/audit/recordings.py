@@ -16,9 +16,10 @@ from merge_runner.audit.findings import Audit, Finding
 from merge_runner.audit.replies import CONSTANT_IDS
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import Entry
-from merge_runner.llm.keys import canonical_json
+from merge_runner.llm.keys import canonical_json, without_prompt
 from merge_runner.recording import read_recording, summarise
 from merge_runner.records import SIDES, Attempt, ChatRequest, Side
+from merge_runner.served import others_among
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,13 @@ def audit_recording(file: Path) -> Audit:
 def _gather(entry: Entry, contents: Contents) -> None:
     request, slot = entry.request, entry.request.slot
     template = canonical_json(
-        [request.endpoint, request.model, request.path, request.headers, _without_prompt(request)]
+        [
+            request.endpoint,
+            request.model,
+            request.path,
+            request.headers,
+            without_prompt(request.body),
+        ]
     )
     track = Track(template, slot.condition, slot.repetition, slot.sample_set, slot.side)
     contents.decisions[track][slot.decision] += 1
@@ -105,20 +112,6 @@ def _gather(entry: Entry, contents: Contents) -> None:
     early = any(a.outcome in ("ok", "refusal", "truncated") for a in entry.attempts[:-1])
     if early or numbers != list(range(1, len(numbers) + 1)):
         contents.misnumbered.append(request)
-
-
-def _without_prompt(request: ChatRequest) -> str:
-    """The body with an empty text in place of its prompt, by far the longest text of it."""
-    prompt = max(_texts(json.loads(request.body)), key=len, default="")
-    return request.body.replace(canonical_json(prompt), '""')
-
-
-def _texts(value: object) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict | list):
-        for inner in value.values() if isinstance(value, dict) else value:
-            yield from _texts(inner)
 
 
 def _reply_id(attempt: Attempt) -> str | None:
@@ -178,14 +171,13 @@ def _shared(contents: Contents) -> Iterator[Finding]:
 
 def _served(contents: Contents, config: SweepConfig | None) -> Iterator[Finding]:
     models = config.models.values() if config else ()
-    accepted = {model.id: model.accepted for model in models}
-    for (requested, served), answers in sorted(contents.served.items()):
-        if served not in accepted.get(requested, [requested]):
-            yield Finding(
-                "served",
-                f"{requested} -> {served}: another model answered than was asked for "
-                f"({answers} answers)",
-            )
+    aliases = [(model.id, alias) for model in models for alias in model.aliases]
+    for requested, served in others_among(sorted(contents.served), aliases):
+        yield Finding(
+            "served",
+            f"{requested} -> {served}: another model answered than was asked for "
+            f"({contents.served[requested, served]} answers)",
+        )
 
 
 def _ended(provenance: dict[str, str]) -> bool:

@@ -67,10 +67,9 @@ SHARED_REPLIES = _SHARED.format(
 
 USED = """
 CREATE OR REPLACE TEMP TABLE used AS
-SELECT DISTINCT call_key, spec_hash,
-    if(model_left = model_right, model_left, model_left || '+' || model_right) || '/' || variant
-        || if(sample_set = 0, '', '/set' || sample_set) AS name
-FROM decisions JOIN trials USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
+SELECT DISTINCT call_key, spec_hash, driver || '/' || variant AS name
+FROM decisions JOIN trials USING (trial_id, spec_hash)
+JOIN trial_drivers USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
 """
 IN_COMMON = """
 SELECT a.name, a.spec_hash, b.name, b.spec_hash, count(DISTINCT call_key)

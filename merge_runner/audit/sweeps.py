@@ -28,6 +28,7 @@ from merge_runner.database import read_database
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.llm.keys import canonical_json
 from merge_runner.records import SIDES
+from merge_runner.served import other_models
 
 TABLES = """
 CREATE OR REPLACE TEMP TABLE rules (spec_hash VARCHAR, executed INTEGER, plan_actions INTEGER,
@@ -35,8 +36,8 @@ CREATE OR REPLACE TEMP TABLE rules (spec_hash VARCHAR, executed INTEGER, plan_ac
 CREATE OR REPLACE TEMP TABLE drivers (spec_hash VARCHAR, side VARCHAR, endpoint VARCHAR,
     body VARCHAR, between_body_and_slot VARCHAR);
 CREATE OR REPLACE TEMP TABLE done AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
-CREATE OR REPLACE TEMP TABLE entries (name VARCHAR, id VARCHAR, provider VARCHAR,
-    accepted VARCHAR[]);
+CREATE OR REPLACE TEMP TABLE entries (name VARCHAR, id VARCHAR, provider VARCHAR);
+CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 """
 AUDITED = """
 CREATE OR REPLACE TEMP TABLE audited AS
@@ -151,7 +152,7 @@ def _audit(
     else:
         claims = sweep.ended if finished is None else finished
         slots = check_slots(connection, sweep.sweep_id, config, specs, finished=claims)
-        models = [(name, m.id, m.provider, m.accepted) for name, m in config.models.items()]
+        models = [(name, m.id, m.provider) for name, m in config.models.items()]
     connection.execute("DELETE FROM entries")
     _fill(connection, "entries", models)
     findings = [
@@ -241,6 +242,7 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
             for side in SIDES
         ),
     )
+    _fill(connection, "other_models", other_models(connection))
     connection.execute(REPLY_IDS)
     connection.execute(USED)
     connection.execute(GAPS)

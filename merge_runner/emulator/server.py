@@ -22,7 +22,7 @@ from merge_runner.emulator.scenarios.base import Scene
 from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
 from merge_runner.errors import UsageError
-from merge_runner.records import ATTEMPT_HEADER, SIDES, SLOT_HEADER, Slot
+from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_HEADER, SIDES, SLOT_HEADER, Slot
 from merge_runner.simulator.conditions import CONDITIONS
 
 HOST = "127.0.0.1"
@@ -51,6 +51,7 @@ class Emulator:
         self._faults = faults or FaultPlan()
         self._asked: Counter[str] = Counter()
         self.app = web.Application(client_max_size=2**22, middlewares=[_only_by_own_name])
+        self.app.on_response_prepare.append(_say_scripted)
         self.app.add_routes(
             [
                 web.post("/v1/chat/completions", self._chat),
@@ -127,12 +128,17 @@ class Emulator:
         elif fault == "truncated_body" and request.transport is not None:
             request.transport.write(
                 b"HTTP/1.1 200 OK\r\ncontent-type: application/json\r\n"
-                b'content-length: 5000\r\n\r\n{"id": "cut'
+                b'%s: true\r\ncontent-length: 5000\r\n\r\n{"id": "cut' % SCRIPTED_HEADER.encode()
             )
             request.transport.close()
         if request.transport is not None and fault != "truncated_body":
             request.transport.abort()
         return web.Response(status=500)
+
+
+async def _say_scripted(_: web.Request, response: web.StreamResponse) -> None:
+    """Every response says that a stand-in made it, also one that refuses, or is no JSON."""
+    response.headers[SCRIPTED_HEADER] = "true"
 
 
 @web.middleware

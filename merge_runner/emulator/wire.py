@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from merge_runner.config import Format
 from merge_runner.emulator.chance import draw_index
+from merge_runner.records import SCRIPTED_FIELD
 
 CREATED = 1_760_000_000
 OPENAI_ERRORS = {
@@ -253,6 +254,11 @@ def _anthropic(said: _Said) -> dict[str, Any]:
     }
 
 
-def dumps(body: object) -> bytes:
-    """A body as it is sent."""
-    return json.dumps(body, ensure_ascii=False).encode()
+def dumps(body: Any) -> bytes:  # noqa: ANN401 # any JSON that a provider sends
+    """A body as it is sent: it says that no model made it."""
+    marked = [_marked(part) for part in body] if isinstance(body, list) else _marked(body)
+    return json.dumps(marked, ensure_ascii=False).encode()
+
+
+def _marked(part: dict[str, Any]) -> dict[str, Any]:
+    return {**part, SCRIPTED_FIELD: True}

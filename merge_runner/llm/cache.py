@@ -23,7 +23,8 @@ from pydantic import TypeAdapter, ValidationError
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.batches import BatchWriter, Operation
 from merge_runner.llm.disk import FORMAT, format_of, open_disk, set_format
-from merge_runner.records import Attempt, ChatRequest
+from merge_runner.llm.keys import manner, without_prompt
+from merge_runner.records import Attempt, ChatRequest, is_scripted
 
 ENTRY_VERSION = 1
 KEY_LENGTH = 64
@@ -76,15 +77,13 @@ _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 
 
 @dataclass(slots=True)
-class ModelFacts:
-    """What the cache knows of a model: the endpoints that answered, and totals over its entries.
+class Totals:
+    """Sums over entries of one model, at one endpoint, asked in one manner (see keys.py).
 
-    Tokens and latencies are those of the ``measured`` answers, which tell both.
+    Tokens and latencies are those of the ``measured`` answers: they tell both, and are the model's
+    own and no stand-in's.
     """
 
-    endpoints: list[str] = field(default_factory=list)
-    answers: int = 0
-    attempts: int = 0
     cost_usd: float = 0.0
     measured: int = 0
     input_tokens: int = 0
@@ -93,16 +92,37 @@ class ModelFacts:
 
     def add(self, entry: Entry) -> None:
         """Count an entry."""
-        self.endpoints = sorted({*self.endpoints, entry.request.endpoint})
-        self.answers += 1
-        self.attempts += len(entry.attempts)
         self.cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
         last = entry.attempts[-1]
+        if entry.request.provider != "emulator" and is_scripted(entry.request, last):
+            return
         if last.usage.input_tokens is not None and last.usage.output_tokens is not None:
             self.measured += 1
             self.input_tokens += last.usage.input_tokens
             self.output_tokens += last.usage.output_tokens
             self.latency_s += last.latency_s or 0.0
+
+
+@dataclass(slots=True)
+class ModelFacts:
+    """What the cache knows of a model: totals by endpoint, and there by how it was asked."""
+
+    totals: dict[str, dict[str, Totals]] = field(default_factory=dict)
+
+    def add(self, entry: Entry) -> None:
+        """Count an entry."""
+        request = entry.request
+        asked = manner(request.path, without_prompt(request.body))
+        self.totals.setdefault(request.endpoint, {}).setdefault(asked, Totals()).add(entry)
+
+    def of(self, endpoint: str, asked: str) -> Totals:
+        """The totals of one endpoint and manner of asking."""
+        return self.totals.get(endpoint, {}).get(asked, Totals())
+
+    @property
+    def cost_usd(self) -> float:
+        """What all its entries cost when they were made."""
+        return sum(each.cost_usd for manners in self.totals.values() for each in manners.values())
 
 
 _FACTS = TypeAdapter(ModelFacts)
@@ -234,7 +254,7 @@ class ResponseCache:
         """The endpoint identities of a model's replies: the recording's, else the folder's."""
         requests = (entry.request for entry in self._overlay.values())
         overlaid = sorted({r.endpoint for r in requests if r.model == model})
-        return overlaid or self.facts(model).endpoints
+        return overlaid or sorted(self.facts(model).totals)
 
     def facts(self, model: str) -> ModelFacts:
         """What the folder knows of a model."""
@@ -287,7 +307,7 @@ class ResponseCache:
             self._disk.set(_MODEL + model, _FACTS.dump_json(known).decode())
 
     def _bring_up_to_date(self) -> None:
-        """The first format knew the endpoints of each model and nothing else."""
+        """Earlier formats knew less of each model: count anew."""
         with self._disk.transact(retry=True):
             if format_of(self._disk) == FORMAT:
                 return  # another process was quicker

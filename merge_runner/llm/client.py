@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from merge_runner.config import ModelEntry
+from merge_runner.config import ModelEntry, driver_name
 from merge_runner.errors import (
     CallFailed,
     EndpointRefused,
@@ -35,7 +35,16 @@ from merge_runner.llm.retry import (
 from merge_runner.llm.sharing import Claiming, Purse, Turn, Turns
 from merge_runner.llm.transport import Transport, TransportFailure
 from merge_runner.llm.verdicts import RawReply, Verdict, judge, may_be_charged
-from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
+from merge_runner.records import (
+    SCRIPTED_HEADER,
+    Attempt,
+    ChatReply,
+    ChatRequest,
+    Slot,
+    Usage,
+    says_scripted,
+)
+from merge_runner.served import is_other_model
 
 EMPTY_RETRIES = 2
 CLAIM_POLL_S = 0.1
@@ -97,8 +106,14 @@ class LlmClient:
         else:
             entry, earlier = await asyncio.shield(self._start(request, order))
         reply = self._reply(entry, earlier)
-        self.meter.count_reply(reply, self.accepted)
-        self._check_served(reply)
+        other_model = self._other_model(reply)
+        self.meter.count_reply(reply, other_model)
+        if self.strict and other_model is not None:
+            raise ModelSwapped(
+                f"{self.driver}: {other_model} answered where {self.entry.id} was asked for, at "
+                f"{_who(slot)}; --strict-model stops the sweep. The reply is kept. To go on with "
+                "it, leave --strict-model out, or name it in `aliases` in experiments/models.toml"
+            )
         return reply
 
     async def drain(self) -> None:
@@ -119,9 +134,9 @@ class LlmClient:
         return len(self._calls) - len(self.meter.waits)
 
     @property
-    def accepted(self) -> frozenset[str]:
-        """The names under which the model may answer."""
-        return frozenset({self.entry.id, *self.entry.aliases})
+    def driver(self) -> str:
+        """Its name, with the endpoint where that is not the provider's own."""
+        return driver_name(self.name, self.endpoint)
 
     def _recorded(self, request: ChatRequest) -> Entry | None:
         """The recorded call; a damaged one is none, unless nothing can be asked anew."""
@@ -144,20 +159,15 @@ class LlmClient:
             for name in self.cache.set_damage_aside(key):
                 self.meter.damaged.append(name)
                 self.meter.notes.append(
-                    f"{self.name}: {_who(request.slot)}: what is recorded is damaged; it is set "
+                    f"{self.driver}: {_who(request.slot)}: what is recorded is damaged; it is set "
                     f"aside in the cache as 'damaged {name}', and asked again"
                 )
             return self.cache.get(key), self.cache.unanswered(key)
 
-    def _check_served(self, reply: ChatReply) -> None:
+    def _other_model(self, reply: ChatReply) -> str | None:
+        """Who answered, where it is another model than was asked for."""
         served = reply.attempts[-1].model_served
-        if self.strict and served is not None and served not in self.accepted:
-            raise ModelSwapped(
-                f"{self.name}: {served} answered where {self.entry.id} was asked for, at "
-                f"{_who(reply.request.slot)}; --strict-model stops the sweep. The reply is kept. "
-                "To go on with it, leave --strict-model out, or name it in `aliases` in "
-                "experiments/models.toml"
-            )
+        return served if is_other_model(self.entry.id, served, self.entry.aliases) else None
 
     def _request(self, prompt: str, slot: Slot) -> ChatRequest:
         wire = FORMATS[self.entry.format].request(self.entry, prompt)
@@ -275,7 +285,7 @@ class LlmClient:
         """Within this, nothing of the call is in flight, so that a drain gives it up."""
         if self._stopping:
             raise CallFailed("the sweep was stopped", request)
-        wait = Wait(f"{self.name}: {_who(request.slot)}", what, until)
+        wait = Wait(f"{self.driver}: {_who(request.slot)}", what, until)
         self.meter.begin_wait(request.key, wait)
         try:
             yield
@@ -335,7 +345,7 @@ class LlmClient:
         delay_s = verdict.delay_s or 0.0
         if verdict.pause and delay_s > self.entry.deadline_s:
             raise QuotaExhausted(
-                f"{self.name}: the provider asks to wait {delay_s:.0f} s, longer than a "
+                f"{self.driver}: the provider asks to wait {delay_s:.0f} s, longer than a "
                 f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
                 "is saved; run the same command again later to go on."
             )
@@ -344,7 +354,7 @@ class LlmClient:
             self.limiter.pause(pause_s)
             until = datetime.now(UTC) + timedelta(seconds=pause_s)
             self.meter.notes.append(
-                f"{self.name}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
+                f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
                 f"{message}"
             )
         if verdict.action == "retry":
@@ -353,11 +363,11 @@ class LlmClient:
             raise RequestFailed("the request was rejected")
         if verdict.action == "quota":
             raise QuotaExhausted(
-                f"{self.name}: the account's quota is exhausted ({message}). Every reply so far "
+                f"{self.driver}: the account's quota is exhausted ({message}). Every reply so far "
                 "is saved; when there is credit again, run the same command to go on."
             )
         if verdict.action == "refused":
-            raise EndpointRefused(f"{self.name}: {self._refusal_advice(verdict)} ({message})")
+            raise EndpointRefused(f"{self.driver}: {self._refusal_advice(verdict)} ({message})")
         empty_again = verdict.outcome == "empty" and FORMATS[self.entry.format].retries_empty
         if empty_again and sum(a.outcome == "empty" for a in attempts) <= EMPTY_RETRIES:
             raise TryAgain("empty answer")
@@ -381,6 +391,7 @@ class LlmClient:
             reply=raw.body,
             error=verdict.message,
             cost_usd=self.pricing.cost_usd(usage) if may_be_charged(raw) else 0.0,
+            scripted=SCRIPTED_HEADER in raw.headers or says_scripted(raw.body),
         )
 
     def _worst_case(self, request: ChatRequest) -> Usage:

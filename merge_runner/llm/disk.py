@@ -11,7 +11,7 @@ from diskcache.core import MODE_PICKLE
 
 from merge_runner.errors import RecordingError, UsageError
 
-FORMAT = 2
+FORMAT = 3
 _FORMAT, _OPENED = "format", "opened"
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from functools import cache
 
 from pydantic import JsonValue
@@ -65,3 +66,24 @@ def between_body_and_slot(endpoint: str, path: str, headers: tuple[tuple[str, st
     """
     parts = {"endpoint": endpoint, "headers": dict(headers), "key_version": KEY_VERSION}
     return canonical_json({**parts, "path": path})[1:-1] + ',"slot":'
+
+
+def without_prompt(body: str) -> str:
+    """A canonical body with an empty text in place of its prompt, by far the longest text of it."""
+    prompt = max(_texts(json.loads(body)), key=len, default="")
+    return body.replace(canonical_json(prompt), '""')
+
+
+def manner(path: str, empty_body: str) -> str:
+    """The short hash of how a model is asked, whatever the prompt: of what is sent besides."""
+    return hashlib.sha256(f"{path} {empty_body}".encode()).hexdigest()[:16]
+
+
+def _texts(value: JsonValue) -> Iterator[str]:
+    waiting = [value]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, str):
+            yield part
+        elif isinstance(part, dict | list):
+            waiting += part.values() if isinstance(part, dict) else part

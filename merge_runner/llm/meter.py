@@ -7,7 +7,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 
-from merge_runner.records import Attempt, ChatReply
+from merge_runner.records import Attempt, ChatReply, is_scripted
 
 MINUTE_S = 60.0
 TOLD_WAIT = timedelta(seconds=5)
@@ -26,8 +26,8 @@ class Wait:
 class Meter:
     """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts.
 
-    ``waits`` are those of the present, by call key; ``damaged`` are the keys of recorded replies
-    that could not be read.
+    ``stand_ins`` counts the answers that one gave in the model's name. ``waits`` are those of the
+    present, by call key; ``damaged`` are the keys of recorded replies that could not be read.
     """
 
     calls_live: int = 0
@@ -36,6 +36,7 @@ class Meter:
     cost_unknown: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     mismatches: Counter[str] = field(default_factory=Counter)
+    stand_ins: int = 0
     notes: deque[str] = field(default_factory=deque)
     waits: dict[str, Wait] = field(default_factory=dict)
     damaged: list[str] = field(default_factory=list)
@@ -59,15 +60,16 @@ class Meter:
         else:
             self.cost_unknown += 1
 
-    def count_reply(self, reply: ChatReply, accepted_models: frozenset[str]) -> None:
-        """Count an answer that a trial uses, and a served model that was not asked for."""
+    def count_reply(self, reply: ChatReply, other_model: str | None) -> None:
+        """Count an answer that a trial uses, and who gave it where it is another model."""
         if reply.cached:
             self.calls_cached += 1
         else:
             self.calls_live += 1
-        served = reply.attempts[-1].model_served
-        if served is not None and served not in accepted_models:
-            self.mismatches[f"{reply.request.model} -> {served}"] += 1
+        if other_model is not None:
+            self.mismatches[f"{reply.request.model} -> {other_model}"] += 1
+        if reply.request.provider != "emulator":
+            self.stand_ins += is_scripted(reply.request, reply.attempts[-1])
 
     def add(self, other: Meter) -> None:
         """Count what another one has counted; its waits are not added."""
@@ -78,6 +80,7 @@ class Meter:
         self.cost_unknown += other.cost_unknown
         self.outcomes += other.outcomes
         self.mismatches += other.mismatches
+        self.stand_ins += other.stand_ins
         self.notes += other.notes
         self.damaged += other.damaged
         self.events += ((now, tokens) for _, tokens in other.events)  # clocks differ

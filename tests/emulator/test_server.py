@@ -9,11 +9,13 @@ import aiohttp
 import pytest
 
 from merge_runner.emulator.faults import FaultPlan
+from merge_runner.emulator.scenarios import SCENARIOS
 from merge_runner.emulator.server import run, serve
 from merge_runner.errors import UsageError
 from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS
 from merge_runner.prompts.parse import parse_reply
+from merge_runner.records import SCRIPTED_FIELD, SCRIPTED_HEADER, says_scripted
 
 WIRES = ("openai-chat", "openai-responses", "gemini", "anthropic")
 PATHS = {
@@ -60,7 +62,8 @@ def without_ids(body):
 
 
 def error_names(wire, body):
-    """The words by which a provider's error goes."""
+    """The words by which a provider's error goes, beside the mark of who sent it."""
+    assert body.pop(SCRIPTED_FIELD) is True
     if wire == "anthropic":
         assert body["type"] == "error"
         assert body["request_id"]
@@ -594,3 +597,44 @@ async def test_it_announces_its_url_serves_and_closes_its_port_when_cancelled(dr
             await serving
     with pytest.raises(aiohttp.ClientConnectorError):
         await ask(url, "openai-chat", driving_prompt)
+
+
+FAULTY = ("rate_limit", "server_error", "bad_gateway", "empty", "refused", "malformed")
+
+
+@all_wires
+@pytest.mark.parametrize("fault", [None, *FAULTY])
+async def test_every_reply_says_that_a_stand_in_made_it(emulator, driving_prompt, wire, fault):
+    url = await emulator(FaultPlan(rates={fault: 1.0} if fault else {}))
+    _, headers, body = await post(url, PATHS[wire], body_for(wire, driving_prompt))
+    assert headers[SCRIPTED_HEADER] == "true"
+    if fault != "bad_gateway":  # an HTML page
+        assert json.loads(body)[SCRIPTED_FIELD] is True
+
+
+PLAYED = [
+    (name, wire)
+    for name, scenes in SCENARIOS.items()
+    for wire, scene in scenes.items()
+    if not (scene.breaks or scene.after_s)
+]
+
+
+@pytest.mark.parametrize(("scenario", "wire"), PLAYED)
+async def test_every_scene_says_that_a_stand_in_plays_it(emulator, driving_prompt, scenario, wire):
+    url = await emulator(FaultPlan(scenarios={scenario: 1.0}))
+    _, headers, body = await post(url, PATHS[wire], body_for(wire, driving_prompt))
+    assert headers[SCRIPTED_HEADER] == "true"
+    if headers["content-type"].startswith("application/json"):
+        assert says_scripted(body.decode())
+
+
+async def test_a_reply_that_is_cut_off_says_it_too(emulator):
+    said = await bytes_until_closed(await emulator(FaultPlan(rates={"truncated_body": 1.0})))
+    assert f"{SCRIPTED_HEADER}: true".encode() in said
+
+
+@pytest.mark.parametrize("path", ["/v1/models", "/nothing", "/v1/chat/completions"])
+async def test_so_does_whatever_else_it_answers(emulator, path):
+    async with aiohttp.ClientSession() as session, session.get(await emulator() + path) as reply:
+        assert reply.headers[SCRIPTED_HEADER] == "true"

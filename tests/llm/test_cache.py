@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError
 from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.keys import make_request
+from merge_runner.llm.keys import make_request, manner
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage
 
 
@@ -307,14 +307,16 @@ def test_a_damaged_entry_is_an_error_and_no_reply(cache, stock):
 
 
 def test_damaged_facts_about_a_model_are_counted_anew(cache, stock):
-    cache.put_now([entry(1), entry(2), entry(3, model="another")])
+    cache.put_now(
+        [entry(1, cost_usd=1), entry(2, cost_usd=2), entry(3, model="another", cost_usd=3)]
+    )
     before = cache.facts("m")
-    assert before.answers == 2
+    assert before.cost_usd == 3
     for name in [name for name in stock if name.startswith("model ")]:
         stock[name] = "no JSON"
     assert cache.facts("m") == before
-    cache.put_now([entry(4)])
-    assert cache.facts("m").answers == 3
+    cache.put_now([entry(4, cost_usd=4)])
+    assert cache.facts("m").cost_usd == 7
 
 
 async def test_damaged_attempts_are_set_aside_and_good_ones_are_not(cache, stock):
@@ -329,14 +331,53 @@ async def test_damaged_attempts_are_set_aside_and_good_ones_are_not(cache, stock
     assert stock[f"damaged {name}"] == "no JSON"
 
 
-def test_a_folder_of_the_first_format_is_counted_once(folder, stock):
+@pytest.mark.parametrize("version", ["1", "2"])
+def test_a_folder_of_an_earlier_format_is_counted_once(folder, stock, version):
     cache = ResponseCache(folder)
-    cache.put_now([entry(1), entry(2)])
-    stock["format"] = "1"
+    cache.put_now([entry(1, cost_usd=1), entry(2, cost_usd=2)])
+    stock["format"] = version
+    stock["model m"] = '{"endpoints": ["openai"], "answers": 9, "cost_usd": 9.0}'
     for _ in range(2):  # as two processes do that saw the old mark at once
         cache._bring_up_to_date()
-        assert cache.facts("m").answers == 2
+        assert cache.facts("m").cost_usd == 3
+        assert cache.recorded_endpoints("m") == ["openai"]
     cache.close()
+
+
+def told(number, *, model="m", endpoint="openai", effort="low", **attempt):
+    """An entry of an answer of 10 tokens to a real request."""
+    prompt = f"What do you do in situation {number}?"
+    request = make_request(
+        provider="openai",
+        endpoint=endpoint,
+        model=model,
+        path="/chat/completions",
+        headers={},
+        body={"model": model, "reasoning_effort": effort, "messages": [{"content": prompt}]},
+        slot=Slot("A1", 1, "left", number, 0),
+    )
+    usage = Usage(input_tokens=100, output_tokens=10)
+    return Entry(request, (Attempt(1, "ok", 200, usage=usage, reply="{}", **attempt),))
+
+
+def test_what_is_measured_is_of_one_endpoint_and_one_way_to_ask(cache):
+    cache.put_now(
+        [
+            *(told(number) for number in range(3)),
+            told(1, effort="high"),
+            told(1, endpoint="http://localhost:8080"),
+            told(7, scripted=True),
+            told(1, model="n"),
+        ]
+    )
+    empty = '{"messages":[{"content":""}],"model":"m","reasoning_effort":"%s"}'
+    low, high = (manner("/chat/completions", empty % effort) for effort in ("low", "high"))
+    facts = cache.facts("m")
+    assert (facts.of("openai", low).measured, facts.of("openai", low).output_tokens) == (3, 30)
+    assert facts.of("openai", high).measured == 1
+    assert facts.of("http://localhost:8080", low).measured == 1
+    assert facts.of("openai", manner("/responses", empty % "low")).measured == 0
+    assert cache.recorded_endpoints("m") == ["http://localhost:8080", "openai"]
 
 
 def test_a_damaged_database_is_an_error_of_ours(folder):

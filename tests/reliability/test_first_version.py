@@ -42,6 +42,10 @@ async def test_its_database_is_brought_up_to_date_and_kept(merge_runner, old):
         assert database.execute("FROM meta").fetchall() == [(SCHEMA_VERSION,)]
         calls = database.execute("SELECT count(*), count(started_at) FROM calls").fetchone()
         assert calls == (19, 0)
+        assert database.execute(
+            "SELECT DISTINCT provider, calls.scripted, trials.scripted "
+            "FROM calls JOIN trials USING (trial_id, spec_hash)"
+        ).fetchall() == [("emulator", True, True)]
         (failed,) = database.execute(
             "SELECT count(*) FROM attempts WHERE fate IN ('retried', 'fallback')"
         ).fetchone()

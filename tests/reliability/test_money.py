@@ -9,7 +9,7 @@ import shutil
 
 import pytest
 from aiohttp import web
-from harness import FAST, PROJECT, watched
+from harness import FAST, PROJECT, as_a_model, watched
 
 pytestmark = pytest.mark.slow
 
@@ -153,7 +153,7 @@ async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(me
 
 
 async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner):
-    async with watched() as server:
+    async with watched(as_a_model, honest=False) as server:
         env = account(server)
         sweep = (*SWEEP, "--reps", 1, *FAST)
         assert (await merge_runner(*sweep, "--dry-run", **env)).summary["measured"] == []
@@ -162,7 +162,7 @@ async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_r
         dry = (await merge_runner(*more, "--dry-run", **env)).summary
         assert dry["trials"] == 3
         assert dry["calls"] == 3 * 21
-        assert dry["measured"] == ["o3"]
+        assert dry["measured"] == [f"o3 at {server.url.removeprefix('http://')}"]
         per_call = first.summary["cost_usd"] / first.summary["calls"]["live"]
         assert dry["cost_usd"] == pytest.approx(dry["calls"] * per_call, rel=0.02)
         second = await merge_runner(*more, "--yes", **env)
