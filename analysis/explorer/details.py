@@ -33,7 +33,9 @@ SELECT DISTINCT decision, side, false AS valid, false AS fallback, true AS lost
 FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) WHERE {OF_TRIAL}
 ORDER BY decision, side
 """  # noqa: S608 # constants
-SPEC = "SELECT spec FROM specs WHERE spec_hash = $spec"
+TASK = f"SELECT source, spec FROM trials LEFT JOIN specs USING (spec_hash) WHERE {OF_TRIAL}"  # noqa: S608 # constants
+# A recording says nothing of its task: the human experiment judged collisions by the boxes.
+HUMAN_TASK = {"collision_rule": "rectangle"}
 # Of one decision with the one before it, or of all.
 DECIDED = f"""
 SELECT * FROM decisions WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
@@ -80,9 +82,10 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     with reading(db) as connection:
         states = {row.pop("side"): row for row in _records(connection, STATES, key)}
         decisions = _records(connection, DECISIONS, key)
-        spec = _records(connection, SPEC, {"spec": spec_hash})
-    told = json.loads(spec[0]["spec"]) if spec else {}
-    scenario = Scenario.model_validate(told.get("scenario", {}))
+        (task,) = _records(connection, TASK, key)
+    told = json.loads(task["spec"]) if task["spec"] else {}
+    usual = HUMAN_TASK if task["source"] == "human" else {}
+    scenario = Scenario.model_validate(told.get("scenario", usual))
     ordered = {side: states[side] for side in SIDES if side in states}
     trial = Trial(trial_id, spec_hash, scenario, ordered, decisions)
     for row in decisions:

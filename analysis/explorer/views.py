@@ -13,8 +13,9 @@ from merge_runner.simulator import track
 from merge_runner.simulator.collision import collided
 from merge_runner.simulator.conditions import CONDITIONS
 
-BISECTIONS = 12
-WIDEST_M = 8.0
+BISECTIONS = 14
+# What a picture shows of the plane around the track, in m.
+BEFORE_M, BEYOND_M, BESIDE_M = 3.0, 5.8, 4.5
 # What each part of a prompt is for.
 BLOCK_MEANINGS = {
     "C0": "situation",
@@ -107,6 +108,26 @@ def collision_text(scenario: Scenario) -> str:
     }[scenario.collision_rule]
 
 
+def judged_text(scenario: Scenario) -> str:
+    """What the picture draws of the rule by which the scenario judges a collision."""
+    length = f"{scenario.vehicle_length_m:g} m"
+    return {
+        "euclid2d": f"circles of {length}, a vehicle's length, about the centres: "
+        "it is a collision where they overlap",
+        "shared_lane": f"bars of {length} along the road: it is a collision where they overlap, "
+        "once a vehicle is past the merge point",
+        "rectangle": f"outlines of {length} by {scenario.vehicle_width_m:g} m: "
+        "it is a collision where they overlap",
+    }[scenario.collision_rule]
+
+
+def view_box() -> str:
+    """The part of the plane that a picture of the track shows: x, y, width, height in m."""
+    half = track.START_DISTANCE_M / 2 + BESIDE_M
+    width = track.MERGE_Y_M + track.TRACK_END_M - track.MERGE_POINT_M + BEFORE_M + BEYOND_M
+    return f"{-BEFORE_M:g} {-half:g} {width:.1f} {2 * half:g}"
+
+
 def facts(row: Row) -> list[str]:
     """What a trial was about and what was measured, in short sentences."""
     text = condition_text(row["condition"])
@@ -130,11 +151,10 @@ def summary(row: Row, trial: Trial) -> list[str]:
             v for t, v in zip(samples["time_s"], samples["velocity_mps"], strict=True) if t >= 0
         ]
         if speeds:
-            hardest = max(samples["acceleration_mps2"], key=abs)
             lines.append(
                 f"The {side} vehicle began at {speeds[0]:.1f} m/s, drove between "
-                f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s; "
-                f"its hardest acceleration was {hardest:+.1f} m/s²."
+                f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s"
+                f"{_hardest(samples)}."
             )
     for side in SIDES:
         mine = [d for d in trial.decisions if d["side"] == side]
@@ -148,6 +168,15 @@ def summary(row: Row, trial: Trial) -> list[str]:
                 + (f"; the trial ended before {', '.join(lost)} was driven." if lost else ".")
             )
     return lines
+
+
+def _hardest(samples: Row) -> str:
+    """The hardest acceleration under control: a sample's is that of the step before it."""
+    times, accelerations = samples["time_s"], samples["acceleration_mps2"]
+    controlled = [a for t, a in zip(times, accelerations, strict=True) if t > 0]
+    if not controlled:
+        return ""
+    return f"; its hardest acceleration was {max(controlled, key=abs):+.1f} m/s²"
 
 
 def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
@@ -190,6 +219,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
             "forward": track.FORWARD,
             "length": trial.scenario.vehicle_length_m,
             "width": trial.scenario.vehicle_width_m,
+            "rule": trial.scenario.collision_rule,
             "hardest": trial.scenario.max_acceleration_mps2,
         },
     }
@@ -222,21 +252,28 @@ def label(row: Row) -> str:
 
 
 def collision_bounds(trial: Trial) -> list[float | None]:
-    """Below which headway the vehicles collide, at each sample's mean position; None: at none."""
+    """Below which headway the vehicles collide at each sample; None: at none."""
     left, right = trial.states.get("left"), trial.states.get("right")
     if left is None or right is None:
         return []
     return [
-        _bound(trial.scenario, (a + b) / 2)
+        _bound(trial.scenario, a, b)
         for a, b in zip(left["position_m"], right["position_m"], strict=False)
     ]
 
 
-def _bound(scenario: Scenario, mean_m: float) -> float | None:
-    """By bisection; the further apart two vehicles are along the road, the less they overlap."""
+def _bound(scenario: Scenario, left_m: float, right_m: float) -> float | None:
+    """At the vehicles' mean position, or on the shared lane once one of them is there.
+
+    By bisection: the further apart two vehicles are along the road, the less they overlap.
+    """
+    if scenario.collision_rule == "shared_lane":
+        shared = max(left_m, right_m) >= track.MERGE_POINT_M
+        return scenario.vehicle_length_m if shared else None
+    mean_m = (left_m + right_m) / 2
     if not collided(scenario, mean_m, mean_m):
         return None
-    low, high = 0.0, WIDEST_M
+    low, high = 0.0, 2 * (scenario.vehicle_length_m + scenario.vehicle_width_m)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         if collided(scenario, mean_m + middle / 2, mean_m - middle / 2):
