@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import tempfile
 import threading
 from dataclasses import dataclass, field, fields
@@ -10,6 +11,7 @@ from typing import Any
 
 import duckdb
 
+from analysis.explorer.child import csv_cell
 from analysis.explorer.reading import PATIENCE_S, reading
 from merge_runner.database import SCHEMA, Instance
 from merge_runner.errors import StoreLocked, UsageError
@@ -349,7 +351,11 @@ class Catalogue:
                 params=values,
             )
             if form == "csv":
-                chosen.write_csv(str(path))
+                with path.open("w", encoding="utf-8", newline="") as file:
+                    rows = [chosen.columns, *chosen.fetchall()]
+                    csv.writer(file, lineterminator="\n").writerows(
+                        map(csv_cell, row) for row in rows
+                    )
             else:
                 chosen.write_parquet(str(path))
             return path.read_bytes()
