@@ -14,7 +14,7 @@ def one_line(text: str) -> str:
 
 
 def in_spreadsheet(value: object) -> object:
-    """A value for a cell of CSV: before a text that a spreadsheet would run stands an apostrophe."""
+    """A value for a cell of CSV, with an apostrophe before a text that a spreadsheet would run."""
     if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r", "\n")):
         return f"'{value}"
     return value

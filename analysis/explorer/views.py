@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import ceil, floor
 from typing import Any
 
 from analysis.explorer.details import Decision, Row, Trial
+from analysis.explorer.texts import visible
 from merge_runner.config import Scenario
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES
@@ -30,28 +32,41 @@ BLOCK_MEANINGS = {
 }
 
 
-def sparkline(row: Row) -> dict[str, str]:
-    """The speeds of both vehicles: points of two lines, and in words.
+Scale = tuple[int, int]
 
-    The lines are 96 wide and 22 high, 6 m/s at the bottom and 14 at the top.
+
+def speed_scale(rows: Sequence[Row]) -> Scale:
+    """The whole m/s at the bottom and the top of all sparklines of these trials."""
+    ranges = [row[f"{side}_range_mps"] for row in rows if _drawn(row) for side in SIDES]
+    low = floor(min((low for low, _ in ranges), default=0.0))
+    return low, max(ceil(max((high for _, high in ranges), default=0.0)), low + 1)
+
+
+def _drawn(row: Row) -> bool:
+    return bool(row["left_mps"] and row["right_mps"])
+
+
+def sparkline(row: Row, scale: Scale) -> dict[str, str] | None:
+    """The speeds of both vehicles: points of two lines, 96 wide and 22 high, and in words.
+
+    None where a vehicle has none.
     """
-    left, right = row["left_mps"], row["right_mps"]
+    if not _drawn(row):
+        return None
+    (left_low, left_high), (right_low, right_high) = row["left_range_mps"], row["right_range_mps"]
     return {
-        "left": _spark_points(left),
-        "right": _spark_points(right),
-        "words": f"speed of the left vehicle {min(left):.1f} to {max(left):.1f} m/s, "
-        f"of the right one {min(right):.1f} to {max(right):.1f} m/s",
+        "left": _spark_points(row["left_mps"], scale),
+        "right": _spark_points(row["right_mps"], scale),
+        "words": f"speed of the left vehicle {left_low:.1f} to {left_high:.1f} m/s, "
+        f"of the right one {right_low:.1f} to {right_high:.1f} m/s",
     }
 
 
-def _spark_points(speeds: Sequence[float]) -> str:
-    step = 96 / max(len(speeds) - 1, 1)
-    heights = [38.5 - 2.75 * speed for speed in speeds]
+def _spark_points(speeds: Sequence[float], scale: Scale) -> str:
+    low, high = scale
+    step, height = 96 / max(len(speeds) - 1, 1), 22 / (high - low)
     return " ".join(
-        [
-            f"{step * i:.0f},{0.0 if y < 0 else 22.0 if y > 22 else y:.1f}"
-            for i, y in enumerate(heights)
-        ]
+        [f"{step * i:.0f},{22 - height * (speed - low):.1f}" for i, speed in enumerate(speeds)]
     )
 
 
@@ -184,7 +199,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
     return {
         "id": row["trial_id"],
         "spec": row["spec_hash"],
-        "outcome": outcome_text(row, trial.scenario),
+        "outcome": visible(outcome_text(row, trial.scenario)),
         "label": label(row),
         "status": row["status"],
         "end": trial.end_s,
@@ -247,8 +262,8 @@ def sample_table(trial: Trial) -> dict[str, Any]:
 def label(row: Row) -> str:
     """A trial in a few words."""
     if row["source"] == "human":
-        return f"human {row['pair']}, {row['condition']}"
-    return f"{row['model']}, {row['variant']}, {row['condition']}, rep {row['rep']}"
+        return visible(f"human {row['pair']}, {row['condition']}")
+    return visible(f"{row['model']}, {row['variant']}, {row['condition']}, rep {row['rep']}")
 
 
 def collision_bounds(trial: Trial) -> list[float | None]:

@@ -10,7 +10,7 @@ from analysis.explorer.asked import whole
 from analysis.explorer.catalogue import FACETS, PAGE, SORTS, Filter
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import NotThere, Site
-from analysis.explorer.views import sparkline
+from analysis.explorer.views import sparkline, speed_scale
 from analysis.tables import TABLES
 from merge_runner.errors import StoreError
 
@@ -27,8 +27,10 @@ def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
             return site.render("behind.html", here="trials", cell=cell, computed=named)
         wanted = replace(wanted, trials=behind(named.result.content))
     totals = site.catalogue.totals(wanted)
-    last = max(1, -(-totals.trials // PAGE))
+    trials = sum(part.trials for part in totals.values())
+    last = max(1, -(-trials // PAGE))
     number = min(page_of(asked), last)
+    rows = site.catalogue.page(wanted, sort, number)
     return site.render(
         "trials.html",
         here="trials",
@@ -40,7 +42,9 @@ def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         sort=sort,
         sorts=SORTS,
         totals=totals,
-        rows=site.catalogue.page(wanted, sort, number),
+        trials=trials,
+        rows=rows,
+        scale=speed_scale(rows),
         page=number,
         last_page=last,
         sparkline=sparkline,
