@@ -34,8 +34,8 @@ FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) WHERE
 ORDER BY decision, side
 """  # noqa: S608 # constants
 TASK = f"SELECT source, spec FROM trials LEFT JOIN specs USING (spec_hash) WHERE {OF_TRIAL}"  # noqa: S608 # constants
-# A recording says nothing of its task: the human experiment judged collisions by the boxes.
-HUMAN_TASK = {"collision_rule": "rectangle"}
+# A recording says nothing of its task: the human experiment judged by the boxes, at 20 Hz.
+HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
 # Of one decision with the one before it, or of all.
 DECIDED = f"""
 SELECT * FROM decisions WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
@@ -83,9 +83,7 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
         states = {row.pop("side"): row for row in _records(connection, STATES, key)}
         decisions = _records(connection, DECISIONS, key)
         (task,) = _records(connection, TASK, key)
-    told = json.loads(task["spec"]) if task["spec"] else {}
-    usual = HUMAN_TASK if task["source"] == "human" else {}
-    scenario = Scenario.model_validate(told.get("scenario", usual))
+    scenario = scenario_of(task["source"], task["spec"])
     ordered = {side: states[side] for side in SIDES if side in states}
     trial = Trial(trial_id, spec_hash, scenario, ordered, decisions)
     for row in decisions:
@@ -93,6 +91,13 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
             row["time_s"] = trial.end_s
         row["driven"] = row["time_s"] < trial.end_s
     return trial
+
+
+def scenario_of(source: str, spec: str | None) -> Scenario:
+    """The task of a trial, by its spec as a text."""
+    usual = HUMAN_TASK if source == "human" else {}
+    told = json.loads(spec) if spec else {}
+    return Scenario.model_validate(told.get("scenario", usual))
 
 
 def read_decisions(

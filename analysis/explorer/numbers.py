@@ -17,6 +17,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from analysis.explorer.details import scenario_of
+from analysis.explorer.views import collision_text
 from analysis.kept import finished, keep_finished
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
@@ -40,8 +42,8 @@ class Numbers:
 
         Where no table has the cell, the answer says so as ``absent``.
 
-        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``. Raises
-        MergeRunnerError.
+        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``, whatever
+        stands after it. Raises MergeRunnerError.
         """
         match list(request):
             case ["tables", *names]:
@@ -50,7 +52,7 @@ class Numbers:
                 return self._cell(table, row, column)
             case ["cells", *names]:
                 return self._counted() | self._cells(names)
-            case ["humans"]:
+            case ["humans", *_]:
                 return self._counted() | human_panels(self.study) | self._tables(["contrasts"])
         raise UsageError(f"nothing answers {request!r}")
 
@@ -156,8 +158,10 @@ def human_panels(study: Study) -> dict[str, Any]:
     """
     from analysis.measures import published_human
     from analysis.published import citation
+    from analysis.tables.notes import sample_notes
 
     measured = study.human.measured
+    rules = _collision_rules(study)
     published = None
     if study.human in study.groups and not measured:
         published = {
@@ -170,16 +174,32 @@ def human_panels(study: Study) -> dict[str, Any]:
     return {
         "measured": measured,
         "published": published,
+        "notes": sample_notes(study, study.baselines),
         "groups": [
             {
                 "id": group.id,
                 "driver": group.driver,
                 "scripted": group.scripted,
+                "rule": rules[group.id],
                 "conditions": {name: _in_condition(group, name) for name in CONDITIONS},
             }
             for group in study.baselines
         ],
     }
+
+
+def _collision_rules(study: Study) -> dict[str, str]:
+    """What is taken for a collision in the trials of each group, and how often it is looked for."""
+    from analysis.load import SPECS, load
+
+    specs = {row.spec_hash: row.spec for row in load(SPECS, study.db).itertuples()}
+    found = {}
+    for group in study.baselines:
+        source = "human" if group is study.human else ""
+        scenario = scenario_of(source, specs.get(group.spec_hash))
+        rate = f"looked for {1 / scenario.step_s:g} times a second"
+        found[group.id] = f"{collision_text(scenario)}, {rate}"
+    return found
 
 
 def _in_condition(group: Group, condition: str) -> dict[str, Any]:
