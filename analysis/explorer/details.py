@@ -83,7 +83,8 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
         states = {row.pop("side"): row for row in _records(connection, STATES, key)}
         decisions = _records(connection, DECISIONS, key)
         (task,) = _records(connection, TASK, key)
-    scenario = scenario_of(task["source"], task["spec"])
+    told = json.loads(task["spec"] or "{}")
+    scenario = scenario_of(task["source"], told.get("scenario"))
     ordered = {side: states[side] for side in SIDES if side in states}
     trial = Trial(trial_id, spec_hash, scenario, ordered, decisions)
     for row in decisions:
@@ -93,11 +94,10 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     return trial
 
 
-def scenario_of(source: str, spec: str | None) -> Scenario:
-    """The task of a trial, by its spec as a text."""
+def scenario_of(source: str, told: Mapping[str, Any] | None) -> Scenario:
+    """The task of a trial, as its spec tells it, or as it usually is."""
     usual = HUMAN_TASK if source == "human" else {}
-    told = json.loads(spec) if spec else {}
-    return Scenario.model_validate(told.get("scenario", usual))
+    return Scenario.model_validate(usual if told is None else told)
 
 
 def read_decisions(

@@ -17,8 +17,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.explorer.details import scenario_of
-from analysis.explorer.views import collision_text
 from analysis.kept import finished, keep_finished
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
@@ -156,12 +154,13 @@ def human_panels(study: Study) -> dict[str, Any]:
     ``published`` holds what the paper prints of the rest: the gap by its regression in m, and the
     RMSE over all conditions in m/s.
     """
+    from analysis.load import SPECS, load
     from analysis.measures import published_human
     from analysis.published import citation
     from analysis.tables.notes import sample_notes
 
     measured = study.human.measured
-    rules = _collision_rules(study)
+    specs = {row.spec_hash: json.loads(row.spec) for row in load(SPECS, study.db).itertuples()}
     published = None
     if study.human in study.groups and not measured:
         published = {
@@ -180,26 +179,12 @@ def human_panels(study: Study) -> dict[str, Any]:
                 "id": group.id,
                 "driver": group.driver,
                 "scripted": group.scripted,
-                "rule": rules[group.id],
+                "scenario": specs.get(group.spec_hash, {}).get("scenario"),
                 "conditions": {name: _in_condition(group, name) for name in CONDITIONS},
             }
             for group in study.baselines
         ],
     }
-
-
-def _collision_rules(study: Study) -> dict[str, str]:
-    """What is taken for a collision in the trials of each group, and how often it is looked for."""
-    from analysis.load import SPECS, load
-
-    specs = {row.spec_hash: row.spec for row in load(SPECS, study.db).itertuples()}
-    found = {}
-    for group in study.baselines:
-        source = "human" if group is study.human else ""
-        scenario = scenario_of(source, specs.get(group.spec_hash))
-        rate = f"looked for {1 / scenario.step_s:g} times a second"
-        found[group.id] = f"{collision_text(scenario)}, {rate}"
-    return found
 
 
 def _in_condition(group: Group, condition: str) -> dict[str, Any]:

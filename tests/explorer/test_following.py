@@ -17,7 +17,7 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulato
     sweep = subprocess.Popen(
         [
             *(PROGRAM, "sweep", "baseline", "--reps", "1", "--conditions", "L_4_0,N_0_0"),
-            *("--db", db, "--cache", tmp_path / "cache", "--rpm", "480"),
+            *("--db", db, "--cache", tmp_path / "cache", "--rpm", "240"),
         ],
         env=environment(EMULATOR_BASE_URL=emulator_url),
         stderr=subprocess.DEVNULL,
@@ -32,8 +32,22 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulato
         expect(verdict).to_contain_text("Running")
         assert serious(page) == []
         page.evaluate("window.stayed = true")
+        listing = page.context.new_page()
+        listing.goto(f"{address}/sweeps")
+        expect(listing.locator(".state")).to_have_text("running")
+        trials = page.context.new_page()
+        trials.goto(f"{address}/trials?condition=N_0_0")
         expect(verdict).to_contain_text("Finished: all 2 trials ended", timeout=30_000)
         assert page.evaluate("window.stayed")
+        expect(page.locator(".heard")).to_have_text(verdict.locator("strong").inner_text())
+        # The list and the trials have noticed its end too.
+        expect(listing.locator(".state")).to_have_text("finished", timeout=15_000)
+        expect(listing.locator("tbody tr")).to_contain_text("2 of 2")
+        trials.get_by_role("link", name="Show them").click(timeout=15_000)
+        expect(trials.locator("tbody tr")).to_have_count(1)
+        assert "condition=N_0_0" in trials.url
+        for other in (listing, trials):
+            other.close()
         page.get_by_role("link", name="Trials").first.click()
         expect(page.locator("tbody tr")).to_have_count(2)
         page.goto("about:blank")  # it asks for nothing more before the server ends

@@ -244,10 +244,12 @@ async def test_a_stream_tells_what_is_new_and_ends_with_the_sweep(study, monkeyp
     events = page.sweep_events(site, "sweep-1")
     assert "event: sweep" in await anext(events)
     assert await anext(events) == (
-        "event: state\ndata: Running: 2 of 33 trials ended, about 20 s left.\n\n"
+        "event: state\ndata: <span>Running: 2 of 33 trials ended, about 20 s left.</span>\n\n"
     )
     running(study, ended={"finished": 3})
     assert "Running: 3 of 33" in await anext(events)
+    # Who listens finds the same sentence, which is not read out again.
+    assert '<span aria-live="off">Running: 3 of 33' in await anext(events)
     Store(study).end_sweep("sweep-1", END, 130)
     file.remove()
     rest = [event async for event in events]
@@ -276,7 +278,7 @@ async def test_a_sweep_that_slept_goes_on_in_the_same_stream(study, monkeypatch)
     running(study, pid=2**22 + 1)
     events = page.sweep_events(Site(study), "sweep-1")
     heard = [await anext(events) for _ in range(2)]
-    assert "event: state\ndata: Stopped without a word" in heard[1]
+    assert "event: state\ndata: <span>Stopped without a word" in heard[1]
     running(study)
     assert "Running: 2 of 33" in await anext(events)
 
@@ -302,6 +304,33 @@ def test_the_newest_sweep_is_the_first_page_and_the_first_of_the_list(study):
         URL,
     ]
     assert "A later run went on with it." in text_of(client)
+
+
+def test_a_page_that_looks_for_news_gets_them_once(study):
+    Store(study).end_sweep("sweep-1", END, 0)
+    client = browser(study)
+    looks = {page: news_of(client.get(page).text) for page in ("/sweeps", "/trials", URL)}
+    assert {page: client.get(look).status_code for page, look in looks.items()} == dict.fromkeys(
+        looks, 204
+    )
+    with duckdb.connect(str(study)) as connection:
+        connection.execute(
+            "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id, "
+            "started_at + INTERVAL 1 DAY AS started_at) FROM sweeps"
+        )
+        connection.execute("DELETE FROM trials WHERE condition = 'N_0_0'")
+    told = {page: client.get(look) for page, look in looks.items()}
+    assert 'href="/sweeps/newer"' in told["/sweeps"].text
+    assert "There is a newer sweep" in told[URL].text
+    assert "The database has changed since" in told["/trials"].text
+    for reply in told.values():
+        assert client.get(news_of(reply.text)).status_code == 204
+    assert "seen=" not in re.search(r'<a href="([^"]*)">Show them', told["/trials"].text)[1]
+
+
+def news_of(text):
+    """Where a page looks for what is new."""
+    return html.unescape(re.search(r'hx-get="([^"]*seen=[^"]*)"', text)[1])
 
 
 def test_a_database_without_sweeps_begins_with_its_trials(tmp_path):

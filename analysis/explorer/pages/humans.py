@@ -9,6 +9,7 @@ from statistics import quantiles
 from typing import Any
 
 from analysis.explorer import views
+from analysis.explorer.details import scenario_of
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import Site
 from analysis.tables.formats import notes_of, shown_value
@@ -110,6 +111,7 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
             "measured": content["measured"],
             "published": content["published"],
             "groups": groups,
+            "rules": {group["id"]: rule_text(group) for group in groups},
             "marks": marks(groups),
             "charts": [chart(kind, groups, content["published"]) for kind in KINDS],
             "collisions": collisions(groups),
@@ -128,6 +130,13 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         value=value_text,
         **values,
     )
+
+
+def rule_text(group: Mapping[str, Any]) -> str:
+    """What is taken for a collision in the trials of a group, and how often it is looked for."""
+    source = HUMAN if group["id"] == HUMAN else ""
+    scenario = scenario_of(source, group["scenario"])
+    return f"{views.collision_text(scenario)}, looked for {1 / scenario.step_s:g} times a second"
 
 
 def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
