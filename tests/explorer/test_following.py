@@ -17,7 +17,7 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulato
     sweep = subprocess.Popen(
         [
             *(PROGRAM, "sweep", "baseline", "--reps", "1", "--conditions", "L_4_0,N_0_0"),
-            *("--db", db, "--cache", tmp_path / "cache", "--rpm", "240"),
+            *("--db", db, "--cache", tmp_path / "cache", "--rpm", "120"),
         ],
         env=environment(EMULATOR_BASE_URL=emulator_url),
         stderr=subprocess.DEVNULL,
@@ -27,17 +27,16 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulato
         assert sweep.poll() is None
         time.sleep(0.05)
     with served(db) as address:
+        listing, trials = page.context.new_page(), page.context.new_page()
+        listing.goto(f"{address}/sweeps")
+        expect(listing.locator(".state")).to_have_text("running")
+        trials.goto(f"{address}/trials?condition=N_0_0")
         page.goto(address)
         verdict = page.locator(".sweep-verdict")
         expect(verdict).to_contain_text("Running")
         assert serious(page) == []
         page.evaluate("window.stayed = true")
-        listing = page.context.new_page()
-        listing.goto(f"{address}/sweeps")
-        expect(listing.locator(".state")).to_have_text("running")
-        trials = page.context.new_page()
-        trials.goto(f"{address}/trials?condition=N_0_0")
-        expect(verdict).to_contain_text("Finished: all 2 trials ended", timeout=30_000)
+        expect(verdict).to_contain_text("Finished: all 2 trials ended", timeout=60_000)
         assert page.evaluate("window.stayed")
         expect(page.locator(".heard")).to_have_text(verdict.locator("strong").inner_text())
         # The list and the trials have noticed its end too.
