@@ -17,7 +17,7 @@ import typer
 
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.places import DEFAULT_CACHE, DEFAULT_DB
-from merge_runner.texts import printable
+from merge_runner.texts import in_spreadsheet, printable
 
 if TYPE_CHECKING:
     from merge_runner.emulator.faults import FaultPlan
@@ -225,8 +225,7 @@ def sql(
         print_out(json.dumps(records, indent=2, default=str, ensure_ascii=False))
     elif output is Format.CSV:
         writer = csv.writer(sys.stdout)
-        writer.writerow(names)
-        writer.writerows(rows)
+        writer.writerows(map(in_spreadsheet, row) for row in (names, *rows))
     else:
         _print_table(names, rows)
 

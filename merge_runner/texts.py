@@ -13,6 +13,13 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
+def in_spreadsheet(value: object) -> object:
+    """A value for a cell of CSV, with an apostrophe before a text that a spreadsheet would run."""
+    if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r", "\n")):
+        return f"'{value}"
+    return value
+
+
 def first_line(exc: Exception) -> str:
     """What an error says: DuckDB adds a stack trace to what it takes for its own fault."""
     return str(exc).partition("\n")[0]

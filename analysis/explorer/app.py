@@ -27,7 +27,7 @@ from starlette.staticfiles import StaticFiles
 
 from analysis.explorer.guard import Guard, from_elsewhere
 from analysis.explorer.pages import ablations, humans, sql, sweep, tables, trial, trials
-from analysis.explorer.site import NotThere, Site
+from analysis.explorer.site import NothingNew, NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
 LOG = logging.getLogger(__name__)
@@ -75,10 +75,10 @@ def _sweep_routes(site: Site) -> list[Route]:
         )
 
     page = partial(_page, site)
-    one = page(lambda r: sweep.sweep_page(site, r.path_params["sweep"]))
+    one = page(lambda r: sweep.sweep_page(site, r.path_params["sweep"], _seen(r)))
     return [
         Route("/", page(lambda _: RedirectResponse(sweep.home(site)))),
-        Route("/sweeps", page(lambda _: sweep.sweeps_page(site))),
+        Route("/sweeps", page(lambda r: sweep.sweeps_page(site, _seen(r)))),
         Route("/sweeps/{sweep:path}/events", events),
         Route("/sweeps/{sweep:path}", one),
     ]
@@ -140,6 +140,11 @@ def _computed_routes(site: Site) -> list[Route]:
     ]
 
 
+def _seen(request: Request) -> str:
+    """What a page has seen already, that looks for news."""
+    return request.query_params.get("seen", "")
+
+
 def _patience(request: Request) -> dict[str, bool]:
     """A script of ours asks for what a page has said to be on its way."""
     return {"patient": request.headers.get("hx-request") == "true"}
@@ -152,7 +157,10 @@ def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[
         if site.beginning:
             return HTMLResponse(site.render("beginning.html", here=""), headers=AGAIN)
         site.catalogue.refresh()
-        rendered = render(request)
+        try:
+            rendered = render(request)
+        except NothingNew:
+            return Response(status_code=204)
         return HTMLResponse(rendered) if isinstance(rendered, str) else rendered
 
     return answer

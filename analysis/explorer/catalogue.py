@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import tempfile
 import threading
 from dataclasses import dataclass, field, fields
@@ -10,9 +11,10 @@ from typing import Any
 
 import duckdb
 
+from analysis.explorer.child import csv_cell
 from analysis.explorer.reading import PATIENCE_S, reading
 from merge_runner.database import SCHEMA, Instance
-from merge_runner.errors import StoreLocked, UsageError
+from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.served import ALIASES, others_among
 
 PAGE = 100
@@ -38,7 +40,8 @@ CREATE TABLE listed (
     status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
     error VARCHAR, scripted BOOLEAN, time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
     joint BOOLEAN, decisions BIGINT, invalid BIGINT, fallbacks BIGINT, attempts BIGINT,
-    cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[]
+    cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[], left_range_mps FLOAT[],
+    right_range_mps FLOAT[]
 );
 CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
@@ -104,7 +107,7 @@ INSERT INTO memory.flaws
     SEMI JOIN memory.trials USING (trial_id, spec_hash) WHERE failure IS NOT NULL GROUP BY ALL;
 """
 # After an invalid reply there is always a fallback, and no other time: the audit sees to that.
-# A sparkline has about 24 points.
+# A sparkline has about 24 points, and its words the slowest and the fastest of all.
 LIST = """
 INSERT INTO listed BY NAME
 SELECT trials.trial_id, trials.spec_hash, source,
@@ -116,7 +119,8 @@ SELECT trials.trial_id, trials.spec_hash, source,
         ELSE 'all valid' END AS validity,
     time_to_merge_s, gap_m, rmse_mps, joint, coalesce(decisions, 0) AS decisions,
     coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
-    coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps
+    coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps, left_range_mps,
+    right_range_mps
 FROM trials
 JOIN trial_metrics USING (trial_id, spec_hash)
 JOIN trial_drivers USING (trial_id, spec_hash)
@@ -124,12 +128,17 @@ LEFT JOIN decided USING (trial_id, spec_hash)
 LEFT JOIN paid USING (trial_id, spec_hash)
 LEFT JOIN (
     SELECT trial_id, spec_hash,
-        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'left') AS left_mps,
-        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'right') AS right_mps
-    FROM states JOIN (SELECT trial_id, spec_hash, min(step) AS first,
-            1 + (max(step) - min(step)) // 24 AS every FROM states GROUP BY ALL)
-        USING (trial_id, spec_hash)
-    WHERE time_s >= 0 AND (step - first) % every = 0 GROUP BY ALL
+        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'left' AND drawn) AS left_mps,
+        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'right' AND drawn) AS right_mps,
+        [min(velocity_mps) FILTER (side = 'left'), max(velocity_mps) FILTER (side = 'left')]
+            AS left_range_mps,
+        [min(velocity_mps) FILTER (side = 'right'), max(velocity_mps) FILTER (side = 'right')]
+            AS right_range_mps
+    FROM (SELECT *, (step - first) % every = 0 AS drawn
+        FROM states JOIN (SELECT trial_id, spec_hash, min(step) AS first,
+                1 + (max(step) - min(step)) // 24 AS every FROM states GROUP BY ALL)
+            USING (trial_id, spec_hash))
+    WHERE time_s >= 0 GROUP BY ALL
 ) USING (trial_id, spec_hash);
 TRUNCATE trials; TRUNCATE states; TRUNCATE decided; TRUNCATE paid;
 """
@@ -145,7 +154,8 @@ SORTS = {
     "invalid": "invalid",
     "cost": "cost_usd",
 }
-EXPORTED = "* EXCLUDE (number, left_mps, right_mps)"
+SPEEDS = "left_mps, right_mps, left_range_mps, right_range_mps"
+EXPORTED = f"* EXCLUDE (number, {SPEEDS})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +204,7 @@ class Filter:
 
 @dataclass(frozen=True, slots=True)
 class Totals:
-    """Counts over all trials of a filter, and means over those that have the value."""
+    """Counts over trials of a filter, and means over those that have the value."""
 
     trials: int
     collided: int
@@ -249,6 +259,9 @@ class Catalogue:
                 if self._stamp is None:
                     raise
                 self.held = True
+            except MergeRunnerError:
+                self._file = self._stamp = None  # whatever is there next, begin anew
+                raise
             else:
                 self._stamp, self.held = stamp, False
             self._note_others()
@@ -271,17 +284,19 @@ class Catalogue:
             found[name].append((value, count))
         return found
 
-    def totals(self, wanted: Filter) -> Totals:
-        """What the trials of a filter come to."""
+    def totals(self, wanted: Filter) -> dict[str, Totals]:
+        """What the trials of a filter come to: those of ``drivers``, and those of ``humans``."""
         where, values = wanted.where()
-        (row,) = self._rows(
-            "SELECT count(*), count(*) FILTER (status = 'collided'), "  # noqa: S608 # constants
+        rows = self._rows(
+            "SELECT if(source = 'human', 'humans', 'drivers') AS who, "  # noqa: S608 # constants
+            "count(*), count(*) FILTER (status = 'collided'), "
             "count(*) FILTER (status = 'failed'), count(*) FILTER (status <> 'failed'), "
             "coalesce(sum(decisions), 0), coalesce(sum(invalid), 0), coalesce(sum(fallbacks), 0), "
-            f"coalesce(sum(cost_usd), 0), avg(gap_m), avg(rmse_mps) FROM listed WHERE {where}",
+            "coalesce(sum(cost_usd), 0), avg(gap_m), avg(rmse_mps) "
+            f"FROM listed WHERE {where} GROUP BY ALL ORDER BY ALL",
             values,
         )
-        return Totals(*row)
+        return {who: Totals(*counts) for who, *counts in rows}
 
     def page(self, wanted: Filter, sort: str, number: int) -> list[dict[str, Any]]:
         """The trials of one page, counted from 1; ``-gap`` sorts the largest gap first."""
@@ -318,7 +333,7 @@ class Catalogue:
         """
         where, values = wanted.where()
         return self._records(
-            "SELECT * EXCLUDE (left_mps, right_mps) FROM listed "  # noqa: S608 # constants
+            f"SELECT * EXCLUDE ({SPEEDS}) FROM listed "  # noqa: S608 # constants
             f"WHERE {where} AND (trial_id, spec_hash) <> (?, ?) QUALIFY row_number() OVER ("
             "PARTITION BY model, variant, spec_hash ORDER BY rep <> ?, trial_id) <= ? "
             "ORDER BY model, variant, trial_id, spec_hash",
@@ -353,7 +368,11 @@ class Catalogue:
                 params=values,
             )
             if form == "csv":
-                chosen.write_csv(str(path))
+                with path.open("w", encoding="utf-8", newline="") as file:
+                    rows = [chosen.columns, *chosen.fetchall()]
+                    csv.writer(file, lineterminator="\n").writerows(
+                        map(csv_cell, row) for row in rows
+                    )
             else:
                 chosen.write_parquet(str(path))
             return path.read_bytes()
@@ -363,7 +382,7 @@ class Catalogue:
         self._instance.drop()
         self._connection = self._instance.cursor()
         self._connection.execute(SCHEMA.read_text(encoding="utf-8"))
-        self._connection.execute(LISTED)
+        self._connection.execute(LISTED + GROUPED)
         self._file, self._stamp = file, None
 
     def _reading(self, sql: str) -> int:
@@ -371,10 +390,8 @@ class Catalogue:
         # Who found it held once does not wait again.
         patience_s = 0.0 if self.held else PATIENCE_S
         with reading(self.db, self._instance, patience_s) as connection:
-            file, self._file = self._file, None  # whatever fails here, begin anew
             connection.execute(sql)
             (waiting,) = connection.execute("SELECT count(*) FROM memory.trials").fetchall()
-            self._file = file
         count: int = waiting[0]
         return count
 

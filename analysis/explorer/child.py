@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import duckdb
 from merge_runner.database import Instance, read_database
 from merge_runner.errors import MergeRunnerError
 from merge_runner.store import answering
+from merge_runner.texts import in_spreadsheet
 
 # Python and DuckDB take addresses for more than they use, beside what the query may use.
 ADDRESSES_MB = 1024
@@ -170,9 +172,9 @@ def _csv(
 ) -> tuple[dict[str, Any], bytes]:
     content, lines = io.BytesIO(), io.StringIO()
     writer = csv.writer(lines)
-    writer.writerow(names)
+    writer.writerow(map(in_spreadsheet, names))
     for number, row in enumerate(rows):
-        writer.writerow([text_of(value) for value in row])
+        writer.writerow(map(csv_cell, row))
         content.write(lines.getvalue().encode())
         lines.seek(0)
         lines.truncate()
@@ -185,6 +187,12 @@ def _csv(
             }, b""
     content.write(lines.getvalue().encode())  # the names, where there is no row
     return {}, content.getvalue()
+
+
+def csv_cell(value: object) -> object:
+    """A value of any type for a cell of CSV."""
+    text = text_of(value)
+    return text if isinstance(value, int | float | Decimal) else in_spreadsheet(text)
 
 
 def text_of(value: object) -> str | None:

@@ -33,7 +33,9 @@ SELECT DISTINCT decision, side, false AS valid, false AS fallback, true AS lost
 FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) WHERE {OF_TRIAL}
 ORDER BY decision, side
 """  # noqa: S608 # constants
-SPEC = "SELECT spec FROM specs WHERE spec_hash = $spec"
+TASK = f"SELECT source, spec FROM trials LEFT JOIN specs USING (spec_hash) WHERE {OF_TRIAL}"  # noqa: S608 # constants
+# A recording says nothing of its task: the human experiment judged by the boxes, at 20 Hz.
+HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
 # Of one decision with the one before it, or of all.
 DECIDED = f"""
 SELECT * FROM decisions WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
@@ -80,9 +82,9 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     with reading(db) as connection:
         states = {row.pop("side"): row for row in _records(connection, STATES, key)}
         decisions = _records(connection, DECISIONS, key)
-        spec = _records(connection, SPEC, {"spec": spec_hash})
-    told = json.loads(spec[0]["spec"]) if spec else {}
-    scenario = Scenario.model_validate(told.get("scenario", {}))
+        (task,) = _records(connection, TASK, key)
+    told = json.loads(task["spec"] or "{}")
+    scenario = scenario_of(task["source"], told.get("scenario"))
     ordered = {side: states[side] for side in SIDES if side in states}
     trial = Trial(trial_id, spec_hash, scenario, ordered, decisions)
     for row in decisions:
@@ -90,6 +92,12 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
             row["time_s"] = trial.end_s
         row["driven"] = row["time_s"] < trial.end_s
     return trial
+
+
+def scenario_of(source: str, told: Mapping[str, Any] | None) -> Scenario:
+    """The task of a trial, as its spec tells it, or as it usually is."""
+    usual = HUMAN_TASK if source == "human" else {}
+    return Scenario.model_validate(usual if told is None else told)
 
 
 def read_decisions(

@@ -30,7 +30,7 @@ from analysis.explorer.pages.tables import table_page, tables_page
 from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import list_sweeps
-from analysis.explorer.views import sparkline
+from analysis.explorer.views import sparkline, speed_scale
 from analysis.tables import TABLES
 from merge_runner.errors import UsageError
 from merge_runner.places import PROJECT
@@ -232,6 +232,7 @@ def _listing(site: Site, rows: list[Row], behind: _Behind) -> str:
         sort="",
         kept={},
         sparkline=sparkline,
+        scale=speed_scale(rows),
         cells=embedded(_packed({"cells": behind.cells, "sets": behind.sets})),
         inlined=inlined(LISTING),
     )

@@ -6,7 +6,7 @@ import hmac
 import ipaddress
 import re
 from collections.abc import Collection
-from urllib.parse import parse_qs, urlencode
+from urllib.parse import parse_qs, urlencode, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse
@@ -32,9 +32,15 @@ HEADERS = {
 def from_elsewhere(headers: Headers) -> bool:
     """Whether another site's page leads here.
 
-    Browsers say so to loopback alone; elsewhere the cookie with the token stays away.
+    Browsers say so to loopback alone, and older ones nowhere: what they say instead is the page
+    that leads here. Elsewhere the cookie with the token stays away.
     """
-    return headers.get("sec-fetch-site") in {"cross-site", "same-site"}
+    site = headers.get("sec-fetch-site")
+    if site is not None:
+        return site in {"cross-site", "same-site"}
+    host = headers.get("host", "")
+    led = [headers[name] for name in ("origin", "referer") if name in headers]
+    return any(urlsplit(address).netloc != host for address in led)
 
 
 def is_address(name: str) -> bool:
@@ -91,7 +97,7 @@ class Guard:
         origin = headers.get("origin")
         if origin not in {None, f"http://{host}"}:
             return "another site's page may not ask here"
-        if from_elsewhere(headers) and headers.get("sec-fetch-mode") != "navigate":
+        if from_elsewhere(headers) and headers.get("sec-fetch-mode", "navigate") != "navigate":
             return "another site's page may not ask here"
         if self._token is None:
             return None

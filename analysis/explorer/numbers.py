@@ -40,8 +40,8 @@ class Numbers:
 
         Where no table has the cell, the answer says so as ``absent``.
 
-        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``. Raises
-        MergeRunnerError.
+        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``, whatever
+        stands after it. Raises MergeRunnerError.
         """
         match list(request):
             case ["tables", *names]:
@@ -50,7 +50,7 @@ class Numbers:
                 return self._cell(table, row, column)
             case ["cells", *names]:
                 return self._counted() | self._cells(names)
-            case ["humans"]:
+            case ["humans", *_]:
                 return self._counted() | human_panels(self.study) | self._tables(["contrasts"])
         raise UsageError(f"nothing answers {request!r}")
 
@@ -154,10 +154,13 @@ def human_panels(study: Study) -> dict[str, Any]:
     ``published`` holds what the paper prints of the rest: the gap by its regression in m, and the
     RMSE over all conditions in m/s.
     """
+    from analysis.load import SPECS, load
     from analysis.measures import published_human
     from analysis.published import citation
+    from analysis.tables.notes import sample_notes
 
     measured = study.human.measured
+    specs = {row.spec_hash: json.loads(row.spec) for row in load(SPECS, study.db).itertuples()}
     published = None
     if study.human in study.groups and not measured:
         published = {
@@ -170,11 +173,13 @@ def human_panels(study: Study) -> dict[str, Any]:
     return {
         "measured": measured,
         "published": published,
+        "notes": sample_notes(study, study.baselines),
         "groups": [
             {
                 "id": group.id,
                 "driver": group.label,
                 "scripted": group.scripted,
+                "scenario": specs.get(group.spec_hash, {}).get("scenario"),
                 "conditions": {name: _in_condition(group, name) for name in CONDITIONS},
             }
             for group in study.baselines

@@ -14,6 +14,8 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.database import SHARED, Instance, read_database
+from merge_runner.errors import UsageError
+from merge_runner.texts import first_line
 
 ALONE = threading.RLock()
 
@@ -26,6 +28,12 @@ PATIENCE_S = 2.0
 def reading(
     db: Path, instance: Instance = SHARED, patience_s: float = PATIENCE_S
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open the database for reading, for a moment; raises UsageError and StoreError."""
-    with ALONE, read_database(db, instance, patience_s) as connection:
-        yield connection
+    """Open the database for reading, for a moment; raises UsageError and StoreError.
+
+    What lies there may be damaged, or have been made by another program.
+    """
+    try:
+        with ALONE, read_database(db, instance, patience_s) as connection:
+            yield connection
+    except duckdb.Error as exc:
+        raise UsageError(f"{db} cannot be read: {first_line(exc)}") from exc

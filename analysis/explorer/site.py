@@ -33,6 +33,10 @@ class NotThere(Exception):
     """What an address asks for is not there; the text says what is."""
 
 
+class NothingNew(Exception):
+    """What a page shows is what it would be now."""
+
+
 @dataclass
 class Site:
     """The explorer of one database; ``static`` pages stand alone, without a server."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import ceil, floor
 from typing import Any
 
 from analysis.explorer.details import Decision, Row, Trial
+from analysis.explorer.texts import visible
 from merge_runner.config import Scenario
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES
@@ -13,8 +15,9 @@ from merge_runner.simulator import track
 from merge_runner.simulator.collision import collided
 from merge_runner.simulator.conditions import CONDITIONS
 
-BISECTIONS = 12
-WIDEST_M = 8.0
+BISECTIONS = 14
+# What a picture shows of the plane around the track, in m.
+BEFORE_M, BEYOND_M, BESIDE_M = 3.0, 5.8, 4.5
 # What each part of a prompt is for.
 BLOCK_MEANINGS = {
     "C0": "situation",
@@ -29,28 +32,41 @@ BLOCK_MEANINGS = {
 }
 
 
-def sparkline(row: Row) -> dict[str, str]:
-    """The speeds of both vehicles: points of two lines, and in words.
+Scale = tuple[int, int]
 
-    The lines are 96 wide and 22 high, 6 m/s at the bottom and 14 at the top.
+
+def speed_scale(rows: Sequence[Row]) -> Scale:
+    """The whole m/s at the bottom and the top of all sparklines of these trials."""
+    ranges = [row[f"{side}_range_mps"] for row in rows if _drawn(row) for side in SIDES]
+    low = floor(min((low for low, _ in ranges), default=0.0))
+    return low, max(ceil(max((high for _, high in ranges), default=0.0)), low + 1)
+
+
+def _drawn(row: Row) -> bool:
+    return bool(row["left_mps"] and row["right_mps"])
+
+
+def sparkline(row: Row, scale: Scale) -> dict[str, str] | None:
+    """The speeds of both vehicles: points of two lines, 96 wide and 22 high, and in words.
+
+    None where a vehicle has none.
     """
-    left, right = row["left_mps"], row["right_mps"]
+    if not _drawn(row):
+        return None
+    (left_low, left_high), (right_low, right_high) = row["left_range_mps"], row["right_range_mps"]
     return {
-        "left": _spark_points(left),
-        "right": _spark_points(right),
-        "words": f"speed of the left vehicle {min(left):.1f} to {max(left):.1f} m/s, "
-        f"of the right one {min(right):.1f} to {max(right):.1f} m/s",
+        "left": _spark_points(row["left_mps"], scale),
+        "right": _spark_points(row["right_mps"], scale),
+        "words": f"speed of the left vehicle {left_low:.1f} to {left_high:.1f} m/s, "
+        f"of the right one {right_low:.1f} to {right_high:.1f} m/s",
     }
 
 
-def _spark_points(speeds: Sequence[float]) -> str:
-    step = 96 / max(len(speeds) - 1, 1)
-    heights = [38.5 - 2.75 * speed for speed in speeds]
+def _spark_points(speeds: Sequence[float], scale: Scale) -> str:
+    low, high = scale
+    step, height = 96 / max(len(speeds) - 1, 1), 22 / (high - low)
     return " ".join(
-        [
-            f"{step * i:.0f},{0.0 if y < 0 else 22.0 if y > 22 else y:.1f}"
-            for i, y in enumerate(heights)
-        ]
+        [f"{step * i:.0f},{22 - height * (speed - low):.1f}" for i, speed in enumerate(speeds)]
     )
 
 
@@ -107,6 +123,26 @@ def collision_text(scenario: Scenario) -> str:
     }[scenario.collision_rule]
 
 
+def judged_text(scenario: Scenario) -> str:
+    """What the picture draws of the rule by which the scenario judges a collision."""
+    length = f"{scenario.vehicle_length_m:g} m"
+    return {
+        "euclid2d": f"circles of {length}, a vehicle's length, about the centres: "
+        "it is a collision where they overlap",
+        "shared_lane": f"bars of {length} along the road: it is a collision where they overlap, "
+        "once a vehicle is past the merge point",
+        "rectangle": f"outlines of {length} by {scenario.vehicle_width_m:g} m: "
+        "it is a collision where they overlap",
+    }[scenario.collision_rule]
+
+
+def view_box() -> str:
+    """The part of the plane that a picture of the track shows: x, y, width, height in m."""
+    half = track.START_DISTANCE_M / 2 + BESIDE_M
+    width = track.MERGE_Y_M + track.TRACK_END_M - track.MERGE_POINT_M + BEFORE_M + BEYOND_M
+    return f"{-BEFORE_M:g} {-half:g} {width:.1f} {2 * half:g}"
+
+
 def facts(row: Row) -> list[str]:
     """What a trial was about and what was measured, in short sentences."""
     text = condition_text(row["condition"])
@@ -130,11 +166,10 @@ def summary(row: Row, trial: Trial) -> list[str]:
             v for t, v in zip(samples["time_s"], samples["velocity_mps"], strict=True) if t >= 0
         ]
         if speeds:
-            hardest = max(samples["acceleration_mps2"], key=abs)
             lines.append(
                 f"The {side} vehicle began at {speeds[0]:.1f} m/s, drove between "
-                f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s; "
-                f"its hardest acceleration was {hardest:+.1f} m/s²."
+                f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s"
+                f"{_hardest(samples)}."
             )
     for side in SIDES:
         mine = [d for d in trial.decisions if d["side"] == side]
@@ -150,12 +185,21 @@ def summary(row: Row, trial: Trial) -> list[str]:
     return lines
 
 
+def _hardest(samples: Row) -> str:
+    """The hardest acceleration under control: a sample's is that of the step before it."""
+    times, accelerations = samples["time_s"], samples["acceleration_mps2"]
+    controlled = [a for t, a in zip(times, accelerations, strict=True) if t > 0]
+    if not controlled:
+        return ""
+    return f"; its hardest acceleration was {max(controlled, key=abs):+.1f} m/s²"
+
+
 def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
     """What the replay draws: samples, decisions, the track, the bounds of a collision."""
     return {
         "id": row["trial_id"],
         "spec": row["spec_hash"],
-        "outcome": outcome_text(row, trial.scenario),
+        "outcome": visible(outcome_text(row, trial.scenario)),
         "label": label(row),
         "status": row["status"],
         "end": trial.end_s,
@@ -190,6 +234,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
             "forward": track.FORWARD,
             "length": trial.scenario.vehicle_length_m,
             "width": trial.scenario.vehicle_width_m,
+            "rule": trial.scenario.collision_rule,
             "hardest": trial.scenario.max_acceleration_mps2,
         },
     }
@@ -217,26 +262,33 @@ def sample_table(trial: Trial) -> dict[str, Any]:
 def label(row: Row) -> str:
     """A trial in a few words."""
     if row["source"] == "human":
-        return f"human {row['pair']}, {row['condition']}"
-    return f"{row['model']}, {row['variant']}, {row['condition']}, rep {row['rep']}"
+        return visible(f"human {row['pair']}, {row['condition']}")
+    return visible(f"{row['model']}, {row['variant']}, {row['condition']}, rep {row['rep']}")
 
 
 def collision_bounds(trial: Trial) -> list[float | None]:
-    """Below which headway the vehicles collide, at each sample's mean position; None: at none."""
+    """Below which headway the vehicles collide at each sample; None: at none."""
     left, right = trial.states.get("left"), trial.states.get("right")
     if left is None or right is None:
         return []
     return [
-        _bound(trial.scenario, (a + b) / 2)
+        _bound(trial.scenario, a, b)
         for a, b in zip(left["position_m"], right["position_m"], strict=False)
     ]
 
 
-def _bound(scenario: Scenario, mean_m: float) -> float | None:
-    """By bisection; the further apart two vehicles are along the road, the less they overlap."""
+def _bound(scenario: Scenario, left_m: float, right_m: float) -> float | None:
+    """At the vehicles' mean position, or on the shared lane once one of them is there.
+
+    By bisection: the further apart two vehicles are along the road, the less they overlap.
+    """
+    if scenario.collision_rule == "shared_lane":
+        shared = max(left_m, right_m) >= track.MERGE_POINT_M
+        return scenario.vehicle_length_m if shared else None
+    mean_m = (left_m + right_m) / 2
     if not collided(scenario, mean_m, mean_m):
         return None
-    low, high = 0.0, WIDEST_M
+    low, high = 0.0, 2 * (scenario.vehicle_length_m + scenario.vehicle_width_m)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         if collided(scenario, mean_m + middle / 2, mean_m - middle / 2):

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 
 from analysis.forms import TableFormat
 from analysis.tables.model import Column, Row, Table, Value
+from merge_runner.texts import in_spreadsheet
 
 MISSING = "–"
 VARIANTS = {
@@ -70,7 +71,7 @@ def as_csv(table: Table) -> str:
     names = [name for column in table.columns for name in _names(column)]
     writer.writerow(["row", *names, "note"])
     for row in value_rows(table):
-        writer.writerow("" if value is None else _exact(value) for value in row.values())
+        writer.writerow(_exact(value) for value in row.values())
     return out.getvalue().rstrip("\n")
 
 
@@ -193,8 +194,8 @@ def _rounded(value: float, digits: int) -> str:
     return text.lstrip("-") if float(text) == 0 else text
 
 
-def _exact(cell: object) -> str:
-    return repr(float(cell)) if isinstance(cell, float) else str(cell)
+def _exact(cell: Value) -> object:
+    return repr(float(cell)) if isinstance(cell, float) else in_spreadsheet(cell)
 
 
 def _names(column: Column) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulato
     sweep = subprocess.Popen(
         [
             *(PROGRAM, "sweep", "baseline", "--reps", "1", "--conditions", "L_4_0,N_0_0"),
-            *("--db", db, "--cache", tmp_path / "cache", "--rpm", "480"),
+            *("--db", db, "--cache", tmp_path / "cache", "--rpm", "120"),
         ],
         env=environment(EMULATOR_BASE_URL=emulator_url),
         stderr=subprocess.DEVNULL,
@@ -27,13 +27,26 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulato
         assert sweep.poll() is None
         time.sleep(0.05)
     with served(db) as address:
+        listing, trials = page.context.new_page(), page.context.new_page()
+        listing.goto(f"{address}/sweeps")
+        expect(listing.locator(".state")).to_have_text("running")
+        trials.goto(f"{address}/trials?condition=N_0_0")
         page.goto(address)
         verdict = page.locator(".sweep-verdict")
         expect(verdict).to_contain_text("Running")
         assert serious(page) == []
         page.evaluate("window.stayed = true")
-        expect(verdict).to_contain_text("Finished: all 2 trials ended", timeout=30_000)
+        expect(verdict).to_contain_text("Finished: all 2 trials ended", timeout=60_000)
         assert page.evaluate("window.stayed")
+        expect(page.locator(".heard")).to_have_text(verdict.locator("strong").inner_text())
+        # The list and the trials have noticed its end too.
+        expect(listing.locator(".state")).to_have_text("finished", timeout=15_000)
+        expect(listing.locator("tbody tr")).to_contain_text("2 of 2")
+        trials.get_by_role("link", name="Show them").click(timeout=15_000)
+        expect(trials.locator("tbody tr")).to_have_count(1)
+        assert "condition=N_0_0" in trials.url
+        for other in (listing, trials):
+            other.close()
         page.get_by_role("link", name="Trials").first.click()
         expect(page.locator("tbody tr")).to_have_count(2)
         page.goto("about:blank")  # it asks for nothing more before the server ends
@@ -61,3 +74,18 @@ def test_a_page_says_when_nobody_answers_it_any_more(browser, study, address):
             page.keyboard.press("]")
         expect(page.locator("#lost")).to_be_hidden()
     context.close()
+
+
+def test_a_link_of_another_page_fills_in_a_query_and_a_click_runs_it(page, site, tmp_path):
+    query = f"{site}/sql?q=select+count(*)+from+trials"
+    (tmp_path / "other.html").write_text(f'<a href="{query}">here</a>')
+    page.goto((tmp_path / "other.html").as_uri())
+    page.get_by_role("link").click()
+    expect(page.locator("#q")).to_have_value("select count(*) from trials")
+    expect(page.locator(".note")).to_contain_text("press Run")
+    expect(page.locator("#result")).to_have_count(0)
+    page.locator("#run").click()
+    expect(page.locator("#result tbody tr")).to_have_count(1)
+    page.goto("about:blank")
+    page.goto(query)
+    expect(page.locator("#result tbody tr")).to_have_count(1)

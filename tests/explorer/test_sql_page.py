@@ -127,6 +127,27 @@ def test_a_query_of_another_site_is_shown_and_not_run(client, asked):
     assert asked == ["select 1", "select 1"]
 
 
+@pytest.mark.parametrize(
+    ("referer", "runs"),
+    [
+        (None, True),
+        (f"http://{HOST}/sql?q=select+2", True),
+        ("http://evil.example/", False),
+        ("https://127.0.0.1:8701/", False),
+        ("null", False),
+    ],
+)
+def test_where_a_browser_says_no_more_the_page_that_leads_here_counts(client, asked, referer, runs):
+    headers = {} if referer is None else {"referer": referer}
+    page = client.get("/sql?q=select+1", headers=headers)
+    assert (page.status_code, box(page.text)) == (200, "select 1")
+    assert ("press Run" in page.text) != runs
+    reply = client.get("/sql.csv?q=select+1", headers=headers, follow_redirects=False)
+    assert reply.status_code == (200 if runs else 307)
+    assert asked == (["select 1"] * 2 if runs else [])
+    assert client.get("/trials", headers=headers).status_code == 200
+
+
 @pytest.mark.parametrize("spec", [True, False])
 def test_a_result_is_a_table_with_types_and_links_to_trials(client, site, monkeypatch, spec):
     name = "o3/baseline/L_0_8/rep01"

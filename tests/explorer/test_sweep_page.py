@@ -121,8 +121,8 @@ def test_every_cell_and_every_cause_leads_to_the_trials_that_it_counts(written):
     assert {kind for kind in kinds if "trial" in kind} == {" trial"}
     for url, count, _ in links:
         asked = {k: v[0] for k, v in parse_qs(urlsplit(html.unescape(url)).query).items()}
-        totals = site.catalogue.totals(filter_of(asked))
-        there = totals.trials if "cause" in asked else totals.ended
+        totals = site.catalogue.totals(filter_of(asked)).values()
+        there = sum(part.trials if "cause" in asked else part.ended for part in totals)
         assert there == int(count), url
     causes = {parse_qs(urlsplit(html.unescape(url)).query)["cause"][0]
               for url, _, kind in links if "trial" in kind}  # fmt: skip
@@ -160,8 +160,9 @@ def test_an_alias_is_nothing_that_went_wrong(study):
     shown = html.unescape(page_of(site))
     assert "o3 → o3-alias" not in shown
     for alias in ("o3-alias", "o3"):
-        assert site.catalogue.totals(filter_of({"cause": f"model: o3 → {alias}"})).trials == 0
-    assert site.catalogue.totals(filter_of({"cause": "model: o3 → another"})).trials == 1
+        assert site.catalogue.totals(filter_of({"cause": f"model: o3 → {alias}"})) == {}
+    another = site.catalogue.totals(filter_of({"cause": "model: o3 → another"}))
+    assert another["drivers"].trials == 1
     with duckdb.connect(str(study)) as connection:
         connection.execute("UPDATE calls SET outcome = 'ok'")
         connection.execute("UPDATE decisions SET failure = NULL, valid = true, fallback = false")
@@ -179,7 +180,7 @@ def test_two_other_models_have_a_line_and_a_list_each(study):
         link = html.unescape(re.search(f'id="model-{number}" href="([^"]*)"', shown)[1])
         asked = {k: v[0] for k, v in parse_qs(urlsplit(link).query).items()}
         assert asked["cause"] == f"model: o3 → {name}"
-        assert site.catalogue.totals(filter_of(asked)).trials > 0
+        assert site.catalogue.totals(filter_of(asked))["drivers"].trials > 0
 
 
 def page_of(site):
@@ -248,10 +249,12 @@ async def test_a_stream_tells_what_is_new_and_ends_with_the_sweep(study, monkeyp
     events = page.sweep_events(site, "sweep-1")
     assert "event: sweep" in await anext(events)
     assert await anext(events) == (
-        "event: state\ndata: Running: 2 of 33 trials ended, about 20 s left.\n\n"
+        "event: state\ndata: <span>Running: 2 of 33 trials ended, about 20 s left.</span>\n\n"
     )
     running(study, ended={"finished": 3})
     assert "Running: 3 of 33" in await anext(events)
+    # Who listens finds the same sentence, which is not read out again.
+    assert '<span aria-live="off">Running: 3 of 33' in await anext(events)
     Store(study).end_sweep("sweep-1", END, 130)
     file.remove()
     rest = [event async for event in events]
@@ -280,7 +283,7 @@ async def test_a_sweep_that_slept_goes_on_in_the_same_stream(study, monkeypatch)
     running(study, pid=2**22 + 1)
     events = page.sweep_events(Site(study), "sweep-1")
     heard = [await anext(events) for _ in range(2)]
-    assert "event: state\ndata: Stopped without a word" in heard[1]
+    assert "event: state\ndata: <span>Stopped without a word" in heard[1]
     running(study)
     assert "Running: 2 of 33" in await anext(events)
 
@@ -306,6 +309,33 @@ def test_the_newest_sweep_is_the_first_page_and_the_first_of_the_list(study):
         URL,
     ]
     assert "A later run went on with it." in text_of(client)
+
+
+def test_a_page_that_looks_for_news_gets_them_once(study):
+    Store(study).end_sweep("sweep-1", END, 0)
+    client = browser(study)
+    looks = {page: news_of(client.get(page).text) for page in ("/sweeps", "/trials", URL)}
+    assert {page: client.get(look).status_code for page, look in looks.items()} == dict.fromkeys(
+        looks, 204
+    )
+    with duckdb.connect(str(study)) as connection:
+        connection.execute(
+            "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id, "
+            "started_at + INTERVAL 1 DAY AS started_at) FROM sweeps"
+        )
+        connection.execute("DELETE FROM trials WHERE condition = 'N_0_0'")
+    told = {page: client.get(look) for page, look in looks.items()}
+    assert 'href="/sweeps/newer"' in told["/sweeps"].text
+    assert "There is a newer sweep" in told[URL].text
+    assert "The database has changed since" in told["/trials"].text
+    for reply in told.values():
+        assert client.get(news_of(reply.text)).status_code == 204
+    assert "seen=" not in re.search(r'<a href="([^"]*)">Show them', told["/trials"].text)[1]
+
+
+def news_of(text):
+    """Where a page looks for what is new."""
+    return html.unescape(re.search(r'hx-get="([^"]*seen=[^"]*)"', text)[1])
 
 
 def test_a_database_without_sweeps_begins_with_its_trials(tmp_path):

@@ -361,15 +361,16 @@ def test_a_process_of_its_own_answers_alike_and_its_end_is_a_failure(db):
 
 
 @pytest.mark.parametrize(
-    ("values", "most", "ends"),
+    ("kind", "reached", "ends"),
     [
-        ([], None, (0, 1)),
-        ([0.0], None, (0, 1)),
-        ([3, 97], 100, (0, 100)),
-        ([-0.2, 1], None, (-0.5, 1)),
+        ("gap_m", (0, 0), (0, 1)),
+        ("left_first_percent", (3, 97), (0, 100)),
+        ("gap_m", (-0.2, 1), (-0.5, 1)),
+        ("rmse_mps", (-0.2, 1), (0, 1)),
+        ("collided_percent", (0, 9), (0, 10)),
     ],
 )
-def test_a_scale_holds_all_values_and_0(values, most, ends):
-    low, high, ticks = scale(values, most)
+def test_a_scale_holds_all_that_is_shown_and_0(kind, reached, ends):
+    low, high, ticks = scale(next(each for each in KINDS if each.name == kind), *reached)
     assert (low, high) == ends
     assert {low, 0, high} <= {round(tick, 6) for tick in ticks}

@@ -297,9 +297,8 @@ def test_who_filters_by_keyboard_stays_where_he_was(page):
     page.get_by_label("outcome").select_option("collided")
     expect(page.locator("tbody tr")).to_have_count(1)
     expect(page.get_by_label("outcome")).to_be_focused()
-    page.evaluate("window.before = true")
-    page.go_back()
-    page.wait_for_function("!window.before && document.readyState === 'complete'")
+    with page.expect_event("load"):
+        page.go_back()
     expect(page.locator("tbody tr")).not_to_have_count(1)
     page.keyboard.press("?")
     expect(page.locator("#help")).to_be_visible()

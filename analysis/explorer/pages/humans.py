@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, floor, log10
+from statistics import quantiles
 from typing import Any
 
 from analysis.explorer import views
+from analysis.explorer.details import scenario_of
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import Site
-from analysis.tables.formats import shown_value
+from analysis.tables.formats import notes_of, shown_value
 from analysis.tables.model import Table, from_text
 from merge_runner.simulator.conditions import CONDITIONS
 
@@ -28,18 +30,19 @@ SHAPE_WORDS = {
     "plus": "plus",
 }
 # Of a picture, in its units.
-LEFT, TOP, HEIGHT, FOOT, STEP, LEAST = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0
+LEFT, TOP, HEIGHT, FOOT, STEP, LEAST, ARROW = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0, 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A row of panels: one measure. ``most`` is the end of a scale that has one."""
+    """A row of panels: one measure. ``least`` and ``most``: the ends of a scale that has them."""
 
     name: str
     heading: str
     unit: str
     digits: int
     meaning: str
+    least: float | None = 0.0
     most: float | None = None
 
 
@@ -50,7 +53,7 @@ KINDS = (
         "%",
         0,
         "of finished trials with a first merger; Wilson intervals",
-        100.0,
+        most=100.0,
     ),
     Kind(
         "gap_m",
@@ -58,6 +61,7 @@ KINDS = (
         "m",
         2,
         "mean of finished trials; Student's t",
+        least=None,
     ),
     Kind(
         "rmse_mps",
@@ -94,20 +98,28 @@ class Mark:
 
 def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
     """Small multiples over the conditions, one row a measure, and the differences."""
-    found = computed(site, ("humans",), asked, patient=patient)
+    # Before and after an import of humans it is another page, and not an older one.
+    (humans,) = site.catalogue.ask("SELECT count(*) AS n FROM listed WHERE source = 'human'")
+    found = computed(site, ("humans", str(humans["n"])), asked, patient=patient)
     values: dict[str, Any] = {}
     if found.result is not None:
         content = found.result.content
         groups = content["groups"]
+        contrasts = against_humans(from_text(content["tables"][0]))
         values = {
             "human": next((group for group in groups if group["id"] == HUMAN), None),
             "measured": content["measured"],
             "published": content["published"],
             "groups": groups,
+            "rules": {group["id"]: rule_text(group) for group in groups},
             "marks": marks(groups),
             "charts": [chart(kind, groups, content["published"]) for kind in KINDS],
             "collisions": collisions(groups),
-            "differences": differences(from_text(content["tables"][0])),
+            "notes": content["notes"],
+            "differences": differences(contrasts),
+            "difference_notes": [
+                note for note in notes_of(contrasts) if note not in content["notes"]
+            ],
         }
     return site.render(
         "humans.html",
@@ -118,6 +130,13 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         value=value_text,
         **values,
     )
+
+
+def rule_text(group: Mapping[str, Any]) -> str:
+    """What is taken for a collision in the trials of a group, and how often it is looked for."""
+    source = HUMAN if group["id"] == HUMAN else ""
+    scenario = scenario_of(source, group["scenario"])
+    return f"{views.collision_text(scenario)}, looked for {1 / scenario.step_s:g} times a second"
 
 
 def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
@@ -148,8 +167,15 @@ def collisions(groups: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
+def against_humans(contrasts: Table) -> Table:
+    """The rows in which humans are the reference."""
+    return replace(
+        contrasts, rows=[row for row in contrasts.rows if row.values["reference"] == HUMAN]
+    )
+
+
 def differences(contrasts: Table) -> list[dict[str, Any]]:
-    """The baselines' differences from the humans, as printed."""
+    """The rows of differences, as printed."""
     columns = {column.name: column for column in contrasts.columns}
     return [
         {
@@ -158,7 +184,6 @@ def differences(contrasts: Table) -> list[dict[str, Any]]:
             **{name: shown_value(columns[name], row.values.get(name)) for name in columns},
         }
         for row in contrasts.rows
-        if row.values["reference"] == HUMAN
     ]
 
 
@@ -167,21 +192,20 @@ def chart(
     groups: Sequence[Mapping[str, Any]],
     published: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """One row of panels: where everything is drawn, in the units of the picture."""
+    """One row of panels: where everything is drawn, in the units of the picture.
+
+    ``cut`` names the intervals that go on beyond the axis.
+    """
     printed = _printed(kind, published)
-    shown = [
-        limit
+    known = [
+        found
         for group in groups
-        for found in group["conditions"].values()
-        for limit in _limits(found.get(kind.name))
-    ] + list(printed.values())
-    low, high, ticks = scale(shown, kind.most)
+        for of_condition in group["conditions"].values()
+        if (found := of_condition.get(kind.name)) is not None and found["value"] is not None
+    ]
+    axis = Axis(*scale(kind, *reach(known, list(printed.values()))))
     panel = max(LEAST, STEP * (len(groups) + 1))
-
-    def y(value: float) -> float:
-        return round(TOP + HEIGHT * (1 - (value - low) / (high - low)), 1)
-
-    panels = []
+    panels: list[dict[str, Any]] = []
     for i, name in enumerate(CONDITIONS):
         x0 = LEFT + i * panel
         points = []
@@ -190,11 +214,8 @@ def chart(
             if found is None or found["value"] is None:
                 continue
             x = round(x0 + panel / 2 + STEP * (j - (len(groups) - 1) / 2), 1)
-            ends = None if found["low"] is None else (y(found["low"]), y(found["high"]))
-            points.append(
-                {"group": group["id"], "x": x, "y": y(found["value"]), "ends": ends, "of": found}
-            )
-        line = y(printed[name]) if name in printed else None
+            points.append({"group": group["id"], "x": x, "of": found, **axis.placed(found)})
+        line = axis.y(printed[name]) if name in printed else None
         panels.append({"name": name, "x": round(x0, 1), "points": points, "line": line})
     return {
         "kind": kind,
@@ -203,16 +224,62 @@ def chart(
         "top": TOP,
         "bottom": TOP + HEIGHT,
         "panel": panel,
-        "ticks": [(y(tick), f"{tick:g}") for tick in ticks],
+        "ticks": [(axis.y(tick), f"{tick:g}") for tick in axis.ticks],
         "panels": panels,
         "printed": printed,
+        "cut": [
+            f"{point['group']} in {panel['name']}: {value_text(point['of'], kind.digits)}"
+            for panel in panels
+            for point in panel["points"]
+            if point["arrows"]
+        ],
     }
 
 
-def scale(values: Sequence[float], most: float | None) -> tuple[float, float, list[float]]:
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """The values at the bottom and the top of a row of panels, and those of its ticks."""
+
+    low: float
+    high: float
+    ticks: Sequence[float]
+
+    def y(self, value: float) -> float:
+        """Where a value is drawn: at the edge if it lies beyond it."""
+        inside = min(max(value, self.low), self.high)
+        return round(TOP + HEIGHT * (1 - (inside - self.low) / (self.high - self.low)), 1)
+
+    def placed(self, found: Mapping[str, Any]) -> dict[str, Any]:
+        """Where an estimate is drawn, and the ends of its interval with arrows where it goes on."""
+        at, low, high = {"y": self.y(found["value"])}, found["low"], found["high"]
+        if low is None:
+            return {**at, "ends": None, "arrows": []}
+        arrows = [("down", TOP + HEIGHT - ARROW)] if low < self.low else []
+        arrows += [("triangle", TOP + ARROW)] if high > self.high else []
+        return {**at, "ends": (self.y(low), self.y(high)), "arrows": arrows}
+
+
+def reach(estimates: Sequence[Mapping[str, Any]], printed: Sequence[float]) -> tuple[float, float]:
+    """What an axis has to show: every value, and of the intervals what is not far out.
+
+    Far out is, as Tukey draws it, what lies beyond the quartiles of all that could be shown by more
+    than 1.5 times their distance: an interval of two or three trials may be ten times as long.
+    """
+    values = [*printed, *(found["value"] for found in estimates)]
+    ends = [found[end] for found in estimates for end in ("low", "high") if found[end] is not None]
+    if len(values) < 2:
+        return min([*values, *ends], default=0.0), max([*values, *ends], default=1.0)
+    first, _, third = quantiles([*values, *ends], n=4, method="inclusive")
+    beyond = 1.5 * (third - first)
+    low = max(min([*values, *ends]), first - beyond)
+    high = min(max([*values, *ends]), third + beyond)
+    return min([low, *values]), max([high, *values])
+
+
+def scale(kind: Kind, low: float, high: float) -> tuple[float, float, list[float]]:
     """Both ends of an axis, and its ticks: round steps, with 0 in it."""
-    low, high = min(values, default=0.0), max(values, default=1.0)
-    low, high = min(low, 0.0), most if most is not None else max(high, 0.0)
+    low = min(low, 0.0) if kind.least is None else kind.least
+    high = max(high, 0.0) if kind.most is None else kind.most
     high = high if high > low else low + 1.0
     rough = (high - low) / 4
     size = 10.0 ** floor(log10(rough))
@@ -251,12 +318,6 @@ def value_text(found: Mapping[str, Any] | None, digits: int) -> str:
     if found["low"] is not None:
         interval = f" [{found['low']:.{digits}f}, {found['high']:.{digits}f}]"
     return f"{found['value']:.{digits}f}{interval}, n {found['n']}"
-
-
-def _limits(found: Mapping[str, Any] | None) -> list[float]:
-    if found is None:
-        return []
-    return [found[name] for name in ("value", "low", "high") if found[name] is not None]
 
 
 def _printed(kind: Kind, published: Mapping[str, Any] | None) -> dict[str, float]:

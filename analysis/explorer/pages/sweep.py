@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import time
 from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass
@@ -10,8 +11,9 @@ from datetime import UTC, datetime
 
 from markupsafe import escape
 
-from analysis.explorer.site import NotThere, Site
+from analysis.explorer.site import NothingNew, NotThere, Site
 from analysis.explorer.sweeps import Cell, Sweep, duration, find_sweep, list_sweeps
+from analysis.explorer.texts import visible
 from analysis.explorer.views import condition_text, prompt_text
 from merge_runner.errors import MergeRunnerError
 from merge_runner.progress_file import read_standing
@@ -36,17 +38,31 @@ def home(site: Site) -> str:
     return site.at.sweep(sweeps[0].sweep_id) if sweeps else site.at.to("trials")
 
 
-def sweeps_page(site: Site) -> str:
-    """All sweeps."""
+def sweeps_page(site: Site, seen: str = "") -> str:
+    """All sweeps; raises NothingNew where they are as they were ``seen``."""
+    sweeps = list_sweeps(site.catalogue)
     return site.render(
-        "sweeps.html", here="sweeps", sweeps=list_sweeps(site.catalogue), lasted=_lasted
+        "sweeps.html", here="sweeps", sweeps=sweeps, lasted=_lasted, seen=_news(sweeps, seen)
     )
 
 
-def sweep_page(site: Site, sweep_id: str) -> str:
-    """One sweep; raises NotThere."""
+def sweep_page(site: Site, sweep_id: str, seen: str = "") -> str:
+    """One sweep, and a newer one if there is; raises NotThere, and NothingNew as ``seen``."""
     sweep = _find(site, sweep_id)
-    return site.render("sweep.html", here="sweeps", **_values(sweep))
+    newest = list_sweeps(site.catalogue)[0]
+    newer = newest if newest.sweep_id != sweep_id else None
+    state = (sweep, newer and (newer.sweep_id, newer.state))
+    return site.render(
+        "sweep.html", here="sweeps", newer=newer, seen=_news(state, seen), **_values(sweep)
+    )
+
+
+def _news(state: object, seen: str) -> str:
+    """What is shown, as a short text that differs where it does; raises NothingNew."""
+    now = hashlib.sha256(repr(state).encode()).hexdigest()[:16]
+    if now == seen:
+        raise NothingNew
+    return now
 
 
 def require_sweep(site: Site, sweep_id: str) -> None:
@@ -57,7 +73,7 @@ def require_sweep(site: Site, sweep_id: str) -> None:
 async def sweep_events(site: Site, sweep_id: str) -> AsyncIterator[str]:
     """What changes on a sweep's page, as server-sent events, until the sweep ends.
 
-    ``sweep`` is the part of the page that is replaced, ``state`` a sentence for who listens, and
+    ``sweep`` is the part of the page that is replaced, ``state`` its sentence for who listens, and
     ``done`` the last one.
     """
     watched = _Watched(site, sweep_id)
@@ -85,6 +101,7 @@ class _Watched:
     updated_at: datetime | None = None
     read_at: float = 0.0
     state: str = ""
+    said: str = ""
     shown: str = ""
 
     def news(self) -> list[tuple[str, str]]:
@@ -108,13 +125,15 @@ class _Watched:
         if catalogue.held and not alive:
             return []  # how it ended cannot be read yet
         self.updated_at = alive.updated_at if alive else None
-        shown = self.site.render("_sweep.html", **_values(sweep))
+        shown = self.site.render("_sweep.html", seen="", **_values(sweep))
         events = [("sweep", shown)] if shown != self.shown else []
         self.shown = shown
-        if sweep.entry.state != self.state:
-            # Once per state, and not once a second: it is read out.
-            events.append(("state", str(escape(sweep.verdict.text))))
-            self.state = sweep.entry.state
+        if sweep.verdict.text != self.said:
+            # Read out once per state, and not once a second.
+            quiet = ' aria-live="off"' if sweep.entry.state == self.state else ""
+            text = escape(visible(sweep.verdict.text))
+            events.append(("state", f"<span{quiet}>{text}</span>"))
+            self.said, self.state = sweep.verdict.text, sweep.entry.state
         return events if sweep.entry.followed else [*events, ("done", "")]
 
 

@@ -9,8 +9,8 @@ from typing import Any
 from analysis.explorer.asked import whole
 from analysis.explorer.catalogue import FACETS, PAGE, SORTS, Filter
 from analysis.explorer.pages.computed import computed
-from analysis.explorer.site import NotThere, Site
-from analysis.explorer.views import sparkline
+from analysis.explorer.site import NothingNew, NotThere, Site
+from analysis.explorer.views import sparkline, speed_scale
 from analysis.tables import TABLES
 from merge_runner.errors import StoreError
 
@@ -19,6 +19,9 @@ EXPORT_WAIT_S = 300.0
 
 def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
     """One page of the trials that an address asks for; ``patient``: an answer may take a while."""
+    state = "-".join(map(str, site.catalogue.state()))
+    if "seen" in asked:
+        return _news(site, asked, state)
     wanted, sort = filter_of(asked), sort_of(asked)
     cell, named = asked.get("cell", ""), None
     if cell:
@@ -27,8 +30,10 @@ def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
             return site.render("behind.html", here="trials", cell=cell, computed=named)
         wanted = replace(wanted, trials=behind(named.result.content))
     totals = site.catalogue.totals(wanted)
-    last = max(1, -(-totals.trials // PAGE))
+    trials = sum(part.trials for part in totals.values())
+    last = max(1, -(-trials // PAGE))
     number = min(page_of(asked), last)
+    rows = site.catalogue.page(wanted, sort, number)
     return site.render(
         "trials.html",
         here="trials",
@@ -40,10 +45,31 @@ def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         sort=sort,
         sorts=SORTS,
         totals=totals,
-        rows=site.catalogue.page(wanted, sort, number),
+        trials=trials,
+        rows=rows,
+        scale=speed_scale(rows),
+        news=at_of(site, asked, seen=state),
         page=number,
         last_page=last,
         sparkline=sparkline,
+    )
+
+
+def at_of(site: Site, asked: Mapping[str, str], **state: str) -> str:
+    """The address of a list, with more of a state."""
+    return site.at.to("trials", **{**asked, **state})
+
+
+def _news(site: Site, asked: Mapping[str, str], state: str) -> str:
+    """That other trials are there than were seen; raises NothingNew."""
+    if asked["seen"] == state:
+        raise NothingNew
+    (every,) = site.catalogue.ask("SELECT count(*) AS n FROM listed")
+    return site.render(
+        "_news.html",
+        trials=every["n"],
+        here=at_of(site, asked, seen=""),
+        news=at_of(site, asked, seen=state),
     )
 
 

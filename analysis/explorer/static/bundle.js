@@ -20,6 +20,6 @@
     data: async (option) => (await unpacked(bundle.trials[option.dataset.url])).data,
   };
   document.getElementById("shown").innerHTML = trial.html;
-  document.title = `${chosen.value.split("|")[0]} · merge-runner`;
+  document.title = `${chosen.text.replace(/: [^:]*$/, "")} · merge-runner`;
   startReplay();
 })();

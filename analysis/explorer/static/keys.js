@@ -7,20 +7,23 @@
   const help = document.getElementById("help");
   document.getElementById("help-button").addEventListener("click", () => help.showModal());
 
-  let chosen = -1;
+  let chosen = -1, address = null;
+  const leads = (row) => row.querySelector("a")?.getAttribute("href");
   const choose = (step) => {
     const rows = [...document.querySelectorAll("[data-list] tbody tr")];
     if (!rows.length) return;
     rows[chosen]?.classList.remove("chosen");
     chosen = Math.min(Math.max(chosen + step, 0), rows.length - 1);
     rows[chosen].classList.add("chosen");
+    address = leads(rows[chosen]);
     rows[chosen].querySelector("a")?.focus({ preventScroll: true });
     rows[chosen].scrollIntoView({ block: "nearest" });
   };
-  document.addEventListener("htmx:afterSwap", (event) => {
-    // What a running sweep sends has the same rows; an answer has others.
-    if (event.detail.xhr) chosen = -1;
-    else document.querySelectorAll("[data-list] tbody tr")[chosen]?.classList.add("chosen");
+  // Rows that come anew are the same where only something in them has changed.
+  document.addEventListener("htmx:afterSwap", () => {
+    const rows = [...document.querySelectorAll("[data-list] tbody tr")];
+    chosen = rows.findIndex((row) => address && leads(row) === address);
+    rows[chosen]?.classList.add("chosen");
   });
 
   document.addEventListener("keydown", (event) => {

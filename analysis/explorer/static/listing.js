@@ -11,7 +11,8 @@
     const known = await unpacked(JSON.parse(document.getElementById("cells").textContent));
     behind = new Set(known.sets[known.cells[cell]]);
     const note = document.getElementById("behind");
-    note.querySelector("strong").textContent = cell;
+    // As on the other pages: what does not show stands there as its code point.
+    note.querySelector("strong").textContent = cell.replace(/\p{C}/gu, (c) => `[U+${c.codePointAt(0).toString(16).toUpperCase().padStart(4, "0")}]`);
     note.hidden = false;
   }
   const fits = (row, name, value) => name === "q"

@@ -62,6 +62,26 @@ window.startReplay = () => {
 
   const track = at("track");
   const vehicles = {};
+  // A vehicle as large as its trial has it; about this trial's, what its collision rule looks at.
+  const judged = {
+    euclid2d: ({ length }) => ["circle", { r: length / 2 }],
+    rectangle: ({ length, width }) => ["rect", { x: -length / 2, y: -width / 2, width: length, height: width }],
+    shared_lane: ({ length }) => ["rect", { x: -length / 2, y: -0.35, width: length, height: 0.7 }],
+  };
+  const build = (name, run) => {
+    const { length, width, rule } = run.track;
+    for (const side of ["left", "right"]) {
+      const group = vehicles[name][side];
+      group.replaceChildren();
+      draw("rect", { x: -length / 2, y: -width / 2, width: length, height: width, rx: 0.5 }, group);
+      if (name === "own") {
+        const [shape, size] = judged[rule](run.track);
+        draw(shape, { class: "judged", ...size }, group);
+      }
+      const reach = (rule === "euclid2d" ? length : width) / 2;
+      draw("text", { x: 0, y: side === "left" ? -reach - 0.8 : reach + 3 }, group, side === "left" ? "L" : "R");
+    }
+  };
   const [mergeX] = place("left", road.merge);
   const drawTrack = () => {
     const [endX] = place("left", road.end);
@@ -82,16 +102,12 @@ window.startReplay = () => {
     draw("text", { class: "sign", x: endX - 5, y: -3.4 }, track, "end");
     for (const name of ["ghost", "own"]) {
       vehicles[name] = {};
-      for (const side of ["left", "right"]) {
-        const group = draw("g", { class: `vehicle ${name} ${side}` }, track);
-        draw("rect", { x: -road.length / 2, y: -road.width / 2, width: road.length, height: road.width, rx: 0.5 }, group);
-        draw("text", { x: 0, y: side === "left" ? -1.7 : 3.9 }, group, side === "left" ? "L" : "R");
-        vehicles[name][side] = group;
-      }
+      for (const side of ["left", "right"]) vehicles[name][side] = draw("g", { class: `vehicle ${name} ${side}` }, track);
     }
+    build("own", trial);
     vehicles.crash = draw("g", { class: "crash" }, track);
     vehicles.between = draw("line", {}, vehicles.crash);
-    vehicles.crashed = draw("text", { y: 9.5 }, vehicles.crash);
+    vehicles.crashed = draw("text", { y: 13.5 }, vehicles.crash);
   };
   const move = (name, run) => {
     for (const side of ["left", "right"]) {
@@ -220,12 +236,20 @@ window.startReplay = () => {
     move("ghost", ghost);
     const over = trial.status === "collided" && now >= trial.end - 1e-9;
     vehicles.crash.setAttribute("display", over ? "inline" : "none");
+    track.classList.toggle("collided", over);
+    const places = Object.values(trial.sides).map((samples) => sampled(samples.t, samples.x, now));
+    track.classList.toggle("unjudged", road.rule === "shared_lane" && Math.max(...places) < road.merge);
     if (over) {
-      const [[x1, y1], [x2, y2]] = ["left", "right"].map((side) => place(side, trial.sides[side].x.at(-1)));
+      const [left, right] = ["left", "right"].map((side) => trial.sides[side].x.at(-1));
+      const [[x1, y1], [x2, y2]] = [place("left", left), place("right", right)];
       for (const [name, value] of Object.entries({ x1, y1, x2, y2 })) vehicles.between.setAttribute(name, value);
       // Beside the signs, and within the picture.
       vehicles.crashed.setAttribute("x", Math.min(Math.max((x1 + x2) / 2, mergeX - 3), mergeX + 15));
-      vehicles.crashed.textContent = `✸ collision, ${Math.hypot(x1 - x2, y1 - y2).toFixed(1)} m between the centres`;
+      vehicles.crashed.textContent = `✸ collision, ${{
+        euclid2d: `${Math.hypot(x1 - x2, y1 - y2).toFixed(1)} m between the centres`,
+        rectangle: "the outlines overlap",
+        shared_lane: `${Math.abs(left - right).toFixed(1)} m apart along the road`,
+      }[road.rule]}`;
     }
     at("scrub").value = now;
     at("scrub").setAttribute("aria-valuetext", `${now.toFixed(1)} s`);
@@ -305,6 +329,7 @@ window.startReplay = () => {
     if (ghost) {
       ghost.named = option.value;
       at("lost").hidden = true;
+      build("ghost", ghost);
     }
     chooser.value = ghost?.named ?? "";
     at("ghost-key").hidden = !ghost && (!id || option);

@@ -1,0 +1,124 @@
+"""The page beside the humans: what its rows rest on, what an import changes, and its axes."""
+
+from __future__ import annotations
+
+import re
+from html import unescape
+
+import pytest
+from recordings import drive, write_folder
+from starlette.testclient import TestClient
+from studies import Drive, write_study, yielding
+from test_tables_pages import InProcess
+
+from analysis.explorer.app import explorer
+from analysis.explorer.computing import Computing
+from analysis.explorer.numbers import Numbers
+from analysis.explorer.pages.humans import KINDS, chart
+from analysis.explorer.site import Site
+from analysis.human.archive import open_files
+from analysis.human.load import import_trials, sort_files
+from analysis.study import Study
+from analysis.tables.notes import sample_notes
+from merge_runner.config import Scenario
+from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.store import Store
+
+HOST = "127.0.0.1:8700"
+# A sweep that was killed: two trials of one condition that have nothing in common.
+KILLED = [
+    Drive("killed", "baseline", "L_4_0", 1, (1.0,) * 3, (-1.0,) * 3),
+    Drive("killed", "baseline", "L_4_0", 2, (0.1,), (-0.1,)),
+]
+
+
+@pytest.fixture
+def db(tmp_path):
+    return write_study(
+        tmp_path / "t.duckdb", [*yielding("o3", reps=5), *KILLED], Scenario(vehicle_length_m=4)
+    )
+
+
+@pytest.fixture
+def ask(db):
+    site = Site(db)
+    site.computing = Computing(db, InProcess)
+    client = TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
+
+    def get(address="/humans"):
+        while 'class="computing"' in (
+            text := client.get(address, headers={"hx-request": "true"}).text
+        ):
+            pass
+        return unescape(text)
+
+    yield get
+    site.computing.close()
+
+
+def import_some(db, folder):
+    """Two pairs in every condition, as a download that is not whole."""
+    files = {}
+    for experiment in (4, 6):
+        for number, condition in enumerate(CONDITIONS):
+            yields = "left" if "R" in condition else "right"
+            name = f"experiment_{experiment}/experiment_{experiment}_iter_{number + 1}.csv"
+            files[name] = drive(condition, yields=yields).csv()
+    with open_files(write_folder(folder, files)) as found:
+        import_trials(sort_files(found).trials, Store(db))
+
+
+def notes_of(db):
+    study = Study(db)
+    return sample_notes(study, study.baselines)
+
+
+def test_the_page_has_the_notes_of_its_rows_and_is_made_anew_after_an_import(ask, db, tmp_path):
+    before = ask()
+    assert "The recordings of the humans are not imported" in before
+    assert all(note in before for note in notes_of(db))
+    import_some(db, tmp_path / "recordings")
+    after = ask()
+    assert "The recordings of the humans are not imported" not in after
+    assert "The database has changed" not in after
+    notes = notes_of(db)
+    assert any("22 of 990" in note for note in notes)
+    assert any("2 pairs" in note for note in notes)
+    assert all(note in after for note in notes)
+
+
+def test_the_page_says_what_counts_as_a_collision_for_whom(ask):
+    text = ask()
+    assert (
+        "o3/baseline: their centres came closer than 4 m, a vehicle's length, looked for 5 times "
+        "a second"
+    ) in text
+    assert "human: their outlines overlapped, looked for 20 times a second" in text
+
+
+def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
+    content = Numbers(db).answer(["humans"])
+    gap, rmse = (
+        next(kind for kind in KINDS if kind.name == name) for name in ("gap_m", "rmse_mps")
+    )
+    (killed,) = (group for group in content["groups"] if group["id"] == "killed/baseline")
+    huge = killed["conditions"]["L_4_0"]["gap_m"]
+    assert huge["low"] < -30
+    assert huge["high"] > 50
+    drawn = chart(gap, content["groups"], content["published"])
+    ticks = [float(text) for _, text in drawn["ticks"]]
+    assert ticks[0] >= -10
+    assert ticks[-1] <= 30
+    assert f"killed/baseline in L_4_0: {huge['value']:.2f} [{huge['low']:.2f}" in drawn["cut"][0]
+    (point,) = (
+        point
+        for panel in drawn["panels"]
+        for point in panel["points"]
+        if point["group"] == "killed/baseline"
+    )
+    assert [shape for shape, _ in point["arrows"]] == ["down", "triangle"]
+    assert drawn["top"] <= point["ends"][1] <= point["y"] <= point["ends"][0] <= drawn["bottom"]
+    assert chart(rmse, content["groups"], content["published"])["ticks"][0][1] == "0"
+    text = ask()
+    assert len(re.findall(r'class="cut"', text)) >= 2
+    assert "An arrow at the edge: an interval goes on beyond the axis. killed/baseline" in text

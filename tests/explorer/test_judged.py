@@ -1,0 +1,136 @@
+"""A replay shows what its own scenario takes for a collision, and control from its start."""
+
+from __future__ import annotations
+
+import re
+
+import duckdb
+import pytest
+from playwright.sync_api import expect
+from recordings import drive, write_folder
+from serving import served
+from starlette.testclient import TestClient
+from studies import Drive, write_study
+
+from analysis.explorer.app import explorer
+from analysis.explorer.details import read_trial
+from analysis.explorer.site import Site
+from analysis.explorer.views import collision_bounds
+from analysis.human.archive import open_files
+from analysis.human.load import import_trials, sort_files
+from merge_runner.config import Scenario
+from merge_runner.simulator.collision import collided
+from merge_runner.store import Store
+
+HOST = "127.0.0.1:8700"
+# Both keep their speed and meet at the merge point.
+MEETING = Drive("o3", "baseline", "N_0_0", 1, (0.0,), (0.0,))
+PASSING = Drive("o3", "baseline", "N_0_0", 2, (0.6,) * 3, (-0.6,) * 3)
+RULES = {
+    "euclid2d": ("circle", "circles of 6 m"),
+    "rectangle": ("rect", "outlines of 6 m by 2.4 m"),
+    "shared_lane": ("rect", "bars of 6 m along the road"),
+}
+
+
+@pytest.fixture
+def study_of(tmp_path):
+    def write(rule):
+        scenario = Scenario(vehicle_length_m=6, vehicle_width_m=2.4, collision_rule=rule)
+        return write_study(tmp_path / f"{rule}.duckdb", [MEETING, PASSING], scenario)
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def humans(tmp_path_factory):
+    """Two recorded trials; the first brakes hard within the tunnel."""
+    folder = tmp_path_factory.mktemp("humans")
+    recording = drive("N_0_0", yields="right")
+    in_tunnel = recording.columns["velocities.left"]
+    in_tunnel[5:] = [speed - 1 for speed in in_tunnel[5:]]
+    files = {
+        "experiment_4/experiment_4_iter_1.csv": recording.csv(),
+        "experiment_4/experiment_4_iter_2.csv": drive("N_0_0", yields="nobody").csv(),
+    }
+    db = folder / "t.duckdb"
+    with open_files(write_folder(folder / "recordings", files)) as found:
+        import_trials(sort_files(found).trials, Store(db))
+    return db
+
+
+def a_trial(db, number=0):
+    with duckdb.connect(str(db), read_only=True) as connection:
+        return connection.execute("SELECT trial_id, spec_hash FROM trials ORDER BY 1").fetchall()[
+            number
+        ]
+
+
+def page_of(db, number=0):
+    name, _ = a_trial(db, number)
+    client = TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+    return client.get(f"/trials/{name}").text
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_band_of_the_chart_holds_the_headways_that_collide(study_of, rule):
+    db = study_of(rule)
+    trial = read_trial(db, *a_trial(db, 1))
+    bounds = collision_bounds(trial)
+    places = zip(*(samples["position_m"] for samples in trial.states.values()), strict=True)
+    for bound, (left, right) in zip(bounds, places, strict=True):
+        mean = (left + right) / 2
+        assert collided(trial.scenario, left, right) == (abs(left - right) < (bound or 0))
+        if rule != "shared_lane":
+            assert bound is None or collided(
+                trial.scenario, mean + bound / 2 - 0.01, mean - bound / 2 + 0.01
+            )
+    assert max(filter(None, bounds)) == pytest.approx(6, abs=0.2)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_picture_draws_what_the_scenario_judges(page, study_of, rule):
+    shape, words = RULES[rule]
+    with served(study_of(rule)) as address:
+        page.goto(f"{address}/trials/o3/baseline/N_0_0/rep01?t=3")
+        expect(page.locator("#judged")).to_contain_text(words)
+        drawn = page.locator(f"#track .own {shape}.judged")
+        expect(drawn).to_have_count(2)
+        assert page.locator("#track .judged").count() == 2
+        size = drawn.first.evaluate(
+            "it => Number(it.getAttribute('width') ?? 2 * it.getAttribute('r'))"
+        )
+        assert size == 6
+        assert page.locator("#track .own.left rect").first.get_attribute("width") == "6"
+        # On the branches the rule of the shared lane judges nothing.
+        assert drawn.first.is_visible() == (rule != "shared_lane")
+        page.keyboard.press("5")
+        page.locator("#play").click()
+        expect(page.locator("#track.collided .crash")).to_be_visible(timeout=20_000)
+        expect(drawn.first).to_be_visible()
+        assert ("centres" in page.locator("#track .crash text").text_content()) == (
+            rule == "euclid2d"
+        )
+        page.goto("about:blank")
+
+
+def test_a_human_trial_is_judged_by_the_boxes(humans):
+    text = page_of(humans, 1)
+    assert "The vehicles collided" in text
+    assert "their outlines overlapped" in text
+    assert "outlines of 4.5 m by 1.8 m" in text
+
+
+def test_the_hardest_acceleration_counts_from_control_on(humans):
+    trial = read_trial(humans, *a_trial(humans))
+    samples = trial.states["left"]
+    times, accelerations = samples["time_s"], samples["acceleration_mps2"]
+    assert min(accelerations) == pytest.approx(-20, abs=0.1)
+    own = [a for t, a in zip(times, accelerations, strict=True) if t > 0]
+    said = re.findall(r"hardest acceleration was ([+-][\d.]+) m/s²", page_of(humans))
+    assert said[0] == f"{max(own, key=abs):+.1f}"
+    with duckdb.connect(str(humans), read_only=True) as connection:
+        (metric,) = connection.execute(
+            "SELECT max_acceleration_mps2 FROM trial_metrics ORDER BY trial_id"
+        ).fetchall()[0]
+    assert max(abs(float(value)) for value in said) == pytest.approx(metric, abs=0.051)

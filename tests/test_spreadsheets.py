@@ -1,0 +1,68 @@
+"""No text in a file of CSV runs in a spreadsheet, and no number becomes a text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+from starlette.testclient import TestClient
+from studies import write_study, yielding
+
+from analysis.explorer.app import explorer
+from analysis.explorer.site import Site
+from merge_runner.texts import in_spreadsheet
+
+HOST = "127.0.0.1:8700"
+FORMULA = "=HYPERLINK(x)"
+QUERY = "select '=1+1' as \"=x\", -1.5 as n, -2::DECIMAL(4, 1) as d, '@a' as a, '-' as b, true as c"
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    """A driver whose name is a formula."""
+    folder = tmp_path_factory.mktemp("spreadsheets")
+    return write_study(folder / "t.duckdb", yielding(FORMULA, reps=1))
+
+
+def cells(text):
+    return list(csv.reader(io.StringIO(text, newline="")))
+
+
+@pytest.mark.parametrize("begins", list("=+-@\t\r\n"))
+def test_a_text_that_a_spreadsheet_would_run_gets_an_apostrophe(begins):
+    assert in_spreadsheet(f"{begins}1") == f"'{begins}1"
+    for same in (f"x{begins}", "", -1, -1.5, None):
+        assert in_spreadsheet(same) is same
+
+
+async def test_sql_keeps_numbers_and_json_as_they_are(merge_runner, db):
+    run = await merge_runner("sql", QUERY, "--db", db, "--format", "csv")
+    assert [row[:5] for row in cells(run.out)] == [
+        ["'=x", "n", "d", "a", "b"],
+        ["'=1+1", "-1.5", "-2.0", "'@a", "'-"],
+    ]
+    run = await merge_runner("sql", QUERY, "--db", db, "--format", "json")
+    assert json.loads(run.out)[0]["=x"] == "=1+1"
+
+
+async def test_a_table_names_a_driver_so_that_it_does_not_run(merge_runner, db):
+    run = await merge_runner("tables", "attempts", "--db", db, "--format", "csv")
+    rows = [row for row in cells(run.out) if FORMULA in row[0]]
+    assert [row[:2] for row in rows] == [[f"'{FORMULA}/baseline", f"'{FORMULA}"]]
+
+
+def test_the_explorers_downloads_do_not_run_either(db):
+    client = TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+    head, *rows = cells(client.get("/trials.csv").text)
+    assert len(rows) == 11
+    for row in rows:
+        told = dict(zip(head, row, strict=True))
+        assert told["trial_id"].startswith(f"'{FORMULA}/baseline/")
+        assert told["joint"] in {"true", "false", ""}
+        assert told["end_time_s"] == str(float(told["end_time_s"]))
+    assert cells(client.get("/sql.csv", params={"q": QUERY}).text) == [
+        ["'=x", "n", "d", "a", "b", "c"],
+        ["'=1+1", "-1.5", "-2.0", "'@a", "'-", "true"],
+    ]
