@@ -18,7 +18,7 @@ NAMES = {
     "I2": "going first becomes less likely with a relative velocity advantage",
     "I3": "the gap grows with the projected headway",
     "I4": "the gap does not depend on the relative velocity",
-    "I5": "speeds are piecewise linear",
+    "I5": "accelerations are held and jump as the humans' do",
 }
 LOW_POWER = 0.8
 MANY_FALLBACKS = 0.05
@@ -123,8 +123,8 @@ def not_shown(study: Study, origin: Provenance) -> list[str]:
     if not study.human.measured:
         texts.append(
             "The human recordings are not imported: human gaps, speed deviations and profiles are "
-            "those that were published, I5 is not calibrated, and the human ceiling rests on a "
-            "normal approximation of the gaps."
+            "those that were published, I5 has nothing to compare with, and the human ceiling "
+            "rests on a normal approximation of the gaps."
         )
     texts.append(
         "The prompt is a reconstruction, the original wording is not public; results hold for this "

@@ -11,7 +11,18 @@ from pathlib import Path
 
 import pandas as pd
 
-from analysis.load import LEFT_SPEEDS, PLANS, SHARED, SPECS, TRIALS, Calls, load_calls, load_each
+from analysis.intermittency import measure_profiles
+from analysis.load import (
+    LEFT_SPEEDS,
+    PLANS,
+    SHARED,
+    SPECS,
+    SPEEDS,
+    TRIALS,
+    Calls,
+    load_calls,
+    load_each,
+)
 from analysis.published import human_outcomes
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
@@ -103,10 +114,8 @@ class Study:
 
     @cached_property
     def profiles(self) -> pd.DataFrame:
-        """One row a vehicle: the piecewise-linear fit of its speeds."""
-        from analysis.profiles import fitted_profiles
-
-        return fitted_profiles(self.db)
+        """One row a vehicle: whether it acted, and how far its acceleration is held."""
+        return measure_profiles(self._read(SPEEDS))
 
     @cached_property
     def left_speeds(self) -> pd.DataFrame:

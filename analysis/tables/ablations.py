@@ -14,7 +14,7 @@ from analysis.tables.indicators import (
     verdict_values,
 )
 from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import ceiling_notes, piecewise_notes, sample_notes
+from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
 from analysis.verdicts import Score, score
 
 
@@ -56,7 +56,7 @@ def ablation_qualitative(study: Study) -> Table:
             RULES,
             *(f"{name}: {text}" for name, text in INDICATORS.items()),
             *ceiling_notes(study),
-            *piecewise_notes(study),
+            *intermittency_notes(study),
             *sample_notes(study, study.groups),
         ),
         "Table VI",
