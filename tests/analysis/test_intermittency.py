@@ -23,6 +23,7 @@ from analysis.intermittency import (
     residuals,
     without_resistance,
 )
+from merge_runner.simulator.vehicle import net_acceleration
 
 DOCS = Path(__file__).parents[2] / "docs/analysis.md"
 
@@ -164,7 +165,7 @@ def test_vehicles_of_any_length_are_measured_in_their_order(lengths):
 def test_a_pedal_that_is_held_against_the_resistance_is_a_straight_line():
     v = [10.0]
     for _ in range(200):
-        v.append(v[-1] + 0.05 * (1.5 - 0.5 - 0.005 * v[-1] ** 2))
+        v.append(v[-1] + 0.05 * net_acceleration(1.5, v[-1], "human"))
     time, v = np.arange(201) * 0.05, np.array(v)
     assert without_resistance(time, v) == pytest.approx(10 + 1.5 * time)
     assert measured(v, 0.05, resisted=True)["gain"] > 0 > measured(v, 0.05)["gain"]
