@@ -19,8 +19,6 @@ from scipy import stats
 from scipy.special import expit
 
 from analysis.indicators import ALPHA, SLOPE_MARGIN_S, TESTED
-from analysis.intervals import wilson_low
-from analysis.piecewise import THRESHOLDS
 from analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
 from analysis.regressions import gap_design
 from merge_runner.simulator.conditions import CONDITIONS
@@ -46,13 +44,11 @@ class Population:
     """Human trials by condition, in the order of CONDITIONS, one array each.
 
     ``left``: 1 or 0 for who merged first, NaN after a collision. ``gap_m``: NaN after a collision.
-    ``piecewise``: 1 or 0 for whether the trial's profiles pass I5, NaN where it did not finish.
-    Without traces the last two are empty.
+    Without traces the last is empty.
     """
 
     left: tuple[Array, ...]
     gap_m: tuple[Array, ...] = ()
-    piecewise: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +65,11 @@ def published_humans() -> Population:
     return Population(left=_by_condition(human_outcomes(), _left(human_outcomes())))
 
 
-def imported_humans(trials: pd.DataFrame, piecewise: pd.Series) -> Population:
-    """The humans as imported: rows of ``load_trials``, and I5 of each trial as in Population."""
+def imported_humans(trials: pd.DataFrame) -> Population:
+    """The humans as imported, from rows of ``load_trials``."""
     return Population(
         left=_by_condition(trials, _left(trials)),
         gap_m=_by_condition(trials, trials["gap_m"]),
-        piecewise=_by_condition(trials, piecewise),
     )
 
 
@@ -88,8 +83,6 @@ def ceiling(humans: Population, sizes: tuple[int, ...]) -> Ceiling:
     for passes in (paper | paper_gap, robust | robust_gap):
         shares = {name: float(passes[name].mean()) for name in TESTED}
         shares["I1-I4"] = float(np.logical_and.reduce([passes[name] for name in TESTED]).mean())
-        if draws.piecewise is not None:
-            shares["I5"] = float(draws.piecewise.mean())
         both.append(shares)
     return Ceiling(*both)
 
@@ -102,7 +95,6 @@ class _Draws:
         shape = (DATA_SETS, len(CONDITIONS))
         self.n, self.left = np.zeros(shape), np.zeros(shape)
         self.gap, self.squared_gap = np.zeros(shape), np.zeros(shape)
-        judged, passing = np.zeros(DATA_SETS, int), np.zeros(DATA_SETS, int)
         expected = GAP_DESIGN @ _published_gap()
         for i, size in enumerate(sizes):
             if size == 0 or len(humans.left[i]) == 0:
@@ -119,13 +111,6 @@ class _Draws:
             self.left[:, i] = np.where(kept, left, 0).sum(axis=1)
             self.gap[:, i] = np.where(kept, gap, 0).sum(axis=1)
             self.squared_gap[:, i] = np.where(kept, gap**2, 0).sum(axis=1)
-            if humans.piecewise:
-                passes = humans.piecewise[i][drawn]
-                judged += np.isfinite(passes).sum(axis=1)
-                passing += np.nansum(passes, axis=1).astype(int)
-        self.piecewise = (
-            wilson_low(passing, judged) >= THRESHOLDS.min_share if humans.piecewise else None
-        )
 
 
 def _wald(draws: _Draws) -> Passes:

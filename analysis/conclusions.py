@@ -20,7 +20,7 @@ NAMES = {
     "I2": "going first becomes less likely with a relative velocity advantage",
     "I3": "the gap grows with the projected headway",
     "I4": "the gap does not depend on the relative velocity",
-    "I5": "speeds are piecewise linear",
+    "I5": "accelerations are held and jump as the humans' do",
 }
 # So many of the human data sets of a study's size that have a mark make its lack strong evidence,
 # and at most so many weak evidence.

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from analysis.indicators import INDICATORS, TESTED
+from analysis.indicators import INDICATORS
 from analysis.measures import MEASURES, known, published_human
 from analysis.panels import (
     VELOCITIES_MPS,
@@ -96,7 +96,7 @@ def ablation_matrix(study: Study) -> Figure:
                 mpl.patches.Rectangle((column, row), 1, 1, facecolor=colour, edgecolor="white")
             )
             text = _mark(passed)
-            if name in TESTED and robust is not None and robust != passed:
+            if robust is not None and robust != passed:
                 text += f" / {_mark(robust)}"
             axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=6)
     axes.set(xlim=(0, len(INDICATORS)), ylim=(len(groups), 0))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 LEVEL = 0.95
@@ -33,14 +32,6 @@ def proportion(successes: int, n: int) -> Estimate:
     half = z / (1 + z**2 / n) * sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     # The exact bounds at 0 and n are 0 and 1; rounding must not leave the estimate outside.
     return Estimate(p, min(p, max(0.0, middle - half)), max(p, min(1.0, middle + half)), n)
-
-
-def wilson_low(successes: NDArray[np.int_], n: NDArray[np.int_]) -> NDArray[np.float64]:
-    """The lower bounds of many proportions, NaN where n is 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        p = successes / n
-        half = Z * np.sqrt(p * (1 - p) / n + Z**2 / (4 * n**2))
-        return np.asarray(np.maximum(p + Z**2 / (2 * n) - half, 0) / (1 + Z**2 / n))
 
 
 def mean(values: Sequence[float] | np.ndarray) -> Estimate:

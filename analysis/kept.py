@@ -1,19 +1,17 @@
 """What is computed from the results and kept beside them in the database, until they change.
 
-Kept are the fits of I5, by vehicle, and whole tables and figures. Where the file cannot be written,
-as on a read-only disk or while another program holds it, nothing is kept, and the next run computes
-anew.
+Kept are whole tables and figures. Where the file cannot be written, as on a read-only disk or while
+another program holds it, nothing is kept, and the next run computes anew.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import duckdb
 
@@ -22,22 +20,7 @@ from merge_runner.database import open_database, read_database
 from merge_runner.errors import StoreError
 from merge_runner.texts import first_line
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 KEPT = """
--- The fit of a vehicle's speeds by one program; NULL where it drove too shortly for one. ``speeds``
--- is a hash of what was fitted.
-CREATE TABLE IF NOT EXISTS i5_fits (
-    trial_id VARCHAR NOT NULL,
-    spec_hash VARCHAR NOT NULL,
-    side VARCHAR NOT NULL,
-    speeds VARCHAR NOT NULL,
-    program VARCHAR NOT NULL,
-    knot_rate_hz DOUBLE,
-    rmse_mps DOUBLE,
-    reversal_rate_hz DOUBLE
-);
 -- A table as JSON, or a figure as SVG in Base64, of the results in one state.
 CREATE TABLE IF NOT EXISTS finished (
     state VARCHAR NOT NULL,
@@ -122,39 +105,16 @@ def finished(db: Path, options: str, names: Sequence[str]) -> tuple[str, dict[st
 
 def keep_finished(db: Path, made_of: str, options: str, contents: dict[str, str]) -> None:
     """Keep tables or figures, unless the results have left the state that these are ``made_of``."""
-
-    def keep(connection: duckdb.DuckDBPyConnection) -> None:
-        if state(connection) == made_of:
-            connection.execute("DELETE FROM finished WHERE state <> ?", [made_of])
-            connection.executemany(
-                "INSERT INTO finished VALUES (?, ?, ?, ?)",
-                [[made_of, options, name, content] for name, content in contents.items()],
-            )
-
-    _write(db, keep)
-
-
-def keep_fits(db: Path, fits: pd.DataFrame) -> None:
-    """Keep these rows of ``i5_fits``, in the place of older ones of their vehicles."""
-
-    def keep(connection: duckdb.DuckDBPyConnection) -> None:
-        connection.register("fits", fits)
-        connection.execute(
-            "DELETE FROM i5_fits WHERE (trial_id, spec_hash, side) IN "
-            "(SELECT (trial_id, spec_hash, side) FROM fits)"
-        )
-        connection.execute("INSERT INTO i5_fits BY NAME FROM fits")
-        connection.unregister("fits")
-
-    _write(db, keep)
-
-
-def _write(db: Path, keep: Callable[[duckdb.DuckDBPyConnection], None]) -> None:
     try:
         with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
             connection.begin()
             connection.execute(KEPT)
-            keep(connection)
+            if state(connection) == made_of:
+                connection.execute("DELETE FROM finished WHERE state <> ?", [made_of])
+                connection.executemany(
+                    "INSERT INTO finished VALUES (?, ?, ?, ?)",
+                    [[made_of, options, name, content] for name, content in contents.items()],
+                )
             connection.commit()
     except (StoreError, duckdb.Error) as exc:
         _say_once(first_line(exc))

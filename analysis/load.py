@@ -32,6 +32,16 @@ LEFT_SPEEDS = (
     "FROM trials WHERE status = 'finished' AND coalesce(variant, 'baseline') = 'baseline') "
     "USING (trial_id, spec_hash) WHERE time_s >= 0 AND side = 'left' GROUP BY ALL ORDER BY ALL"
 )
+# One row a vehicle: its speeds under control, and whether the simulator slowed it by itself.
+SPEEDS = """
+SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
+    list(velocity_mps ORDER BY step) AS velocity_mps,
+    any_value(resisted) AS resisted
+FROM states JOIN (
+    SELECT spec_hash, coalesce(spec->>'$.source', spec->>'$.scenario.resistance') = 'human'
+        AS resisted FROM specs
+) USING (spec_hash) WHERE time_s >= 0 GROUP BY ALL ORDER BY ALL
+"""
 # A plan's revision: |the new plan's first actions - the old plan's for the same instants|. Both
 # plans cover the horizon; the older one is `executed` actions ahead of the new one.
 PLANS = """

@@ -12,11 +12,13 @@ from pathlib import Path
 import pandas as pd
 
 from analysis.imported import Imported, imported
+from analysis.intermittency import measure_profiles
 from analysis.load import (
     LEFT_SPEEDS,
     PLANS,
     SHARED,
     SPECS,
+    SPEEDS,
     TRACES,
     TRIALS,
     Calls,
@@ -150,10 +152,8 @@ class Study:
 
     @cached_property
     def profiles(self) -> pd.DataFrame:
-        """One row a vehicle: the piecewise-linear fit of its speeds."""
-        from analysis.profiles import fitted_profiles
-
-        return fitted_profiles(self.db)
+        """One row a vehicle: whether it acted, and how far its acceleration is held."""
+        return measure_profiles(self._read(SPEEDS))
 
     @cached_property
     def left_speeds(self) -> pd.DataFrame:

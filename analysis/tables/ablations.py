@@ -16,7 +16,7 @@ from analysis.tables.indicators import (
     verdict_values,
 )
 from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import ceiling_notes, piecewise_notes, sample_notes
+from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
 from analysis.verdicts import score
 
 
@@ -36,7 +36,6 @@ def ablation_qualitative(study: Study) -> Table:
             ),
             Column(f"{prefix}differ", "", meaning="where the two rules disagree", optional=True),
         ]
-    columns = [c for c in columns if c.name not in {"i5_robust", "i5_differ"}]
     columns += [
         Column(
             "score_paper",
@@ -68,7 +67,7 @@ def ablation_qualitative(study: Study) -> Table:
             RULES,
             *(f"{name}: {text}" for name, text in INDICATORS.items()),
             *ceiling_notes(study),
-            *piecewise_notes(study),
+            *intermittency_notes(study),
             *sample_notes(study, study.groups),
         ),
         "Table VI",

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from analysis.indicators import INDICATORS, Verdict
+from analysis.likeness import gains
 from analysis.measures import MEASURES, Measure, estimate, known, published_human
 from analysis.published import citation
 from analysis.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import ceiling_notes, piecewise_notes, sample_notes
+from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
+from analysis.tables.profiles import gain_values
 from analysis.verdicts import Score, score, total
 
 SOURCE = "paper_ablation_quantitative"
@@ -37,7 +39,7 @@ def indicators(study: Study) -> Table:
             ),
             Column("robust", "robust", "verdict", meaning="by robust tests", optional=True),
             Column("differ", "", meaning="where the two rules disagree", optional=True),
-            Column("value", "value", "number", 2, "score or measure", optional=True),
+            Column("value", "value", "number", 2, "gain (I5) or measure", optional=True),
             Column(
                 "interval", "95 % CI", "interval", 2, "Wilson for rates, t for means", optional=True
             ),
@@ -64,7 +66,7 @@ def indicators(study: Study) -> Table:
             RULES,
             *(f"{name}: {text}" for name, text in INDICATORS.items()),
             *ceiling_notes(study),
-            *piecewise_notes(study),
+            *intermittency_notes(study),
             *sample_notes(study, study.baselines),
         ),
         "Table V",
@@ -121,12 +123,19 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
             "indicator": name,
             "driver": group.label,
             **verdict_values(found, name),
+            **(gain_values(study, group, "value", "interval") if name == "I5" else {}),
             "ceiling_paper": percent(found.ceiling.paper.get(name)),
             "ceiling_robust": percent(found.ceiling.robust.get(name)),
             "n": len(group.finished),
         },
-        verdict_note(found, name),
+        "; ".join(filter(None, (verdict_note(found, name), _inaction(study, group, name)))),
     )
+
+
+def _inaction(study: Study, group: Group, name: str) -> str:
+    """Which trials do not count for I5."""
+    still = int(gains(study, group)["steady"].sum()) if name == "I5" and group.measured else 0
+    return f"I5 without {still} of {len(group.finished)} trials: no control action" * bool(still)
 
 
 def _total_row(study: Study, group: Group) -> Row:

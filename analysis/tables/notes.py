@@ -7,10 +7,10 @@ from functools import cache
 
 from analysis.ceiling import DATA_SETS, SEED
 from analysis.human.counts import findings, human_counts
-from analysis.piecewise import THRESHOLDS
+from analysis.intermittency import STEADY_MPS
+from analysis.likeness import MARGIN_SD
 from analysis.published import HUMAN_DOI, HUMAN_GAP_SD_M
 from analysis.study import Group, Study
-from analysis.verdicts import thresholds
 
 
 def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
@@ -67,17 +67,17 @@ def ceiling_notes(study: Study) -> list[str]:
     ]
 
 
-def piecewise_notes(study: Study) -> list[str]:
-    """The thresholds of I5."""
-    limits = thresholds(study)
-    state = (
-        "the reversal limit is the human 95th percentile, the others are uncalibrated"
+def intermittency_notes(study: Study) -> list[str]:
+    """How I5 is measured, and what is judged by it."""
+    rule = (
+        "a driver passes where the 95 % interval of its difference from the humans in the same "
+        f"conditions lies within {MARGIN_SD} human SD, fails where it lies beyond, and cannot be "
+        "judged otherwise"
         if study.calibrated
-        else "uncalibrated: human traces of every condition are not imported"
+        else "without human traces of every condition nobody is judged by it"
     )
     return [
-        f"I5: a trial passes where both speeds are fitted within {limits.max_rmse_mps:.2f} m/s "
-        f"with at most {limits.max_knot_rate_hz:.1f} knots and {limits.max_reversal_rate_hz:.2f} "
-        f"reversals per s ({state}); a group passes where at least "
-        f"{100 * THRESHOLDS.min_share:.0f} % of its trials do, by the Wilson lower bound"
+        "I5: the gain of straight lines over cubics in the speeds under control, BIC per "
+        "sample at 5 Hz; above 0 accelerations are held and jump, below 0 they move. Vehicles "
+        f"that stay within {STEADY_MPS} m/s took no action and do not count; {rule}"
     ]

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from analysis.intervals import mean
+from analysis.intervals import Estimate
+from analysis.likeness import NO_ACTION, difference, gains, mean_gain
 from analysis.study import Group, Study, of_group
 from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import piecewise_notes, sample_notes
-from analysis.verdicts import piecewise_share
+from analysis.tables.notes import intermittency_notes, sample_notes
 
 
 def velocity_profiles(study: Study) -> Table:
-    """One row a group: share of piecewise-linear trials, knots, residuals, reversals, plans."""
-    profile = "of the piecewise-linear fit, mean of both vehicles of finished trials"
+    """One row a group: how far accelerations are held, beside the humans', and the plans."""
     return Table(
         "velocity-profiles",
         "Piecewise-linear velocity profiles (I5) and plan revisions",
@@ -19,11 +18,19 @@ def velocity_profiles(study: Study) -> Table:
             Column("driver", "driver"),
             Column("setting", "setting"),
             Column("n", "n", "count", 0, "finished trials"),
-            Column("passing_percent", "passing (%)", "percent", 1, "trials that pass I5"),
-            Column("passing_percent_ci", "95 % CI", "interval", 1, "Wilson", optional=True),
-            Column("knot_rate_hz", "knots (1/s)", "number", 2, f"knots per s {profile}"),
-            Column("residual_mps", "residual (m/s)", "number", 3, f"RMSE {profile}"),
-            Column("reversal_rate_hz", "reversals (1/s)", "number", 2, "sign changes of a per s"),
+            Column("no_action", "no action", "count", 0, "trials in which no vehicle acted"),
+            Column("gain", "gain", "number", 2, "mean gain of lines over cubics (I5)"),
+            Column("gain_ci", "95 % CI", "interval", 2, "t, of humans over pairs", optional=True),
+            Column("held_percent", "held (%)", "percent", 1, "trials with a gain above 0"),
+            Column(
+                "difference_sd",
+                "- humans (SD)",
+                "number",
+                2,
+                "difference from the humans within conditions, in human SD",
+                optional=True,
+            ),
+            Column("difference_sd_ci", "95 % CI", "interval", 2, "Welch, by pair", optional=True),
             Column(
                 "revision",
                 "revision",
@@ -47,7 +54,7 @@ def velocity_profiles(study: Study) -> Table:
             ),
         ),
         [_row(study, group) for group in study.groups],
-        (*piecewise_notes(study), *sample_notes(study, study.groups)),
+        (*intermittency_notes(study), *sample_notes(study, study.groups)),
     )
 
 
@@ -60,18 +67,14 @@ def _row(study: Study, group: Group) -> Row:
     if not group.measured:
         return Row(group.id, (group.id,), values | {"setting": ""}, "no human traces are imported")
     values["setting"] = group.setting
-    share = piecewise_share(study, group)
-    profiles = of_group(study.profiles, group, group.finished)
-    note = "" if len(profiles) else "no finished trial"
-    if share.value is not None and share.low is not None and share.high is not None:
-        values["passing_percent"] = 100 * share.value
-        values["passing_percent_ci"] = (100 * share.low, 100 * share.high)
-    for name, column in (
-        ("knot_rate_hz", "knot_rate_hz"),
-        ("residual_mps", "rmse_mps"),
-        ("reversal_rate_hz", "reversal_rate_hz"),
-    ):
-        values[name] = mean(profiles[column].to_numpy(float)).value
+    trials = gains(study, group)
+    judged = trials["gain"].dropna()
+    values |= {"no_action": int(trials["steady"].sum())} | gain_values(study, group)
+    if len(judged):
+        values["held_percent"] = float(100 * (judged > 0).mean())
+    if study.calibrated and group is not study.human:
+        found = difference(study, group)
+        values |= {"difference_sd": found.value, "difference_sd_ci": bounds(found)}
     plans = of_group(study.plans, group, group.ended)[
         ["plans", "coarse_plans", "revised_plans", "total_revision", "large_revisions"]
     ].sum()
@@ -80,4 +83,19 @@ def _row(study: Study, group: Group) -> Row:
     if plans["revised_plans"]:
         values["revision"] = float(plans["total_revision"] / plans["revised_plans"])
         values["revised_percent"] = float(100 * plans["large_revisions"] / plans["revised_plans"])
-    return Row(group.id, (group.id,), values, note)
+    return Row(group.id, (group.id,), values, "" if len(judged) else NO_ACTION)
+
+
+def gain_values(
+    study: Study, group: Group, value: str = "gain", interval: str = "gain_ci"
+) -> dict[str, Value]:
+    """The mean gain of a group whose speeds are known, under the names of two columns."""
+    if not group.measured:
+        return {}
+    found = mean_gain(study, group)
+    return {value: found.value, interval: bounds(found)}
+
+
+def bounds(found: Estimate) -> tuple[float, float] | None:
+    """The interval of an estimate, where it has one."""
+    return None if found.low is None or found.high is None else (found.low, found.high)

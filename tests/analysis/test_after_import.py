@@ -11,11 +11,15 @@ from analysis.conclusions import not_shown
 from analysis.figures import figure_2
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
-from analysis.piecewise import THRESHOLDS
+from analysis.indicators import Verdict
+from analysis.intermittency import measure_profiles
+from analysis.intervals import mean
+from analysis.likeness import MARGIN_SD, gains
+from analysis.load import SPEEDS
 from analysis.provenance import provenance
-from analysis.study import Study, of_group
+from analysis.study import Study
 from analysis.tables import make_tables
-from analysis.verdicts import population, thresholds
+from analysis.verdicts import population, score
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.store import Store
 
@@ -70,12 +74,42 @@ def test_humans_have_further_rows_with_a_random_intercept_per_pair(imported):
         assert all(row.values.get("b") is not None or row.note for row in rows)
 
 
-def test_the_limit_of_reversals_becomes_the_human_95th_percentile(imported):
-    human = of_group(imported.profiles, imported.human, imported.human.finished)
-    expected = human["reversal_rate_hz"].quantile(0.95)
-    assert thresholds(imported).max_reversal_rate_hz == expected != THRESHOLDS.max_reversal_rate_hz
+def test_a_driver_is_compared_with_the_humans_by_i5(imported):
+    """The driver holds its accelerations; these humans approach their speed exponentially."""
+    (group,) = imported.models
+    found = score(imported, group)
+    assert found.robust["I5"] == Verdict(False)
+    assert found.paper["I5"] == Verdict(None, None, "by eye, the paper")
     (table,) = make_tables(imported, ["velocity-profiles"])
-    assert any("human 95th percentile" in note for note in table.notes)
+    human, driver = (row.values for row in table.rows)
+    assert human["gain"] < 0 < driver["gain"]
+    assert driver["difference_sd_ci"][0] > MARGIN_SD
+    assert any("within 0.5 human SD" in note for note in table.notes)
+
+
+def test_the_human_interval_is_over_pairs(imported):
+    (table,) = make_tables(imported, ["velocity-profiles"])
+    trials = gains(imported, imported.human)
+    pairs = mean(trials.groupby("pair")["gain"].mean())
+    assert pairs.n == 3
+    assert table.rows[0].values["gain_ci"] == (pairs.low, pairs.high)
+    assert table.rows[0].values["gain"] == pairs.value
+
+
+def test_humans_are_not_compared_with_themselves(imported):
+    found = score(imported, imported.human)
+    for verdicts in (found.paper, found.robust):
+        assert verdicts["I5"] == Verdict(None, None, "the humans are the reference")
+    (table,) = make_tables(imported, ["velocity-profiles"])
+    assert table.rows[0].values.get("difference_sd") is None
+
+
+def test_the_speeds_of_humans_are_judged_without_the_simulators_resistance(imported):
+    profiles = measure_profiles(imported._read(SPEEDS).assign(resisted=True))
+    human = imported.profiles["spec_hash"] == imported.human.spec_hash
+    assert human.sum() == 2 * len(imported.human.trials)
+    assert profiles[human].equals(imported.profiles[human])
+    assert not profiles[~human].equals(imported.profiles[~human])
 
 
 def test_ceilings_are_drawn_from_the_published_humans_while_some_are_missing(imported):

@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
-from statsmodels.stats.proportion import proportion_confint
 
 from analysis.ceiling import (
     DATA_SETS,
@@ -283,47 +282,15 @@ def test_i1_to_i4_together_pass_where_each_does():
     assert found["I1-I4"] == np.mean(together)
 
 
-def test_i5_has_no_ceiling_before_an_import():
+def test_i5_is_a_comparison_with_humans_and_has_no_ceiling():
     found = ceiling(HUMANS, even(10))
-    assert "I5" not in found.paper | found.robust
+    assert set(found.paper) == set(found.robust) == {"I1", "I2", "I3", "I4", "I1-I4"}
 
 
 def finished_humans() -> pd.DataFrame:
     """The published outcomes that did not collide, with gaps."""
     trials = human_outcomes().query("status == 'finished'")
     return trials.assign(gap_m=np.random.default_rng(1).normal(4, 1.8, len(trials)))
-
-
-@pytest.mark.parametrize("percent", [0, 85, 90, 100])
-def test_after_an_import_i5_passes_as_often_as_by_the_binomial(percent):
-    trials = finished_humans()
-    by_condition = trials.groupby("condition")
-    order = by_condition.cumcount() / by_condition["status"].transform("size")
-    humans = imported_humans(trials, order < percent / 100)
-    needed = min(k for k in range(111) if proportion_confint(k, 110, method="wilson")[0] >= 0.8)
-    share = sum(flags.mean() for flags in humans.piecewise) / 11
-    expected = stats.binom.sf(needed - 1, 110, share)
-    assert _Draws(humans, even(10)).piecewise.mean() == pytest.approx(expected, abs=0.06)
-
-
-@pytest.mark.usefixtures("few")
-def test_after_an_import_the_ceiling_has_i5_by_both_rules():
-    trials = finished_humans()
-    always = pd.Series(True, index=trials.index)
-    found = ceiling(imported_humans(trials, always), even(10))
-    assert found.paper["I5"] == found.robust["I5"] == 1.0
-    assert _Draws(imported_humans(trials, ~always), even(10)).piecewise.mean() == 0
-
-
-def test_trials_that_did_not_finish_do_not_count_for_i5():
-    """Half of the human trials collided; all others pass, mostly enough of them."""
-    left = [np.array([1.0, np.nan])] * 11
-    passing = [np.array([1.0, np.nan])] * 11
-    gaps = [np.array([4.0, np.nan])] * 11
-    draws = _Draws(Population(tuple(left), tuple(gaps), tuple(passing)), even(10))
-    enough = proportion_confint(draws.n.sum(axis=1), draws.n.sum(axis=1), method="wilson")[0] >= 0.8
-    assert (draws.piecewise == enough).all()
-    assert enough.mean() > 0.9
 
 
 def test_imported_humans_are_their_trials_by_condition():
@@ -335,15 +302,12 @@ def test_imported_humans_are_their_trials_by_condition():
         ("L_4_8", "finished", "left", 5.0),
     ]
     trials = pd.DataFrame(rows, columns=["condition", "status", "merged_first", "gap_m"])
-    found = imported_humans(trials, pd.Series([1.0, 0.0, np.nan, np.nan, 1.0]))
+    found = imported_humans(trials)
     at = list(CONDITIONS).index("N_0_0")
     assert found.left[at] == pytest.approx([1, 0, np.nan, np.nan], nan_ok=True)
     assert found.gap_m[at] == pytest.approx([3, 4, np.nan, np.nan], nan_ok=True)
-    assert found.piecewise[at] == pytest.approx([1, 0, np.nan, np.nan], nan_ok=True)
     last = list(CONDITIONS).index("L_4_8")
-    assert [list(part[last]) for part in (found.left, found.gap_m, found.piecewise)] == [
-        [1], [5], [1]
-    ]  # fmt: skip
+    assert [list(part[last]) for part in (found.left, found.gap_m)] == [[1], [5]]
     assert sum(map(len, found.left)) == 5
 
 
@@ -352,6 +316,6 @@ def test_imported_gaps_are_drawn_with_the_outcome_of_the_same_trial():
     """Who merged first on the left kept 3 m, on the right 5 m."""
     trials = finished_humans()
     trials["gap_m"] = trials["merged_first"].map({"left": 3.0, "right": 5.0})
-    draws = _Draws(imported_humans(trials, trials["gap_m"] > 0), even(3))
+    draws = _Draws(imported_humans(trials), even(3))
     assert (draws.n == 3).all()
     assert (draws.gap == 15 - 2 * draws.left).all()

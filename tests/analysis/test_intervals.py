@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from statsmodels.stats.proportion import proportion_confint
 
-from analysis.intervals import Estimate, mean, proportion, wilson_low
+from analysis.intervals import Estimate, mean, proportion
 
 NOTHING = Estimate(None, None, None, 0)
 SHARES = st.integers(1, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
@@ -89,11 +89,3 @@ def test_a_mean_lies_inside_its_interval_and_between_the_extremes(values):
     found = mean(values)
     assert found.low <= found.value <= found.high
     assert min(values) - 1e-6 <= found.value <= max(values) + 1e-6
-
-
-@given(st.lists(SHARES | st.just((0, 0)), min_size=1, max_size=20))
-def test_many_lower_bounds_are_those_of_single_proportions(shares):
-    successes, n = np.array(shares).T
-    expected = [proportion(*map(int, share)).low for share in shares]
-    found = [None if np.isnan(low) else low for low in wilson_low(successes, n)]
-    assert found == pytest.approx(expected, abs=1e-12)

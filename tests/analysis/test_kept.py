@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,19 +9,18 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from studies import Said, played, write_study, yielding
+from studies import write_study, yielding
 
-from analysis import kept, profiles
+from analysis import kept
 from analysis.forms import TableFormat
 from analysis.kept import finished, keep_finished
-from analysis.profiles import fitted_profiles
 from analysis.report import finished_figures
 from analysis.study import Study
 from analysis.tables import TABLES, finished_tables, make_tables
 from analysis.tables.formats import render
 from analysis.tables.model import from_text, to_text
 from merge_runner.errors import UsageError
-from merge_runner.store import Store, results_digest
+from merge_runner.store import results_digest
 
 HOLDER = """
 import sys, duckdb
@@ -53,20 +51,6 @@ def db(tmp_path) -> Path:
     """o3 once in every condition, and asked."""
     drives = [replace(drive, said={}) for drive in yielding("o3", reps=1)]
     return write_study(tmp_path / "t.duckdb", drives)
-
-
-@pytest.fixture
-def fitted(monkeypatch):
-    """Notes how many vehicles are fitted each time."""
-    counts = []
-
-    def fit(speeds):
-        counts.append(len(speeds))
-        return original(speeds)
-
-    original = profiles.fit_profiles
-    monkeypatch.setattr("analysis.profiles.fit_profiles", fit)
-    return counts
 
 
 @pytest.fixture
@@ -118,13 +102,11 @@ def test_after_any_change_of_the_results_tables_are_made_anew(db, made, what):
     assert made == ["attempts", "attempts"]
 
 
-def test_another_program_makes_tables_and_fits_anew(db, made, fitted, monkeypatch):
+def test_another_program_makes_tables_anew(db, made, monkeypatch):
     for name in ("one", "one", "other", "other"):
         monkeypatch.setattr("analysis.kept.program", lambda name=name: name)
-        monkeypatch.setattr("analysis.profiles.program", lambda name=name: name)
         finished_tables(db, None, ["velocity-profiles"])
     assert made == ["velocity-profiles"] * 2
-    assert fitted == [22, 22]
 
 
 def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, monkeypatch):
@@ -138,37 +120,6 @@ def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, 
     monkeypatch.setattr("analysis.kept.version", lambda _: "0")
     found.add(kept.program.__wrapped__())
     assert len(found) == 4
-
-
-def test_kept_fits_equal_fresh_ones_and_a_changed_speed_is_fitted_again(db, fitted):
-    first = fitted_profiles(db)
-    assert first.equals(fitted_profiles(db))
-    change(db, CHANGES["a speed"])
-    third = fitted_profiles(db)
-    assert fitted == [22, 1]
-    different = first.compare(third).index
-    assert list(first.loc[different, "trial_id"]) == ["o3/baseline/N_0_0/rep01"]
-    change(db, "DROP TABLE i5_fits")
-    assert fitted_profiles(db).equals(third)
-
-
-def test_a_failed_trial_that_was_played_again_is_fitted_again(tmp_path, fitted):
-    (drive, *_) = yielding("o3", reps=1)
-    lost = replace(drive, said={3: Said(("timeout",), lost=True)})
-    db = write_study(tmp_path / "t.duckdb", [lost])
-    before = fitted_profiles(db)
-    Store(db).write("sweep-1", [played(replace(drive, said={}))], patience_s=1)
-    after = fitted_profiles(db)
-    assert fitted == [2, 2]
-    assert len(before) == len(after) == 2
-    with duckdb.connect(str(db)) as connection:
-        assert connection.execute("SELECT count(*) FROM i5_fits").fetchone() == (2,)
-
-
-def test_too_short_a_drive_has_no_fit_and_is_looked_at_once(db, fitted):
-    change(db, "DELETE FROM states WHERE step > 2 AND trial_id LIKE '%N_0_0/rep01'")
-    assert len(fitted_profiles(db)) == len(fitted_profiles(db)) == 20
-    assert fitted == [22]
 
 
 @pytest.mark.usefixtures("few_draws")
@@ -240,10 +191,3 @@ def test_unknown_names_are_refused_also_beside_kept_tables(db):
         finished_tables(db, None, ["gaps"])
     with pytest.raises(UsageError, match="no driver 'o4'"):
         finished_tables(db, ["o4"], ["attempts"])
-
-
-def test_a_copied_database_keeps_what_was_computed(db, tmp_path, fitted):
-    first = fitted_profiles(db)
-    copy = Path(shutil.copy(db, tmp_path / "copy.duckdb"))
-    assert Study(copy).profiles.equals(first)
-    assert fitted == [22]
