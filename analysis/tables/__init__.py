@@ -25,6 +25,7 @@ TABLES = {
     "ablation-qualitative": "ablations",
     "ablation-quantitative": "ablations",
     "contrasts": "contrasts",
+    "differences": "differences",
     "velocity-profiles": "profiles",
     "conflict-resolution": "conflicts",
     "criticality": "conflicts",

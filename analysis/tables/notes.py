@@ -13,8 +13,11 @@ from analysis.study import Group, Study
 from analysis.verdicts import thresholds
 
 
-def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
-    """One note a group on its trials and those left out, and what else to know of the drivers."""
+def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) -> list[str]:
+    """One note a group on its trials and those left out, and what else to know of the drivers.
+
+    ``pooled`` says that the table takes imported human trials as independent.
+    """
     shown = list(groups)
     notes = [
         f"{group.id}: {len(group.finished)} of {len(group.trials)} trials finished, left out: "
@@ -24,21 +27,24 @@ def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
     if study.empty:
         notes.append(f"{study.db} holds no trial of a model; `make sweep` plays some")
     if study.human in study.groups:
-        notes += _human_notes(study)
+        notes += _human_notes(study, pooled)
     scripted = dict.fromkeys(group.driver for group in shown if group.scripted)
     return [*notes, *(f"{driver} is a scripted stand-in, no language model" for driver in scripted)]
 
 
 @cache
-def _human_notes(study: Study) -> tuple[str, ...]:
+def _human_notes(study: Study, pooled: bool) -> tuple[str, ...]:
     if not study.human.measured:
         return (
             "human: the published outcomes of 990 trials; for the rest `merge-runner human import "
             f"PATH` reads the recordings (doi {HUMAN_DOI})",
         )
+    found = tuple(f"human: {finding}" for finding in findings(human_counts(study.db)))
+    if not pooled:
+        return found
     pairs = study.human.trials["pair"].nunique()
     return (
-        *(f"human: {finding}" for finding in findings(human_counts(study.db))),
+        *found,
         f"human: intervals and tests take the trials as independent, but they come from {pairs} "
         "pairs who differ: they are too narrow",
     )
