@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import cache
 
-from analysis.ceiling import DATA_SETS, SEED
+from analysis import ceiling
 from analysis.human.counts import findings, human_counts
 from analysis.piecewise import THRESHOLDS
 from analysis.published import HUMAN_DOI, HUMAN_GAP_SD_M
@@ -59,9 +59,9 @@ def ceiling_notes(study: Study) -> list[str]:
         f"residuals of SD {HUMAN_GAP_SD_M} m"
     )
     return [
-        f"humans pass: share of {DATA_SETS} human data sets with as many trials per condition as "
-        f"the row has (seed {SEED}; {source}); at the score: I1 to I4 together. So often a perfect "
-        "copy of the humans passes"
+        f"humans pass: share of {ceiling.DATA_SETS} human data sets with as many trials per "
+        f"condition as the row has (seed {ceiling.SEED}; {source}); at the score: I1 to I4 "
+        "together. So often a perfect copy of the humans passes"
     ]
 
 

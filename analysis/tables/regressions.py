@@ -233,5 +233,4 @@ def _published_gap(group: Group, term: str) -> Row:
             "p": _published_p(str(values["p"])),
         },
         f"published values, no human traces are imported ({citation('paper_gap')})",
-        printed=("n", "b", "se", "t", "p"),
     )
