@@ -141,4 +141,4 @@ def _quantitative_row(group: Group) -> Row:
     if shipped:
         note = "gap, RMSE and joint rate are published values, no human traces are imported"
         note += f" ({citation(SOURCE)})"
-    return Row(group.id, (group.id,), values, note)
+    return Row(group.id, (group.id,), values, note, printed=tuple(shipped))

@@ -60,17 +60,17 @@ def _placed(table: Table, row: Row, group: Group) -> Row:
         row,
         beside=group.model if own and group.model in DRIVERS else "",
         stand_in_for=group.model if posing else "",
-        published=_published(table, row, group),
+        printed=_printed(table, row, group),
     )
 
 
-def _published(table: Table, row: Row, group: Group) -> tuple[str, ...]:
+def _printed(table: Table, row: Row, group: Group) -> tuple[str, ...]:
     """The columns that rest on published values: to compare them with these says nothing."""
     every = tuple(column.name for column in table.columns)
     if not group.measured:
         return every
     if group.published_outcomes is None:
-        return ()
+        return row.printed
     item = row.id.rpartition("/")[2]
     outcomes = table.name == "who-first" or item in {"collided_percent", "score"}
     return every if outcomes else ("collided_percent", "score_paper")
@@ -201,6 +201,6 @@ def _compared(row: Row, name: str, printed: dict[str, Any] | None, theirs: str) 
     if isinstance(ours, bool):
         return {f"{name}_in_paper": bool(value)}
     values: dict[str, Value] = {f"{name}_in_paper": value}
-    if isinstance(ours, (int, float)) and name not in row.published:
+    if isinstance(ours, (int, float)) and name not in row.printed:
         values[f"{name}_difference"] = ours - value
     return values

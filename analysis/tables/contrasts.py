@@ -113,7 +113,7 @@ def _corrected(pairs: list[tuple[Group, Group]], measure: Measure, reference: st
                 "n": _n(group, measure),
                 "n_reference": _n(other, measure),
             },
-            _note(other, measure, contrast),
+            "; ".join(filter(None, (_joint_note(other, measure), _powerless(contrast, measure)))),
             counts=measure.counts,
         )
         for i, (group, other, contrast) in enumerate(found)
@@ -142,11 +142,14 @@ def _n(group: Group, measure: Measure) -> int:
     return estimate(group, measure).n
 
 
-def _note(other: Group, measure: Measure, contrast: Contrast) -> str:
-    notes = [] if known(other, measure) else [JOINT_NOTE]
-    if contrast.detectable is None:
-        notes.append(f"{measure.heading}: so few trials can show no difference, however large")
-    return "; ".join(notes)
+def _joint_note(other: Group, measure: Measure) -> str:
+    return "" if known(other, measure) else JOINT_NOTE
+
+
+def _powerless(contrast: Contrast, measure: Measure) -> str:
+    if contrast.detectable is not None:
+        return ""
+    return f"{measure.heading}: so few trials can show no difference, however large"
 
 
 def _percent(value: float | None, measure: Measure) -> float | None:

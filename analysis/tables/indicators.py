@@ -135,7 +135,7 @@ def _measure_row(group: Group, measure: Measure) -> Row:
     if not known(group, measure):
         source = f"published value, no human traces are imported ({citation(SOURCE)})"
         values = {**key, "value": published_human(measure)}
-        return Row(row, (group.id,), values, source)
+        return Row(row, (group.id,), values, source, printed=("value",))
     found = estimate(group, measure)
     interval = None if found.low is None or found.high is None else (found.low, found.high)
     return Row(

@@ -36,10 +36,10 @@ class Column:
 class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
-    ``counts`` is the SQL predicate of its trials, where it is not that of the columns. ``beside``
-    is the driver of the paper whose row it stands beside, if any; ``stand_in_for`` the model in
-    whose name a scripted stand-in answered; ``published`` the columns whose values rest on
-    published ones.
+    ``counts`` is the SQL predicate of its trials, where it is not that of the columns; ``printed``
+    names the columns whose values are the published ones, or rest on them. ``beside`` is the driver
+    of the paper whose row it stands beside, if any, and ``stand_in_for`` the model in whose name a
+    scripted stand-in answered.
     """
 
     id: str
@@ -47,9 +47,9 @@ class Row:
     values: Mapping[str, Value]
     note: str = ""
     counts: str = ""
+    printed: tuple[str, ...] = ()
     beside: str = ""
     stand_in_for: str = ""
-    published: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ def from_text(text: str) -> Table:
         for name in intervals & row["values"].keys():
             if row["values"][name] is not None:
                 row["values"][name] = tuple(row["values"][name])
-        row["groups"], row["published"] = tuple(row["groups"]), tuple(row["published"])
+        row["groups"], row["printed"] = tuple(row["groups"]), tuple(row["printed"])
     rows = [Row(**row) for row in content["rows"]]
     return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})
 

@@ -60,8 +60,7 @@ def few_draws(monkeypatch):
     monkeypatch.setattr("analysis.ceiling.DATA_SETS", 20)
     monkeypatch.setattr("analysis.contrasts.PERMUTATIONS", 99)
     yield
-    # The published humans are the same for all studies: others draw from them in earnest.
-    ceiling.cache_clear()
+    ceiling.cache_clear()  # the published humans are the same for all studies
 
 
 @pytest.fixture(scope="session")
