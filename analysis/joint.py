@@ -79,7 +79,7 @@ def differences(human: Group, group: Group) -> tuple[Difference, ...]:
 
 
 def pairs_known(human: Group, outcome: str) -> int:
-    """How many imported pairs the humans' part of a model rests on; 0 where it is published."""
+    """How many pairs of imported humans have the outcome; 0 where that of the published counts."""
     trials = human.outcomes if outcome == WHO_FIRST else human.finished
     return trials["pair"].nunique() if "pair" in trials else 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from analysis.joint import GAP, NARROW, WHO_FIRST, Difference, pairs_known
 from analysis.joint import differences as tested
+from analysis.mixed import MIN_PAIRS
 from analysis.study import Group, Study
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import sample_notes
@@ -63,12 +64,12 @@ def differences(study: Study) -> Table:
 
 def _row(human: Group, group: Group, found: Difference) -> Row:
     # Published outcomes and fits are no trials that could be listed.
-    listed = (group.id, human.id) if pairs_known(human, found.outcome) else (group.id,)
+    of_traces = pairs_known(human, found.outcome) >= MIN_PAIRS
     ci = None if found.low is None or found.high is None else (found.low, found.high)
     said = found.problem or found.remark
     return Row(
         f"{group.id}/{found.outcome}/{found.term}",
-        listed,
+        (group.id, human.id) if of_traces else (group.id,),
         {
             "driver": group.label,
             "outcome": OUTCOMES[found.outcome],

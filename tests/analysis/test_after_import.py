@@ -70,6 +70,17 @@ def test_humans_have_further_rows_with_a_random_intercept_per_pair(imported):
         assert all(row.values.get("b") is not None or row.note for row in rows)
 
 
+def test_a_difference_from_humans_names_their_trials_where_it_rests_on_them(imported):
+    (table,) = make_tables(imported, ["differences"])
+    behind = {row.values["outcome"]: row.groups for row in table.rows}
+    assert behind == {
+        "left first (logit)": ("o3/baseline",),  # and on the published outcomes
+        "gap (m)": ("o3/baseline", "human"),
+    }
+    assert any("jackknife over 3 pairs" in row.note for row in table.rows)
+    assert not any("intervals and tests take the trials" in note for note in table.notes)
+
+
 def test_the_limit_of_reversals_becomes_the_human_95th_percentile(imported):
     human = of_group(imported.profiles, imported.human, imported.human.finished)
     expected = human["reversal_rate_hz"].quantile(0.95)
