@@ -45,10 +45,24 @@ def tables(
         TableFormat, typer.Option("--format", help="Form of the tables.")
     ] = TableFormat.TEXT,
     against: Annotated[
-        str | None, typer.Option("--against", help="paper: published values and differences.")
+        str | None,
+        typer.Option(
+            "--against", help="paper: published values and differences, for drivers of that name."
+        ),
+    ] = None,
+    as_driver: Annotated[
+        str | None,
+        typer.Option(
+            "--as",
+            metavar="DRIVER",
+            help="With --against paper: every driver beside the paper's human, o3 or "
+            "gemini-2.5-pro.",
+        ),
     ] = None,
 ) -> None:
     """Print the paper's tables III to VII, and those that say what these cannot."""
+    if as_driver is not None and against is None:
+        raise UsageError("--as DRIVER goes with --against paper")
     from analysis.tables import finished_tables
     from analysis.tables.formats import render
 
@@ -56,7 +70,7 @@ def tables(
     if against is not None:
         from analysis.tables.against import against as beside
 
-        made = [beside(table, against) for table in made]
+        made = [beside(table, against, as_driver) for table in made]
     print_out(render(made, output))
 
 

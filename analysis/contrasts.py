@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import optimize, special, stats
 
-from analysis.intervals import LEVEL
+from analysis.intervals import LEVEL, POWER, detectable
 
 SEED = 260409609
 PERMUTATIONS = 9999
@@ -18,12 +19,17 @@ DRAWN_AT_ONCE = 2**15  # they stay in the processor
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """A difference (first minus second) with its 95 % interval and a two-sided p-value."""
+    """A difference (first minus second) with its 95 % interval and a two-sided p-value.
+
+    ``detectable`` is the smallest difference, in either direction, that is found at p < .05 with a
+    power of 0.8; None where none is.
+    """
 
     difference: float
     low: float | None
     high: float | None
     p: float
+    detectable: float | None
 
 
 def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Contrast:
@@ -33,7 +39,44 @@ def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Contrast:
     (a, n), (b, m) = first, second
     low, high = confint_proportions_2indep(a, n, b, m, method="newcomb", alpha=1 - LEVEL)
     p = stats.fisher_exact([[a, n - a], [b, m - b]]).pvalue
-    return Contrast(a / n - b / m, float(low), float(high), float(p))
+    found = detectable_rate(n, m, b / m)
+    return Contrast(a / n - b / m, float(low), float(high), float(p), found)
+
+
+def detectable_rate(n: int, m: int, rate: float) -> float | None:
+    """The smallest difference from a true ``rate`` that Fisher's test of n and m trials finds.
+
+    In the direction in which less is enough; None where not even rates of 0 and 1 are told apart
+    from it with the power.
+    """
+    found = rejected(n, m) @ stats.binom.pmf(np.arange(m + 1), m, rate)
+
+    def power(other: float) -> float:
+        return float(stats.binom.pmf(np.arange(n + 1), n, other) @ found)
+
+    ends = [end for end in (0.0, 1.0) if power(end) >= POWER]
+    return min(
+        (abs(optimize.brentq(lambda x: power(x) - POWER, rate, end) - rate) for end in ends),
+        default=None,
+    )
+
+
+@cache
+def rejected(n: int, m: int) -> NDArray[np.bool_]:
+    """Of all outcomes, successes of n by successes of m, those with a Fisher's p below .05."""
+    counts = np.arange(n + 1), np.arange(m + 1)
+    # Log of k! (n - k)!: what is left of binomial coefficients when they are normalised.
+    first, second = (special.gammaln(k + 1) + special.gammaln(k[::-1] + 1) for k in counts)
+    found = np.empty((n + 1, m + 1), dtype=bool)
+    for total in range(n + m + 1):
+        a = np.arange(max(0, total - m), min(n, total) + 1)
+        log = -first[a] - second[total - a]
+        p = np.exp(log - special.logsumexp(log))
+        order = np.argsort(p)
+        # As likely but for rounding is as likely.
+        last = np.searchsorted(p[order], p * (1 + 1e-7), side="right") - 1
+        found[a, total - a] = np.cumsum(p[order])[last] < 1 - LEVEL
+    return found
 
 
 def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Contrast | None:
@@ -53,14 +96,16 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> C
         return None
     difference = float((group * value).sum()) / weight
     freedom = len(both) - by_condition.ngroups - 1
-    low = high = None
+    low = high = found = None
     if freedom > 0:
         variance = float(((value - difference * group) ** 2).sum()) / freedom
-        half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * float(np.sqrt(variance / weight))
-        low, high = difference - half, difference + half
+        se = float(np.sqrt(variance / weight))
+        half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * se
+        low, high, found = difference - half, difference + half, detectable(se, freedom)
     chosen = both["_first"].to_numpy(float) == 1
     sizes = by_condition.size().to_numpy()
-    return Contrast(difference, low, high, _permutation_p(value, chosen, sizes, weight, difference))
+    p = _permutation_p(value, chosen, sizes, weight, difference)
+    return Contrast(difference, low, high, p, found)
 
 
 def _permutation_p(
@@ -105,10 +150,7 @@ def shuffled_sums(
 
 def corrected(p: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A family's p-values by Holm (1979) and by Benjamini and Hochberg (1995)."""
-    found = np.asarray(p, dtype=float)
-    order = np.argsort(found, kind="stable")
-    # The smallest is multiplied by the number of tests, the next by one less, and none falls.
-    steps = np.maximum.accumulate(found[order] * np.arange(len(found), 0, -1))
-    holm = np.empty_like(found)
-    holm[order] = np.minimum(steps, 1)
-    return holm, np.asarray(stats.false_discovery_control(found))
+    from statsmodels.stats.multitest import multipletests
+
+    holm, false_discovery = (multipletests(p, method=m)[1] for m in ("holm", "fdr_bh"))
+    return np.asarray(holm), np.asarray(false_discovery)

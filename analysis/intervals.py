@@ -1,4 +1,4 @@
-"""Confidence intervals of proportions and means."""
+"""Confidence intervals of proportions and means, and what could have been found."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 LEVEL = 0.95
+POWER = 0.8
 Z = float(stats.norm.ppf((1 + LEVEL) / 2))
 
 
@@ -44,3 +45,8 @@ def mean(values: Sequence[float] | np.ndarray) -> Estimate:
     value = float(sample.mean())
     half = float(stats.t.ppf((1 + LEVEL) / 2, n - 1) * sample.std(ddof=1) / sqrt(n))
     return Estimate(value, value - half, value + half, n)
+
+
+def detectable(se: float, freedom: float) -> float:
+    """The smallest effect that a two-sided t test at 5 % finds with a power of 0.8."""
+    return float(stats.t.ppf((1 + LEVEL) / 2, freedom) + stats.t.ppf(POWER, freedom)) * se

@@ -25,6 +25,7 @@ TABLES = {
     "ablation-qualitative": "ablations",
     "ablation-quantitative": "ablations",
     "contrasts": "contrasts",
+    "differences": "differences",
     "velocity-profiles": "profiles",
     "conflict-resolution": "conflicts",
     "criticality": "conflicts",
@@ -37,7 +38,9 @@ TABLES = {
 
 def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
     """The named tables, or all; raises UsageError."""
-    return [_maker(name)(study) for name in _valid(names)]
+    from analysis.tables.against import placed
+
+    return [placed(_maker(name)(study), study.groups) for name in _valid(names)]
 
 
 def finished_tables(

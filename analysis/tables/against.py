@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import pandas as pd
 
 from analysis.published import citation, published
+from analysis.study import EMULATOR, HUMAN, Group
 from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.errors import UsageError
 
 PAPER = "paper"
+# Whom the paper has rows of, and what may follow the name of a driver that is one of them.
+DRIVERS = ("human", "o3", "gemini-2.5-pro")
+MARKS = re.compile(r"(/set\d+)?( \[[^]]+\])*")
 # Table to its published file, and our columns to the file's.
 FILES: dict[str, tuple[str, dict[str, str]]] = {
     "who-first": ("paper_who_first", {c: c for c in ("n", "b", "se", "z", "p")}),
@@ -36,22 +42,82 @@ INDICATOR_ROWS = {
 }
 
 
-def against(table: Table, reference: str) -> Table:
-    """A table with published values and differences; raises UsageError for another reference."""
+def placed(table: Table, groups: Iterable[Group]) -> Table:
+    """The table with rows that say which driver of the paper they stand beside.
+
+    That is a driver of the very name whom its provider answered, and no stand-in.
+    """
+    if not in_paper(table):
+        return table
+    known = {group.id: group for group in groups}
+    return replace(table, rows=[_placed(table, row, known[row.groups[0]]) for row in table.rows])
+
+
+def _placed(table: Table, row: Row, group: Group) -> Row:
+    own = MARKS.fullmatch(group.driver.removeprefix(group.model)) and not group.scripted
+    posing = group.scripted and group.model != EMULATOR
+    return replace(
+        row,
+        beside=group.model if own and group.model in DRIVERS else "",
+        stand_in_for=group.model if posing else "",
+        printed=_printed(table, row, group),
+    )
+
+
+def _printed(table: Table, row: Row, group: Group) -> tuple[str, ...]:
+    """The columns that rest on published values: to compare them with these says nothing."""
+    every = tuple(column.name for column in table.columns)
+    if not group.measured:
+        return every
+    if group.published_outcomes is None:
+        return row.printed
+    item = row.id.rpartition("/")[2]
+    outcomes = table.name == "who-first" or item in {"collided_percent", "score"}
+    return every if outcomes else ("collided_percent", "score_paper")
+
+
+def against(table: Table, reference: str, driver: str | None = None) -> Table:
+    """A table with published values and differences.
+
+    Each row stands beside the paper's row of that name; with ``driver`` those of all drivers stand
+    beside its rows, except for stand-ins that answered in its name. Raises UsageError for another
+    reference, and for a driver that the paper has not.
+    """
     if reference != PAPER:
         raise UsageError(f"--against {reference}: valid is {PAPER}")
+    if driver is not None and driver not in DRIVERS:
+        raise UsageError(f"--as {driver}: the paper has {', '.join(DRIVERS)}")
     if table.name == "indicators":
-        columns, rows = _indicators(table)
+        columns, rows = _indicators(table, driver)
         files = ["paper_ablation_qualitative", "paper_ablation_quantitative"]
     elif table.name in FILES:
-        columns, rows = _beside(table)
+        columns, rows = _beside(table, driver)
         files = [FILES[table.name][0]]
     else:
         return replace(table, notes=(*table.notes, "the paper has no such table"))
     cited = [f"paper: {citation(name)}" for name in files]
     found = any(row.values.get(c.name) is not None for row in rows for c in columns if _added(c))
     absent = [] if found else ["the paper has none of these drivers and variants"]
-    return replace(table, columns=columns, rows=rows, notes=(*table.notes, *cited, *absent))
+    notes = (*table.notes, *cited, *_placements(table, driver), *absent)
+    return replace(table, columns=columns, rows=rows, notes=notes)
+
+
+def _placements(table: Table, driver: str | None) -> list[str]:
+    """Who stands beside whom, where that is not the row of the same name; and who does not."""
+    names = [name for name in DRIVERS if driver in {None, name}]
+    kept_off = [
+        (row.values["driver"], name)
+        for row in table.rows
+        for name in names
+        if name in row.stand_in_for.split("+")
+    ]
+    return [
+        *([] if driver is None else [f"every driver stands beside the paper's {driver}"]),
+        *(
+            f"{label} does not stand beside the paper's {name}"
+            for label, name in dict(kept_off).items()
+        ),
+    ]
 
 
 def in_paper(table: Table) -> bool:
@@ -59,7 +125,7 @@ def in_paper(table: Table) -> bool:
     return table.name in {*FILES, "indicators"}
 
 
-def _beside(table: Table) -> tuple[list[Column], list[Row]]:
+def _beside(table: Table, named: str | None) -> tuple[list[Column], list[Row]]:
     name, pairs = FILES[table.name]
     columns: list[Column] = []
     for column in table.columns:
@@ -68,7 +134,7 @@ def _beside(table: Table) -> tuple[list[Column], list[Row]]:
             columns += _columns(column)
     rows = []
     for row in table.rows:
-        driver, setting, term = _key(row)
+        driver, setting, term = _key(row, named)
         printed = _row(published(name), driver, setting, term)
         values = dict(row.values)
         for ours, theirs in pairs.items():
@@ -77,7 +143,7 @@ def _beside(table: Table) -> tuple[list[Column], list[Row]]:
     return columns, rows
 
 
-def _indicators(table: Table) -> tuple[list[Column], list[Row]]:
+def _indicators(table: Table, named: str | None) -> tuple[list[Column], list[Row]]:
     columns: list[Column] = []
     for column in table.columns:
         columns.append(column)
@@ -85,7 +151,7 @@ def _indicators(table: Table) -> tuple[list[Column], list[Row]]:
             columns += _columns(column)
     rows = []
     for row in table.rows:
-        driver, setting, item = _key(row)
+        driver, setting, item = _key(row, named)
         file, theirs, ours = INDICATOR_ROWS[item]
         printed = _row(published(file), driver, setting, "")
         values = dict(row.values) | _compared(row, ours, printed, theirs)
@@ -93,15 +159,15 @@ def _indicators(table: Table) -> tuple[list[Column], list[Row]]:
     return columns, rows
 
 
-def _key(row: Row) -> tuple[str, str, str]:
-    """Driver, setting and item of a row's id; the humans' mixed models have no counterpart."""
-    parts = row.id.split("/")
-    if parts[0] == "human":
-        return "human", "", "/".join(parts[1:])
+def _key(row: Row, named: str | None) -> tuple[str, str, str]:
+    """The paper's driver, setting and item of a row; the mixed models have no counterpart."""
     group = row.groups[0]
-    driver, _, setting = group.rpartition("/")
-    driver = driver.partition(" [")[0].partition("/set")[0]
-    return driver, setting, row.id.removeprefix(group).lstrip("/")
+    item = row.id.removeprefix(group).lstrip("/")
+    driver = row.beside
+    if named is not None and driver != HUMAN:
+        driver = "" if named in row.stand_in_for.split("+") else named
+    # The humans had no prompt: whatever a driver's was, they stand beside it.
+    return driver, "" if driver == HUMAN else group.rpartition("/")[2], item
 
 
 def _row(file: pd.DataFrame, driver: str, setting: str, term: str) -> dict[str, Any] | None:
@@ -124,7 +190,7 @@ def _added(column: Column) -> bool:
 
 
 def _compared(row: Row, name: str, printed: dict[str, Any] | None, theirs: str) -> dict[str, Value]:
-    """The paper's value, and the difference unless ours is that very value."""
+    """The paper's value, and the difference unless ours rests on published values."""
     if printed is None:
         return {}
     ours, value = row.values.get(name), printed[theirs]

@@ -33,6 +33,14 @@ def contrasts(study: Study) -> Table:
             Column("p", "p", "p", 3, "Fisher's exact or permutation test"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
             Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
+            Column(
+                "detectable",
+                "detectable",
+                "number",
+                2,
+                "smallest difference, in either direction, found at p < .05 with power .8",
+                optional=True,
+            ),
             Column("n", "n", "count", 0, "trials of the setting"),
             Column("n_reference", "n ref.", "count", 0, "trials of the reference"),
         ),
@@ -41,6 +49,10 @@ def contrasts(study: Study) -> Table:
             "rates: Fisher's exact test; means: their difference within conditions, tested by "
             "permutation, seeded; a family is one measure of one driver over its variants, or over "
             "all drivers against humans",
+            "detectable: the smallest difference that is found at p < .05, before correction, with "
+            "a power of .8; rates: by the exact power of Fisher's test, the reference's true rate "
+            "being the observed one, in the direction in which less is enough; means: (t.975 + "
+            "t.8) times the standard error of the linear model",
             *(
                 []
                 if study.human.measured
@@ -97,10 +109,11 @@ def _corrected(pairs: list[tuple[Group, Group]], measure: Measure, reference: st
                 "p": contrast.p,
                 "p_holm": float(holm[i]),
                 "p_bh": float(bh[i]),
+                "detectable": _percent(contrast.detectable, measure),
                 "n": _n(group, measure),
                 "n_reference": _n(other, measure),
             },
-            JOINT_NOTE if not known(other, measure) else "",
+            "; ".join(filter(None, (_joint_note(other, measure), _powerless(contrast, measure)))),
             counts=measure.counts,
         )
         for i, (group, other, contrast) in enumerate(found)
@@ -127,6 +140,20 @@ def _n(group: Group, measure: Measure) -> int:
     if measure.rate:
         return _rate(group, measure)[1]
     return estimate(group, measure).n
+
+
+def _joint_note(other: Group, measure: Measure) -> str:
+    return "" if known(other, measure) else JOINT_NOTE
+
+
+def _powerless(contrast: Contrast, measure: Measure) -> str:
+    if contrast.detectable is not None:
+        return ""
+    return f"{measure.heading}: so few trials can show no difference, however large"
+
+
+def _percent(value: float | None, measure: Measure) -> float | None:
+    return 100 * value if value is not None and measure.rate else value
 
 
 def _scaled(contrast: Contrast, measure: Measure) -> tuple[float, float] | None:

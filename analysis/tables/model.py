@@ -37,7 +37,9 @@ class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
     ``counts`` is the SQL predicate of its trials, where it is not that of the columns; ``printed``
-    names the columns whose values are the published ones.
+    names the columns whose values are the published ones, or rest on them. ``beside`` is the driver
+    of the paper whose row it stands beside, if any, and ``stand_in_for`` the model in whose name a
+    scripted stand-in answered.
     """
 
     id: str
@@ -46,6 +48,8 @@ class Row:
     note: str = ""
     counts: str = ""
     printed: tuple[str, ...] = ()
+    beside: str = ""
+    stand_in_for: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import cache
 
-from analysis.ceiling import DATA_SETS, SEED
+from analysis import ceiling
 from analysis.human.counts import findings, human_counts
 from analysis.intermittency import STEADY_MPS
 from analysis.likeness import MARGIN_SD
@@ -13,8 +13,11 @@ from analysis.published import HUMAN_DOI, HUMAN_GAP_SD_M
 from analysis.study import Group, Study
 
 
-def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
-    """One note a group on its trials and those left out, and what else to know of the drivers."""
+def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) -> list[str]:
+    """One note a group on its trials and those left out, and what else to know of the drivers.
+
+    ``pooled`` says that the table takes imported human trials as independent.
+    """
     shown = list(groups)
     notes = [
         f"{group.id}: {len(group.finished)} of {len(group.trials)} trials finished, left out: "
@@ -24,7 +27,7 @@ def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
     if study.empty:
         notes.append(f"{study.db} holds no trial of a model; `make sweep` plays some")
     if study.human in study.groups:
-        notes += _human_notes(study)
+        notes += _human_notes(study, pooled)
     return [*notes, *(f"{group.id}: {repeated_note(group)}" for group in shown if group.repeated)]
 
 
@@ -38,15 +41,18 @@ def repeated_note(group: Group) -> str:
 
 
 @cache
-def _human_notes(study: Study) -> tuple[str, ...]:
+def _human_notes(study: Study, pooled: bool) -> tuple[str, ...]:
     if not study.human.measured:
         return (
             "human: the published outcomes of 990 trials; for the rest `merge-runner human import "
             f"PATH` reads the recordings (doi {HUMAN_DOI})",
         )
+    found = tuple(f"human: {finding}" for finding in findings(human_counts(study.db)))
+    if not pooled:
+        return found
     pairs = study.human.trials["pair"].nunique()
     return (
-        *(f"human: {finding}" for finding in findings(human_counts(study.db))),
+        *found,
         f"human: intervals and tests take the trials as independent, but they come from {pairs} "
         "pairs who differ: they are too narrow",
     )
@@ -61,9 +67,9 @@ def ceiling_notes(study: Study) -> list[str]:
         f"residuals of SD {HUMAN_GAP_SD_M} m"
     )
     return [
-        f"humans pass: share of {DATA_SETS} human data sets with as many trials per condition as "
-        f"the row has (seed {SEED}; {source}); at the score: I1 to I4 together. So often a perfect "
-        "copy of the humans passes"
+        f"humans pass: share of {ceiling.DATA_SETS} human data sets with as many trials per "
+        f"condition as the row has (seed {ceiling.SEED}; {source}); at the score: I1 to I4 "
+        "together. So often a perfect copy of the humans passes"
     ]
 
 

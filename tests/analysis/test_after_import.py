@@ -74,6 +74,17 @@ def test_humans_have_further_rows_with_a_random_intercept_per_pair(imported):
         assert all(row.values.get("b") is not None or row.note for row in rows)
 
 
+def test_a_difference_from_humans_names_their_trials_where_it_rests_on_them(imported):
+    (table,) = make_tables(imported, ["differences"])
+    behind = {row.values["outcome"]: row.groups for row in table.rows}
+    assert behind == {
+        "left first (logit)": ("o3/baseline",),  # and on the published outcomes
+        "gap (m)": ("o3/baseline", "human"),
+    }
+    assert any("jackknife over 3 pairs" in row.note for row in table.rows)
+    assert not any("intervals and tests take the trials" in note for note in table.notes)
+
+
 def test_a_driver_is_compared_with_the_humans_by_i5(imported):
     """The driver holds its accelerations; these humans approach their speed exponentially."""
     (group,) = imported.models

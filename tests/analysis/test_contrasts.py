@@ -17,6 +17,8 @@ from analysis.contrasts import (
     contrast_means,
     contrast_rates,
     corrected,
+    detectable_rate,
+    rejected,
     shuffled_sums,
 )
 
@@ -67,6 +69,38 @@ def test_o3s_collisions_do_not_differ_from_the_humans_and_geminis_do():
     assert contrast_rates((0, 110), (28, 990)).p == pytest.approx(0.10, abs=0.005)
     assert contrast_rates((28, 110), (28, 990)).p == pytest.approx(3e-15, rel=0.2)
     assert contrast_rates((3, 110), (0, 110)).p == pytest.approx(0.25, abs=0.005)
+
+
+def test_which_outcomes_fishers_test_rejects_is_known_beforehand():
+    for n, m in ((7, 12), (20, 9)):
+        expected = [[fisher((a, n), (b, m)) < 0.05 for b in range(m + 1)] for a in range(n + 1)]
+        assert rejected(n, m).tolist() == expected
+
+
+def power(n, m, rate, other, studies=2000) -> float:
+    """Share of simulated studies in which Fisher's test finds the difference."""
+    rng = np.random.default_rng(1)
+    drawn = zip(rng.binomial(n, other, studies), rng.binomial(m, rate, studies), strict=True)
+    pairs, times = np.unique(list(drawn), axis=0, return_counts=True)
+    found = [stats.fisher_exact([[a, n - a], [b, m - b]]).pvalue < 0.05 for a, b in pairs.tolist()]
+    return float(times @ found) / studies
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "rate", "sign"),
+    [(110, 990, 28 / 990, 1), (110, 110, 0.0, 1), (60, 60, 0.95, -1), (40, 50, 0.4, -1)],
+)
+def test_the_detectable_difference_of_rates_is_found_in_four_of_five_studies(n, m, rate, sign):
+    found = detectable_rate(n, m, rate)
+    assert power(n, m, rate, rate + sign * found) == pytest.approx(0.8, abs=0.03)
+
+
+def test_110_trials_without_a_collision_could_show_no_less_than_7_percent():
+    assert contrast_rates((3, 110), (0, 110)).detectable == pytest.approx(0.071, abs=0.001)
+
+
+def test_so_few_trials_show_no_difference_however_large():
+    assert contrast_rates((2, 2), (0, 2)).detectable is None
 
 
 def group(**values) -> pd.DataFrame:
@@ -136,6 +170,8 @@ def test_the_interval_is_that_of_least_squares_with_a_level_for_each_condition()
     half = stats.t.ppf(0.975, freedom) * se
     assert found.difference == pytest.approx(b[0]) == pytest.approx(within(FIRST, SECOND))
     assert (found.low, found.high) == pytest.approx((b[0] - half, b[0] + half))
+    t = stats.t(freedom)
+    assert found.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * se)
 
 
 def mixes(shift, seed=2):
@@ -190,7 +226,7 @@ def test_where_nothing_varies_there_is_no_difference():
 
 def test_two_trials_alone_have_no_interval():
     found = contrast_means(group(N_0_0=[3.0]), group(N_0_0=[4.0]), "gap_m")
-    assert (found.difference, found.low, found.high, found.p) == (-1, None, None, 1)
+    assert (found.difference, found.low, found.detectable, found.p) == (-1, None, None, 1)
 
 
 def test_a_family_is_corrected_by_holm_and_by_benjamini_and_hochberg():

@@ -1,0 +1,90 @@
+"""Whether drivers differ from humans: the interactions with the source in one model of both."""
+
+from __future__ import annotations
+
+from analysis.joint import GAP, NARROW, WHO_FIRST, Difference, pairs_known
+from analysis.joint import differences as tested
+from analysis.mixed import MIN_PAIRS
+from analysis.study import Group, Study
+from analysis.tables.model import Column, Row, Table
+from analysis.tables.notes import sample_notes
+from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
+
+OUTCOMES = {WHO_FIRST: "left first (logit)", GAP: "gap (m)"}
+COUNTS = {WHO_FIRST: WITH_MERGER, GAP: WITH_GAP}
+
+
+def differences(study: Study) -> Table:
+    """Every driver's baseline against the humans, one row an outcome and term."""
+    drivers = [group for group in study.baselines if group is not study.human]
+    compared = drivers if study.human in study.groups else []
+    human = study.human
+    rows = [_row(human, group, one) for group in compared for one in tested(human, group)]
+    return Table(
+        "differences",
+        "Differences of the baseline from humans, tested in one model of both",
+        (
+            Column("driver", "driver"),
+            Column("outcome", "outcome"),
+            Column("term", "term"),
+            Column("n", "n", "count", 0, "trials of the driver in the model"),
+            Column("n_human", "n humans", "count", 0, "trials of the humans in the model"),
+            Column("b_driver", "driver b", "number", 2, "coefficient of the driver"),
+            Column("b_human", "human b", "number", 2, "coefficient of the humans"),
+            Column("difference", "difference", "number", 2, "interaction: driver minus humans"),
+            Column("ci", "95 % CI", "interval", 2, "of the interaction"),
+            Column("p", "p", "p", 3, "test of the interaction"),
+            Column("freedom", "df", "number", 0, "of its t test; none: normal", optional=True),
+            Column(
+                "detectable",
+                "detectable",
+                "number",
+                2,
+                "smallest difference found with power .8: (t.975 + t.8) SE",
+            ),
+            Column("method", "method", meaning="how the model is fitted", optional=True),
+        ),
+        rows,
+        (
+            "left first ~ (headway + relative velocity) x source and gap ~ (abs. headway + abs. "
+            "relative velocity + headway : relative velocity) x source, source being 1 for the "
+            "driver and 0 for humans; Source is the difference where the other terms are 0",
+            "errors of the driver: Fisher's information (left first), HC3 (gap); of the humans: "
+            "jackknife over their pairs where these are known; t with Satterthwaite's df. Firth, "
+            "where maximum likelihood has no finite estimate: penalised likelihood ratios, and "
+            "Fisher's information for what is detectable",
+            "detectable: what a two-sided test at 5 % finds in four of five such studies, from "
+            f"the standard error of this one; where {NARROW}, it is too small as well",
+            "p is not corrected for the number of terms and drivers",
+            *sample_notes(study, [study.human, *compared] if rows else [], pooled=False),
+            *([] if rows else ["there is no driver and no human to compare"]),
+        ),
+    )
+
+
+def _row(human: Group, group: Group, found: Difference) -> Row:
+    # Published outcomes and fits are no trials that could be listed.
+    of_traces = pairs_known(human, found.outcome) >= MIN_PAIRS
+    ci = None if found.low is None or found.high is None else (found.low, found.high)
+    said = found.problem or found.remark
+    return Row(
+        f"{group.id}/{found.outcome}/{found.term}",
+        (group.id, human.id) if of_traces else (group.id,),
+        {
+            "driver": group.label,
+            "outcome": OUTCOMES[found.outcome],
+            "term": "Source" if found.term == "intercept" else TERM_NAMES[found.term],
+            "n": found.n,
+            "n_human": found.n_human,
+            "b_driver": found.driver,
+            "b_human": found.human,
+            "difference": found.b,
+            "ci": ci,
+            "p": found.p,
+            "freedom": found.freedom,
+            "detectable": found.detectable,
+            "method": found.method or None,
+        },
+        f"{found.outcome}: {said}" if said else "",
+        counts=COUNTS[found.outcome],
+    )
