@@ -25,6 +25,8 @@ TABLES = {
     "ablation-qualitative": "ablations",
     "ablation-quantitative": "ablations",
     "contrasts": "contrasts",
+    "who-first-variants": "variants",
+    "gap-variants": "variants",
     "velocity-profiles": "profiles",
     "conflict-resolution": "conflicts",
     "criticality": "conflicts",

@@ -19,7 +19,8 @@ class Column:
 
     ``meaning`` says in words what stands in it, and ``counts`` is the SQL predicate of the
     trials that its values rest on. A value may be missing without a note where ``optional``.
-    ``within`` narrows the trials of its rows, also of those that name their own.
+    ``within`` narrows the trials of its rows, also of those that name their own. Where it
+    ``compares``, its values rest on the trials of the row's ``reference`` as well.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Column:
     counts: str = "status = 'finished'"
     optional: bool = False
     within: str = ""
+    compares: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +39,8 @@ class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
     ``counts`` is the SQL predicate of its trials, where it is not that of the columns; ``printed``
-    names the columns whose values are the published ones.
+    names the columns whose values are the published ones; ``reference`` is the group that it is
+    compared with, in the columns that compare.
     """
 
     id: str
@@ -46,6 +49,7 @@ class Row:
     note: str = ""
     counts: str = ""
     printed: tuple[str, ...] = ()
+    reference: str = ""
 
 
 @dataclass(frozen=True, slots=True)
