@@ -156,7 +156,7 @@ class Study:
 
     @cached_property
     def left_speeds(self) -> pd.DataFrame:
-        """One row a finished baseline trial: the left vehicle's speeds under control."""
+        """One row a finished trial: the left vehicle's speeds under control."""
         return self._read(LEFT_SPEEDS)
 
     @cached_property
