@@ -115,6 +115,7 @@ class Study:
     def __init__(self, db: Path | str = DEFAULT_DB, models: Sequence[str] | None = None) -> None:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
         self.db = Path(db)
+        self.chosen = models
         found = load_each({"trials": TRIALS, "specs": SPECS, "traces": TRACES}, self.db)
         trials = found["trials"].merge(found["traces"], on=["trial_id", "spec_hash"], how="left")
         recorded = trials["source"] == HUMAN

@@ -116,7 +116,9 @@ def _traces(axis: Axes, study: Study, group: Group, first: str) -> None:
         axis.add_collection(lines)
     axis.autoscale_view()
     if count:
-        axis.text(0.98, 0.04, f"n = {count}", transform=axis.transAxes, ha="right", fontsize=5.5)
+        # Who goes first drives faster: below there is room, and above for who goes second.
+        y, va = (0.04, "bottom") if first == "left" else (0.96, "top")
+        axis.text(0.98, y, f"n = {count}", transform=axis.transAxes, ha="right", va=va, fontsize=6)
     else:
         say(axis, "no such trial" if group.measured else MISSING)
 
@@ -149,18 +151,21 @@ def _scales(axes: NDArray[np.object_], groups: list[Group]) -> None:
     for axis in axes[0, :2]:
         axis.set_ylim(min(speeds), max(speeds))
     axes[0, 2].set_ylim(-0.08, 1.08)
+    axes[0, 2].set_yticks([0, 0.5, 1])
+    published = not all(group.measured for group in groups)
+    lines = [float(y) for v in VELOCITIES_MPS for y in published_gap_line(v)[1] if published]
     for axis, points in zip(axes[0, 3:], PANELS[1:], strict=True):
         found = [p.estimate for g in groups for v in VELOCITIES_MPS for p in points(g, v)]
         if found:
-            axis.set_ylim(*_limits(found))
+            axis.set_ylim(*_limits(found, lines if points is gaps else []))
     for axis in axes[0, 2:]:
         axis.set_xlim(-5, 5)
         axis.set_xticks([-4, 0, 4])
 
 
-def _limits(found: list[Estimate]) -> tuple[float, float]:
-    """Limits that hold all values, and of 20 bounds of intervals 19."""
-    values = [one.value for one in found if one.value is not None]
+def _limits(found: list[Estimate], lines: list[float]) -> tuple[float, float]:
+    """Limits that hold all values and lines, and of 20 bounds of intervals 19."""
+    values = [*lines, *(one.value for one in found if one.value is not None)]
     lows = [one.low for one in found if one.low is not None] or values
     highs = [one.high for one in found if one.high is not None] or values
     low = min(*values, float(np.quantile(lows, 1 - SHOWN)))
