@@ -82,12 +82,13 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
     predicate = row.counts or _predicate(table, column)
     if column is not None and column.within:
         predicate += f" AND {column.within}"
+    compared = (row.reference,) if column is not None and column.compares else ()
     return tuple(
         _source(study, group, predicate)
         if group.measured or not row.note
         else Source(group.id, f"published: {row.note}", "", ())
         for group in study.groups
-        if group.id in row.groups
+        if group.id in (*row.groups, *compared)
     )
 
 

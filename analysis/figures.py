@@ -16,6 +16,18 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from analysis.drawing import (
+    COLUMN_IN,
+    LINE_IN,
+    MISSING,
+    PAGE_IN,
+    draw_points,
+    line_count,
+    named,
+    say,
+    velocity_text,
+    wrapped,
+)
 from analysis.indicators import INDICATORS
 from analysis.measures import MEASURES, known, published_human
 from analysis.panels import (
@@ -28,11 +40,10 @@ from analysis.panels import (
     published_gap_line,
 )
 from analysis.study import Group, Study
+from analysis.variant_figure import figure_2_variants
 from analysis.verdicts import score
 from merge_runner.errors import UsageError
 
-# IEEE transactions: one column and the whole page, in inches.
-COLUMN_IN, PAGE_IN = 3.5, 7.16
 # Okabe and Ito's palette, safe for the colour-blind; each driver has a marker as well.
 HUMAN_STYLE = ("#000000", "o")
 STYLES = (
@@ -43,8 +54,8 @@ STYLES = (
     ("#56B4E9", "P"),
     ("#E69F00", "X"),
 )
+LEGEND_COLUMNS = 4
 PASSED, FAILED, UNKNOWN = "#56B4E9", "#E69F00", "#DDDDDD"
-MISSING = "human recordings\nare not imported"
 # The same input gives the same file.
 SETTINGS: Any = {
     "font.size": 7,
@@ -71,13 +82,12 @@ def figure_2(study: Study) -> Figure:
     _curves(axes[2], groups, deviations, "E", "RMSE of speed (m/s)")
     axes[0, 0].set_ylim(-0.05, 1.05)
     for column, velocity in enumerate(VELOCITIES_MPS):
-        sign = {-1: "−", 0: "", 1: "+"}[int(np.sign(velocity))]
-        axes[0, column].set_title(f"Δv = {sign}{abs(velocity):g} m/s")
+        axes[0, column].set_title(f"Δv = {velocity_text(velocity)}")
         axes[2, column].set_xlabel("projected headway (m)")
         if study.human in groups and not study.human.measured:
             axes[1, column].plot(*published_gap_line(velocity), color="black", ls="--", lw=0.8)
             axes[2, column].margins(y=0.3)
-            _say(axes[2, column], MISSING, 0.99)
+            say(axes[2, column], MISSING, 0.99)
     _legend(curves, study, groups)
     return figure
 
@@ -85,7 +95,9 @@ def figure_2(study: Study) -> Figure:
 def ablation_matrix(study: Study) -> Figure:
     """Which indicators hold for which driver and variant; text and colour say the same."""
     groups = study.groups
-    figure = Figure(figsize=(COLUMN_IN, 0.6 + 0.22 * len(groups)), layout="constrained")
+    names = [wrapped(named(group), COLUMN_IN / 2) for group in groups]
+    row_in = max(0.22, LINE_IN * line_count(names) + 0.04)
+    figure = Figure(figsize=(COLUMN_IN, 0.6 + row_in * len(groups)), layout="constrained")
     axes = figure.subplots()
     for row, group in enumerate(groups):
         found = score(study, group)
@@ -101,7 +113,7 @@ def ablation_matrix(study: Study) -> Figure:
             axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=6)
     axes.set(xlim=(0, len(INDICATORS)), ylim=(len(groups), 0))
     axes.set_xticks(np.arange(len(INDICATORS)) + 0.5, list(INDICATORS))
-    axes.set_yticks(np.arange(len(groups)) + 0.5, [group.id for group in groups])
+    axes.set_yticks(np.arange(len(groups)) + 0.5, names)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
     axes.spines[:].set_visible(False)
     return figure
@@ -110,7 +122,9 @@ def ablation_matrix(study: Study) -> Figure:
 def distributions(study: Study) -> Figure:
     """Gaps and speed deviations of finished trials: median, quartiles, and every trial."""
     groups = study.groups
-    figure = Figure(figsize=(PAGE_IN, 0.8 + 0.28 * len(groups)), layout="constrained")
+    names = [wrapped(named(group), PAGE_IN / 4) for group in groups]
+    row_in = max(0.28, LINE_IN * line_count(names) + 0.04)
+    figure = Figure(figsize=(PAGE_IN, 0.8 + row_in * len(groups)), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     for axis, measure in zip(axes, (m for m in MEASURES if not m.rate), strict=True):
         assert measure.column is not None
@@ -135,7 +149,7 @@ def distributions(study: Study) -> Figure:
                 medianprops={"color": colour, "lw": 1.4}, manage_ticks=False,
             )  # fmt: skip
         axis.set_xlabel(measure.heading)
-    axes[0].set_yticks(range(len(groups)), [group.id for group in groups])
+    axes[0].set_yticks(range(len(groups)), names)
     axes[0].set_ylim(len(groups) - 0.5, -0.5)
     return figure
 
@@ -153,6 +167,15 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
         "by projected headway and relative velocity, with Wilson intervals. (D) Mean gap at the "
         "merge point and (E) mean RMSE of the speed from the initial speed, two values a trial, "
         "with intervals of Student's t.",
+    ),
+    "figure2-variants": (
+        figure_2_variants,
+        "The same for every prompt variant, a row a driver and variant, collisions left out. (A, "
+        "B) Speed of the left vehicle from the start of control, where it merges first and second. "
+        "(C) How often the left vehicle merges first by projected headway, with Wilson intervals. "
+        "(D) Mean gap at the merge point and (E) mean RMSE of the speed from the initial speed, "
+        "two values a trial, with intervals of Student's t. Colours and markers tell the relative "
+        "velocities apart; few very wide intervals of D and E are cut at the frame.",
     ),
     "ablation-matrix": (
         ablation_matrix,
@@ -193,9 +216,9 @@ def _figure(study: Study, name: str) -> Figure:
     """A figure, laid out once for all its forms."""
     figure = FIGURES[name][0](study)
     engine = figure.get_layout_engine()
-    assert engine is not None
-    engine.execute(figure)
-    figure.set_layout_engine(None)  # or every form would be laid out anew
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)  # or every form would be laid out anew
     return figure
 
 
@@ -211,12 +234,11 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
             axis.add_collection(lines)
             axis.autoscale_view()
             if not group.measured:
-                _say(axis, MISSING)
+                say(axis, MISSING)
             elif not found:
-                _say(axis, f"{first} never merged first")
+                say(axis, f"{first} never merged first")
             if row == 0:
-                name = group.driver.replace("+", "+\n").replace(" [", "\n[")
-                axis.set_title(name if len(name) < 20 else name.replace("-", "-\n"))
+                axis.set_title(wrapped(group.label, 0.85 * PAGE_IN / len(study.baselines)))
             if found:
                 axis.text(0.98, 0.04, f"n = {len(found)}", transform=axis.transAxes, ha="right")
             if column == 0:
@@ -240,15 +262,8 @@ def _curves(
         for index, group in enumerate(groups):
             found = points(group, velocity)
             # Side by side, so that intervals do not hide each other.
-            x = np.array([p.headway_m for p in found]) + 0.16 * (index - (len(groups) - 1) / 2)
-            y = np.array([p.estimate.value for p in found], dtype=float)
-            low = np.array([p.estimate.low for p in found], dtype=float)
-            high = np.array([p.estimate.high for p in found], dtype=float)
-            colour, marker = _group_style(groups, group)
-            axis.errorbar(
-                x, y, yerr=np.nan_to_num(np.vstack([y - low, high - y])), color=colour,
-                marker=marker, ms=3, lw=0.8, elinewidth=0.7, capsize=1.5, mfc="white", mew=0.8,
-            )  # fmt: skip
+            shift = 0.16 * (index - (len(groups) - 1) / 2)
+            draw_points(axis, found, shift, *_group_style(groups, group))
         axis.set_xticks([-4, -2, 0, 2, 4])
 
 
@@ -256,16 +271,15 @@ def _legend(figure: SubFigure, study: Study, groups: list[Group]) -> None:
     handles = []
     for group in groups:
         colour, marker = _group_style(groups, group)
+        label = wrapped(group.label, PAGE_IN / LEGEND_COLUMNS - 0.4)
         handles.append(
-            Line2D(
-                [], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white", label=group.driver
-            )
+            Line2D([], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white", label=label)
         )
     if study.human in groups and not study.human.measured:
         handles.append(
             Line2D([], [], color="black", ls="--", lw=0.8, label="human gap, published regression")
         )
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False)
 
 
 def _style(study: Study, group: Group) -> tuple[str, str]:
@@ -287,10 +301,3 @@ def _mark(passed: bool | None) -> str:
 
 def _panel(axis: Axes, letter: str) -> None:
     axis.text(-0.02, 1.06, letter, transform=axis.transAxes, fontweight="bold", ha="right")
-
-
-def _say(axis: Axes, text: str, height: float = 0.9) -> None:
-    axis.text(
-        0.5, height, text, transform=axis.transAxes, ha="center", va="top", fontsize=6,
-        color="#555555",
-    )  # fmt: skip

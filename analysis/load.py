@@ -25,11 +25,11 @@ SELECT trial_id, spec_hash, sum(hash(step, side, position_m, velocity_mps))::VAR
 FROM states SEMI JOIN (FROM trials WHERE source <> 'human' AND status <> 'failed')
 USING (trial_id, spec_hash) GROUP BY ALL
 """
-# One row a finished trial of humans or with the baseline prompt: the left vehicle's speeds.
+# One row a finished trial: the left vehicle's speeds.
 LEFT_SPEEDS = (
     "SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s, "
     "list(velocity_mps ORDER BY step) AS velocity_mps FROM states SEMI JOIN ("
-    "FROM trials WHERE status = 'finished' AND coalesce(variant, 'baseline') = 'baseline') "
+    "FROM trials WHERE status = 'finished') "
     "USING (trial_id, spec_hash) WHERE time_s >= 0 AND side = 'left' GROUP BY ALL ORDER BY ALL"
 )
 # One row a vehicle: its speeds under control, and whether the simulator slowed it by itself.

@@ -118,6 +118,7 @@ class Study:
     def __init__(self, db: Path | str = DEFAULT_DB, models: Sequence[str] | None = None) -> None:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
         self.db = Path(db)
+        self.chosen = models
         found = load_each({"trials": TRIALS, "specs": SPECS, "traces": TRACES}, self.db)
         trials = found["trials"].merge(found["traces"], on=["trial_id", "spec_hash"], how="left")
         recorded = trials["source"] == HUMAN
@@ -157,7 +158,7 @@ class Study:
 
     @cached_property
     def left_speeds(self) -> pd.DataFrame:
-        """One row a finished baseline trial: the left vehicle's speeds under control."""
+        """One row a finished trial: the left vehicle's speeds under control."""
         return self._read(LEFT_SPEEDS)
 
     @cached_property

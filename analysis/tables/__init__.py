@@ -26,6 +26,8 @@ TABLES = {
     "ablation-quantitative": "ablations",
     "contrasts": "contrasts",
     "differences": "differences",
+    "who-first-variants": "variants",
+    "gap-variants": "variants",
     "velocity-profiles": "profiles",
     "conflict-resolution": "conflicts",
     "criticality": "conflicts",

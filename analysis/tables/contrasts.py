@@ -58,7 +58,7 @@ def contrasts(study: Study) -> Table:
                 if study.human.measured
                 else ["gap and RMSE against humans need the recordings: merge-runner human import"]
             ),
-            *_shared_notes(study),
+            *shared_notes(study),
             *sample_notes(study, study.groups),
             *([] if rows else ["there is no pair of groups to compare"]),
         ),
@@ -163,7 +163,7 @@ def _scaled(contrast: Contrast, measure: Measure) -> tuple[float, float] | None:
     return factor * contrast.low, factor * contrast.high
 
 
-def _shared_notes(study: Study) -> list[str]:
+def shared_notes(study: Study) -> list[str]:
     """Variants share a reply with the baseline where their prompts are equal."""
     named = {group.spec_hash: group.id for group in study.models}
     return [

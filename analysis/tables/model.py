@@ -19,7 +19,8 @@ class Column:
 
     ``meaning`` says in words what stands in it, and ``counts`` is the SQL predicate of the
     trials that its values rest on. A value may be missing without a note where ``optional``.
-    ``within`` narrows the trials of its rows, also of those that name their own.
+    ``within`` narrows the trials of its rows, also of those that name their own. Where it
+    ``compares``, its values rest on the trials of the row's ``reference`` as well.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Column:
     counts: str = "status = 'finished'"
     optional: bool = False
     within: str = ""
+    compares: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +41,8 @@ class Row:
     ``counts`` is the SQL predicate of its trials, where it is not that of the columns; ``printed``
     names the columns whose values are the published ones, or rest on them. ``beside`` is the driver
     of the paper whose row it stands beside, if any, and ``stand_in_for`` the model in whose name a
-    scripted stand-in answered.
+    scripted stand-in answered. ``reference`` is the group that it is compared with, in the columns
+    that compare.
     """
 
     id: str
@@ -50,6 +53,7 @@ class Row:
     printed: tuple[str, ...] = ()
     beside: str = ""
     stand_in_for: str = ""
+    reference: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,7 +47,7 @@ def who_first(study: Study) -> Table:
                         **_wald(fit.logit, term, "z"),
                         **_firth(fit.firth, term),
                     },
-                    _problems(fit.logit, fit.firth),
+                    problems(fit.logit, fit.firth),
                 )
             )
             rows += _mixed_rows(group, term, "z")
@@ -79,7 +79,7 @@ def gap(study: Study) -> Table:
     for term in GAP_TERMS:
         for group in study.baselines:
             if not group.measured:
-                rows.append(_published_gap(group, term))
+                rows.append(published_gap(group, term))
                 continue
             fit = fits(group)
             rows.append(
@@ -93,7 +93,7 @@ def gap(study: Study) -> Table:
                         **_wald(fit.ols, term, "t"),
                         **_hc3(fit.hc3, term),
                     },
-                    _problems(fit.ols, fit.hc3),
+                    problems(fit.ols, fit.hc3),
                 )
             )
             rows += _mixed_rows(group, term, "t")
@@ -166,7 +166,8 @@ def _hc3(fit: Regression, term: str) -> dict[str, Value]:
     return values
 
 
-def _problems(*found: Regression) -> str:
+def problems(*found: Regression) -> str:
+    """What keeps any of the fits from having terms, empty where nothing does."""
     return "; ".join(dict.fromkeys(fit.problem for fit in found if fit.problem))
 
 
@@ -227,7 +228,8 @@ def _mixed_notes(study: Study, table: str) -> tuple[str, ...]:
     )
 
 
-def _published_gap(group: Group, term: str) -> Row:
+def published_gap(group: Group, term: str) -> Row:
+    """The humans' row of Table IV as the paper prints it."""
     values = published("paper_gap").query("driver == 'human' and term == @term").iloc[0]
     return Row(
         f"{group.id}/{term}",

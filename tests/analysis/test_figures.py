@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import re
 import struct
+from itertools import combinations
 
+import duckdb
+import matplotlib as mpl
 import pytest
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 from studies import Drive, write_study, yielding
 
-from analysis.figures import FIGURES, PAGE_IN, figure_2, rendered, write_figures
+from analysis.drawing import PAGE_IN
+from analysis.figures import FIGURES, SETTINGS, figure_2, rendered, write_figures
 from analysis.intervals import mean, proportion
 from analysis.load import load
 from analysis.panels import VELOCITIES_MPS, deviations, gaps, left_first, left_traces
 from analysis.study import Study
+from analysis.variant_figure import figure_2_variants
 from merge_runner.errors import UsageError
 from merge_runner.simulator.conditions import CONDITIONS
 
@@ -109,6 +116,115 @@ def test_before_an_import_the_figure_says_what_is_missing_and_draws_the_publishe
     assert heights[4] == pytest.approx(3.54 + 4 * 0.17)
 
 
+LONG = "gemini-2.5-pro-preview-05-06+constant"
+
+
+@pytest.fixture(scope="module")
+def long_names(tmp_path_factory):
+    """A model with a long name, at an endpoint of its own, in whose name stand-ins answered too."""
+    drives = [
+        *yielding(LONG, reps=2)[:4],
+        *yielding(LONG, "A2", reps=2)[:4],
+        *yielding("o3", "A7", 1),
+        *yielding("o3", reps=1),
+        *yielding("other", "A1", reps=1),
+    ]
+    path = write_study(tmp_path_factory.mktemp("long") / "t.duckdb", drives)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE trials SET scripted = trial_id NOT LIKE 'o3/%'")
+    return Study(path)
+
+
+def written_words(figure):
+    """The texts of a figure that hold words, with the boxes that they fill."""
+    figure.draw_without_rendering()
+    return {
+        text: text.get_window_extent()
+        for text in figure.findobj(Text)
+        if text.get_visible() and re.search("[a-z]{2}", text.get_text())
+    }
+
+
+@pytest.mark.usefixtures("few_draws")
+@pytest.mark.parametrize("name", FIGURES)
+def test_no_name_is_cut_and_none_lies_over_another(name, long_names):
+    with mpl.rc_context(SETTINGS):
+        figure = FIGURES[name][0](long_names)
+        words = written_words(figure)
+    for text, box in words.items():
+        assert Bbox.union([figure.bbox, box]).bounds == pytest.approx(figure.bbox.bounds, abs=1), (
+            text
+        )
+    for (one, box), (other, another) in combinations(words.items(), 2):
+        assert not box.padded(-1).overlaps(another.padded(-1)), (one, other)
+
+
+@pytest.mark.usefixtures("few_draws")
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_figure_says_who_is_a_stand_in_and_names_its_variant(name, long_names):
+    figure = FIGURES[name][0](long_names)
+    texts = [text.get_text().replace("\n", " ") for text in figure.findobj(Text)]
+    shown = {text.replace("+ ", "+").replace("- ", "-") for text in texts}
+    marked = [text for text in shown if "scripted stand-in, not" in text]
+    assert any(LONG in text for text in marked)
+    assert not any("o3" in text and "not o3" in text for text in shown)
+    if name != "figure2":
+        assert any("A2" in text for text in marked)
+        assert any("A1" in text for text in marked)
+        assert any("A7" in text and "o3" in text for text in shown)
+
+
+def rows_of(figure):
+    """The panels of the figure of variants, by row."""
+    return [figure.axes[i : i + 5] for i in range(0, len(figure.axes), 5)]
+
+
+def test_each_group_has_a_row_of_its_own_with_its_trials(study):
+    figure = figure_2_variants(study)
+    rows = rows_of(figure)
+    assert len(rows) == len(study.groups) == 5
+    for group, row in zip(study.groups[1:], rows[1:], strict=True):
+        firsts = group.finished["merged_first"].value_counts()
+        for axis, side in zip(row[:2], ("left", "right"), strict=True):
+            assert sum(len(c.get_segments()) for c in axis.collections[:3]) == firsts[side]
+        for axis, points in zip(row[2:], (left_first, gaps, deviations), strict=True):
+            for index, velocity in enumerate(VELOCITIES_MPS):
+                found = points(group, velocity)
+                line = axis.containers[index].lines[0]
+                assert list(line.get_ydata()) == [p.estimate.value for p in found]
+                assert line.get_xdata() == pytest.approx(
+                    [p.headway_m + 0.3 * (index - 1) for p in found]
+                )
+
+
+def test_variants_are_shown_by_the_same_scales_and_before_an_import_humans_as_published(study):
+    rows = rows_of(figure_2_variants(study))
+    for row in rows:
+        assert row[0].get_ylim() == row[1].get_ylim()
+        assert [axis.get_ylim() for axis in row] == [axis.get_ylim() for axis in rows[0]]
+    human = rows[0]
+    assert [any("not imported" in t.get_text() for t in axis.texts) for axis in human] == [
+        True, True, False, False, True,
+    ]  # fmt: skip
+    assert sum(line.get_linestyle() == "--" for line in human[3].lines) == 3
+    assert sum(len(c.lines[0].get_xdata()) for c in human[2].containers) == len(CONDITIONS)
+
+
+def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
+    """Two trials of a condition that differ by 10 m have an interval of 130 m."""
+    drives = [*yielding("o3", reps=10), *yielding("o3", "A1", reps=4)]
+    drives += [
+        Drive("o3", "A2", "L_4_0", rep, (strength,) * 3, (-strength,) * 3)
+        for rep, strength in enumerate((0.3, 0.7), 1)
+    ]
+    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    low, high = rows_of(figure_2_variants(study))[0][3].get_ylim()
+    found = [p.estimate for g in study.groups for v in VELOCITIES_MPS for p in gaps(g, v)]
+    assert max(one.high - one.low for one in found) > 2 * (high - low)
+    assert all(low < one.value < high for one in found)
+    assert sum(low < one.low and one.high < high for one in found) >= 0.8 * len(found)
+
+
 @pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     "drives",
@@ -116,6 +232,7 @@ def test_before_an_import_the_figure_says_what_is_missing_and_draws_the_publishe
         [],
         [Drive("o3", "baseline", "N_0_0", 1, (0.0,), (0.0,))],
         yielding("o3", "A1", reps=1)[:1],
+        [Drive("o3", "A1", name, 1, (0.0,), (0.0,)) for name in CONDITIONS],
     ],
 )
 def test_figures_of_next_to_nothing_are_drawn_all_the_same(drives, tmp_path, recwarn):

@@ -19,6 +19,8 @@ ABOUT = {
     "ablation-quantitative": "Table VII: collisions, gap, RMSE and joint rate of these",
     "contrasts": "every variant against its baseline, every baseline against the humans",
     "differences": "who merges first and the gap, against the humans in one model of both",
+    "who-first-variants": "Table III for every prompt variant, and what differs from the baseline",
+    "gap-variants": "Table IV for every prompt variant, and what differs from the baseline",
     "velocity-profiles": "the numbers behind I5, and how much plans are revised",
     "conflict-resolution": "when the conflict is resolved, by condition",
     "criticality": "times to merge and to collision, the hardest acceleration",

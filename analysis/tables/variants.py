@@ -1,0 +1,229 @@
+"""Tables III and IV for every prompt variant, and how each differs from its baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from analysis.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
+from analysis.study import Group, Study
+from analysis.tables.contrasts import shared_notes
+from analysis.tables.model import Column, Kind, Row, Table, Value
+from analysis.tables.notes import sample_notes
+from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER, problems, published_gap
+from analysis.variants import (
+    POWER,
+    Corrected,
+    Differences,
+    corrected_differences,
+    firth_intervals,
+    gap_differences,
+    interval,
+    variants,
+    who_first_differences,
+)
+from analysis.verdicts import fits
+
+FAMILY_NOTE = (
+    "difference: variant minus its driver's baseline; Holm, BH: corrected over the variants of a "
+    "driver, one term a family; detectable: the smallest difference that one such test, not yet "
+    f"corrected, shows in {100 * POWER:.0f} % of studies of this size"
+)
+
+
+def who_first_variants(study: Study) -> Table:
+    """Table III with a row a group and term, and the differences from the baseline."""
+    return Table(
+        "who-first-variants",
+        "Logistic regression of which driver merged first (1: left), for every prompt variant",
+        (
+            *_key_columns(WITH_MERGER),
+            *_fit_columns("", "", "", "p", "Wald", WITH_MERGER),
+            *_fit_columns("firth_", "Firth ", "", "LR p", "penalised likelihood", WITH_MERGER),
+            *_difference_columns(WITH_MERGER),
+            Column("by", "fits", meaning="the fits that are compared", optional=True),
+        ),
+        _rows(study, WHO_FIRST_TERMS, _who_first_row, who_first_differences, _firth),
+        (
+            FAMILY_NOTE,
+            "differences are tested by Wald's test; where one of the two fits has no finite "
+            "estimate, of Firth's fits by penalised likelihood ratio, with a profile interval and "
+            "an approximate detectable one (fits: Firth; Firth, Wald where the profile does not "
+            "converge)",
+            *shared_notes(study),
+            *sample_notes(study, study.groups),
+        ),
+    )
+
+
+def gap_variants(study: Study) -> Table:
+    """Table IV with a row a group and term, and the differences from the baseline."""
+    return Table(
+        "gap-variants",
+        "Linear regression of the gap at the merge point (m), for every prompt variant",
+        (
+            *_key_columns(WITH_GAP),
+            *_fit_columns("", "", "", "p", "Student's t", WITH_GAP),
+            *_fit_columns("hc3_", "", "HC3 ", "HC3 p", "Student's t, HC3 errors", WITH_GAP)[1:],
+            *_difference_columns(WITH_GAP),
+        ),
+        _rows(study, GAP_TERMS, _gap_row, gap_differences, _hc3),
+        (
+            FAMILY_NOTE,
+            "differences are tested by Welch's t test with HC3 errors",
+            *shared_notes(study),
+            *sample_notes(study, study.groups),
+        ),
+    )
+
+
+def _key_columns(counts: str) -> tuple[Column, ...]:
+    return (
+        Column("term", "term"),
+        Column("driver", "driver"),
+        Column("setting", "setting"),
+        Column("n", "n", "count", 0, "trials in the regression", counts),
+    )
+
+
+def _fit_columns(
+    name: str, estimate: str, other: str, p: str, test: str, counts: str
+) -> tuple[Column, ...]:
+    """Coefficient, error, interval and p of one fit; ``estimate`` and ``other`` lead headings."""
+    optional = bool(name)
+    return (
+        Column(f"{name}b", f"{estimate}b", "number", 2, "coefficient", counts, optional),
+        Column(f"{name}se", f"{other}SE", "number", 3, "standard error", counts, optional),
+        Column(f"{name}ci", f"{other}95 % CI", "interval", 2, test, counts, optional),
+        Column(f"{name}p", p, "p", 3, test, counts, optional),
+    )
+
+
+def _difference_columns(counts: str) -> tuple[Column, ...]:
+    def column(name: str, heading: str, kind: Kind, digits: int, meaning: str) -> Column:
+        return Column(name, heading, kind, digits, meaning, counts, optional=True, compares=True)
+
+    return (
+        column("difference", "difference", "number", 2, "of the coefficient from the baseline's"),
+        column("difference_ci", "95 % CI", "interval", 2, "of the difference"),
+        column("difference_p", "p", "p", 3, "of the difference, two-sided"),
+        column("p_holm", "Holm", "p", 3, "corrected by Holm"),
+        column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
+        column("detectable", "detectable", "number", 2, "smallest difference that would be shown"),
+    )
+
+
+def _who_first_row(group: Group, term: str) -> Row:
+    fit, bounds = fits(group), firth_intervals(group)
+    penalised = _values("firth_", fit.firth, term)
+    return Row(
+        f"{group.id}/{term}",
+        (group.id,),
+        {
+            **_keys(group, term, fit.logit.n),
+            **_values("", fit.logit, term),
+            **penalised,
+            **({"firth_ci": bounds.get(term)} if penalised else {}),
+        },
+        problems(fit.logit, fit.firth),
+    )
+
+
+def _gap_row(group: Group, term: str) -> Row:
+    if not group.measured:
+        row = published_gap(group, term)
+        n, b, se = (row.values[name] for name in ("n", "b", "se"))
+        assert isinstance(n, int)
+        assert isinstance(b, float)
+        assert isinstance(se, float)
+        bounds = interval(b, se, n - len(GAP_TERMS))
+        return replace(row, values={**row.values, "ci": bounds})
+    fit = fits(group)
+    return Row(
+        f"{group.id}/{term}",
+        (group.id,),
+        {
+            **_keys(group, term, fit.ols.n),
+            **_values("", fit.ols, term),
+            **_values("hc3_", fit.hc3, term),
+        },
+        problems(fit.ols, fit.hc3),
+    )
+
+
+def _keys(group: Group, term: str, n: int) -> dict[str, Value]:
+    return {"term": TERM_NAMES[term], "driver": group.label, "setting": group.setting, "n": n}
+
+
+def _values(prefix: str, fit: Regression, term: str) -> dict[str, Value]:
+    found = fit.terms.get(term)
+    if found is None:
+        return {}
+    return {
+        f"{prefix}b": found.b,
+        f"{prefix}se": found.se,
+        f"{prefix}ci": interval(found.b, found.se, fit.freedom),
+        f"{prefix}p": found.p,
+    }
+
+
+def _firth(group: Group) -> Regression:
+    return fits(group).firth
+
+
+def _hc3(group: Group) -> Regression:
+    return fits(group).hc3
+
+
+def _rows(
+    study: Study,
+    terms: Sequence[str],
+    row: Callable[[Group, str], Row],
+    differences: Differences,
+    compared: Callable[[Group], Regression],
+) -> list[Row]:
+    """Term by term a row a group; ``compared`` is the fit without which there is no difference."""
+    found, baselines = corrected_differences(study, differences), dict(variants(study))
+    rows = []
+    for term in terms:
+        for group in study.groups:
+            one = found.get((group.id, term))
+            plain = row(group, term)
+            if one is not None:
+                plain = _with_difference(plain, baselines[group], one)
+            elif group in baselines:
+                why = _why_none(compared(group), baselines[group], compared)
+                plain = replace(plain, note="; ".join(filter(None, (plain.note, why))))
+            rows.append(plain)
+    return rows
+
+
+def _with_difference(row: Row, baseline: Group | None, one: Corrected) -> Row:
+    assert baseline is not None
+    found = one.found
+    return replace(
+        row,
+        reference=baseline.id,
+        values={
+            **row.values,
+            "difference": found.value,
+            "difference_ci": (found.low, found.high),
+            "difference_p": found.p,
+            "p_holm": one.holm,
+            "p_bh": one.bh,
+            "detectable": found.detectable,
+            "by": found.by,
+        },
+    )
+
+
+def _why_none(
+    own: Regression, baseline: Group | None, compared: Callable[[Group], Regression]
+) -> str:
+    """Why a variant has no difference from its baseline, as far as its own note does not say it."""
+    if own.problem:
+        return ""
+    if baseline is None:
+        return "no difference: its driver has no baseline"
+    problem = compared(baseline).problem or "neither fit leaves an error"
+    return f"no difference from {baseline.id}: {problem}"
