@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 from analysis.contrasts import contrast_rates
 from analysis.indicators import ALPHA, INDICATORS, TESTED, Verdict
-from analysis.measures import MEASURES, counts, estimate
+from analysis.measures import BOXES, GAP, counts, estimate
 from analysis.provenance import Mismatch, Provenance, tally
 from analysis.study import Group, Study
 from analysis.verdicts import Score, score
 
-COLLISIONS, GAP = MEASURES[0], MEASURES[1]
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",
     "I2": "going first becomes less likely with a relative velocity advantage",
@@ -162,17 +161,17 @@ def _shown(study: Study, group: Group) -> list[str]:
 
 
 def _collisions(study: Study, group: Group) -> str:
-    found, human = estimate(group, COLLISIONS), estimate(study.human, COLLISIONS)
-    contrast = contrast_rates(counts(group, COLLISIONS), counts(study.human, COLLISIONS))
+    found, human = estimate(group, BOXES), estimate(study.human, BOXES)
+    contrast = contrast_rates(counts(group, BOXES), counts(study.human, BOXES))
     verdict = (
         "a difference that chance does not explain"
         if contrast.p < ALPHA
         else "no difference can be shown; a small one is not excluded"
     )
     return (
-        f"{group.driver} collided in {found.value:.1f} % of {found.n} trials "
-        f"(95 % CI {found.low:.1f} to {found.high:.1f}), humans in {human.value:.1f} % "
-        f"({human.low:.1f} to {human.high:.1f}); Fisher's exact p {_p(contrast.p)}: {verdict}."
+        f"{group.driver} collided, by boxes that overlap, in {found.value:.1f} % of "
+        f"{found.n} trials (95 % CI {found.low:.1f} to {found.high:.1f}), humans in "
+        f"{human.value:.1f} % ({human.low:.1f} to {human.high:.1f}); Fisher's exact p {_p(contrast.p)}: {verdict}."
     )
 
 

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from analysis.indicators import INDICATORS, TESTED
-from analysis.measures import MEASURES, known, published_human
+from analysis.measures import GAP, RMSE, known, published_human
 from analysis.panels import (
     VELOCITIES_MPS,
     Point,
@@ -112,8 +112,7 @@ def distributions(study: Study) -> Figure:
     groups = study.groups
     figure = Figure(figsize=(PAGE_IN, 0.8 + 0.28 * len(groups)), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
-    for axis, measure in zip(axes, (m for m in MEASURES if not m.rate), strict=True):
-        assert measure.column is not None
+    for axis, measure in zip(axes, (GAP, RMSE), strict=True):
         for row, group in enumerate(groups):
             colour, _ = _style(study, group)
             if not known(group, measure):
@@ -215,7 +214,7 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
             elif not found:
                 _say(axis, f"{first} never merged first")
             if row == 0:
-                name = group.driver.replace("+", "+\n").replace(" [", "\n[")
+                name = group.label.replace("+", "+\n").replace(" [", "\n[").replace(" (", "\n(")
                 axis.set_title(name if len(name) < 20 else name.replace("-", "-\n"))
             if found:
                 axis.text(0.98, 0.04, f"n = {len(found)}", transform=axis.transAxes, ha="right")
@@ -258,7 +257,7 @@ def _legend(figure: SubFigure, study: Study, groups: list[Group]) -> None:
         colour, marker = _group_style(groups, group)
         handles.append(
             Line2D(
-                [], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white", label=group.driver
+                [], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white", label=group.label
             )
         )
     if study.human in groups and not study.human.measured:

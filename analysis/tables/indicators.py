@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 from analysis.indicators import INDICATORS
-from analysis.measures import MEASURES, Measure, estimate, known, published_human
+from analysis.measures import (
+    BOXES,
+    COLLISIONS,
+    MEASURES,
+    RULES_NOTE,
+    Measure,
+    estimate,
+    known,
+    outcomes_note,
+    published_human,
+    undecided,
+)
 from analysis.published import citation
 from analysis.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import ceiling_notes, piecewise_notes, sample_notes
 from analysis.verdicts import Score, score
 
+BOXES_ALONE = f"{COLLISIONS.heading}: published human collisions are boxes that overlap"
 SOURCE = "paper_ablation_quantitative"
+# The indicators that rest on who merged first, and all columns of their rows.
+OF_OUTCOMES = ("I1", "I2")
+EVERY = ("paper", "robust", "differ", "value", "interval", "n")
 RULES = (
     "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
     "Firth's fit (I1, I2), HC3 errors (I3), equivalence (I4)"
@@ -18,7 +33,7 @@ RULES = (
 
 
 def indicators(study: Study) -> Table:
-    """Table V: I1 to I5 and the four quantitative measures, one row a driver."""
+    """Table V: I1 to I5 and the quantitative measures, one row a driver."""
     rows = []
     for name in INDICATORS:
         rows += [_verdict_row(study, group, name) for group in study.baselines]
@@ -62,6 +77,7 @@ def indicators(study: Study) -> Table:
         (
             RULES,
             *(f"{name}: {text}" for name, text in INDICATORS.items()),
+            RULES_NOTE,
             *ceiling_notes(study),
             *piecewise_notes(study),
             *sample_notes(study, study.baselines),
@@ -94,6 +110,10 @@ def verdict_note(found: Score, *names: str) -> str:
 
 def _verdict_row(study: Study, group: Group, name: str) -> Row:
     found = score(study, group)
+    of_outcomes = name in OF_OUTCOMES
+    trials = group.outcomes if of_outcomes else group.trials
+    # A ceiling is drawn with as many trials as there are outcomes.
+    drawn = of_outcomes or not outcomes_note(group)
     return Row(
         f"{group.id}/{name}",
         (group.id,),
@@ -101,11 +121,12 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
             "indicator": name,
             "driver": group.label,
             **verdict_values(found, name),
-            "ceiling_paper": percent(found.ceiling.paper.get(name)),
-            "ceiling_robust": percent(found.ceiling.robust.get(name)),
-            "n": len(group.finished),
+            "ceiling_paper": percent(found.ceiling.paper.get(name)) if drawn else None,
+            "ceiling_robust": percent(found.ceiling.robust.get(name)) if drawn else None,
+            "n": int((trials["status"] == "finished").sum()),
         },
-        verdict_note(found, name),
+        "; ".join(filter(None, (verdict_note(found, name), outcomes_note(group)))),
+        published=EVERY if of_outcomes else (),
     )
 
 
@@ -113,6 +134,7 @@ def _total_row(study: Study, group: Group) -> Row:
     found = score(study, group)
     paper, robust = Score.total(found.paper), Score.total(found.robust)
     missing = [name for name in INDICATORS if found.paper[name].passed is None]
+    of_both = outcomes_note(group)
     return Row(
         f"{group.id}/score",
         (group.id,),
@@ -121,17 +143,24 @@ def _total_row(study: Study, group: Group) -> Row:
             "driver": group.label,
             "paper": paper,
             "robust": robust,
-            "ceiling_paper": percent(found.ceiling.paper["I1-I4"]),
-            "ceiling_robust": percent(found.ceiling.robust["I1-I4"]),
+            "ceiling_paper": None if of_both else percent(found.ceiling.paper["I1-I4"]),
+            "ceiling_robust": None if of_both else percent(found.ceiling.robust["I1-I4"]),
             "n": len(group.finished),
         },
-        f"no score: {', '.join(missing)} cannot be judged" if missing else "",
+        "; ".join(
+            filter(
+                None,
+                (f"no score: {', '.join(missing)} cannot be judged" if missing else "", of_both),
+            )
+        ),
     )
 
 
 def _measure_row(group: Group, measure: Measure) -> Row:
     key: dict[str, Value] = {"indicator": measure.heading, "driver": group.label}
     row = f"{group.id}/{measure.name}"
+    if measure is COLLISIONS and not known(group, measure):
+        return Row(row, (group.id,), key, BOXES_ALONE)
     if not known(group, measure):
         source = f"published value, no human traces are imported ({citation(SOURCE)})"
         values = {**key, "value": published_human(measure)}
@@ -142,8 +171,18 @@ def _measure_row(group: Group, measure: Measure) -> Row:
         row,
         (group.id,),
         {**key, "value": found.value, "interval": interval, "n": found.n},
-        "" if found.value is not None else f"{measure.heading}: no trial with this measure",
+        "; ".join(
+            filter(
+                None,
+                (
+                    "" if found.value is not None else f"{measure.heading}: no trial has it",
+                    undecided(group, measure),
+                    outcomes_note(group),
+                ),
+            )
+        ),
         measure.counts,
+        published=EVERY if measure is BOXES else (),
     )
 
 

@@ -37,7 +37,8 @@ class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
     ``counts`` is the SQL predicate of its trials, where it is not that of the columns; ``printed``
-    names the columns whose values are the published ones.
+    names the columns whose values are the published ones, ``published`` those that the published
+    human outcomes are in, where trials of humans are in others.
     """
 
     id: str
@@ -46,6 +47,7 @@ class Row:
     note: str = ""
     counts: str = ""
     printed: tuple[str, ...] = ()
+    published: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,8 @@ def from_text(text: str) -> Table:
         for name in intervals & row["values"].keys():
             if row["values"][name] is not None:
                 row["values"][name] = tuple(row["values"][name])
-        row["groups"], row["printed"] = tuple(row["groups"]), tuple(row["printed"])
+        for name in ("groups", "printed", "published"):
+            row[name] = tuple(row[name])
     rows = [Row(**row) for row in content["rows"]]
     return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})
 

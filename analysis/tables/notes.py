@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from functools import cache
 
 from analysis.ceiling import DATA_SETS, SEED
-from analysis.human.counts import findings, human_counts
 from analysis.piecewise import THRESHOLDS
 from analysis.published import HUMAN_DOI, HUMAN_GAP_SD_M
 from analysis.study import Group, Study
@@ -31,16 +30,15 @@ def sample_notes(study: Study, groups: Iterable[Group]) -> list[str]:
 
 @cache
 def _human_notes(study: Study) -> tuple[str, ...]:
-    if not study.human.measured:
+    if study.imported is None:
         return (
             "human: the published outcomes of 990 trials; for the rest `merge-runner human import "
             f"PATH` reads the recordings (doi {HUMAN_DOI})",
         )
-    pairs = study.human.trials["pair"].nunique()
     return (
-        *(f"human: {finding}" for finding in findings(human_counts(study.db))),
-        f"human: intervals and tests take the trials as independent, but they come from {pairs} "
-        "pairs who differ: they are too narrow",
+        *(f"human: {finding}" for finding in study.imported.findings()),
+        "human: intervals and tests take the trials as independent, but the imported ones come "
+        f"from {study.imported.pairs} pairs who differ: they are too narrow",
     )
 
 

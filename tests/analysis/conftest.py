@@ -10,6 +10,7 @@ import pytest
 from harness import CONFIGURING
 from studies import ANSWERS, Said, write_study, yielding
 
+from analysis.ceiling import ceiling
 from analysis.commands import main
 from analysis.study import Study
 from analysis.tables import make_tables
@@ -58,6 +59,8 @@ def few_draws(monkeypatch):
     """For tests that look at no chance: never with the studies that others read."""
     monkeypatch.setattr("analysis.ceiling.DATA_SETS", 20)
     monkeypatch.setattr("analysis.contrasts.PERMUTATIONS", 99)
+    yield
+    ceiling.cache_clear()  # the published humans are the same for all studies
 
 
 @pytest.fixture(scope="session")

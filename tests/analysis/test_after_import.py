@@ -48,12 +48,14 @@ def test_human_rows_come_from_the_traces(imported):
     human = imported.human
     assert human.measured
     row = next(r for r in tables["ablation-quantitative"].rows if r.id == "human")
-    assert row.values["n"] == 66
+    assert (row.values["n"], row.values["driver"]) == (990, "humans (66 of 990 imported)")
+    assert row.values["collided_boxes_percent"] == pytest.approx(100 * 28 / 990)
+    assert "990 published outcomes; the rest: 66 imported trials, 55 finished" in row.note
     assert row.values["gap_m"] == pytest.approx(human.finished["gap_m"].mean())
-    assert "published" not in row.note
+    assert "published values" not in row.note
     assert {row.groups for row in tables["contrasts"].rows} == {("o3/baseline", "human")}
     assert {row.values["measure"] for row in tables["contrasts"].rows} == {
-        *("coll. (%)", "gap (m)", "RMSE (m/s)", "joint (%)")
+        *("coll. boxes (%)", "gap (m)", "RMSE (m/s)", "joint (%)")
     }
     assert any("66 of 990 trials" in note for note in tables["who-first"].notes)
     windows = [row.values["window"] for row in tables["speed-windows"].rows if "human" in row.id]

@@ -98,7 +98,7 @@ def test_conclusions_name_power_and_missing_traces(study):
     assert "human recordings are not imported" in texts
     assert "reconstruction" in texts
     said = " ".join(shown(study))
-    assert "o3 collided in 0.0 % of 110 trials" in said
+    assert "o3 collided, by boxes that overlap, in 0.0 % of 110 trials" in said
     assert "o3 shows, by both rules" in said
     assert "o3, by one rule alone" in said
 

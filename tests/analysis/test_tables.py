@@ -51,7 +51,7 @@ def test_human_rows_carry_the_golden_numbers(tables):
     assert found == [[-0.304, 0.135], [1.111, 0.075], [-3.304, 0.310]]
     assert cell(table, "human/intercept", "n") == 962
     quantitative = tables["ablation-quantitative"]
-    assert round(cell(quantitative, "human", "collided_percent"), 2) == 2.83
+    assert round(cell(quantitative, "human", "collided_boxes_percent"), 2) == 2.83
     assert [cell(quantitative, "human", c) for c in ("gap_m", "rmse_mps", "joint_percent")] == [
         3.85,
         0.66,
@@ -278,6 +278,7 @@ def test_every_cell_can_be_traced_to_its_trials_and_the_query_that_lists_them(st
         ("indicators", "o3/baseline/collided_percent", "n"),
         ("velocity-profiles", "o3/A2", "n"),
         ("robustness", "o3/A2/rectangle", "n"),
+        ("gap-definitions", "o3/A2/gap_mean100_m", "n"),
         ("attempts", "other/baseline", "trials"),
         ("attempts", "other/baseline", "failed"),
         ("attempts", "other/baseline", "other_model"),
