@@ -171,7 +171,8 @@ def _collisions(study: Study, group: Group) -> str:
     return (
         f"{group.driver} collided, by boxes that overlap, in {found.value:.1f} % of "
         f"{found.n} trials (95 % CI {found.low:.1f} to {found.high:.1f}), humans in "
-        f"{human.value:.1f} % ({human.low:.1f} to {human.high:.1f}); Fisher's exact p {_p(contrast.p)}: {verdict}."
+        f"{human.value:.1f} % ({human.low:.1f} to {human.high:.1f}); "
+        f"Fisher's exact p {_p(contrast.p)}: {verdict}."
     )
 
 

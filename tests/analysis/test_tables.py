@@ -149,6 +149,10 @@ def test_against_the_paper_stand_its_values_and_the_difference(tables):
     assert cell(quantitative, "o3/A2", "gap_m_difference") == pytest.approx(
         cell(quantitative, "o3/A2", "gap_m") - 10.63
     )
+    assert cell(quantitative, "o3/A2", "collided_percent_in_paper") == 2.73
+    assert cell(quantitative, "o3/A2", "collided_boxes_percent_in_paper") is None
+    assert cell(quantitative, "human", "collided_percent_in_paper") is None
+    assert cell(quantitative, "human", "collided_boxes_percent_in_paper") == 2.83
     qualitative = against(tables["ablation-qualitative"], "paper")
     assert cell(qualitative, "o3/A1", "i2_paper_in_paper") is False
     assert cell(qualitative, "o3/A2", "score_paper_in_paper") == 5
@@ -156,9 +160,26 @@ def test_against_the_paper_stand_its_values_and_the_difference(tables):
     assert cell(indicators, "o3/baseline/I2", "paper_in_paper") is False
     assert cell(indicators, "o3/baseline/rmse_mps", "value_in_paper") == 1.34
     assert cell(indicators, "human/score", "paper_in_paper") == 5
+    assert cell(indicators, "human/collided_boxes_percent", "value_in_paper") == 2.83
+    assert cell(indicators, "o3/baseline/collided_boxes_percent", "value_in_paper") is None
+    assert cell(indicators, "o3/baseline/collided_percent", "value_in_paper") == 0
     assert any("arXiv 2604.09609, Table III" in note for note in table.notes)
     with pytest.raises(UsageError, match="valid is paper"):
         against(table, "humans")
+
+
+def test_the_gap_is_told_by_each_of_its_definitions(study, tables):
+    table, regression = tables["gap-definitions"], tables["gap"]
+    group = study.models[0]
+    for column in ("gap_m", "gap_first_sample_m", "gap_mean100_m"):
+        found = group.finished[column]
+        assert cell(table, f"{group.id}/{column}", "n") == len(found)
+        assert cell(table, f"{group.id}/{column}", "gap_m") == pytest.approx(found.mean())
+    for term, name in (("abs_projected_headway", "headway"), ("abs_relative_velocity", "velocity")):
+        for value in ("b", "p"):
+            ours = cell(regression, f"{group.id}/{term}", value)
+            assert cell(table, f"{group.id}/gap_m", f"{name}_{value}") == ours
+            assert cell(table, f"{group.id}/gap_mean100_m", f"{name}_{value}") != ours
 
 
 def test_a_table_that_the_paper_has_not_says_so(tables):
