@@ -8,13 +8,12 @@ from __future__ import annotations
 from analysis.alarms import mismatch
 from analysis.contrasts import contrast_rates
 from analysis.indicators import ALPHA, INDICATORS, Verdict
-from analysis.measures import MEASURES, counts, estimate, known, published_human
+from analysis.measures import BOXES, GAP, counts, estimate, known, published_human
 from analysis.provenance import Provenance
 from analysis.published import HUMAN_TRIALS
 from analysis.study import Group, Study, stand_in
 from analysis.verdicts import Score, score
 
-COLLISIONS, GAP = MEASURES[0], MEASURES[1]
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",
     "I2": "going first becomes less likely with a relative velocity advantage",
@@ -110,8 +109,10 @@ def _weight(found: Score, name: str) -> str:
 
 
 def _collisions(study: Study, group: Group) -> str:
-    found, human = estimate(group, COLLISIONS), estimate(study.human, COLLISIONS)
-    contrast = contrast_rates(counts(group, COLLISIONS), counts(study.human, COLLISIONS))
+    found, human = estimate(group, BOXES), estimate(study.human, BOXES)
+    if found.value is None:
+        return f"{group.driver}: of no trial is it decided whether boxes would have overlapped."
+    contrast = contrast_rates(counts(group, BOXES), counts(study.human, BOXES))
     assert contrast.low is not None
     assert contrast.high is not None
     verdict = (
@@ -121,10 +122,10 @@ def _collisions(study: Study, group: Group) -> str:
         f"{100 * contrast.high:+.1f} percentage points is compatible with these trials"
     )
     return (
-        f"{group.driver} collided in {found.value:.1f} % of {_trials(found.n)} "
-        f"(95 % CI {found.low:.1f} to {found.high:.1f}), humans in {human.value:.1f} % of "
-        f"{human.n} ({human.low:.1f} to {human.high:.1f}); Fisher's exact p {_p(contrast.p)}: "
-        f"{verdict}."
+        f"{group.driver} collided, by boxes that overlap, in {found.value:.1f} % of "
+        f"{_trials(found.n)} (95 % CI {found.low:.1f} to {found.high:.1f}), humans in "
+        f"{human.value:.1f} % of {human.n} ({human.low:.1f} to {human.high:.1f}); Fisher's exact p "
+        f"{_p(contrast.p)}: {verdict}."
     )
 
 

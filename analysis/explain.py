@@ -14,6 +14,7 @@ from analysis.tables.formats import shown_value
 from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
+from merge_runner.texts import quoted
 
 SHOWN = 10
 
@@ -84,16 +85,29 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
         predicate += f" AND {column.within}"
     compared = (row.reference,) if column is not None and column.compares else ()
     return tuple(
-        _source(study, group, predicate)
-        if group.measured or not row.note
-        else Source(group.id, f"published: {row.note}", "", ())
+        _published(group, row, column)
+        or (
+            _source(study, group, predicate)
+            if group.measured or not row.note
+            else Source(group.id, f"published: {row.note}", "", ())
+        )
         for group in study.groups
         if group.id in (*row.groups, *compared)
     )
 
 
+def _published(group: Group, row: Row, column: Column | None) -> Source | None:
+    """The source of a human value that stays the published one after a part of an import."""
+    if group.published_outcomes is None or column is None or column.name not in row.published:
+        return None
+    text = f"{len(group.published_outcomes)} published outcomes: {citation('human_outcomes')}"
+    return Source(group.id, text, "", ())
+
+
 def query_of(group: Group, predicate: str) -> str:
     """The query that lists the trials of a group which a value rests on, with their measures."""
+    for column in ("collided", "collided_boxes"):
+        predicate = predicate.replace(f"{column} IS NOT NULL", _decided(group, column))
     variant = f" AND variant = '{group.setting}'" if group.setting else ""
     narrowed = f" AND {group.narrowed}" if group.narrowed else ""
     return (
@@ -103,6 +117,13 @@ def query_of(group: Group, predicate: str) -> str:
         f"WHERE trials.spec_hash = '{group.spec_hash}'{variant}{narrowed} AND {predicate} "
         "ORDER BY ALL"
     )
+
+
+def _decided(group: Group, column: str) -> str:
+    """Which trials are known to have collided or not, as the database can tell them."""
+    left_open = group.ended.loc[group.ended[column].isna(), "trial_id"]
+    names = ", ".join(map(quoted, left_open))
+    return "status <> 'failed'" + (f" AND trials.trial_id NOT IN ({names})" if names else "")
 
 
 def _resampled(study: Study) -> Source:

@@ -29,7 +29,7 @@ from analysis.drawing import (
     wrapped,
 )
 from analysis.indicators import INDICATORS
-from analysis.measures import MEASURES, known, published_human
+from analysis.measures import GAP, RMSE, known, published_human
 from analysis.panels import (
     VELOCITIES_MPS,
     Point,
@@ -126,8 +126,7 @@ def distributions(study: Study) -> Figure:
     row_in = max(0.28, LINE_IN * line_count(names) + 0.04)
     figure = Figure(figsize=(PAGE_IN, 0.8 + row_in * len(groups)), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
-    for axis, measure in zip(axes, (m for m in MEASURES if not m.rate), strict=True):
-        assert measure.column is not None
+    for axis, measure in zip(axes, (GAP, RMSE), strict=True):
         for row, group in enumerate(groups):
             colour, _ = _style(study, group)
             if not known(group, measure):

@@ -14,6 +14,11 @@ DATA = Path(__file__).with_name("data")
 # arXiv 2604.09609 (Table IV, human rows, n = 962) imply.
 HUMAN_GAP_SD_M = 1.82
 HUMAN_TRIALS = 990
+# The experiments whose pairs the publications number 1 to 9.
+PAIRS = {
+    experiment: f"pair{number}"
+    for number, experiment in enumerate((4, 5, 6, 8, 9, 10, 11, 12, 13), start=1)
+}
 HUMAN_DOI = "10.4121/19550377"
 
 
@@ -34,7 +39,7 @@ def human_outcomes() -> pd.DataFrame:
     """The 990 human trials as far as they are published.
 
     Columns as in ``trials``: condition, projected_headway_m, relative_velocity_mps, status,
-    merged_first.
+    merged_first. ``collided_boxes``: the experiment's collisions are boxes that overlap.
     """
     rows = []
     for counts in published("human_outcomes").itertuples():
@@ -54,4 +59,5 @@ def human_outcomes() -> pd.DataFrame:
             for outcome in outcomes
         ]
     names = ["condition", "projected_headway_m", "relative_velocity_mps", "status", "merged_first"]
-    return pd.DataFrame(rows, columns=names)
+    trials = pd.DataFrame(rows, columns=names)
+    return trials.assign(collided_boxes=trials["status"] == "collided")

@@ -154,14 +154,14 @@ def who_first_firth(trials: pd.DataFrame) -> Regression:
     )
 
 
-def gap_ols(trials: pd.DataFrame, *, robust: bool = False) -> Regression:
-    """OLS of the gap on |h|, |dv| and h*dv (eq. 2); ``robust`` takes HC3 standard errors.
+def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = False) -> Regression:
+    """OLS of a gap on |h|, |dv| and h*dv (eq. 2); ``robust`` takes HC3 standard errors.
 
     HC3 holds under unequal variances (MacKinnon and White 1985).
     """
     from statsmodels.regression.linear_model import OLS
 
-    design, gap, _ = gap_data(trials)
+    design, gap, _ = gap_data(trials, measure)
     if not np.isfinite(gap).all():
         return Regression(len(gap), {}, "a gap is not finite")
     freedom = len(gap) - design.shape[1]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from analysis.imported import Imported, imported
+from analysis.imported import Imported, imported, of_published_pairs
 from analysis.intermittency import measure_profiles
 from analysis.load import (
     LEFT_SPEEDS,
@@ -26,6 +26,7 @@ from analysis.load import (
     load_each,
 )
 from analysis.published import human_outcomes
+from analysis.robustness import judged
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
 from merge_runner.plan import PROGRAMS
@@ -43,13 +44,14 @@ EMULATOR = "emulator"
 class Group:
     """Trials of equal drivers, prompts and parameters.
 
-    ``trials`` are rows of ``load_trials``; for humans before an import only the outcomes that are
-    published, and ``measured`` is False. ``setting`` is the prompt variant, empty for humans.
-    ``label`` is how tables name the driver, ``model`` the name that was asked for. Of a driver
-    without chance, whose repetitions are the same trial again, only the first are ``trials``, and
-    ``repeated`` counts the others. ``narrowed`` is what tells them in SQL from other trials of
-    their spec and variant, empty where there are none. ``published_outcomes`` stand in the place
-    of the trials' outcomes where these are a part of the published ones.
+    ``trials`` are rows of ``load_trials``, judged by both rules of collisions; for humans before an
+    import only the outcomes that are published, and ``measured`` is False. ``setting`` is the
+    prompt variant, empty for humans. ``label`` is how tables name the driver, ``model`` the name
+    that was asked for. Of a driver without chance, whose repetitions are the same trial again, only
+    the first are ``trials``, and ``repeated`` counts the others. ``narrowed`` is what tells them in
+    SQL from other trials of their spec and variant, empty where there are none.
+    ``published_outcomes`` stand in the place of the trials' outcomes where these are a part of the
+    published ones.
     """
 
     driver: str
@@ -94,10 +96,14 @@ class Group:
         return self.trials[self.trials["status"] == "finished"]
 
     @property
+    def ended_outcomes(self) -> pd.DataFrame:
+        """The outcomes of trials that did not fail."""
+        return self.outcomes[self.outcomes["status"] != "failed"]
+
+    @property
     def sizes(self) -> tuple[int, ...]:
         """How many outcomes there are in each condition, in the order of CONDITIONS."""
-        ended = self.outcomes[self.outcomes["status"] != "failed"]
-        counts = ended["condition"].value_counts()
+        counts = self.ended_outcomes["condition"].value_counts()
         return tuple(int(counts.get(name, 0)) for name in CONDITIONS)
 
     @cached_property
@@ -121,9 +127,10 @@ class Study:
         self.chosen = models
         found = load_each({"trials": TRIALS, "specs": SPECS, "traces": TRACES}, self.db)
         trials = found["trials"].merge(found["traces"], on=["trial_id", "spec_hash"], how="left")
+        trials = judged(self.db, trials)
         recorded = trials["source"] == HUMAN
         self.imported = imported(trials[recorded]) if recorded.any() else None
-        self.human = _human_group(trials[recorded], self.imported)
+        self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
         every = _model_groups(trials[~recorded], _tasks(found["specs"]))
         valid = [HUMAN, *dict.fromkeys(group.driver for group in every)]
         wanted = valid if models is None else list(models)
@@ -196,6 +203,7 @@ def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.Data
 def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
     if known is None:
         return _published_group()
+    pairs = ", ".join(quoted(pair) for pair in sorted(trials["pair"].unique()))
     return Group(
         HUMAN,
         "",
@@ -203,6 +211,7 @@ def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
         trials,
         label=known.label,
         model=HUMAN,
+        narrowed=f"pair IN ({pairs})" if known.left_out else "",
         published_outcomes=None if known.complete else human_outcomes(),
     )
 

@@ -17,7 +17,8 @@ from pathlib import Path
 import duckdb
 import numpy as np
 
-from analysis.human.record import PAIRS, SPEC, SPEC_HASH
+from analysis.human.record import SPEC, SPEC_HASH
+from analysis.published import PAIRS
 from merge_runner.config import Scenario
 from merge_runner.records import (
     SIDES,

@@ -155,7 +155,7 @@ def human_panels(study: Study) -> dict[str, Any]:
     RMSE over all conditions in m/s.
     """
     from analysis.load import SPECS, load
-    from analysis.measures import published_human
+    from analysis.measures import RMSE, outcomes_note, published_human
     from analysis.published import citation
     from analysis.tables.notes import sample_notes
 
@@ -165,7 +165,7 @@ def human_panels(study: Study) -> dict[str, Any]:
     if study.human in study.groups and not measured:
         published = {
             "gap_m": _published_gaps(),
-            "rmse_mps": published_human(_measure("rmse_mps")),
+            "rmse_mps": published_human(RMSE),
             "outcomes_from": citation("human_outcomes"),
             "gaps_from": citation("paper_gap"),
             "rmse_from": citation("paper_ablation_quantitative"),
@@ -174,6 +174,7 @@ def human_panels(study: Study) -> dict[str, Any]:
         "measured": measured,
         "published": published,
         "notes": sample_notes(study, study.baselines),
+        "caveat": outcomes_note(study.human) if study.human in study.groups else "",
         "groups": [
             {
                 "id": group.id,
@@ -189,23 +190,25 @@ def human_panels(study: Study) -> dict[str, Any]:
 
 def _in_condition(group: Group, condition: str) -> dict[str, Any]:
     """The trials of a group in one condition: counts, and estimates with 95 % intervals."""
-    from analysis.measures import LEFT_FIRST, counts, estimate, known
+    from analysis.measures import (
+        BOXES,
+        COLLISIONS,
+        GAP,
+        LEFT_FIRST,
+        RMSE,
+        counts,
+        estimate,
+        known,
+    )
 
     part = group.part(lambda trials: trials["condition"] == condition)
-    found: dict[str, Any] = {"all": len(part.trials), "ended": len(part.ended)}
-    for measure in (LEFT_FIRST, *map(_measure, ("gap_m", "rmse_mps", "collided_percent"))):
-        # Who merged first is published, gaps and speeds are not.
-        if measure is LEFT_FIRST or known(group, measure):
+    found: dict[str, Any] = {"all": len(part.outcomes), "ended": len(part.ended_outcomes)}
+    for measure in (LEFT_FIRST, GAP, RMSE, BOXES, COLLISIONS):
+        if known(group, measure):
             found[measure.name] = asdict(estimate(part, measure))
             if measure.rate:
                 found[measure.name]["k"] = counts(part, measure)[0]
     return found
-
-
-def _measure(name: str) -> Any:  # noqa: ANN401 # its module loads pandas
-    from analysis.measures import MEASURES
-
-    return next(measure for measure in MEASURES if measure.name == name)
 
 
 def _published_gaps() -> dict[str, float]:

@@ -39,8 +39,8 @@ def human_import(
     from rich.progress import track
 
     from analysis.human.archive import open_files
-    from analysis.human.counts import findings, human_counts
     from analysis.human.load import import_trials, sort_files
+    from analysis.imported import human_trials, imported
     from merge_runner.store import Store
 
     try:
@@ -61,7 +61,7 @@ def human_import(
         sys.exit(INTERRUPTED)
     for line in _messages(download, report):
         say(line)
-    for line in findings(human_counts(db)):
+    for line in imported(human_trials(db)).findings():
         say(f"note: {line}")
     print_out(
         f"{report.added} trials added, {report.there} there already, {len(report.unreadable)} "
@@ -73,30 +73,23 @@ def human_import(
 @human_app.command("status")
 def human_status(db: DbOption = DEFAULT_DB) -> None:
     """Count the human trials per pair and condition, beside the published counts."""
-    from analysis.human.counts import (
-        COUNTS,
-        OUTCOMES,
-        by_condition,
-        by_pair,
-        findings,
-        human_counts,
-    )
+    from analysis.imported import COUNTS, OUTCOMES, by_condition, by_pair, human_trials, imported
     from analysis.published import HUMAN_DOI
 
-    counts = human_counts(db) if db.exists() else None
-    if counts is None or counts.empty:
+    trials = human_trials(db) if db.exists() else None
+    if trials is None or trials.empty:
         print_out(
             "no human recordings are imported: merge-runner human import PATH, where PATH is the "
             f"download of https://doi.org/{HUMAN_DOI}"
         )
         return
-    conditions = by_condition(counts)
+    conditions = by_condition(trials)
     known = conditions[[f"{outcome}_published" for outcome in OUTCOMES]].astype(str)
-    print_out(_text(by_pair(counts)))
+    print_out(_text(by_pair(trials)))
     print_out("")
     print_out(_text(conditions[COUNTS].assign(published=known.agg(" ".join, axis=1))))
     print_out("")
-    for line in findings(counts):
+    for line in imported(trials).findings():
         print_out(line)
 
 

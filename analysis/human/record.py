@@ -6,18 +6,13 @@ from itertools import pairwise
 
 from analysis.human.archive import Unreadable
 from analysis.human.trace import Trace
-from analysis.published import HUMAN_DOI
+from analysis.published import HUMAN_DOI, PAIRS
 from merge_runner.llm.keys import canonical_json
 from merge_runner.plan import spec_hash
 from merge_runner.records import SIDES, Side, StateRow, Status, TrialRecord, TrialSpec
 from merge_runner.simulator.conditions import CONDITIONS, Condition
 from merge_runner.simulator.track import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
 
-# The experiments whose pairs the publications number 1 to 9.
-PAIRS = {
-    experiment: f"pair{number}"
-    for number, experiment in enumerate((4, 5, 6, 8, 9, 10, 11, 12, 13), start=1)
-}
 STATUSES: dict[str, Status] = {
     "Finished": "finished",
     "Collided": "collided",

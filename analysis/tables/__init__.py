@@ -32,6 +32,7 @@ TABLES = {
     "conflict-resolution": "conflicts",
     "criticality": "conflicts",
     "speed-windows": "windows",
+    "gap-definitions": "gaps",
     "robustness": "robustness",
     "attempts": "attempts",
     "fallbacks": "fallbacks",

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 from analysis.indicators import INDICATORS
-from analysis.measures import MEASURES, estimate, known, published_human
+from analysis.measures import (
+    BOXES,
+    COLLISIONS,
+    MEASURES,
+    RULES_NOTE,
+    estimate,
+    known,
+    outcomes_note,
+    published_human,
+    undecided,
+)
 from analysis.published import citation
 from analysis.study import Group, Study
 from analysis.tables.indicators import (
+    BOXES_ALONE,
     RULES,
     SOURCE,
     percent,
@@ -18,6 +29,11 @@ from analysis.tables.indicators import (
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
 from analysis.verdicts import score
+
+# Columns that rest on who merged first.
+OF_OUTCOMES = tuple(
+    f"{name}_{rule}" for name in ("i1", "i2") for rule in ("paper", "robust", "differ")
+)
 
 
 def ablation_qualitative(study: Study) -> Table:
@@ -99,6 +115,7 @@ def ablation_quantitative(study: Study) -> Table:
         (
             "collisions over all ended trials; gap, RMSE and joint rate over finished ones; "
             "intervals: Wilson for rates, Student's t for means",
+            RULES_NOTE,
             *sample_notes(study, study.groups),
         ),
         "Table VII",
@@ -117,7 +134,7 @@ def _keys(group: Group) -> dict[str, Value]:
     return {
         "driver": group.label,
         "setting": group.setting,
-        "n": len(group.ended),
+        "n": len(group.ended_outcomes),
     }
 
 
@@ -132,13 +149,21 @@ def _qualitative_row(study: Study, group: Group) -> Row:
         "ceiling_paper": percent(found.ceiling.paper["I1-I4"]),
         "ceiling_robust": percent(found.ceiling.robust["I1-I4"]),
     }
-    notes = filter(None, (verdict_note(found, *INDICATORS), score_note(found)))
-    return Row(group.id, (group.id,), values, "; ".join(notes))
+    of_both = outcomes_note(group)
+    if of_both:
+        values |= {"ceiling_paper": None, "ceiling_robust": None}
+        of_both += "; no ceiling: the indicators rest on different trials"
+    notes = filter(None, (verdict_note(found, *INDICATORS), score_note(found), of_both))
+    return Row(group.id, (group.id,), values, "; ".join(notes), published=("n", *OF_OUTCOMES))
 
 
 def _quantitative_row(group: Group) -> Row:
     values, missing, shipped = _keys(group), [], []
+    remarks = [outcomes_note(group), *(undecided(group, measure) for measure in MEASURES)]
     for measure in MEASURES:
+        if measure is COLLISIONS and not known(group, measure):
+            remarks.append(BOXES_ALONE)
+            continue
         if not known(group, measure):
             values[measure.name] = published_human(measure)
             shipped.append(measure.name)
@@ -149,8 +174,18 @@ def _quantitative_row(group: Group) -> Row:
             values[f"{measure.name}_ci"] = (found.low, found.high)
         if found.value is None:
             missing.append(measure.heading)
-    note = f"no trial with {', '.join(missing)}" if missing else ""
+    if missing:
+        remarks.append(f"no trial with {', '.join(missing)}")
     if shipped:
-        note = "gap, RMSE and joint rate are published values, no human traces are imported"
-        note += f" ({citation(SOURCE)})"
-    return Row(group.id, (group.id,), values, note, printed=tuple(shipped))
+        remarks.append(
+            "gap, RMSE and joint rate are published values, no human traces are imported "
+            f"({citation(SOURCE)})"
+        )
+    return Row(
+        group.id,
+        (group.id,),
+        values,
+        "; ".join(filter(None, remarks)),
+        printed=tuple(shipped),
+        published=("n", BOXES.name, f"{BOXES.name}_ci"),
+    )

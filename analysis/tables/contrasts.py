@@ -5,11 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from analysis.contrasts import Contrast, contrast_means, contrast_rates, corrected
-from analysis.measures import MEASURES, Measure, counts, estimate, known, published_human
+from analysis.measures import (
+    BOXES,
+    JOINT,
+    MEASURES,
+    RULES_NOTE,
+    Measure,
+    counts,
+    estimate,
+    known,
+    outcomes_note,
+    published_human,
+    undecided,
+)
 from analysis.study import BASELINE, Group, Study
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import sample_notes
 
+# Of a row: those that the outcomes of humans are in.
+COLUMNS = ("difference", "ci", "p", "p_holm", "p_bh", "n", "n_reference")
 JOINT_NOTE = "human joint rate: 510 of 962 trials, from the 53.0 % that the paper prints"
 
 
@@ -53,6 +67,7 @@ def contrasts(study: Study) -> Table:
             "a power of .8; rates: by the exact power of Fisher's test, the reference's true rate "
             "being the observed one, in the direction in which less is enough; means: (t.975 + "
             "t.8) times the standard error of the linear model",
+            RULES_NOTE,
             *(
                 []
                 if study.human.measured
@@ -81,7 +96,7 @@ def _against_humans(study: Study) -> Iterator[Row]:
         return
     pairs = [(group, study.human) for group in study.models if group.setting == BASELINE]
     for measure in MEASURES:
-        if known(study.human, measure) or measure.name == "joint_percent":
+        if known(study.human, measure) or measure is JOINT:
             yield from _corrected(pairs, measure, "human")
 
 
@@ -113,18 +128,26 @@ def _corrected(pairs: list[tuple[Group, Group]], measure: Measure, reference: st
                 "n": _n(group, measure),
                 "n_reference": _n(other, measure),
             },
-            "; ".join(filter(None, (_joint_note(other, measure), _powerless(contrast, measure)))),
+            "; ".join(filter(None, (_note(group, other, measure), _powerless(contrast, measure)))),
             counts=measure.counts,
+            published=COLUMNS if measure is BOXES else (),
         )
         for i, (group, other, contrast) in enumerate(found)
     ]
+
+
+def _note(group: Group, other: Group, measure: Measure) -> str:
+    named = {group.id: undecided(group, measure), other.id: undecided(other, measure)}
+    remarks = [f"{name}, {remark}" for name, remark in named.items() if remark]
+    if not known(other, measure):
+        remarks.append(JOINT_NOTE)
+    return "; ".join(filter(None, [*remarks, outcomes_note(other)]))
 
 
 def _contrast(group: Group, other: Group, measure: Measure) -> Contrast | None:
     if measure.rate:
         first, second = counts(group, measure), _rate(other, measure)
         return contrast_rates(first, second) if first[1] and second[1] else None
-    assert measure.column is not None
     return contrast_means(group.finished, other.finished, measure.column)
 
 

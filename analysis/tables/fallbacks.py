@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from analysis.indicators import INDICATORS, TESTED, Verdict, paper_verdicts, robust_verdicts
 from analysis.intervals import Estimate
-from analysis.measures import LEFT_FIRST, MEASURES, Measure, estimate
+from analysis.measures import (
+    BOXES,
+    COLLISIONS,
+    GAP,
+    JOINT,
+    LEFT_FIRST,
+    RMSE,
+    RULES_NOTE,
+    Measure,
+    estimate,
+    undecided,
+)
 from analysis.study import Group, Study, of_group
 from analysis.tables.attempts import FALLBACK
 from analysis.tables.indicators import RULES
@@ -12,9 +23,7 @@ from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
 from analysis.verdicts import Fits, fits
 
-COLLISIONS, *OTHERS = MEASURES
-COMPARED = (COLLISIONS, LEFT_FIRST, *OTHERS)
-GAP = MEASURES[1]
+COMPARED = (COLLISIONS, BOXES, LEFT_FIRST, GAP, RMSE, JOINT)
 # What an indicator's regression is fitted to.
 FITTED = {"I1": LEFT_FIRST, "I2": LEFT_FIRST, "I3": GAP, "I4": GAP}
 # The two sides: name, suffix of the columns, predicate of the trials.
@@ -46,6 +55,7 @@ def fallbacks(study: Study) -> Table:
             "all: every trial; without: those in which every decision was driven from its own "
             "answer. Intervals: Wilson for rates, Student's t for means. Where the two are far "
             "apart, failed answers bias the result",
+            RULES_NOTE,
             RULES,
             *(f"{name}: {INDICATORS[name]}" for name in TESTED),
             *([] if rows else ["there is no trial of a driver to compare"]),
@@ -126,7 +136,7 @@ def _measure_row(group: Group, kept: Group, measure: Measure, why: str) -> Row:
         f"{group.id}/{measure.name}",
         (group.id,),
         values,
-        "; ".join(filter(None, (why, nothing))),
+        "; ".join(filter(None, (why, nothing, undecided(group, measure)))),
         measure.counts,
     )
 

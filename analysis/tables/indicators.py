@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from analysis.indicators import INDICATORS, Verdict
 from analysis.likeness import gains
-from analysis.measures import MEASURES, Measure, estimate, known, published_human
+from analysis.measures import (
+    BOXES,
+    COLLISIONS,
+    MEASURES,
+    RULES_NOTE,
+    Measure,
+    estimate,
+    known,
+    outcomes_note,
+    published_human,
+    undecided,
+)
 from analysis.published import citation
 from analysis.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
@@ -12,8 +23,12 @@ from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_not
 from analysis.tables.profiles import gain_values
 from analysis.verdicts import Score, score, total
 
+BOXES_ALONE = f"{COLLISIONS.heading}: published human collisions are boxes that overlap"
 SOURCE = "paper_ablation_quantitative"
 PAPER_RULE, ROBUST_RULE = "by the paper's test", "by the robust tests"
+# The indicators that rest on who merged first, and all columns of their rows.
+OF_OUTCOMES = ("I1", "I2")
+EVERY = ("paper", "robust", "differ", "value", "interval", "n")
 RULES = (
     "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
     "Firth's fit (I1, I2), HC3 errors (I3), equivalence (I4)"
@@ -21,7 +36,7 @@ RULES = (
 
 
 def indicators(study: Study) -> Table:
-    """Table V: I1 to I5 and the four quantitative measures, one row a driver."""
+    """Table V: I1 to I5 and the quantitative measures, one row a driver."""
     rows = []
     for name in INDICATORS:
         rows += [_verdict_row(study, group, name) for group in study.baselines]
@@ -65,6 +80,7 @@ def indicators(study: Study) -> Table:
         (
             RULES,
             *(f"{name}: {text}" for name, text in INDICATORS.items()),
+            RULES_NOTE,
             *ceiling_notes(study),
             *intermittency_notes(study),
             *sample_notes(study, study.baselines),
@@ -116,6 +132,10 @@ def score_note(found: Score) -> str:
 
 def _verdict_row(study: Study, group: Group, name: str) -> Row:
     found = score(study, group)
+    of_outcomes = name in OF_OUTCOMES
+    trials = group.outcomes if of_outcomes else group.trials
+    # A ceiling is drawn with as many trials as there are outcomes.
+    drawn = of_outcomes or not outcomes_note(group)
     return Row(
         f"{group.id}/{name}",
         (group.id,),
@@ -124,11 +144,17 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
             "driver": group.label,
             **verdict_values(found, name),
             **(gain_values(study, group, "value", "interval") if name == "I5" else {}),
-            "ceiling_paper": percent(found.ceiling.paper.get(name)),
-            "ceiling_robust": percent(found.ceiling.robust.get(name)),
-            "n": len(group.finished),
+            "ceiling_paper": percent(found.ceiling.paper.get(name)) if drawn else None,
+            "ceiling_robust": percent(found.ceiling.robust.get(name)) if drawn else None,
+            "n": int((trials["status"] == "finished").sum()),
         },
-        "; ".join(filter(None, (verdict_note(found, name), _inaction(study, group, name)))),
+        "; ".join(
+            filter(
+                None,
+                (verdict_note(found, name), _inaction(study, group, name), outcomes_note(group)),
+            )
+        ),
+        published=EVERY if of_outcomes else (),
     )
 
 
@@ -140,6 +166,7 @@ def _inaction(study: Study, group: Group, name: str) -> str:
 
 def _total_row(study: Study, group: Group) -> Row:
     found = score(study, group)
+    of_both = outcomes_note(group)
     return Row(
         f"{group.id}/score",
         (group.id,),
@@ -148,17 +175,19 @@ def _total_row(study: Study, group: Group) -> Row:
             "driver": group.label,
             "paper": score_text(found.paper),
             "robust": score_text(found.robust),
-            "ceiling_paper": percent(found.ceiling.paper["I1-I4"]),
-            "ceiling_robust": percent(found.ceiling.robust["I1-I4"]),
+            "ceiling_paper": None if of_both else percent(found.ceiling.paper["I1-I4"]),
+            "ceiling_robust": None if of_both else percent(found.ceiling.robust["I1-I4"]),
             "n": len(group.finished),
         },
-        score_note(found),
+        "; ".join(filter(None, (score_note(found), of_both))),
     )
 
 
 def _measure_row(group: Group, measure: Measure) -> Row:
     key: dict[str, Value] = {"indicator": measure.heading, "driver": group.label}
     row = f"{group.id}/{measure.name}"
+    if measure is COLLISIONS and not known(group, measure):
+        return Row(row, (group.id,), key, BOXES_ALONE)
     if not known(group, measure):
         source = f"published value, no human traces are imported ({citation(SOURCE)})"
         values = {**key, "value": published_human(measure)}
@@ -169,8 +198,18 @@ def _measure_row(group: Group, measure: Measure) -> Row:
         row,
         (group.id,),
         {**key, "value": found.value, "interval": interval, "n": found.n},
-        "" if found.value is not None else f"{measure.heading}: no trial with this measure",
+        "; ".join(
+            filter(
+                None,
+                (
+                    "" if found.value is not None else f"{measure.heading}: no trial has it",
+                    undecided(group, measure),
+                    outcomes_note(group),
+                ),
+            )
+        ),
         measure.counts,
+        published=EVERY if measure is BOXES else (),
     )
 
 

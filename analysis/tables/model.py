@@ -39,10 +39,11 @@ class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
     ``counts`` is the SQL predicate of its trials, where it is not that of the columns; ``printed``
-    names the columns whose values are the published ones, or rest on them. ``beside`` is the driver
-    of the paper whose row it stands beside, if any, and ``stand_in_for`` the model in whose name a
-    scripted stand-in answered. ``reference`` is the group that it is compared with, in the columns
-    that compare.
+    names the columns whose values are the published ones, or rest on them, ``published`` those that
+    the published human outcomes are in, where trials of humans are in others. ``beside`` is the
+    driver of the paper whose row it stands beside, if any, and ``stand_in_for`` the model in whose
+    name a scripted stand-in answered. ``reference`` is the group that it is compared with, in the
+    columns that compare.
     """
 
     id: str
@@ -54,6 +55,7 @@ class Row:
     beside: str = ""
     stand_in_for: str = ""
     reference: str = ""
+    published: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +98,8 @@ def from_text(text: str) -> Table:
         for name in intervals & row["values"].keys():
             if row["values"][name] is not None:
                 row["values"][name] = tuple(row["values"][name])
-        row["groups"], row["printed"] = tuple(row["groups"]), tuple(row["printed"])
+        for name in ("groups", "printed", "published"):
+            row[name] = tuple(row[name])
     rows = [Row(**row) for row in content["rows"]]
     return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})
 

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from functools import cache
 
 from analysis import ceiling
-from analysis.human.counts import findings, human_counts
 from analysis.intermittency import STEADY_MPS
 from analysis.likeness import MARGIN_SD
 from analysis.published import HUMAN_DOI, HUMAN_GAP_SD_M
@@ -42,19 +41,18 @@ def repeated_note(group: Group) -> str:
 
 @cache
 def _human_notes(study: Study, pooled: bool) -> tuple[str, ...]:
-    if not study.human.measured:
+    if study.imported is None:
         return (
             "human: the published outcomes of 990 trials; for the rest `merge-runner human import "
             f"PATH` reads the recordings (doi {HUMAN_DOI})",
         )
-    found = tuple(f"human: {finding}" for finding in findings(human_counts(study.db)))
+    found = tuple(f"human: {finding}" for finding in study.imported.findings())
     if not pooled:
         return found
-    pairs = study.human.trials["pair"].nunique()
     return (
         *found,
-        f"human: intervals and tests take the trials as independent, but they come from {pairs} "
-        "pairs who differ: they are too narrow",
+        "human: intervals and tests take the trials as independent, but the imported ones come "
+        f"from {study.imported.pairs} pairs who differ: they are too narrow",
     )
 
 

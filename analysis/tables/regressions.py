@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 from analysis.indicators import GAP_MARGIN_M, LARGEST_VELOCITY_MPS, equivalence_p
+from analysis.measures import outcomes_note
 from analysis.mixed import gap_mixed, who_first_mixed
 from analysis.published import citation, published
 from analysis.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
@@ -27,6 +28,8 @@ TESTED_ELSEWHERE = (
     "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
     "table differences tests it"
 )
+# Of Table III: the columns that rest on who merged first.
+EVERY = ("n", "b", "se", "z", "p", "firth_b", "firth_se", "firth_p")
 RANDOM_INTERCEPT = "random intercept per pair"
 
 
@@ -47,7 +50,8 @@ def who_first(study: Study) -> Table:
                         **_wald(fit.logit, term, "z"),
                         **_firth(fit.firth, term),
                     },
-                    problems(fit.logit, fit.firth),
+                    "; ".join(filter(None, (problems(fit.logit, fit.firth), outcomes_note(group)))),
+                    published=EVERY,
                 )
             )
             rows += _mixed_rows(group, term, "z")

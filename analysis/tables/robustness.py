@@ -1,4 +1,4 @@
-"""Outcomes under the three readings of the paper's collision rule."""
+"""Outcomes under the readings of the paper's collision rule, and under the humans' own."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pandas as pd
 
 from analysis.intervals import proportion
 from analysis.load import SIZES, load_each
-from analysis.robustness import RULES, UNDECIDED, outcomes
+from analysis.robustness import BOXES, READINGS, UNDECIDED, outcomes
 from analysis.study import Group, Study, of_group
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
@@ -24,7 +24,7 @@ def robustness(study: Study) -> Table:
     everything = "status <> 'failed'"
     return Table(
         "robustness",
-        "Outcomes under three collision rules, from the stored plans",
+        "Outcomes under the readings of the collision rule, from the stored plans",
         (
             Column("driver", "driver"),
             Column("setting", "setting"),
@@ -40,9 +40,10 @@ def robustness(study: Study) -> Table:
         ),
         rows,
         (
-            "euclid2d: centres closer than a vehicle's length in the plane; rectangle: the "
-            "vehicles' boxes overlap, the rule of the human experiment; shared_lane: closer than a "
-            "vehicle's length along the track once either vehicle has passed the merge point",
+            "euclid2d: centres closer than a vehicle length in the plane; rectangle: the vehicles' "
+            "boxes overlap; shared_lane: closer than a vehicle length along the track once either "
+            "vehicle has passed the merge point. They are looked for at the steps of the "
+            f"simulation, of humans every 0.2 s. {BOXES}: the rule of the human experiment",
             *_size_notes(study, measured),
             "undecided: the trial ended in a collision that this rule does not see, and the last "
             "plans, or the human trace, end before it is decided",
@@ -67,7 +68,7 @@ def _size_notes(study: Study, groups: Iterable[Group]) -> Iterator[str]:
 def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
     own = of_group(found, group, group.ended)
     rows = []
-    for rule in RULES:
+    for rule in READINGS:
         chosen = own[own["rule"] == rule]
         counts = chosen["status"].value_counts()
         collided, n = int(counts.get("collided", 0)), len(chosen)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from analysis.intervals import mean, proportion
-from analysis.measures import MEASURES, published_human
+from analysis.measures import JOINT, RMSE, published_human
 from analysis.study import Group, Study, of_group
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import sample_notes
@@ -19,7 +19,9 @@ WINDOWS = {
 def speed_windows(study: Study) -> Table:
     """One row a group and window; the right window gives the published human values."""
     measured = [group for group in study.groups if group.measured]
-    human = " and ".join(f"{published_human(m):g} {'%' if m.rate else 'm/s'}" for m in MEASURES[2:])
+    human = " and ".join(
+        f"{published_human(m):g} {'%' if m.rate else 'm/s'}" for m in (RMSE, JOINT)
+    )
     rows = [_row(study, group, window) for group in measured for window in WINDOWS]
     return Table(
         "speed-windows",
@@ -29,8 +31,8 @@ def speed_windows(study: Study) -> Table:
             Column("setting", "setting"),
             Column("window", "window"),
             Column("n", "n", "count", 0, "finished trials in which the window ends"),
-            Column("rmse_mps", "RMSE (m/s)", "number", 2, MEASURES[2].meaning),
-            Column("joint_percent", "joint (%)", "percent", 2, MEASURES[3].meaning),
+            Column("rmse_mps", "RMSE (m/s)", "number", 2, RMSE.meaning),
+            Column("joint_percent", "joint (%)", "percent", 2, JOINT.meaning),
         ),
         rows,
         (

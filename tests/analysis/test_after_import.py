@@ -8,6 +8,8 @@ from studies import write_study, yielding
 
 from analysis.ceiling import published_humans
 from analysis.conclusions import not_shown
+from analysis.explain import explain
+from analysis.explorer.numbers import human_panels
 from analysis.figures import figure_2
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
@@ -52,18 +54,63 @@ def test_human_rows_come_from_the_traces(imported):
     human = imported.human
     assert human.measured
     row = next(r for r in tables["ablation-quantitative"].rows if r.id == "human")
-    assert row.values["n"] == 66
+    assert (row.values["n"], row.values["driver"]) == (990, "humans (66 of 990 imported)")
+    assert row.values["collided_boxes_percent"] == pytest.approx(100 * 28 / 990)
+    assert "990 published outcomes; the rest: 66 imported trials, 55 finished" in row.note
     assert row.values["gap_m"] == pytest.approx(human.finished["gap_m"].mean())
-    assert "published" not in row.note
+    assert "published values" not in row.note
     assert {row.groups for row in tables["contrasts"].rows} == {("o3/baseline", "human")}
     assert {row.values["measure"] for row in tables["contrasts"].rows} == {
-        *("coll. (%)", "gap (m)", "RMSE (m/s)", "joint (%)")
+        *("coll. boxes (%)", "gap (m)", "RMSE (m/s)", "joint (%)")
     }
     assert any("66 of 990 trials" in note for note in tables["who-first"].notes)
     windows = [row.values["window"] for row in tables["speed-windows"].rows if "human" in row.id]
     assert len(windows) == 4
     rules = {r.values["rule"]: r.values for r in tables["robustness"].rows if "human" in r.id}
     assert rules["rectangle"]["n"] == 66
+
+
+def test_a_cell_of_published_outcomes_names_no_imported_trial(imported):
+    tables = {table.name: table for table in make_tables(imported)}
+    for name, cell in (
+        ("ablation-quantitative", "human:n"),
+        ("ablation-quantitative", "human:collided_boxes_percent"),
+        ("indicators", "human/I1:n"),
+        ("who-first", "human/intercept:b"),
+        ("contrasts", "o3/baseline/human/collided_boxes_percent:p"),
+    ):
+        (human,) = (s for s in explain(imported, tables[name], cell).sources if s.group == "human")
+        assert human.trials == (), (name, cell)
+        assert human.text.startswith("990 published outcomes"), (name, cell)
+    for name, cell in (
+        ("ablation-quantitative", "human:gap_m"),
+        ("gap-definitions", "human/gap_m:n"),
+        ("who-first", "human/mixed/intercept:n"),
+    ):
+        (human,) = explain(imported, tables[name], cell).sources
+        assert len(human.trials) == 55, (name, cell)
+
+
+def test_the_ceiling_of_humans_is_left_out_where_their_indicators_rest_on_both(imported):
+    (table,) = make_tables(imported, ["indicators"])
+    rows = {row.id: row for row in table.rows}
+    assert rows["human/I1"].values["n"] == 962
+    assert rows["human/I1"].values["ceiling_paper"] is not None
+    for name in ("I3", "I4", "score"):
+        assert rows[f"human/{name}"].values["n"] == 55
+        assert rows[f"human/{name}"].values["ceiling_paper"] is None
+        assert "990 published outcomes" in rows[f"human/{name}"].note
+
+
+def test_the_panels_have_published_outcomes_and_imported_gaps(imported):
+    found = human_panels(imported)
+    human = found["groups"][0]
+    assert human["driver"] == "humans (66 of 990 imported)"
+    tie = human["conditions"]["N_0_0"]
+    assert (tie["all"], tie["ended"], tie["collided_boxes_percent"]["k"]) == (90, 90, 5)
+    assert "collided_percent" not in tie
+    assert tie["gap_m"]["n"] <= 6
+    assert "66 imported trials" in found["caveat"]
 
 
 def test_humans_have_further_rows_with_a_random_intercept_per_pair(imported):

@@ -10,7 +10,7 @@ from harness import RECORDING
 from studies import Drive, write_study
 
 from analysis.load import load, load_trials
-from analysis.robustness import RULES, UNDECIDED, outcomes, redrive
+from analysis.robustness import BOXES, READINGS, RULES, UNDECIDED, judged, outcomes, redrive
 from analysis.study import Study
 from analysis.tables.robustness import robustness
 from merge_runner.config import Scenario
@@ -29,7 +29,7 @@ CRUISE = [0.0] * 5  # a decision's actions
 
 def by_rule(found) -> dict[str, pd.DataFrame]:
     """The outcomes of each rule, in the order of the trials."""
-    assert list(found["rule"].unique()) == list(RULES)
+    assert list(found["rule"].unique()) == list(READINGS)
     return {rule: rows.reset_index(drop=True) for rule, rows in found.groupby("rule")}
 
 
@@ -51,6 +51,7 @@ def driven(condition, left, right, rest=0):
 
 def test_the_rules_are_those_of_the_scenario():
     assert RULES == ("euclid2d", "rectangle", "shared_lane")
+    assert (*RULES, "rectangle at 20 Hz") == READINGS
 
 
 def test_a_sweeps_trials_have_their_stored_outcomes_under_their_own_rule(in_process, tmp_path):
@@ -183,7 +184,7 @@ def test_a_driver_that_decided_later_cruised_in_the_steps_before():
 
 
 def test_stored_plans_are_driven_again_under_each_rule(tmp_path):
-    """Three trials: boxes that overlap alone, last plans that lead apart, and one not known."""
+    """Boxes that overlap alone, plans that lead apart but for one look, and one not known."""
     gain = 0.58 / 2.5  # held for a second each way
     apart = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0)
     drives = [
@@ -205,6 +206,7 @@ def test_stored_plans_are_driven_again_under_each_rule(tmp_path):
         "euclid2d": ["finished", "collided", "collided", "collided"],
         "rectangle": ["collided", UNDECIDED, "collided", UNDECIDED],
         "shared_lane": ["finished", UNDECIDED, "collided", UNDECIDED],
+        BOXES: ["collided", "collided", "collided", UNDECIDED],
     }
     firsts = found.dropna(subset=["merged_first"])
     assert set(firsts["rule"]) == {"euclid2d", "shared_lane"}
@@ -230,11 +232,12 @@ def test_stored_traces_are_judged_as_their_plans_driven_again(tmp_path, length_m
         db,
     ).groupby("trial_id")
     found = by_rule(outcomes(db, trials))
-    for rule in RULES:
+    for rule in READINGS:
+        own = scenario.model_copy(update={"collision_rule": rule.split(" at ")[0]})
         expected = [
-            redrive(scenario.model_copy(update={"collision_rule": rule}), trial.condition,
+            redrive(own, trial.condition,
                     *(decided.get_group(trial.trial_id)[name].tolist()
-                      for name in ("applied", "last")))
+                      for name in ("applied", "last")), between=rule == BOXES)
             for trial in trials.itertuples()
         ]  # fmt: skip
         statuses, firsts = zip(*expected, strict=True)
@@ -278,13 +281,14 @@ def test_human_traces_are_judged_as_they_are(humans):
         ("timeout", None, apart[:1]),
     )
     found = outcomes(db, load_trials(db))
-    assert len(found) == 15
+    assert len(found) == 20
     finished, collided, opened = ("finished", "left"), ("collided", None), (UNDECIDED, None)
     timeout = ("timeout", None)
     expected = {
         "euclid2d": [finished, collided, opened, opened, timeout],
         "rectangle": [finished, finished, collided, opened, timeout],
         "shared_lane": [finished, finished, opened, opened, timeout],
+        BOXES: [finished, finished, collided, collided, timeout],
     }
     for rule, rows in by_rule(found).items():
         merged = rows["merged_first"].astype(object).where(rows["merged_first"].notna(), None)
@@ -297,3 +301,18 @@ def test_the_table_says_how_long_the_vehicles_are_that_it_judges(tmp_path):
     notes = robustness(Study(db)).notes
     assert "the vehicles are 8 m x 1.8 m" in notes
     assert not any("4.5" in note for note in notes)
+
+
+def test_humans_are_judged_by_the_drivers_rule_every_fifth_of_a_second(humans):
+    """Boxes are what was recorded; a disc is not looked for between the steps of the drivers."""
+    apart, close, end = (90.0, 80.0), (84.0, 84.0), (150.0, 140.0)
+    db = humans(
+        ("finished", "left", [apart] * 4 + [close, apart, end]),
+        ("finished", "left", [apart, close, close, close, apart, end]),
+        ("collided", None, [apart, close]),
+        ("collided", None, [close, apart]),
+    )
+    trials = judged(db, load_trials(db))
+    assert trials["collided_boxes"].tolist() == [False, False, True, True]
+    assert trials["collided"].drop(2).tolist() == [True, False, True]
+    assert trials["collided"].isna()[2]

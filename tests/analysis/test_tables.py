@@ -51,7 +51,7 @@ def test_human_rows_carry_the_golden_numbers(tables):
     assert found == [[-0.304, 0.135], [1.111, 0.075], [-3.304, 0.310]]
     assert cell(table, "human/intercept", "n") == 962
     quantitative = tables["ablation-quantitative"]
-    assert round(cell(quantitative, "human", "collided_percent"), 2) == 2.83
+    assert round(cell(quantitative, "human", "collided_boxes_percent"), 2) == 2.83
     assert [cell(quantitative, "human", c) for c in ("gap_m", "rmse_mps", "joint_percent")] == [
         3.85,
         0.66,
@@ -152,15 +152,37 @@ def test_against_the_paper_stand_its_values_and_the_difference(tables):
     assert cell(quantitative, "o3/A2", "gap_m_difference") == pytest.approx(
         cell(quantitative, "o3/A2", "gap_m") - 10.63
     )
+    assert cell(quantitative, "o3/A2", "collided_percent_in_paper") == 2.73
+    assert cell(quantitative, "o3/A2", "collided_boxes_percent_in_paper") is None
+    assert cell(quantitative, "human", "collided_percent_in_paper") is None
+    assert cell(quantitative, "human", "collided_boxes_percent_in_paper") == 2.83
     qualitative = against(tables["ablation-qualitative"], "paper")
     assert cell(qualitative, "o3/A1", "i2_paper_in_paper") is False
     assert cell(qualitative, "o3/A2", "score_paper_in_paper") == 5
     indicators = against(tables["indicators"], "paper")
     assert cell(indicators, "o3/baseline/I2", "paper_in_paper") is False
     assert cell(indicators, "o3/baseline/rmse_mps", "value_in_paper") == 1.34
+    assert cell(indicators, "human/score", "paper_in_paper") == 5
+    assert cell(indicators, "human/collided_boxes_percent", "value_in_paper") == 2.83
+    assert cell(indicators, "o3/baseline/collided_boxes_percent", "value_in_paper") is None
+    assert cell(indicators, "o3/baseline/collided_percent", "value_in_paper") == 0
     assert any("arXiv 2604.09609, Table III" in note for note in table.notes)
     with pytest.raises(UsageError, match="valid is paper"):
         against(table, "humans")
+
+
+def test_the_gap_is_told_by_each_of_its_definitions(study, tables):
+    table, regression = tables["gap-definitions"], tables["gap"]
+    group = study.models[0]
+    for column in ("gap_m", "gap_first_sample_m", "gap_mean100_m"):
+        found = group.finished[column]
+        assert cell(table, f"{group.id}/{column}", "n") == len(found)
+        assert cell(table, f"{group.id}/{column}", "gap_m") == pytest.approx(found.mean())
+    for term, name in (("abs_projected_headway", "headway"), ("abs_relative_velocity", "velocity")):
+        for value in ("b", "p"):
+            ours = cell(regression, f"{group.id}/{term}", value)
+            assert cell(table, f"{group.id}/gap_m", f"{name}_{value}") == ours
+            assert cell(table, f"{group.id}/gap_mean100_m", f"{name}_{value}") != ours
 
 
 def test_a_table_that_the_paper_has_not_says_so(tables):
@@ -281,6 +303,7 @@ def test_every_cell_can_be_traced_to_its_trials_and_the_query_that_lists_them(st
         ("indicators", "o3/baseline/collided_percent", "n"),
         ("velocity-profiles", "o3/A2", "n"),
         ("robustness", "o3/A2/rectangle", "n"),
+        ("gap-definitions", "o3/A2/gap_mean100_m", "n"),
         ("attempts", "other/baseline", "trials"),
         ("attempts", "other/baseline", "failed"),
         ("attempts", "other/baseline", "other_model"),

@@ -118,7 +118,7 @@ def test_without_are_the_trials_in_which_every_decision_was_driven_from_its_answ
 
 def test_where_no_trial_had_a_fallback_nothing_differs_and_the_row_says_so(tables):
     rows = [row for row in tables["fallbacks"].rows if row.groups == ("o3/baseline",)]
-    assert len(rows) == 5 + 4
+    assert len(rows) == 6 + 4
     for row in rows:
         assert "no trial had a fallback: nothing differs" in row.note
         assert row.values["n"] == row.values["n_without"] == 110

@@ -22,6 +22,7 @@ from analysis.explorer.pages.ablations import ablations
 from analysis.explorer.pages.humans import KINDS, scale
 from analysis.explorer.pages.tables import ABOUT
 from analysis.explorer.site import Site
+from analysis.measures import MEASURES
 from analysis.study import Study
 from analysis.tables import TABLES, make_tables
 from merge_runner.errors import MergeRunnerError
@@ -273,7 +274,7 @@ def test_an_ablation_has_the_numbers_of_both_tables(ask, db):
         assert base.difference is None
     text = ask("/ablations")
     assert "without C1: history" in text
-    assert text.count("<svg") == 4
+    assert text.count("<svg") == len(MEASURES)
     assert "/discordant?model=o3&amp;variant=A1&amp;by=outcome" in text
 
 
@@ -285,6 +286,9 @@ def test_humans_stand_in_every_condition_with_both_denominators(ask):
     assert re.search(r"<strong>28</strong> of 990 ended.*?of 990 trials", text, re.DOTALL)
     assert re.search(r"<strong>0</strong> of 33 ended.*?of 33 trials", text, re.DOTALL)
     assert "human 5 of 90" in text
+    by_boxes, by_disc = text.split('id="collided_boxes_percent"')[1].split('id="collided_percent"')
+    assert "of 990 ended" in by_boxes
+    assert "of 990 ended" not in by_disc  # of humans only boxes are published
     assert "The recordings of the humans are not imported" in text
 
 

@@ -72,13 +72,23 @@ KINDS = (
         "Student's t",
     ),
     Kind(
-        "collided_percent",
-        "Collisions",
+        "collided_boxes_percent",
+        "Collisions by the humans' rule",
         "%",
         1,
-        "of the trials that ended; Wilson intervals; the table has both denominators",
+        "boxes that overlap, looked for at 20 Hz, of the trials that ended and are decided; Wilson "
+        "intervals; the table has both denominators",
+    ),
+    Kind(
+        "collided_percent",
+        "Collisions by the drivers' rule",
+        "%",
+        1,
+        "by the rule of the trials' scenario, in the paper centres closer than a vehicle length, "
+        "of the trials that ended and are decided; Wilson intervals",
     ),
 )
+COLLISIONS = ("collided_boxes_percent", "collided_percent")
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +124,8 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
             "rules": {group["id"]: rule_text(group) for group in groups},
             "marks": marks(groups),
             "charts": [chart(kind, groups, content["published"]) for kind in KINDS],
-            "collisions": collisions(groups),
+            "collisions": {name: collisions(groups, name) for name in COLLISIONS},
+            "caveat": content["caveat"],
             "notes": content["notes"],
             "differences": differences(contrasts),
             "difference_notes": [
@@ -154,14 +165,20 @@ def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
     return found
 
 
-def collisions(groups: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Collided, ended and all trials of each group, by condition and together."""
+def collisions(groups: Sequence[Mapping[str, Any]], rule: str) -> list[dict[str, Any]]:
+    """Collided, decided and all trials of each group, by condition and together.
+
+    A group that this rule is not known of has no row.
+    """
     rows = []
     for group in groups:
         cells: dict[str, tuple[int, int, int]] = {
-            name: (found["collided_percent"]["k"], found["ended"], found["all"])
+            name: (found[rule]["k"], found[rule]["n"], found["all"])
             for name, found in group["conditions"].items()
+            if rule in found
         }
+        if not cells:
+            continue
         k, ended, every = (sum(cell[i] for cell in cells.values()) for i in range(3))
         rows.append({"group": group["id"], "cells": cells, "total": (k, ended, every)})
     return rows

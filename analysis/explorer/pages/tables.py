@@ -25,6 +25,7 @@ ABOUT = {
     "conflict-resolution": "when the conflict is resolved, by condition",
     "criticality": "times to merge and to collision, the hardest acceleration",
     "speed-windows": "RMSE and joint rate over other windows",
+    "gap-definitions": "the gap and its regression by three definitions of the gap",
     "robustness": "outcomes under other collision rules",
     "attempts": "what became of the calls",
     "fallbacks": "the measures with and without trials that had a fallback",

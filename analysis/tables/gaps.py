@@ -1,0 +1,72 @@
+"""What the gap comes to by each of its definitions."""
+
+from __future__ import annotations
+
+from analysis.intervals import mean
+from analysis.regressions import Regression, gap_ols
+from analysis.study import Group, Study
+from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.notes import sample_notes
+
+# Column of the trials to what is measured.
+DEFINITIONS = {
+    "gap_m": "interpolated, first vehicle at the merge point (ours)",
+    "gap_first_sample_m": "first sample, first vehicle at the merge point",
+    "gap_mean100_m": "first sample, mean position at the merge point",
+}
+TERMS = {"headway": "abs_projected_headway", "velocity": "abs_relative_velocity"}
+
+
+def gap_definitions(study: Study) -> Table:
+    """One row a group and definition: the mean gap, and what I3 and I4 rest on."""
+    measured = [group for group in study.groups if group.measured]
+    rows = [_row(group, column) for group in measured for column in DEFINITIONS]
+    return Table(
+        "gap-definitions",
+        "The gap and its dependence on headway and velocity, by the definition of the gap",
+        (
+            Column("driver", "driver"),
+            Column("setting", "setting"),
+            Column("definition", "definition"),
+            Column("n", "n", "count", 0, "finished trials with this gap"),
+            Column("gap_m", "gap (m)", "number", 2, "mean, net of the vehicle length"),
+            Column("gap_m_ci", "95 % CI", "interval", 2, "Student's t", optional=True),
+            Column("headway_b", "b of |h|", "number", 2, "coefficient of |h| (I3)"),
+            Column("headway_p", "p", "p", 3, "its t test"),
+            Column("velocity_b", "b of |Δv|", "number", 2, "coefficient of |Δv| in s (I4)"),
+            Column("velocity_p", "p", "p", 3, "its t test"),
+        ),
+        rows,
+        (
+            "coefficients: least squares of the gap on |h|, |Δv| and h·Δv, as in the table gap; "
+            "the mean position is that of Siebinga et al.",
+            *([] if rows else ["there is no measured trial to show"]),
+            *sample_notes(study, measured),
+        ),
+    )
+
+
+def _row(group: Group, column: str) -> Row:
+    found = mean(group.finished[column].to_numpy(float))
+    fit = gap_ols(group.trials, column)
+    interval = None if found.low is None or found.high is None else (found.low, found.high)
+    values: dict[str, Value] = {
+        "driver": group.label,
+        "setting": group.setting,
+        "definition": DEFINITIONS[column],
+        "n": found.n,
+        "gap_m": found.value,
+        "gap_m_ci": interval,
+        **_coefficients(fit),
+    }
+    return Row(f"{group.id}/{column}", (group.id,), values, fit.problem, f"{column} IS NOT NULL")
+
+
+def _coefficients(fit: Regression) -> dict[str, Value]:
+    if not fit.terms:
+        return {}
+    found = {name: fit.terms[term] for name, term in TERMS.items()}
+    return {
+        **{f"{name}_b": term.b for name, term in found.items()},
+        **{f"{name}_p": term.p for name, term in found.items()},
+    }
