@@ -10,14 +10,16 @@ from typing import Any
 from scipy import stats
 
 from analysis.indicators import ALPHA
+from analysis.intervals import POWER
 from analysis.measures import MEASURES, Measure, counts
 from analysis.study import BASELINE, Group, Study
 from analysis.tables import finished_tables
 from analysis.tables.model import Row
-from analysis.variants import POWER, variants
+from analysis.variants import variants
 
 NAMES = {
-    "collided_percent": ("collisions", "points"),
+    "collided_percent": ("collisions by the scenario's rule", "points"),
+    "collided_boxes_percent": ("collisions of boxes", "points"),
     "gap_m": ("the gap", "m"),
     "rmse_mps": ("the RMSE of the speed", "m/s"),
     "joint_percent": ("joint contributions", "points"),
@@ -98,7 +100,7 @@ def _changes(group: Group, baseline: Group, rows: dict[str, Row]) -> Iterator[Ch
         if row is not None:
             possible = smallest_p(group, baseline, measure) < ALPHA
             yield _change(group, measure.name, row, "ci", possible=possible)
-    for slope in list(NAMES)[len(MEASURES) :]:
+    for slope in (name for name in NAMES if name not in {one.name for one in MEASURES}):
         row = rows[f"{group.id}/{slope}"]
         if "difference" in row.values:
             yield _change(group, slope, row, "difference_ci", possible=True)
@@ -142,7 +144,7 @@ def _differs(label: str, group: Group, baseline: Group, changes: list[Change]) -
     if found:
         yield (
             f"{label}, {group.setting} ({len(group.ended)} trials) differs from the baseline "
-            f"({len(baseline.ended)}), also after Holm's correction, in {_listed(found)}."
+            f"({len(baseline.ended)}), also after Holm's correction, in {listed(found)}."
         )
 
 
@@ -162,7 +164,7 @@ def _not_shown(label: str, changes: list[Change]) -> Iterator[str]:
         if not sizes
         else f"{_which(changes)}. That does not show that there is none: the smallest difference "
         f"that one such test, not yet corrected, finds with a chance of {100 * POWER:.0f} % is "
-        f"about {_listed(sizes)}."
+        f"about {listed(sizes)}."
     )
 
 
@@ -200,7 +202,7 @@ def _grouped(found: list[tuple[str, str]]) -> str:
         settings = ", ".join(setting for setting, other in found if other == what)
         if settings:
             alike.setdefault(settings, []).append(name)
-    return "; ".join(f"{_listed(names)} ({settings})" for settings, names in alike.items())
+    return "; ".join(f"{listed(names)} ({settings})" for settings, names in alike.items())
 
 
 def _span(values: list[float]) -> str:
@@ -208,5 +210,6 @@ def _span(values: list[float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _listed(items: list[str]) -> str:
+def listed(items: list[str]) -> str:
+    """``a, b and c``."""
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

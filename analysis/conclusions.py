@@ -5,6 +5,7 @@ Each sentence is made of the numbers that it talks about. Scripted stand-ins are
 
 from __future__ import annotations
 
+from analysis.ablated import ablation_sentences
 from analysis.alarms import mismatch
 from analysis.contrasts import contrast_rates
 from analysis.indicators import ALPHA, INDICATORS, Verdict
@@ -12,6 +13,7 @@ from analysis.measures import BOXES, GAP, counts, estimate, known, published_hum
 from analysis.provenance import Provenance
 from analysis.published import HUMAN_TRIALS
 from analysis.study import Group, Study, stand_in
+from analysis.unlike import unlike
 from analysis.verdicts import Score, score
 
 NAMES = {
@@ -28,8 +30,9 @@ HUMAN_PAIRS = 9
 
 
 def shown(study: Study) -> list[str]:
-    """What the baseline of each driver shows, some sentences a driver."""
-    return [text for group in _concluded(study) for text in _shown(study, group)]
+    """What the baseline of each driver shows, and then its prompt variants."""
+    texts = [text for group in _concluded(study) for text in _shown(study, group)]
+    return texts + ablation_sentences(study)
 
 
 def not_shown(study: Study, origin: Provenance) -> list[str]:
@@ -70,7 +73,12 @@ def _shown(study: Study, group: Group) -> list[str]:
             f"{group.driver}: no trial finished ({group.left_out}).",
             _collisions(study, group),
         ]
-    return [*_marks(study, group), _collisions(study, group), _gap(study, group)]
+    return [
+        *_marks(study, group),
+        _collisions(study, group),
+        _gap(study, group),
+        *unlike(study, group),
+    ]
 
 
 def _marks(study: Study, group: Group) -> list[str]:

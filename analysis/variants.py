@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from math import hypot
+from math import hypot, inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy import stats
 from scipy.linalg import LinAlgError
 
 from analysis.contrasts import corrected
-from analysis.intervals import LEVEL
+from analysis.intervals import LEVEL, detectable
 from analysis.regressions import (
     MAX_ITERATIONS,
     WHO_FIRST_TERMS,
@@ -31,8 +31,6 @@ from analysis.verdicts import fits
 
 if TYPE_CHECKING:
     from firthmodels import FirthLogisticRegression
-
-POWER = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +112,7 @@ def difference(first: Regression, second: Regression, term: str, by: str) -> Dif
         value - half,
         value + half,
         2 * _above(abs(value) / se, freedom),
-        half + se * _quantile(POWER, freedom),
+        detectable(se, inf if freedom is None else freedom),
         by,
     )
 

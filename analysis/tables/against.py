@@ -9,6 +9,7 @@ from typing import Any
 
 import pandas as pd
 
+from analysis.indicators import INDICATORS
 from analysis.published import citation, published
 from analysis.study import EMULATOR, HUMAN, Group
 from analysis.tables.model import Column, Row, Table, Value
@@ -44,6 +45,8 @@ INDICATOR_ROWS = {
     },
     "collided_boxes_percent": ("paper_ablation_quantitative", "collided_percent", "value"),
 }
+# Rows of Table V that rest on who merged first, or on collisions.
+OF_OUTCOMES = {"I1", "I2", "collided_percent", "collided_boxes_percent"}
 # The rule by which the paper does not count collisions: the other's of humans, and of models.
 NOT_PRINTED = {True: "collided_percent", False: "collided_boxes_percent"}
 
@@ -78,8 +81,8 @@ def _printed(table: Table, row: Row, group: Group) -> tuple[str, ...]:
     if group.published_outcomes is None:
         return row.printed
     item = row.id.rpartition("/")[2]
-    outcomes = table.name == "who-first" or item in {"collided_percent", "score"}
-    return every if outcomes else ("collided_percent", "score_paper")
+    outcomes = table.name == "who-first" or item in OF_OUTCOMES
+    return every if outcomes else ("collided_boxes_percent",)
 
 
 def against(table: Table, reference: str, driver: str | None = None) -> Table:
@@ -207,7 +210,9 @@ def _compared(row: Row, name: str, printed: dict[str, Any] | None, theirs: str) 
         if value.startswith("<"):
             return {f"{name}_in_paper": value}
         value = float(value)
-    if isinstance(ours, bool):
+    if theirs == "score":
+        return {f"{name}_in_paper": f"{value} of {len(INDICATORS)}"}
+    if theirs.upper() in INDICATORS:
         return {f"{name}_in_paper": bool(value)}
     values: dict[str, Value] = {f"{name}_in_paper": value}
     if isinstance(ours, (int, float)) and name not in row.printed:

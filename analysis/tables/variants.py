@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from analysis.intervals import POWER
 from analysis.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
 from analysis.study import Group, Study
 from analysis.tables.contrasts import shared_notes
@@ -12,7 +13,6 @@ from analysis.tables.model import Column, Kind, Row, Table, Value
 from analysis.tables.notes import sample_notes
 from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER, problems, published_gap
 from analysis.variants import (
-    POWER,
     Corrected,
     Differences,
     corrected_differences,

@@ -37,7 +37,7 @@ def changed(db, *statements):
 def test_what_is_not_excluded_is_the_interval_of_these_trials(tmp_path):
     few = Study(write_study(tmp_path / "few.duckdb", yielding("o3", reps=1)[:2]))
     said, _ = texts(few)
-    assert "o3 collided in 0.0 % of 2 trials (95 % CI 0.0 to 65.8)" in said
+    assert "o3 collided, by boxes that overlap, in 0.0 % of 2 trials (95 % CI 0.0 to 65.8)" in said
     told = re.search(r"one from ([+-][0-9.]+) to ([+-][0-9.]+) percentage points", said)
     low, high = map(float, told.groups())
     assert low < -2
@@ -52,7 +52,7 @@ def test_a_difference_that_chance_seldom_makes_is_called_so(tmp_path):
         for rep in range(1, 4)
     ]
     said, _ = texts(Study(write_study(tmp_path / "t.duckdb", drives)))
-    assert "o3 collided in 100.0 % of 6 trials" in said
+    assert "o3 collided, by boxes that overlap, in 100.0 % of 6 trials" in said
     assert "p < 0.001: a difference that chance alone seldom makes" in said
 
 
@@ -135,7 +135,7 @@ def test_a_stand_in_is_in_no_conclusion_whatever_name_it_answered_in(tmp_path):
     db = write_study(tmp_path / "t.duckdb", [*yielding("o3", reps=1), *yielding("other", reps=1)])
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%'")
     said, limits = texts(study)
-    assert "other collided in" in said
+    assert "other collided, by boxes that overlap, in" in said
     assert "o3" not in said
     assert "o3/baseline: scripted stand-in, not o3: its rows say nothing about a language" in limits
     alone = changed(db, "UPDATE trials SET scripted = true")

@@ -15,7 +15,10 @@ from analysis.tables import make_tables
 # What the report of a kind says, and what it must not say.
 SAID = {
     "two_trials": (
-        ["o3 collided in 0.0 % of 2 trials (95 % CI 0.0 to 65.8)", "in too few conditions"],
+        [
+            "o3 collided, by boxes that overlap, in 0.0 % of 2 trials (95 % CI 0.0 to 65.8)",
+            "in too few conditions",
+        ],
         ["evidence against the driver"],
     ),
     "stand_in_behind_o3": (
@@ -26,7 +29,10 @@ SAID = {
         ],
         ["o3 collided", "o3 leaves", "o3 shows", ">o3</td>"],
     ),
-    "another_endpoint": (["o3 at localhost:8080 collided in"], [">o3</td>"]),
+    "another_endpoint": (
+        ["o3 at localhost:8080 collided, by boxes that overlap, in"],
+        [">o3</td>"],
+    ),
     "partial_import": (
         ["humans (129 of 990 imported)", "of 5 pairs", "humans in 2.8 % of 990"],
         ["The human recordings are not imported"],
@@ -36,14 +42,17 @@ SAID = {
     "programs": (
         [
             "11 of 22 trials of projected-order/baseline repeat an earlier one",
-            "projected-order collided in 0.0 % of 11 trials",
+            "projected-order collided, by boxes that overlap, in 0.0 % of 11 trials",
             "projected-order is a program",
             "emulator+constant (scripted stand-in, no language model)",
         ],
         ["temperature", "A scripted stand-in answered"],
     ),
     "only_failed": (["o3: no trial ended (11 failed).", "Trials failed"], ["o3 collided"]),
-    "killed": (["o3 collided in 0.0 % of 2 trials"], ["evidence against the driver"]),
+    "killed": (
+        ["o3 collided, by boxes that overlap, in 0.0 % of 2 trials"],
+        ["evidence against the driver"],
+    ),
     "word_for_word": (
         ["22 of 33 trials of o3/baseline repeat an earlier one", "0.0 % of 11 trials"],
         ["% of 33 trials"],

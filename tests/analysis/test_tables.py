@@ -162,7 +162,7 @@ def test_against_the_paper_stand_its_values_and_the_difference(tables):
     indicators = against(tables["indicators"], "paper")
     assert cell(indicators, "o3/baseline/I2", "paper_in_paper") is False
     assert cell(indicators, "o3/baseline/rmse_mps", "value_in_paper") == 1.34
-    assert cell(indicators, "human/score", "paper_in_paper") == 5
+    assert cell(indicators, "human/score", "paper_in_paper") == "5 of 5"
     assert cell(indicators, "human/collided_boxes_percent", "value_in_paper") == 2.83
     assert cell(indicators, "o3/baseline/collided_boxes_percent", "value_in_paper") is None
     assert cell(indicators, "o3/baseline/collided_percent", "value_in_paper") == 0
