@@ -14,7 +14,7 @@ from analysis.provenance import Provenance
 from analysis.published import HUMAN_TRIALS
 from analysis.study import Group, Study, stand_in
 from analysis.unlike import unlike
-from analysis.verdicts import Score, score
+from analysis.verdicts import Score, score, unjudged
 
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",
@@ -173,19 +173,8 @@ def _limits(study: Study, group: Group) -> list[str]:
         )
     return texts + [
         f"{group.driver}: {', '.join(names)} cannot be judged {' or '.join(rules)}: {why}."
-        for why, (names, rules) in _unjudged(found).items()
+        for why, (names, rules) in unjudged(found, *INDICATORS).items()
     ]
-
-
-def _unjudged(found: Score) -> dict[str, tuple[list[str], list[str]]]:
-    """Why indicators have no verdict: which, and by which rules."""
-    reasons: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
-    for name in INDICATORS:
-        for rule, verdicts in (("by the paper's test", found.paper), ("robustly", found.robust)):
-            if verdicts[name].passed is None and (why := verdicts[name].why):
-                names, rules = reasons.setdefault(why, ({}, {}))
-                names[name] = rules[rule] = None
-    return {why: (list(names), list(rules)) for why, (names, rules) in reasons.items()}
 
 
 def _human_limits(study: Study) -> list[str]:

@@ -17,6 +17,8 @@ from analysis.study import Group, Study
 
 PUBLISHED = "as published, no human traces are imported"
 BY_EYE = "by eye, the paper"
+NO_RULE = "the paper judged by eye"
+PAPER_RULE, ROBUST_RULE = "by the paper's test", "by the robust tests"
 REFERENCE = "the humans are the reference"
 
 
@@ -76,6 +78,17 @@ def total(verdicts: dict[str, Verdict]) -> Total:
     return Total(sum(known.values()), len(known), tuple(n for n in verdicts if n not in known))
 
 
+def unjudged(found: Score, *names: str) -> dict[str, tuple[list[str], list[str]]]:
+    """Why some of these indicators have no verdict: which, and by which rules."""
+    reasons: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
+    for name in names:
+        for rule, verdicts in ((PAPER_RULE, found.paper), (ROBUST_RULE, found.robust)):
+            if verdicts[name].passed is None and (why := verdicts[name].why):
+                indicators, rules = reasons.setdefault(why, ({}, {}))
+                indicators[name] = rules[rule] = None
+    return {why: (list(which), list(rules)) for why, (which, rules) in reasons.items()}
+
+
 @cache
 def score(study: Study, group: Group) -> Score:
     """Judge a group's indicators."""
@@ -90,7 +103,7 @@ def score(study: Study, group: Group) -> Score:
     elif group is study.human:
         paper["I5"] = robust["I5"] = Verdict(None, None, REFERENCE)
     else:
-        paper["I5"], robust["I5"] = Verdict(None, None, BY_EYE), likeness(study, group)
+        paper["I5"], robust["I5"] = Verdict(None, None, NO_RULE), likeness(study, group)
     return Score(paper, robust, population(study), group.sizes)
 
 

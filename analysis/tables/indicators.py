@@ -21,11 +21,10 @@ from analysis.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
 from analysis.tables.profiles import gain_values
-from analysis.verdicts import Score, score, total
+from analysis.verdicts import PAPER_RULE, ROBUST_RULE, Score, score, total, unjudged
 
 BOXES_ALONE = f"{COLLISIONS.heading}: published human collisions are boxes that overlap"
 SOURCE = "paper_ablation_quantitative"
-PAPER_RULE, ROBUST_RULE = "by the paper's test", "by the robust tests"
 # The indicators that rest on who merged first, and all columns of their rows.
 OF_OUTCOMES = ("I1", "I2")
 EVERY = ("paper", "robust", "differ", "value", "interval", "n")
@@ -102,15 +101,20 @@ def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value
 
 def verdict_note(found: Score, *names: str) -> str:
     """Why a verdict is missing or rests on something else than a test."""
-    reasons = [
-        f"{name} {verdict.why}"
-        if verdict.passed is not None
-        else f"{name} cannot be judged {rule}: {verdict.why}"
-        for name in names
-        for rule, verdict in ((PAPER_RULE, found.paper[name]), (ROBUST_RULE, found.robust[name]))
-        if verdict.why
-    ]
-    return "; ".join(dict.fromkeys(reasons))
+    known: dict[str, dict[str, None]] = {}
+    for name in names:
+        for verdict in (found.paper[name], found.robust[name]):
+            if verdict.why and verdict.passed is not None:
+                known.setdefault(verdict.why, {})[name] = None
+    return "; ".join(
+        [
+            *(f"{', '.join(which)} {why}" for why, which in known.items()),
+            *(
+                f"{', '.join(which)} cannot be judged {' or '.join(rules)}: {why}"
+                for why, (which, rules) in unjudged(found, *names).items()
+            ),
+        ]
+    )
 
 
 def score_text(verdicts: dict[str, Verdict]) -> str | None:
@@ -120,14 +124,15 @@ def score_text(verdicts: dict[str, Verdict]) -> str | None:
 
 
 def score_note(found: Score) -> str:
-    """Which indicators are in no score."""
-    parts = [
-        f"{', '.join(one.open)} {'is' if len(one.open) == 1 else 'are'} in neither number of the "
-        f"score {rule}"
-        for rule, verdicts in ((PAPER_RULE, found.paper), (ROBUST_RULE, found.robust))
-        if (one := total(verdicts)).open
-    ]
-    return "; ".join(parts)
+    """Which indicators are in neither number of a score, and of which."""
+    rules: dict[tuple[str, ...], list[str]] = {}
+    for rule, verdicts in ((PAPER_RULE, found.paper), (ROBUST_RULE, found.robust)):
+        if left_out := total(verdicts).open:
+            rules.setdefault(left_out, []).append(rule)
+    return "; ".join(
+        f"the score {' and '.join(which)} leaves out {', '.join(left_out)}"
+        for left_out, which in rules.items()
+    )
 
 
 def _verdict_row(study: Study, group: Group, name: str) -> Row:

@@ -40,7 +40,10 @@ def test_what_a_variant_changes_is_said_with_interval_and_what_not_with_what_cou
     assert f"the gap by {change:+.2f} m (95 % CI {low:+.2f} to {high:+.2f})" in a1
     assert "collisions" not in a1
     (rest,) = [text for text in texts if "no difference from the baseline is shown" in text]
-    assert "collisions, joint contributions, the effect of headway on who merges first" in rest
+    assert (
+        "collisions by the scenario's rule, collisions of boxes, joint contributions, the effect "
+        "of headway on who merges first" in rest
+    )
     slopes = [
         r.values["detectable"]
         for r in tables["gap-variants"].rows
@@ -55,7 +58,13 @@ def test_what_a_variant_changes_is_said_with_interval_and_what_not_with_what_cou
     ("drives", "words"),
     [
         (yielding("o3", "A1", 1), "its baseline was not played, so what A1 changes cannot be said"),
-        ([*LEVEL, *as_variant(LEVEL)], "nothing could have been shown in collisions, the gap"),
+        (
+            [*LEVEL, *as_variant(LEVEL)],
+            (
+                "nothing could have been shown in collisions by the scenario's rule, collisions of "
+                "boxes, the gap"
+            ),
+        ),
         ([*yielding("o3", reps=3), *CRASHES], "differs from the baseline (33), also after Holm's"),
         ([*yielding("o3", reps=3), *CRASHES], "not compared with the baseline, for want of"),
     ],
