@@ -6,7 +6,8 @@ from collections import Counter
 from dataclasses import dataclass
 
 from analysis.provenance import Mismatch, Provenance, tally
-from analysis.study import EMULATOR, Group, Study, stand_in
+from analysis.study import Group, Study
+from merge_runner.plan import EMULATOR, stand_in
 
 MANY_FALLBACKS = 0.05
 

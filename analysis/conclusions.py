@@ -12,9 +12,10 @@ from analysis.indicators import ALPHA, INDICATORS, Verdict
 from analysis.measures import BOXES, GAP, counts, estimate, known, published_human
 from analysis.provenance import Provenance
 from analysis.published import HUMAN_TRIALS
-from analysis.study import Group, Study, stand_in
+from analysis.study import Group, Study
 from analysis.unlike import unlike
 from analysis.verdicts import Score, score, unjudged
+from merge_runner.plan import stand_in
 
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",
@@ -209,10 +210,12 @@ def _asked(group: Group, origin: Provenance) -> list[str]:
     """What the results of a baseline are bound to: the wording, and what was sent with it."""
     if not group.setting or group.scripted:
         return []
+    changed = origin.tasks.get(group.spec_hash or "")
+    task = [f"{group.driver}: its task is not the default one: {changed}."] if changed else []
     if (group.trials["source"] == "driver").all():
-        return [f"{group.driver} is a program: it reads no prompt, and samples nothing."]
+        return [*task, f"{group.driver} is a program: it reads no prompt, and samples nothing."]
     sent = origin.sent.get(group.spec_hash or "") or {"": {}}
-    return [
+    return task + [
         f"{group.driver}: results hold for the wording of the prompt, which is a reconstruction "
         f"(the original is not public), and for what was sent with it: {text}."
         for text in dict.fromkeys(_parameters(parameters) for parameters in sent.values())

@@ -110,10 +110,10 @@ class Provenance:
 
     ``sweeps``, ``calls``, ``sweep_costs`` and ``model_costs`` are rows of the queries here;
     ``switches`` holds, by driver, variant and spec_hash, the settings of the driving task that
-    differ from the defaults; ``mismatches`` says where another model answered than was asked for.
-    ``alike`` has the drivers all of whose answers to a prompt that was asked before are word for
-    word as before, with their number. ``sent`` holds what was sent to the models beside the
-    prompt, by spec_hash and side.
+    differ from the defaults, and ``tasks`` the same by spec_hash, empty where none does;
+    ``mismatches`` says where another model answered than was asked for. ``alike`` has the drivers
+    all of whose answers to a prompt that was asked before are word for word as before, with their
+    number. ``sent`` holds what was sent to the models beside the prompt, by spec_hash and side.
     """
 
     sweeps: pd.DataFrame
@@ -121,6 +121,7 @@ class Provenance:
     sweep_costs: pd.DataFrame
     model_costs: pd.DataFrame
     switches: dict[str, str]
+    tasks: dict[str, str]
     mismatches: list[Mismatch]
     alike: dict[str, int]
     sent: dict[str, dict[str, dict[str, object]]]
@@ -179,7 +180,11 @@ def provenance(db: Path) -> Provenance:
         calls=found["calls"],
         sweep_costs=found["sweep_costs"],
         model_costs=found["model_costs"],
-        switches=_switches(found["specs"]),
+        switches={
+            f"{row.driver}/{row.variant} ({row.spec_hash})": _switched(row.spec) or "defaults"
+            for row in found["specs"].itertuples()
+        },
+        tasks={row.spec_hash: _switched(row.spec) for row in found["specs"].itertuples()},
         mismatches=_mismatches(found["served"], found["aliases"]),
         alike=_alike(db),
         sent={row.spec_hash: _sent(json.loads(row.spec)) for row in found["specs"].itertuples()},
@@ -213,14 +218,10 @@ def _other_model(study: Study, answered: pd.DataFrame) -> list[bool]:
     return [pair in study.calls.others for pair in pairs]
 
 
-def _switches(specs: pd.DataFrame) -> dict[str, str]:
-    defaults = Scenario().model_dump()
-    found = {}
-    for row in specs.itertuples():
-        scenario = json.loads(row.spec).get("scenario", {})
-        changed = [f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v]
-        found[f"{row.driver}/{row.variant} ({row.spec_hash})"] = ", ".join(changed) or "defaults"
-    return found
+def _switched(spec: str) -> str:
+    """The settings of a spec's driving task that differ from the defaults."""
+    defaults, scenario = Scenario().model_dump(), json.loads(spec).get("scenario", {})
+    return ", ".join(f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v)
 
 
 def _alike(db: Path) -> dict[str, int]:

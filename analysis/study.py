@@ -29,7 +29,7 @@ from analysis.published import human_outcomes
 from analysis.robustness import judged
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
-from merge_runner.plan import PROGRAMS
+from merge_runner.plan import stand_in
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.texts import quoted
 
@@ -37,7 +37,6 @@ HUMAN = "human"
 BASELINE = "baseline"
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
-EMULATOR = "emulator"
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,14 +283,6 @@ def _model_group(
         repeated=len(rows) - len(distinct),
         narrowed=" AND ".join(narrowed),
     )
-
-
-def stand_in(model: str) -> str:
-    """What is said of a scripted stand-in that answered in a model's name."""
-    asked = [name for name in model.split("+") if name not in {EMULATOR, *PROGRAMS}]
-    if not asked:
-        return "scripted stand-in, no language model"
-    return f"scripted stand-in, not {'+'.join(asked)}"
 
 
 def _distinct(rows: pd.DataFrame) -> pd.DataFrame:

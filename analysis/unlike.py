@@ -8,7 +8,7 @@ from analysis.ablated import NAMES, listed
 from analysis.contrasts import corrected
 from analysis.indicators import ALPHA
 from analysis.intervals import POWER
-from analysis.joint import GAP, WHO_FIRST, Difference, differences
+from analysis.joint import GAP, NARROW, WHO_FIRST, Difference, differences
 from analysis.study import Group, Study
 
 LEVELS = {
@@ -23,6 +23,8 @@ def unlike(study: Study, group: Group) -> Iterator[str]:
     tested = [one for one in found if one.p is not None]
     for problem in dict.fromkeys(one.problem for one in found if one.problem):
         yield f"{group.driver}: a difference from the humans cannot be tested: {problem}."
+    for remark in dict.fromkeys(one.remark for one in tested if NARROW in one.remark):
+        yield f"{group.driver} beside the humans: {remark}."
     holm, _ = corrected([one.p for one in tested if one.p is not None]) if tested else ((), ())
     shown = [one for one, p in zip(tested, holm, strict=True) if p < ALPHA]
     if shown:

@@ -32,6 +32,7 @@ PROGRAMS: dict[str, dict[str, float]] = {
     "constant": {},
     "projected-order": projected_order.PARAMETERS,
 }
+EMULATOR = "emulator"
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +177,14 @@ class Plan:
             "headers": sent.headers,
             "body": sent.body,
         }
+
+
+def stand_in(model: str) -> str:
+    """What is said of a scripted stand-in that answered in a model's name."""
+    asked = [name for name in model.split("+") if name not in {EMULATOR, *PROGRAMS}]
+    if not asked:
+        return "scripted stand-in, no language model"
+    return f"scripted stand-in, not {'+'.join(asked)}"
 
 
 def _lot(*what: object) -> str:

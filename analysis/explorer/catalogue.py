@@ -15,6 +15,7 @@ from analysis.explorer.child import csv_cell
 from analysis.explorer.reading import PATIENCE_S, reading
 from merge_runner.database import SCHEMA, Instance
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
+from merge_runner.plan import stand_in
 from merge_runner.served import ALIASES, others_among
 
 PAGE = 100
@@ -38,7 +39,8 @@ CREATE TABLE listed (
     number INTEGER DEFAULT nextval('numbers'), trial_id VARCHAR, spec_hash VARCHAR,
     source VARCHAR, model VARCHAR, variant VARCHAR, condition VARCHAR, rep INTEGER, pair VARCHAR,
     status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
-    error VARCHAR, scripted BOOLEAN, time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
+    error VARCHAR, scripted BOOLEAN, stand_in VARCHAR,
+    time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
     joint BOOLEAN, decisions BIGINT, invalid BIGINT, fallbacks BIGINT, attempts BIGINT,
     cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[], left_range_mps FLOAT[],
     right_range_mps FLOAT[]
@@ -265,6 +267,7 @@ class Catalogue:
             else:
                 self._stamp, self.held = stamp, False
             self._note_others()
+            self._name_stand_ins()
             self._connection.execute(GROUPED)
             return not self.held
 
@@ -394,6 +397,18 @@ class Catalogue:
             (waiting,) = connection.execute("SELECT count(*) FROM memory.trials").fetchall()
         count: int = waiting[0]
         return count
+
+    def _name_stand_ins(self) -> None:
+        """Say of each trial that a stand-in drove in whose name it did."""
+        assert self._connection is not None
+        named = "split_part(trial_id, '/', 1)"
+        for (model,) in self._connection.execute(
+            f"SELECT DISTINCT {named} FROM listed WHERE scripted AND stand_in IS NULL"  # noqa: S608 # constants
+        ).fetchall():
+            self._connection.execute(
+                f"UPDATE listed SET stand_in = ? WHERE scripted AND {named} = ?",  # noqa: S608 # constants
+                [stand_in(model), model],
+            )
 
     def _note_others(self) -> None:
         """Find out where another model answered, by the aliases of all sweeps."""

@@ -179,7 +179,6 @@ def human_panels(study: Study) -> dict[str, Any]:
             {
                 "id": group.id,
                 "driver": group.label,
-                "scripted": group.scripted,
                 "scenario": specs.get(group.spec_hash, {}).get("scenario"),
                 "conditions": {name: _in_condition(group, name) for name in CONDITIONS},
             }

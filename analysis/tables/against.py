@@ -11,9 +11,10 @@ import pandas as pd
 
 from analysis.indicators import INDICATORS
 from analysis.published import citation, published
-from analysis.study import EMULATOR, HUMAN, Group
+from analysis.study import HUMAN, Group
 from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.errors import UsageError
+from merge_runner.plan import EMULATOR
 
 PAPER = "paper"
 # Whom the paper has rows of, and what may follow the name of a driver that is one of them.

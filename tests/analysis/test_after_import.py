@@ -137,7 +137,7 @@ def test_a_driver_is_compared_with_the_humans_by_i5(imported):
     (group,) = imported.models
     found = score(imported, group)
     assert found.robust["I5"] == Verdict(False)
-    assert found.paper["I5"] == Verdict(None, None, "by eye, the paper")
+    assert found.paper["I5"] == Verdict(None, None, "the paper judged by eye")
     (table,) = make_tables(imported, ["velocity-profiles"])
     human, driver = (row.values for row in table.rows)
     assert human["gain"] < 0 < driver["gain"]

@@ -37,7 +37,7 @@ SAID = {
         ["humans (129 of 990 imported)", "of 5 pairs", "humans in 2.8 % of 990"],
         ["The human recordings are not imported"],
     ),
-    "other_vehicle_length": (["vehicle_length_m = 8.0"], []),
+    "other_vehicle_length": (["o3: its task is not the default one: vehicle_length_m = 8.0."], []),
     "temperature": (["temperature = 0.2"], ["no temperature", "default sampling temperature"]),
     "programs": (
         [

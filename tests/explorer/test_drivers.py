@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+import time
 from urllib.parse import parse_qs, urlsplit
 
 import duckdb
@@ -13,7 +14,10 @@ from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.pages.trials import filter_of
+from analysis.explorer.pages.ablations import ablations_page
+from analysis.explorer.pages.humans import humans_page
+from analysis.explorer.pages.trial import trial_page
+from analysis.explorer.pages.trials import filter_of, trials_page
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import list_sweeps
 
@@ -80,7 +84,29 @@ def test_a_sweep_is_named_by_its_driver_and_says_that_a_stand_in_answered(site, 
     assert [entry.config.driver for entry in list_sweeps(site.catalogue)] == names
     shown = client.get("/sweeps").text
     for entry, name in zip(list_sweeps(site.catalogue), names, strict=True):
-        assert f"{name} (a scripted stand-in)" in shown
+        assert f"{name} (scripted stand-in, not o3)" in shown
         page = client.get(f"/sweeps/{entry.sweep_id}").text
         assert f"{name} drives" in page
-        assert f"A scripted stand-in answers, and not {entry.config.model}." in page
+        assert "<strong>scripted stand-in, not o3.</strong>" in page
+
+
+def computed(page, site):
+    """A page once its numbers are there."""
+    while "Computing, about" in (text := page(site, {}, patient=True)):
+        time.sleep(0.1)
+    return text
+
+
+def test_every_page_says_who_is_a_stand_in_and_for_whom(site):
+    words = "scripted stand-in, not o3"
+    site.catalogue.refresh()
+    trials = site.catalogue.every(Filter())
+    assert [row["stand_in"] for row in trials] == [words] * len(trials)
+    pages = {
+        "trials": trials_page(site, {}),
+        "trial": trial_page(site, trials[0]["trial_id"], {}),
+        "humans": computed(humans_page, site),
+        "ablations": computed(ablations_page, site),
+        "csv": site.catalogue.export(Filter(), "trial", "csv").decode(),
+    }
+    assert [name for name, page in pages.items() if words not in page] == []

@@ -176,7 +176,7 @@ def test_while_the_trials_are_read_for_the_first_time_a_page_says_so(study, monk
 
 def test_a_fault_is_one_line_and_the_other_pages_go_on(study, monkeypatch, caplog):
     site = Site(study)
-    monkeypatch.setattr("analysis.explorer.pages.sweep.sweeps_page", lambda _: 1 / 0)
+    monkeypatch.setattr("analysis.explorer.pages.sweep.sweeps_page", lambda *_, **__: 1 / 0)
     app = explorer(site, {HOST})
     with TestClient(app, base_url=f"http://{HOST}", raise_server_exceptions=False) as client:
         reply = client.get("/sweeps")

@@ -13,6 +13,7 @@ from studies import write_study, yielding
 
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
+from merge_runner.database import SCHEMA_VERSION
 
 HOST = "127.0.0.1:8700"
 TRIAL = "/trials/o3/baseline/N_0_0/rep01"
@@ -30,7 +31,7 @@ def bad(good, tmp_path_factory):
     whole = good.read_bytes()
     foreign = tmp_path_factory.mktemp("bad") / "foreign.duckdb"
     with duckdb.connect(str(foreign)) as connection:
-        connection.execute("CREATE TABLE meta AS SELECT 3 AS schema_version")
+        connection.execute(f"CREATE TABLE meta AS SELECT {SCHEMA_VERSION} AS schema_version")
     return {
         "garbage": b"garbage" * 1000,
         "empty": b"",

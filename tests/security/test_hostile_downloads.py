@@ -134,10 +134,11 @@ def test_names_cannot_speak_to_the_terminal(imported, tmp_path):
     ):
         run = imported(path)
         assert run.code == 1
-        error, note = run.err.splitlines()
+        error, *notes = run.err.splitlines()
         assert error.startswith(f"error: two?lines?[2J?/{TRIAL}.csv: it lacks ")
         assert error.isprintable()
-        assert note.startswith("note: ")
+        assert notes
+        assert all(note.startswith("note: ") for note in notes)
 
 
 def test_text_that_looks_like_sql_or_a_formula_is_text(imported, tmp_path):

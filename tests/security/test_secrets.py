@@ -145,7 +145,7 @@ async def test_no_key_and_no_account_id_is_in_anything_that_a_sweep_leaves(
     monkeypatch.setattr("analysis.contrasts.PERMUTATIONS", 99)
     results = tmp_path / "results"
     report = write_report(
-        results / "merge.duckdb", ["o3"], results / "report.html", tmp_path / "files"
+        results / "merge.duckdb", None, results / "report.html", tmp_path / "files"
     )
     assert list(report)
     kept = everything_in(tmp_path) + str(runs)

@@ -58,9 +58,13 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """A driver's variants, the baseline first; ``widest`` by measure: the picture's half range."""
+    """A driver's variants, the baseline first; ``widest`` by measure: the picture's half range.
+
+    ``label`` is how the driver is shown.
+    """
 
     name: str
+    label: str
     variants: dict[str, list[Cell]]
     widest: dict[str, float] = field(default_factory=dict)
 
@@ -85,7 +89,7 @@ def ablations_page(site: Site, asked: Mapping[str, str], *, patient: bool = Fals
         drivers = ablations(quantitative, contrasts)
         values = {
             "drivers": [d for d in drivers if set(d.variants) - {BASELINE}],
-            "alone": [d.name for d in drivers if not set(d.variants) - {BASELINE}],
+            "alone": [d.label for d in drivers if not set(d.variants) - {BASELINE}],
             "measures": measures(quantitative),
             "notes": contrasts.notes,
         }
@@ -129,7 +133,9 @@ def ablations(quantitative: Table, contrasts: Table) -> list[Driver]:
         setting = str(row.values["setting"])
         name = row.groups[0].removesuffix(f"/{setting}")
         if setting:
-            variants = drivers.setdefault(name, Driver(name, {})).variants
+            variants = drivers.setdefault(
+                name, Driver(name, str(row.values["driver"]), {})
+            ).variants
             variants[setting] = [
                 _cell(quantitative, contrasts, row, column, compared, of_baseline)
                 for column in measures(quantitative)

@@ -98,7 +98,7 @@ class Mark:
     group: str
     colour: str
     shape: str
-    scripted: bool = False
+    label: str
 
     @property
     def word(self) -> str:
@@ -161,7 +161,7 @@ def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
             colour = COLOURS[models % len(COLOURS)]
             shape = SHAPES[(models + models // len(COLOURS)) % len(SHAPES)]
             models += 1
-        found[group["id"]] = Mark(group["id"], colour, shape, group["scripted"])
+        found[group["id"]] = Mark(group["id"], colour, shape, group["driver"])
     return found
 
 
