@@ -83,7 +83,7 @@ def _of_driver(
         yield f"{label} is a program and reads no prompt: {names} can change nothing."
         return
     if baseline is None:
-        yield f"{label}: its baseline was not played, so what {names} changes cannot be said."
+        yield f"{label}: it has no baseline of its own, so what {names} changes cannot be said."
         return
     changes = [change for group in groups for change in _changes(group, baseline, rows)]
     for group in groups:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from analysis.provenance import Mismatch, Provenance, tally
 from analysis.study import Group, Study
-from merge_runner.plan import EMULATOR, stand_in
+from merge_runner.plan import EMULATOR
 
 MANY_FALLBACKS = 0.05
 
@@ -26,14 +26,26 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
     for title, parts, rest in (
         (
             "A scripted stand-in answered",
-            [f"{group.id}: {stand_in(group.model)}" for group in _posing(study)],
-            "These rows stand last, are in no conclusion, and beside no row of the paper.",
+            [f"{group.id}: {group.posing}" for group in _posing(study)],
+            "These rows stand last, are in no conclusion, and never beside the paper's row of that "
+            "model.",
         ),
         (
             "Repetitions are the same trial",
             [_repeated(group) for group in study.models if group.repeated],
             "A driver without chance goes the same way each time: equal trials count once, in "
             "every n, interval and test.",
+        ),
+        (
+            "Some trials are equal",
+            [_equal(group) for group in study.models if group.equal],
+            "Others of their repetitions differ, so that each counts; where they came from a cache "
+            "on the way, they are no samples.",
+        ),
+        (
+            "The human trials are another data set",
+            list(study.imported.contradicting) if study.imported else [],
+            "They are no part of the published trials, and their rows say so.",
         ),
         (
             "Answers are word for word as before",
@@ -89,6 +101,13 @@ def _repeated(group: Group) -> str:
     every = len(group.trials) + group.repeated
     return (
         f"{group.repeated} of {every} trials of {group.id} repeat an earlier one to the last state"
+    )
+
+
+def _equal(group: Group) -> str:
+    return (
+        f"{group.equal} of {len(group.trials)} trials of {group.id} are as an earlier one to the "
+        "last state"
     )
 
 

@@ -10,12 +10,13 @@ from analysis.alarms import mismatch
 from analysis.contrasts import contrast_rates
 from analysis.indicators import ALPHA, INDICATORS, Verdict
 from analysis.measures import BOXES, GAP, counts, estimate, known, published_human
+from analysis.mixed import MIN_PAIRS
 from analysis.provenance import Provenance
-from analysis.published import HUMAN_TRIALS
+from analysis.published import HUMAN_TRIALS, PAIRS
 from analysis.study import Group, Study
 from analysis.unlike import unlike
 from analysis.verdicts import Score, score, unjudged
-from merge_runner.plan import stand_in
+from merge_runner.simulator.conditions import CONDITIONS
 
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",
@@ -27,7 +28,6 @@ NAMES = {
 # So many of the human data sets of a study's size that have a mark make its lack strong evidence,
 # and at most so many weak evidence.
 STRONG, WEAK = 0.95, 0.8
-HUMAN_PAIRS = 9
 
 
 def shown(study: Study) -> list[str]:
@@ -40,7 +40,7 @@ def not_shown(study: Study, origin: Provenance) -> list[str]:
     """What cannot be concluded, and why."""
     texts = [text for group in _concluded(study) for text in _limits(study, group)]
     texts += [
-        f"{group.id}: {stand_in(group.model)}: its rows say nothing about a language model."
+        f"{group.id}: {group.posing}: its rows say nothing about a language model."
         for group in study.baselines
         if group.scripted
     ]
@@ -54,6 +54,8 @@ def not_shown(study: Study, origin: Provenance) -> list[str]:
 
 def nothing(study: Study) -> str:
     """Why there is nothing to conclude, where ``shown`` is empty."""
+    if study.chosen is not None:
+        return "Nothing: no driver that was played with the baseline prompt is chosen."
     if study.empty:
         return "Nothing yet: there is no trial of a driver. `make sweep` plays some."
     if any(group.setting and group.scripted for group in study.baselines):
@@ -87,12 +89,12 @@ def _marks(study: Study, group: Group) -> list[str]:
     found = score(study, group)
     both = {name: (found.paper[name].passed, found.robust[name].passed) for name in INDICATORS}
     agreed = [NAMES[name] for name, verdicts in both.items() if verdicts == (True, True)]
-    failed = [name for name, verdicts in both.items() if verdicts == (False, False)]
+    failed = [name for name, verdicts in both.items() if False in verdicts and True not in verdicts]
     mixed = [
         f"{NAMES[name]} (paper's rule: {_word(found.paper[name])}, "
         f"robust: {_word(found.robust[name])})"
         for name, verdicts in both.items()
-        if (False in verdicts and name not in failed) or set(verdicts) == {True, None}
+        if True in verdicts and verdicts != (True, True)
     ]
     texts = [f"{group.driver} shows, by both rules: {_listed(agreed)}."] if agreed else []
     texts += [
@@ -105,23 +107,36 @@ def _marks(study: Study, group: Group) -> list[str]:
 
 
 def _weight(found: Score, name: str) -> str:
-    """What the lack of a mark says, from how often humans have it in studies of this size."""
-    share = found.ceiling.robust.get(name)
-    if share is None:
+    """What the lack of a mark says, from how often humans have it in studies of this size.
+
+    Who has it by neither rule lacks also the one that humans pass more often.
+    """
+    robust, paper = found.ceiling.robust.get(name), found.ceiling.paper.get(name)
+    if robust is None or paper is None:
         return "how often humans would in a study of this size is not known"
-    strength = "strong" if share >= STRONG else "weak" if share < WEAK else "some"
+    judging = [
+        share
+        for share, verdicts in ((robust, found.robust), (paper, found.paper))
+        if verdicts[name].passed is not None
+    ]
+    strength = _strength(max(judging))
     return (
-        f"{100 * share:.0f} % of human data sets of this size do by the robust tests, "
-        f"{100 * found.ceiling.paper[name]:.0f} % by the paper's, so that this is {strength} "
-        "evidence against the driver"
+        f"{100 * robust:.0f} % of human data sets of this size do by the robust tests, "
+        f"{100 * paper:.0f} % by the paper's, so that this is {strength} evidence against the "
+        "driver"
     )
 
 
+def _strength(share: float) -> str:
+    return "strong" if share >= STRONG else "weak" if share < WEAK else "some"
+
+
 def _collisions(study: Study, group: Group) -> str:
-    found, human = estimate(group, BOXES), estimate(study.human, BOXES)
+    humans = _alike(study.human, group)
+    found, human = estimate(group, BOXES), estimate(humans, BOXES)
     if found.value is None:
         return f"{group.driver}: of no trial is it decided whether boxes would have overlapped."
-    contrast = contrast_rates(counts(group, BOXES), counts(study.human, BOXES))
+    contrast = contrast_rates(counts(group, BOXES), counts(humans, BOXES))
     assert contrast.low is not None
     assert contrast.high is not None
     verdict = (
@@ -133,7 +148,8 @@ def _collisions(study: Study, group: Group) -> str:
     return (
         f"{group.driver} collided, by boxes that overlap, in {found.value:.1f} % of "
         f"{_trials(found.n)} (95 % CI {found.low:.1f} to {found.high:.1f}), humans in "
-        f"{human.value:.1f} % of {human.n} ({human.low:.1f} to {human.high:.1f}); Fisher's exact p "
+        f"{human.value:.1f} % of {human.n} in the same {_conditions(group)} ({human.low:.1f} to "
+        f"{human.high:.1f}); Fisher's exact p "
         f"{_p(contrast.p)}: {verdict}."
     )
 
@@ -145,17 +161,27 @@ def _gap(study: Study, group: Group) -> str:
     interval = "" if found.low is None else f" (95 % CI {found.low:.2f} to {found.high:.2f})"
     return (
         f"{group.driver} leaves {found.value:.2f} m on average of {_trials(found.n)}{interval}; "
-        f"humans {_human_gap(study)}."
+        f"humans {_human_gap(study, group)}."
     )
 
 
-def _human_gap(study: Study) -> str:
+def _human_gap(study: Study, group: Group) -> str:
     if not known(study.human, GAP):
-        return f"{published_human(GAP):.2f} m as published"
-    human = estimate(study.human, GAP)
+        return f"{published_human(GAP):.2f} m as published, over all {len(CONDITIONS)} conditions"
+    human = estimate(_alike(study.human, group), GAP)
     if human.value is None:
-        return "have none in the imported trials"
-    return f"{human.value:.2f} m in {human.n} imported trials"
+        return "have none in the imported trials of these conditions"
+    return f"{human.value:.2f} m in {human.n} imported trials of the same {_conditions(group)}"
+
+
+def _alike(human: Group, group: Group) -> Group:
+    """The humans in the conditions that a driver was played in."""
+    return human.part(lambda trials: trials["condition"].isin(group.ended["condition"]))
+
+
+def _conditions(group: Group) -> str:
+    number = group.ended["condition"].nunique()
+    return f"{number} condition{'s' * (number != 1)}"
 
 
 def _limits(study: Study, group: Group) -> list[str]:
@@ -165,7 +191,7 @@ def _limits(study: Study, group: Group) -> list[str]:
             f"{group.driver}: of human data sets with as many trials in each condition "
             f"({sum(group.sizes)} in all), {100 * found.ceiling.paper['I1-I4']:.0f} % pass I1 to "
             f"I4 together by the paper's tests, {100 * found.ceiling.robust['I1-I4']:.0f} % by the "
-            "robust ones."
+            "robust ones; one that a test cannot judge does not pass."
         )
     if found.paper["I4"].passed and found.robust["I4"].passed is False:
         texts.append(
@@ -189,16 +215,21 @@ def _human_limits(study: Study) -> list[str]:
         )
     elif not study.complete:
         texts.append(
-            f"{study.imported.trials} human trials of {HUMAN_TRIALS} are imported, of "
-            f"{study.imported.pairs} pairs: gaps, speeds and profiles are theirs, collisions and "
-            "who merged first are the published ones."
+            f"{study.imported.trials} human trials are imported, of {study.imported.pairs} "
+            f"pair{'s' * (study.imported.pairs != 1)}: gaps, speeds and profiles are theirs, "
+            f"collisions and who merged first are those of the {HUMAN_TRIALS} published ones."
         )
+        if study.imported.pairs < MIN_PAIRS:
+            texts.append(
+                f"With fewer than {MIN_PAIRS} human pairs a difference from the humans in the gap "
+                "is tested against the published regression."
+            )
     if study.imported is not None and study.imported.contradicting:
         texts.append(
-            "The imported human trials are no part of the published ones ("
+            "The imported human trials contradict the published counts ("
             f"{'; '.join(study.imported.contradicting)}): they are another data set."
         )
-    pairs = study.imported.pairs if study.complete and study.imported else HUMAN_PAIRS
+    pairs = study.imported.pairs if study.complete and study.imported else len(PAIRS)
     texts.append(
         f"Trials of humans come from {pairs} pairs who differ: tests that pool them, as the "
         "paper's, understate the human uncertainty."
@@ -215,10 +246,16 @@ def _asked(group: Group, origin: Provenance) -> list[str]:
     if (group.trials["source"] == "driver").all():
         return [*task, f"{group.driver} is a program: it reads no prompt, and samples nothing."]
     sent = origin.sent.get(group.spec_hash or "") or {"": {}}
-    return task + [
+    alike = len({str(parameters) for parameters in sent.values()}) == 1
+    told = [
+        _parameters(parameters) if alike else f"{side}: {_parameters(parameters)}"
+        for side, parameters in sent.items()
+    ]
+    return [
+        *task,
         f"{group.driver}: results hold for the wording of the prompt, which is a reconstruction "
-        f"(the original is not public), and for what was sent with it: {text}."
-        for text in dict.fromkeys(_parameters(parameters) for parameters in sent.values())
+        f"(the original is not public), and for what was sent with it: "
+        f"{'; '.join(dict.fromkeys(told))}.",
     ]
 
 

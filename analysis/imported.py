@@ -51,7 +51,7 @@ class Imported:
         if not self.complete:
             yield (
                 f"{which}: who merged first and collisions stay the {HUMAN_TRIALS} published "
-                "outcomes until every condition is complete, the rest comes from these"
+                "outcomes while a condition has fewer trials, the rest comes from these"
             )
         for pair, trials in self.left_out.items():
             yield f"{pair}: {trials} trials, not of the nine published pairs: left out"

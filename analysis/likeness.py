@@ -102,6 +102,8 @@ def likeness(study: Study, group: Group) -> Verdict:
 
 def judged(found: Estimate) -> Verdict:
     """Whether a difference in human standard deviations lies within the margin."""
+    if found.value is None and found.n:
+        return Verdict(None, None, "human trials of a condition are alike: no spread to compare by")
     if found.low is None or found.high is None:
         return Verdict(None, None, "too few trials or human pairs to compare")
     if found.low > -MARGIN_SD and found.high < MARGIN_SD:

@@ -15,9 +15,14 @@ from merge_runner.served import ALIASES, PAIRS, Pair, others_among
 from merge_runner.store import query
 
 TRIALS = (
-    "SELECT trials.*, driver, trial_metrics.* EXCLUDE (trial_id, spec_hash) "
+    "SELECT trials.*, driver, coalesce(left_scripted, false) AS left_scripted, "
+    "coalesce(right_scripted, false) AS right_scripted, "
+    "trial_metrics.* EXCLUDE (trial_id, spec_hash) "
     "FROM trials JOIN trial_drivers USING (trial_id, spec_hash) "
-    "JOIN trial_metrics USING (trial_id, spec_hash) ORDER BY trial_id, spec_hash"
+    "JOIN trial_metrics USING (trial_id, spec_hash) "
+    "LEFT JOIN (SELECT trial_id, spec_hash, bool_or(side = 'left') AS left_scripted, "
+    "bool_or(side = 'right') AS right_scripted FROM calls WHERE scripted GROUP BY ALL) "
+    "USING (trial_id, spec_hash) ORDER BY trial_id, spec_hash"
 )
 # Of each driven trial that ended a hash of its states: equal ones went the same way.
 TRACES = """

@@ -220,4 +220,4 @@ def _too_few(n: int, what: str) -> str:
     if n == 0:
         return f"no finished trial {what}"
     trials = "trial" if n == 1 else "trials"
-    return f"{n} finished {trials} {what}, in too few conditions to tell the terms apart"
+    return f"{n} finished {trials} {what}, too few or in too few conditions to tell the terms apart"

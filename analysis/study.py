@@ -30,10 +30,13 @@ from analysis.robustness import judged
 from merge_runner.errors import UsageError
 from merge_runner.places import DEFAULT_DB
 from merge_runner.plan import stand_in
+from merge_runner.records import SIDES
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.texts import quoted
 
 HUMAN = "human"
+# What tells groups apart, and is no measure.
+COLUMNS_OF_GROUPS = ["driver", "task", "trace", "left_scripted", "right_scripted"]
 BASELINE = "baseline"
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
@@ -43,14 +46,14 @@ ENOUGH_PER_CONDITION = 5
 class Group:
     """Trials of equal drivers, prompts and parameters.
 
-    ``trials`` are rows of ``load_trials``, judged by both rules of collisions; for humans before an
-    import only the outcomes that are published, and ``measured`` is False. ``setting`` is the
-    prompt variant, empty for humans. ``label`` is how tables name the driver, ``model`` the name
-    that was asked for. Of a driver without chance, whose repetitions are the same trial again, only
-    the first are ``trials``, and ``repeated`` counts the others. ``narrowed`` is what tells them in
-    SQL from other trials of their spec and variant, empty where there are none.
-    ``published_outcomes`` stand in the place of the trials' outcomes where these are a part of the
-    published ones.
+    ``trials`` are rows of ``load_trials``; for humans before an import only the outcomes that are
+    published, and ``measured`` is False. ``setting`` is the prompt variant, empty for humans.
+    ``label`` is how tables name the driver, ``model`` the name that was asked for, and ``posing``
+    what is said of a scripted stand-in. Of a driver without chance, whose repetitions are the same
+    trial again, only the first are ``trials``, and ``repeated`` counts the others; ``equal`` counts
+    such trials of a driver that samples. ``narrowed`` is what tells the trials in SQL from others
+    of their spec and variant, empty where there are none. ``published_outcomes`` stand in the place
+    of the trials' outcomes where these are a part of the published ones.
     """
 
     driver: str
@@ -60,8 +63,9 @@ class Group:
     label: str
     model: str
     measured: bool = True
-    scripted: bool = False
+    posing: str = ""
     repeated: int = 0
+    equal: int = 0
     narrowed: str = ""
     published_outcomes: pd.DataFrame | None = None
 
@@ -69,6 +73,11 @@ class Group:
     def id(self) -> str:
         """``o3/A2``, or ``human``."""
         return f"{self.driver}/{self.setting}" if self.setting else self.driver
+
+    @property
+    def scripted(self) -> bool:
+        """Whether a scripted stand-in answered."""
+        return bool(self.posing)
 
     @property
     def outcomes(self) -> pd.DataFrame:
@@ -267,6 +276,8 @@ def _model_group(
 ) -> Group:
     model = str(rows["trial_id"].iloc[0]).split("/", maxsplit=1)[0]
     scripted = bool(rows["scripted"].any())
+    sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
+    posing = stand_in(model, sides or SIDES) if scripted else ""
     distinct = _distinct(rows)
     narrowed = [f"scripted = {str(scripted).lower()}"] if told_apart else []
     if len(distinct) < len(rows):
@@ -276,11 +287,12 @@ def _model_group(
         driver,
         variant,
         spec_hash,
-        distinct.drop(columns=["driver", "task", "trace"]),
-        label=f"{driver} ({stand_in(model)})" if scripted else driver,
+        distinct.drop(columns=COLUMNS_OF_GROUPS),
+        label=f"{driver} ({posing})" if scripted else driver,
         model=model,
-        scripted=scripted,
+        posing=posing,
         repeated=len(rows) - len(distinct),
+        equal=len(_again(distinct)),
         narrowed=" AND ".join(narrowed),
     )
 
@@ -291,13 +303,19 @@ def _distinct(rows: pd.DataFrame) -> pd.DataFrame:
     That is a program, and a model that in every condition went the same way each time. Of a driver
     that samples, two equal trials are two samples.
     """
-    ended = rows[rows["trace"].notna()].sort_values("rep", kind="stable")
-    again = ended.index[ended.duplicated(["condition", "trace"])]
-    ways = ended.groupby("condition")["trace"].agg(["size", "nunique"])
-    repeated = ways[ways["size"] > 1]
+    again = _again(rows)
+    ways = rows.groupby("condition")["trace"].agg(["count", "nunique"])
+    repeated = ways[ways["count"] > 1]
+    # In a single condition it may be chance.
     no_chance = len(repeated) > 1 and bool((repeated["nunique"] == 1).all())
     programs = bool((rows["source"] == "driver").all())
     return rows.drop(index=again) if no_chance or programs else rows
+
+
+def _again(rows: pd.DataFrame) -> pd.Index:
+    """The trials that went the same way as an earlier repetition."""
+    ended = rows[rows["trace"].notna()].sort_values("rep", kind="stable")
+    return ended.index[ended.duplicated(["condition", "trace"])]
 
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:

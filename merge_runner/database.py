@@ -16,6 +16,7 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.errors import StoreError, StoreLocked, UsageError
+from merge_runner.records import SCRIPTED_FIELD
 from merge_runner.texts import first_line, quoted
 
 SCHEMA_VERSION = 4
@@ -269,7 +270,14 @@ def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
     for (table,) in new:
         if table in old and table != "meta":
             connection.execute(f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table}")  # noqa: S608 # our tables
-    # Before version 4 the provider alone told who was a stand-in.
-    connection.execute("UPDATE copied.calls SET scripted = true WHERE provider = 'emulator'")
+    # Before version 4 nobody looked at what the replies say of a stand-in.
+    connection.execute(
+        "UPDATE copied.calls SET scripted = true WHERE provider = 'emulator' OR reply->>? = 'true'",
+        [f"$.{SCRIPTED_FIELD}"],
+    )
+    connection.execute(
+        "UPDATE copied.trials SET scripted = true WHERE NOT scripted AND (trial_id, spec_hash) IN "
+        "(SELECT (trial_id, spec_hash) FROM copied.calls WHERE scripted)"
+    )
     connection.execute("INSERT INTO copied.meta VALUES (?)", [SCHEMA_VERSION])
     connection.execute("DETACH copied")

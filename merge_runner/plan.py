@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,7 +21,7 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import canonical_json
 from merge_runner.prompts.blocks import VARIANTS, block_digests
-from merge_runner.records import Side, TrialSpec
+from merge_runner.records import SIDES, Side, TrialSpec
 from merge_runner.simulator.conditions import CONDITIONS
 
 SPEC_VERSION = 2  # since then one valid array in a reply is enough
@@ -179,12 +179,15 @@ class Plan:
         }
 
 
-def stand_in(model: str) -> str:
-    """What is said of a scripted stand-in that answered in a model's name."""
-    asked = [name for name in model.split("+") if name not in {EMULATOR, *PROGRAMS}]
-    if not asked:
-        return "scripted stand-in, no language model"
-    return f"scripted stand-in, not {'+'.join(asked)}"
+def stand_in(model: str, sides: Collection[Side] = SIDES) -> str:
+    """What is said of trials of ``model`` in which a scripted stand-in answered on these sides."""
+    left, _, right = model.partition("+")
+    names: dict[Side, str] = {"left": left, "right": right or left}
+    models = {side: name for side, name in names.items() if name not in {EMULATOR, *PROGRAMS}}
+    posing = "+".join(dict.fromkeys(name for side, name in models.items() if side in sides))
+    real = [side for side in models if side not in sides]
+    where = f" on the {'left' if real == ['right'] else 'right'}" if real else ""
+    return f"scripted stand-in{where}, {f'not {posing}' if posing else 'no language model'}"
 
 
 def _lot(*what: object) -> str:

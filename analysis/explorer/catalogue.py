@@ -16,6 +16,7 @@ from analysis.explorer.reading import PATIENCE_S, reading
 from merge_runner.database import SCHEMA, Instance
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.plan import stand_in
+from merge_runner.records import SIDES
 from merge_runner.served import ALIASES, others_among
 
 PAGE = 100
@@ -52,6 +53,7 @@ CREATE TABLE paid (trial_id VARCHAR, spec_hash VARCHAR, attempts BIGINT, cost_us
 CREATE TABLE tried (trial_id VARCHAR, spec_hash VARCHAR, requested VARCHAR, served VARCHAR,
     answered BOOLEAN, outcome VARCHAR, unpriced BIGINT, times BIGINT);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
+CREATE TABLE posed (trial_id VARCHAR, spec_hash VARCHAR, side VARCHAR);
 CREATE TABLE flaws (trial_id VARCHAR, spec_hash VARCHAR, failure VARCHAR, times BIGINT);
 """
 # What each sweep has of them; what went wrong in a trial, and how often. Of an error stand the
@@ -77,6 +79,8 @@ FORGET = """
 DELETE FROM memory.listed WHERE status = 'failed' OR (trial_id, spec_hash, status, end_time_s)
     NOT IN (SELECT (trial_id, spec_hash, status, end_time_s) FROM trials);
 DELETE FROM memory.tried WHERE (trial_id, spec_hash) NOT IN
+    (SELECT (trial_id, spec_hash) FROM memory.listed);
+DELETE FROM memory.posed WHERE (trial_id, spec_hash) NOT IN
     (SELECT (trial_id, spec_hash) FROM memory.listed);
 DELETE FROM memory.flaws WHERE (trial_id, spec_hash) NOT IN
     (SELECT (trial_id, spec_hash) FROM memory.listed);
@@ -104,6 +108,9 @@ INSERT INTO memory.tried
     SELECT trial_id, spec_hash, model_requested, model_served, http_status = 200, outcome,
         count(*) FILTER (cost_usd IS NULL), count(*)
     FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
+INSERT INTO memory.posed
+    SELECT DISTINCT trial_id, spec_hash, side FROM calls
+    SEMI JOIN memory.trials USING (trial_id, spec_hash) WHERE scripted;
 INSERT INTO memory.flaws
     SELECT trial_id, spec_hash, failure, count(*) FROM decisions
     SEMI JOIN memory.trials USING (trial_id, spec_hash) WHERE failure IS NOT NULL GROUP BY ALL;
@@ -143,6 +150,14 @@ LEFT JOIN (
     WHERE time_s >= 0 GROUP BY ALL
 ) USING (trial_id, spec_hash);
 TRUNCATE trials; TRUNCATE states; TRUNCATE decided; TRUNCATE paid;
+"""
+# Trials of stand-ins that are not said to be: by the model asked for, and the sides it answered on.
+UNNAMED = """
+SELECT split_part(trial_id, '/', 1) AS asked, sides, list(number)
+FROM listed LEFT JOIN (
+    SELECT trial_id, spec_hash, list_sort(list(side)) AS sides FROM posed GROUP BY ALL
+) USING (trial_id, spec_hash)
+WHERE scripted AND stand_in IS NULL GROUP BY asked, sides
 """
 FACETS = ("sweep", "model", "variant", "condition", "outcome", "validity", "cause")
 # Facets of which a trial may have several: their tables.
@@ -288,10 +303,11 @@ class Catalogue:
         return found
 
     def totals(self, wanted: Filter) -> dict[str, Totals]:
-        """What the trials of a filter come to: those of ``drivers``, and those of ``humans``."""
+        """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``."""
         where, values = wanted.where()
         rows = self._rows(
-            "SELECT if(source = 'human', 'humans', 'drivers') AS who, "  # noqa: S608 # constants
+            "SELECT CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' "  # noqa: S608 # constants
+            "ELSE 'drivers' END AS who, "
             "count(*), count(*) FILTER (status = 'collided'), "
             "count(*) FILTER (status = 'failed'), count(*) FILTER (status <> 'failed'), "
             "coalesce(sum(decisions), 0), coalesce(sum(invalid), 0), coalesce(sum(fallbacks), 0), "
@@ -399,15 +415,13 @@ class Catalogue:
         return count
 
     def _name_stand_ins(self) -> None:
-        """Say of each trial that a stand-in drove in whose name it did."""
+        """Say of each trial that a stand-in drove for whom it stood."""
         assert self._connection is not None
-        named = "split_part(trial_id, '/', 1)"
-        for (model,) in self._connection.execute(
-            f"SELECT DISTINCT {named} FROM listed WHERE scripted AND stand_in IS NULL"  # noqa: S608 # constants
-        ).fetchall():
+        unnamed = self._connection.execute(UNNAMED).fetchall()
+        for model, sides, numbers in unnamed:
             self._connection.execute(
-                f"UPDATE listed SET stand_in = ? WHERE scripted AND {named} = ?",  # noqa: S608 # constants
-                [stand_in(model), model],
+                "UPDATE listed SET stand_in = ? WHERE number IN (SELECT unnest(?))",
+                [stand_in(model, sides or SIDES), numbers],
             )
 
     def _note_others(self) -> None:
@@ -418,6 +432,11 @@ class Catalogue:
         self._connection.execute("TRUNCATE others")
         if others:
             self._connection.executemany("INSERT INTO others VALUES (?, ?)", others)
+
+    @property
+    def others(self) -> set[tuple[str, str]]:
+        """The models that were asked for, with the other ones that answered."""
+        return set(self._rows("FROM others", []))
 
     def _rows(self, sql: str, values: list[Any]) -> list[Any]:
         assert self._connection is not None, "it was never refreshed"

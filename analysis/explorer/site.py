@@ -17,7 +17,6 @@ from analysis.explorer.sandbox import Sandbox
 from analysis.explorer.texts import visible
 from merge_runner.errors import MergeRunnerError
 from merge_runner.places import DEFAULT_DB
-from merge_runner.plan import stand_in
 
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {
@@ -72,7 +71,6 @@ class Site:
             shell="static.html" if self.static else "base.html",
             static=self.static,
             study=self.db.name if self.static else str(self.db),
-            stand_in=stand_in,
             visible=visible,
             **self.shared,
         )

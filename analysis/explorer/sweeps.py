@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from analysis.explorer.catalogue import Catalogue
 from merge_runner.audit.expected import ModelFacts
 from merge_runner.config import pair_name
+from merge_runner.plan import stand_in
 from merge_runner.progress_file import Standing, read_standing
 
 Row = dict[str, Any]
@@ -20,10 +21,11 @@ OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, exit_code, config::VARCHAR AS config,
     coalesce(trials, 0) AS trials, coalesce(failed, 0) AS failed,
-    coalesce(cost_usd, 0) AS cost_usd, coalesce(scripted, false) AS scripted
+    coalesce(cost_usd, 0) AS cost_usd, coalesce(scripted, 0) AS scripted, stand_ins
 FROM sweeps LEFT JOIN (
     SELECT sweep AS sweep_id, count(*) AS trials, count(*) FILTER (status = 'failed') AS failed,
-        sum(cost_usd) AS cost_usd, bool_or(scripted) AS scripted
+        sum(cost_usd) AS cost_usd, count(*) FILTER (scripted) AS scripted,
+        string_agg(DISTINCT stand_in, '; ') AS stand_ins
     FROM members JOIN listed USING (number) GROUP BY ALL
 ) USING (sweep_id)
 ORDER BY started_at DESC, sweep_id DESC
@@ -89,10 +91,17 @@ class Entry:
         return str(self.row["sweep_id"])
 
     @property
-    def scripted(self) -> bool:
-        """Whether a scripted stand-in answers, as its trials say, or before there are any."""
+    def stand_in(self) -> str:
+        """What is said of a scripted stand-in that answers; empty where none is known to.
+
+        Its trials say so, in how many of them; before there are any, what is asked.
+        """
+        trials, scripted = self.row["trials"], self.row["scripted"]
+        if scripted:
+            part = f", in {scripted} of {trials} trials" if scripted < trials else ""
+            return f"{self.row['stand_ins']}{part}"
         asked = {model.provider for model in self.config.models.values()}
-        return bool(self.row["scripted"]) or "emulator" in asked
+        return stand_in(self.config.model) if "emulator" in asked and not trials else ""
 
     @property
     def state(self) -> str:

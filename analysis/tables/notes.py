@@ -8,7 +8,7 @@ from functools import cache
 from analysis import ceiling
 from analysis.intermittency import STEADY_MPS
 from analysis.likeness import MARGIN_SD
-from analysis.published import HUMAN_DOI, HUMAN_GAP_SD_M
+from analysis.published import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
 from analysis.study import Group, Study
 
 
@@ -43,8 +43,8 @@ def repeated_note(group: Group) -> str:
 def _human_notes(study: Study, pooled: bool) -> tuple[str, ...]:
     if study.imported is None:
         return (
-            "human: the published outcomes of 990 trials; for the rest `merge-runner human import "
-            f"PATH` reads the recordings (doi {HUMAN_DOI})",
+            f"human: the published outcomes of {HUMAN_TRIALS} trials; for the rest `merge-runner "
+            f"human import PATH` reads the recordings (doi {HUMAN_DOI})",
         )
     found = tuple(f"human: {finding}" for finding in study.imported.findings())
     if not pooled:

@@ -50,7 +50,8 @@ COUNTS = """
 SELECT * FROM
     (SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid
     FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)),
-    (SELECT count(DISTINCT call_key) AS calls, count(*) AS attempts
+    (SELECT count(DISTINCT call_key) AS calls, count(*) AS attempts,
+        count(*) FILTER (scripted) AS "attempts answered by a scripted stand-in"
     FROM calls SEMI JOIN audited USING (trial_id, spec_hash)),
     (SELECT count(DISTINCT reply_id) AS "reply ids"
     FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash))

@@ -31,6 +31,7 @@ from merge_runner.store import Store
 
 OWN = {"endpoint": "openai", "body": {"model": "o3", "messages": [], "reasoning_effort": "medium"}}
 IMPORTED = 129
+UNLIMITED = ("--rpm", "100000", "--tpm", "1000000000")
 
 
 def two_trials(db: Path) -> None:
@@ -41,7 +42,7 @@ def two_trials(db: Path) -> None:
 def stand_in_behind_o3(db: Path) -> None:
     """The emulator at OPENAI_BASE_URL, asked for o3."""
     url = {"OPENAI_BASE_URL": f"{_emulator()}/v1", "OPENAI_API_KEY": "no-key"}
-    _sweep(db, "--model", "o3", "--reps", "2", "--yes", **url)
+    _sweep(db, "--model", "o3", "--reps", "2", "--yes", *UNLIMITED, **url)
 
 
 def another_endpoint(db: Path) -> None:

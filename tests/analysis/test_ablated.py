@@ -57,7 +57,10 @@ def test_what_a_variant_changes_is_said_with_interval_and_what_not_with_what_cou
 @pytest.mark.parametrize(
     ("drives", "words"),
     [
-        (yielding("o3", "A1", 1), "its baseline was not played, so what A1 changes cannot be said"),
+        (
+            yielding("o3", "A1", 1),
+            "it has no baseline of its own, so what A1 changes cannot be said",
+        ),
         (
             [*LEVEL, *as_variant(LEVEL)],
             (

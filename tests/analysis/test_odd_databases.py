@@ -17,7 +17,7 @@ SAID = {
     "two_trials": (
         [
             "o3 collided, by boxes that overlap, in 0.0 % of 2 trials (95 % CI 0.0 to 65.8)",
-            "in too few conditions",
+            "too few or in too few conditions",
         ],
         ["evidence against the driver"],
     ),
@@ -34,7 +34,11 @@ SAID = {
         [">o3</td>"],
     ),
     "partial_import": (
-        ["humans (129 of 990 imported)", "of 5 pairs", "humans in 2.8 % of 990"],
+        [
+            "humans (129 of 990 imported)",
+            "of 5 pairs",
+            "humans in 2.8 % of 990 in the same 11 conditions",
+        ],
         ["The human recordings are not imported"],
     ),
     "other_vehicle_length": (["o3: its task is not the default one: vehicle_length_m = 8.0."], []),

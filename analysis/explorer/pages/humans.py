@@ -214,6 +214,7 @@ def chart(
     ``cut`` names the intervals that go on beyond the axis.
     """
     printed = _printed(kind, published)
+    labels = {group["id"]: group["driver"] for group in groups}
     known = [
         found
         for group in groups
@@ -245,7 +246,7 @@ def chart(
         "panels": panels,
         "printed": printed,
         "cut": [
-            f"{point['group']} in {panel['name']}: {value_text(point['of'], kind.digits)}"
+            f"{labels[point['group']]} in {panel['name']}: {value_text(point['of'], kind.digits)}"
             for panel in panels
             for point in panel["points"]
             if point["arrows"]

@@ -89,6 +89,7 @@ def rendered(site: Site, row: Row, trial: Trial, found: Decision) -> str:
         parts=found.parts,
         meanings=views.BLOCK_MEANINGS,
         attempts=found.attempts,
+        others=site.catalogue.others,
         reply=None if body is None else {"text": text, "more": more},
         raw=site.at.raw(row, found.row["side"], found.row["decision"]),
         chart=views.plan_chart(found, trial),
