@@ -26,7 +26,7 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
     for title, parts, rest in (
         (
             "A scripted stand-in answered",
-            [f"{group.id}: {group.posing}" for group in _posing(study)],
+            [f"{group.id}: {group.posing}" for group in posing(study)],
             "These rows stand last, are in no conclusion, and never beside the paper's row of that "
             "model.",
         ),
@@ -92,7 +92,7 @@ def mismatch(one: Mismatch) -> str:
     )
 
 
-def _posing(study: Study) -> list[Group]:
+def posing(study: Study) -> list[Group]:
     """Stand-ins that answered in a model's name; the emulator has one of its own."""
     return [g for g in study.models if g.scripted and EMULATOR not in g.model.split("+")]
 

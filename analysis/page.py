@@ -9,7 +9,7 @@ from pathlib import Path
 import jinja2
 import pandas as pd
 
-from analysis.alarms import alarms
+from analysis.alarms import alarms, posing
 from analysis.conclusions import not_shown, nothing, shown
 from analysis.explain import Source, sources_of, sql_command
 from analysis.figures import FIGURES
@@ -56,6 +56,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         shown=shown(study),
         not_shown=not_shown(study, origin),
         nothing=nothing(study),
+        posing=posing(study),
         figures=[
             {"name": name, "caption": FIGURES[name][1], "data": data}
             for name, data in figures.items()

@@ -16,6 +16,7 @@ from merge_runner.sweep import Options, Outcome
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
 LEDGER = ("model", "variant", "fate", "outcome", "attempts")
 FAILURES_SHOWN = 10
+PRICED_ALIKE = "replies of stand-ins are priced as the model's; nobody charges for them"
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +88,8 @@ class Summary:
             yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
         if facts is not None:
             yield from (_stand_in(*found) for found in facts.stand_ins)
+            if outcome.cost_usd and facts.stand_ins:
+                yield PRICED_ALIKE
             audit = outcome.audit
             if audit is not None:
                 checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
