@@ -83,7 +83,8 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
     predicate = row.counts or _predicate(table, column)
     if column is not None and column.within:
         predicate += f" AND {column.within}"
-    compared = (row.reference,) if column is not None and column.compares else ()
+    whose = {"own": row.groups, "reference": (row.reference,), "both": (*row.groups, row.reference)}
+    groups = row.groups if column is None or not row.reference else whose[column.of]
     return tuple(
         _published(group, row, column)
         or (
@@ -92,13 +93,17 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
             else Source(group.id, f"published: {row.note}", "", ())
         )
         for group in study.groups
-        if group.id in (*row.groups, *compared)
+        if group.id in groups
     )
 
 
 def _published(group: Group, row: Row, column: Column | None) -> Source | None:
     """The source of a human value that stays the published one after a part of an import."""
-    if group.published_outcomes is None or column is None or column.name not in row.published:
+    if group.setting or column is None or column.name not in row.published:
+        return None
+    if row.cited:
+        return Source(group.id, f"published, not from traces: {citation(row.cited)}", "", ())
+    if group.published_outcomes is None:
         return None
     text = f"{len(group.published_outcomes)} published outcomes: {citation('human_outcomes')}"
     return Source(group.id, text, "", ())

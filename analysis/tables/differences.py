@@ -12,6 +12,9 @@ from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
 
 OUTCOMES = {WHO_FIRST: "left first (logit)", GAP: "gap (m)"}
 COUNTS = {WHO_FIRST: WITH_MERGER, GAP: WITH_GAP}
+# What the humans are known by where it is not by their traces, and the columns that rest on them.
+FILES = {WHO_FIRST: "human_outcomes", GAP: "paper_gap"}
+OF_HUMANS = ("n_human", "b_human", "difference", "ci", "p", "freedom", "detectable")
 
 
 def differences(study: Study) -> Table:
@@ -28,19 +31,42 @@ def differences(study: Study) -> Table:
             Column("outcome", "outcome"),
             Column("term", "term"),
             Column("n", "n", "count", 0, "trials of the driver in the model"),
-            Column("n_human", "n humans", "count", 0, "trials of the humans in the model"),
+            Column(
+                "n_human",
+                "n humans",
+                "count",
+                0,
+                "trials of the humans in the model",
+                of="reference",
+            ),
             Column("b_driver", "driver b", "number", 2, "coefficient of the driver"),
-            Column("b_human", "human b", "number", 2, "coefficient of the humans"),
-            Column("difference", "difference", "number", 2, "interaction: driver minus humans"),
-            Column("ci", "95 % CI", "interval", 2, "of the interaction"),
-            Column("p", "p", "p", 3, "test of the interaction"),
-            Column("freedom", "df", "number", 0, "of its t test; none: normal", optional=True),
+            Column("b_human", "human b", "number", 2, "coefficient of the humans", of="reference"),
+            Column(
+                "difference",
+                "difference",
+                "number",
+                2,
+                "interaction: driver minus humans",
+                of="both",
+            ),
+            Column("ci", "95 % CI", "interval", 2, "of the interaction", of="both"),
+            Column("p", "p", "p", 3, "test of the interaction", of="both"),
+            Column(
+                "freedom",
+                "df",
+                "number",
+                0,
+                "of its t test; none: normal",
+                optional=True,
+                of="both",
+            ),
             Column(
                 "detectable",
                 "detectable",
                 "number",
                 2,
                 "smallest difference found with power .8: (t.975 + t.8) SE",
+                of="both",
             ),
             Column("method", "method", meaning="how the model is fitted", optional=True),
         ),
@@ -63,13 +89,12 @@ def differences(study: Study) -> Table:
 
 
 def _row(human: Group, group: Group, found: Difference) -> Row:
-    # Published outcomes and fits are no trials that could be listed.
     of_traces = pairs_known(human, found.outcome) >= MIN_PAIRS
     ci = None if found.low is None or found.high is None else (found.low, found.high)
     said = found.problem or found.remark
     return Row(
         f"{group.id}/{found.outcome}/{found.term}",
-        (group.id, human.id) if of_traces else (group.id,),
+        (group.id,),
         {
             "driver": group.label,
             "outcome": OUTCOMES[found.outcome],
@@ -87,4 +112,7 @@ def _row(human: Group, group: Group, found: Difference) -> Row:
         },
         f"{found.outcome}: {said}" if said else "",
         counts=COUNTS[found.outcome],
+        reference=human.id,
+        published=() if of_traces else OF_HUMANS,
+        cited="" if of_traces else FILES[found.outcome],
     )

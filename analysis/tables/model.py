@@ -19,8 +19,8 @@ class Column:
 
     ``meaning`` says in words what stands in it, and ``counts`` is the SQL predicate of the
     trials that its values rest on. A value may be missing without a note where ``optional``.
-    ``within`` narrows the trials of its rows, also of those that name their own. Where it
-    ``compares``, its values rest on the trials of the row's ``reference`` as well.
+    ``within`` narrows the trials of its rows, also of those that name their own. ``of`` says whose
+    trials its values rest on: the row's own, those of its ``reference``, or both.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Column:
     counts: str = "status = 'finished'"
     optional: bool = False
     within: str = ""
-    compares: bool = False
+    of: Literal["own", "reference", "both"] = "own"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Row:
     the published human outcomes are in, where trials of humans are in others. ``beside`` is the
     driver of the paper whose row it stands beside, if any, and ``stand_in_for`` the model in whose
     name a scripted stand-in answered. ``reference`` is the group that it is compared with, in the
-    columns that compare.
+    columns that compare, and ``cited`` the shipped file that its ``published`` columns are made of.
     """
 
     id: str
@@ -56,6 +56,7 @@ class Row:
     stand_in_for: str = ""
     reference: str = ""
     published: tuple[str, ...] = ()
+    cited: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,7 +101,7 @@ def _fit_columns(
 
 def _difference_columns(counts: str) -> tuple[Column, ...]:
     def column(name: str, heading: str, kind: Kind, digits: int, meaning: str) -> Column:
-        return Column(name, heading, kind, digits, meaning, counts, optional=True, compares=True)
+        return Column(name, heading, kind, digits, meaning, counts, optional=True, of="both")
 
     return (
         column("difference", "difference", "number", 2, "of the coefficient from the baseline's"),

@@ -123,11 +123,17 @@ def test_humans_have_further_rows_with_a_random_intercept_per_pair(imported):
 
 def test_a_difference_from_humans_names_their_trials_where_it_rests_on_them(imported):
     (table,) = make_tables(imported, ["differences"])
-    behind = {row.values["outcome"]: row.groups for row in table.rows}
-    assert behind == {
-        "left first (logit)": ("o3/baseline",),  # and on the published outcomes
-        "gap (m)": ("o3/baseline", "human"),
-    }
+    with_gap = next(r.values["n_human"] for r in table.rows if r.id.endswith("gap/intercept"))
+    for cell, behind in {
+        "gap/intercept:n": {"o3/baseline": 22},
+        "gap/intercept:n_human": {"human": with_gap},
+        "gap/intercept:p": {"human": with_gap, "o3/baseline": 22},
+        "who-first/intercept:b_driver": {"o3/baseline": 22},
+        "who-first/intercept:b_human": {"human": 0},  # published outcomes
+        "who-first/intercept:difference": {"human": 0, "o3/baseline": 22},
+    }.items():
+        sources = explain(imported, table, f"o3/baseline/{cell}").sources
+        assert {source.group: len(source.trials) for source in sources} == behind, cell
     assert any("jackknife over 3 pairs" in row.note for row in table.rows)
     assert not any("intervals and tests take the trials" in note for note in table.notes)
 
