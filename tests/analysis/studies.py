@@ -10,6 +10,9 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import duckdb
+
+from analysis.study import Study
 from merge_runner.config import Scenario
 from merge_runner.records import (
     SIDES,
@@ -171,6 +174,14 @@ def write_study(
     store.begin_sweep(sweep, specs, [])
     store.write("sweep-1", records, patience_s=5)
     return path
+
+
+def changed(db: Path, *statements: str) -> Study:
+    """The study of a database after some changes."""
+    with duckdb.connect(str(db)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+    return Study(db)
 
 
 @cache

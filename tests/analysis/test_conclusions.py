@@ -6,9 +6,8 @@ import json
 import re
 from dataclasses import replace
 
-import duckdb
 import pytest
-from studies import Drive, write_study, yielding
+from studies import Drive, changed, write_study, yielding
 
 from analysis.ceiling import Ceiling
 from analysis.conclusions import not_shown, nothing, shown
@@ -24,14 +23,6 @@ pytestmark = pytest.mark.usefixtures("few_draws")
 def texts(study):
     """What is shown, and what is not."""
     return " ".join(shown(study)), " ".join(not_shown(study, provenance(study.db)))
-
-
-def changed(db, *statements):
-    """The study of a database after some changes."""
-    with duckdb.connect(str(db)) as connection:
-        for statement in statements:
-            connection.execute(statement)
-    return Study(db)
 
 
 def test_what_is_not_excluded_is_the_interval_of_these_trials(tmp_path):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
-import duckdb
 import pytest
-from studies import write_study, yielding
+from studies import changed, write_study, yielding
 
 from analysis.alarms import alarms
 from analysis.explain import explain
@@ -15,6 +15,7 @@ from analysis.provenance import provenance
 from analysis.study import Study
 from analysis.tables import make_tables
 from analysis.tables.formats import value_rows
+from merge_runner.plan import stand_in
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 
@@ -24,14 +25,6 @@ def db(tmp_path):
     """Three repetitions of two drivers."""
     drives = [*yielding("o3", reps=3), *yielding("other", reps=3)]
     return write_study(tmp_path / "t.duckdb", drives)
-
-
-def changed(db, *statements):
-    """The study of a database after some changes."""
-    with duckdb.connect(str(db)) as connection:
-        for statement in statements:
-            connection.execute(statement)
-    return Study(db)
 
 
 def endpoint(url):
@@ -118,6 +111,41 @@ def test_two_equal_trials_of_a_driver_that_samples_are_two_samples(db):
     one = "trial_id LIKE 'o3/baseline/N_0_0/%'"
     study = changed(db, *same_each_time(db, one))
     assert study.models[0].repeated == 0
+
+
+def test_equal_trials_of_a_driver_that_samples_are_told_and_count(db):
+    study = changed(db, *same_each_time(db, "trial_id LIKE 'o3/baseline/N_0_0/%'"))
+    (alarm,) = alarms(study, provenance(db))
+    assert alarm.title == "Some trials are equal"
+    assert "2 of 33 trials of o3/baseline are as an earlier one to the last state" in alarm.text
+
+
+@pytest.mark.parametrize(
+    ("model", "sides", "words"),
+    [
+        ("o3", ("left", "right"), "scripted stand-in, not o3"),
+        ("o3", ("left",), "scripted stand-in on the left, not o3"),
+        ("emulator", ("left", "right"), "scripted stand-in, no language model"),
+        ("emulator+constant", ("left",), "scripted stand-in, no language model"),
+        ("emulator+o3", ("left",), "scripted stand-in on the left, no language model"),
+        ("emulator+o3", ("left", "right"), "scripted stand-in, not o3"),
+        ("constant+o3", ("right",), "scripted stand-in, not o3"),
+        ("o3+gemini-2.5-pro", ("right",), "scripted stand-in on the right, not gemini-2.5-pro"),
+        ("o3+gemini-2.5-pro", ("left", "right"), "scripted stand-in, not o3+gemini-2.5-pro"),
+    ],
+)
+def test_a_stand_in_stands_for_the_models_on_whose_sides_it_answered(model, sides, words):
+    assert stand_in(model, sides) == words
+
+
+def test_the_sides_are_those_of_the_scripted_calls(tmp_path):
+    drives = [replace(drive, said={}) for drive in yielding("o3", reps=1)]
+    study = changed(
+        write_study(tmp_path / "t.duckdb", drives),
+        "UPDATE calls SET scripted = true WHERE side = 'left'",
+        "UPDATE trials SET scripted = true",
+    )
+    assert study.models[0].label == "o3 (scripted stand-in on the left, not o3)"
 
 
 def test_a_program_repeats_itself_wherever_it_does(db):
