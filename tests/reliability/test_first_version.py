@@ -52,6 +52,19 @@ async def test_its_database_is_brought_up_to_date_and_kept(merge_runner, old):
         assert failed == 4
 
 
+async def test_a_reply_that_says_it_was_scripted_is_so_in_an_old_database_too(merge_runner, old):
+    with duckdb.connect(str(old / "results.duckdb")) as database:
+        database.execute("UPDATE calls SET provider = 'openai'")
+        database.execute("UPDATE trials SET scripted = false")
+        told = ['{"merge_runner_scripted": true}']
+        database.execute("UPDATE calls SET reply = ? WHERE side = 'left' AND decision = 0", told)
+    assert (await merge_runner("digest", "--db", "results.duckdb")).code == 0
+    with duckdb.connect(str(old / "results.duckdb"), read_only=True) as database:
+        found = "SELECT DISTINCT side, decision FROM calls WHERE scripted"
+        assert database.execute(found).fetchall() == [("left", 0)]
+        assert database.execute("SELECT scripted FROM trials").fetchall() == [(True,)]
+
+
 async def test_a_sweep_goes_on_in_its_database(merge_runner, old):
     run = await merge_runner("sweep", "baseline", "--reps", 1, "--model", "constant",
                              "--db", "results.duckdb", "--json")  # fmt: skip
