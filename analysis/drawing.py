@@ -7,9 +7,11 @@ import textwrap
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
 from analysis.panels import Point
-from analysis.study import Group
+from analysis.published import HUMAN_TRIALS
+from analysis.study import Group, Study
 
 # IEEE transactions: one column and the whole page, in inches.
 COLUMN_IN, PAGE_IN = 3.5, 7.16
@@ -43,6 +45,19 @@ def velocity_text(velocity_mps: float) -> str:
     """A relative velocity as a reader sees it."""
     sign = "−" if velocity_mps < 0 else "+" if velocity_mps > 0 else ""
     return f"{sign}{abs(velocity_mps):g} m/s"
+
+
+def remarks(study: Study, colour: str) -> list[Line2D]:
+    """What a legend says of humans who are shown by something else than their own trials."""
+    if study.human not in study.groups:
+        return []
+    if not study.human.measured:
+        label = "human gap, published regression"
+        return [Line2D([], [], color=colour, ls="--", lw=0.8, label=label)]
+    if study.human.published_outcomes is None:
+        return []
+    label = f"humans in C: the {HUMAN_TRIALS} published"
+    return [Line2D([], [], ls="", label=label)]
 
 
 def say(axis: Axes, text: str, height: float = 0.9) -> None:

@@ -24,6 +24,7 @@ from analysis.drawing import (
     draw_points,
     line_count,
     named,
+    remarks,
     say,
     velocity_text,
     wrapped,
@@ -274,10 +275,7 @@ def _legend(figure: SubFigure, study: Study, groups: list[Group]) -> None:
         handles.append(
             Line2D([], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white", label=label)
         )
-    if study.human in groups and not study.human.measured:
-        handles.append(
-            Line2D([], [], color="black", ls="--", lw=0.8, label="human gap, published regression")
-        )
+    handles += remarks(study, "black")
     figure.legend(handles=handles, loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False)
 
 

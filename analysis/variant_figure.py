@@ -17,6 +17,7 @@ from analysis.drawing import (
     PAGE_IN,
     draw_points,
     line_count,
+    remarks,
     say,
     velocity_text,
     wrapped,
@@ -190,7 +191,5 @@ def _legend(figure: Figure, study: Study) -> None:
         )
         for velocity, (colour, marker) in zip(VELOCITIES_MPS, STYLES, strict=True)
     ]  # fmt: skip
-    if study.human in study.groups and not study.human.measured:
-        label = "human gap, published regression"
-        handles.append(Line2D([], [], color="#555555", ls="--", lw=0.8, label=label))
+    handles += remarks(study, "#555555")
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False)

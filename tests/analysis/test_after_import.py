@@ -21,6 +21,7 @@ from analysis.load import SPEEDS
 from analysis.provenance import provenance
 from analysis.study import Study
 from analysis.tables import make_tables
+from analysis.variant_figure import figure_2_variants
 from analysis.verdicts import population, score
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.store import Store
@@ -158,6 +159,14 @@ def test_the_human_interval_is_over_pairs(imported):
     assert pairs.n == 3
     assert table.rows[0].values["gain_ci"] == (pairs.low, pairs.high)
     assert table.rows[0].values["gain"] == pairs.value
+
+
+def test_figures_say_that_who_was_first_is_published_while_some_humans_are_missing(imported):
+    for draw in (figure_2, figure_2_variants):
+        figure = draw(imported)
+        legends = [*figure.legends, *(one for part in figure.subfigs for one in part.legends)]
+        words = [text.get_text() for legend in legends for text in legend.get_texts()]
+        assert "humans in C: the 990 published" in words
 
 
 def test_humans_are_not_compared_with_themselves(imported):
