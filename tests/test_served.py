@@ -79,6 +79,7 @@ def test_the_table_and_the_trials_behind_its_cell_agree(db):
 
 
 names = st.text(max_size=3)
+MEMORY = in_memory({})
 
 
 @given(st.lists(st.tuples(names, names)), st.lists(st.tuples(names, names)))
@@ -86,13 +87,11 @@ def test_the_condition_in_sql_is_the_rule(pairs, aliases):
     others = others_among(pairs, aliases)
     declared = {asked: {a for model, a in aliases if model == asked} for asked, _ in pairs}
     assert others == [p for p in pairs if is_other_model(*p, declared[p[0]])]
-    with in_memory({}) as connection:
-        for pair in pairs:
-            (other,) = connection.execute(
-                f"SELECT {sql_of(others)} FROM (SELECT ? AS model_requested, ? AS model_served)",
-                pair,
-            ).fetchone()
-            assert other is (pair in others)
+    for pair in pairs:
+        (other,) = MEMORY.execute(
+            f"SELECT {sql_of(others)} FROM (SELECT ? AS model_requested, ? AS model_served)", pair
+        ).fetchone()
+        assert other is (pair in others)
 
 
 def test_an_unnamed_answer_is_nobody_elses():
