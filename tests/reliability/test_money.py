@@ -126,30 +126,30 @@ async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(m
 
 async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(merge_runner):
     async def middle(request, handler):
-        if server.requests <= 2:
-            arrived.set()
+        if 1 < server.requests <= 4:  # the first one goes alone
+            if server.requests == 4:
+                arrived.set()
             await asyncio.Event().wait()
         return await handler(request)
 
     arrived = asyncio.Event()
-    sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
+    sweep = (*SWEEP, "--reps", 2, "--conditions", "L_4_0", "--yes", *FAST)
     async with watched(middle) as server:
         env = account(server)
         process = await merge_runner.fork(*sweep, **env)
         await arrived.wait()
-        await asyncio.sleep(0.3)
         process.kill()
         await process.wait()
         run = await merge_runner(*sweep, **env)
     assert run.code == 0, run.err
-    assert run.summary["attempts_of_unknown_cost"] == 2
-    assert 0.25 < run.summary["set_aside_usd"] < 0.3
+    assert run.summary["attempts_of_unknown_cost"] == 3
+    assert 0.38 < run.summary["set_aside_usd"] < 0.45
     fates = await sql(
         merge_runner,
-        "select outcome, fate, cached, count(*) as n from attempts where attempt = 1 "
-        "and decision = 0 group by all",
+        "select outcome, fate, cached, count(*) as n from attempts where outcome = 'unknown' "
+        "group by all",
     )
-    assert fates == [{"outcome": "unknown", "fate": "retried", "cached": True, "n": 2}]
+    assert fates == [{"outcome": "unknown", "fate": "retried", "cached": True, "n": 3}]
 
 
 async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner):
@@ -216,7 +216,7 @@ async def test_two_runs_under_one_cap_never_pass_it_and_both_end(merge_runner):
     assert calls["n"] <= server.requests
 
 
-async def test_a_gateways_error_may_be_charged_and_a_providers_is_not(merge_runner, experiments):
+async def test_a_gateways_error_may_be_charged_whatever_its_form(merge_runner, experiments):
     async def middle(request, handler):
         await handler(request)
         if server.requests % 2:
@@ -235,8 +235,9 @@ async def test_a_gateways_error_may_be_charged_and_a_providers_is_not(merge_runn
     assert run.code == 1
     attempts = run.summary["attempts"]
     assert attempts["server_error"] > 0 < attempts["overloaded"]
-    assert run.summary["attempts_of_unknown_cost"] == attempts["server_error"]
-    assert run.summary["set_aside_usd"] == pytest.approx(0.137 * attempts["server_error"], rel=0.1)
+    unknown = attempts["server_error"] + attempts["overloaded"]
+    assert run.summary["attempts_of_unknown_cost"] == unknown
+    assert run.summary["set_aside_usd"] == pytest.approx(0.137 * unknown, rel=0.1)
 
 
 async def test_a_dry_run_makes_no_file(merge_runner, tmp_path):
