@@ -104,6 +104,12 @@ class Spending:
         """How often the worst case is set aside: more than once where a server ignores the cap."""
         return self.overruns.get(driver, 1.0)
 
+    @property
+    def dearest(self) -> str:
+        """How much more than their worst case replies cost at most, by driver, in words."""
+        ratios = self.overruns.items()
+        return ", ".join(f"{driver} up to {ratio:.2f} times as much" for driver, ratio in ratios)
+
 
 _SPENDING = TypeAdapter(Spending)
 _SET_ASIDE = TypeAdapter(list[SetAside])

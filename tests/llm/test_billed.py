@@ -7,9 +7,11 @@ tells in `usage`, and the whole output cap for each request that no reply shows 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
+from collections.abc import Iterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import pytest
 from aiohttp import web
@@ -30,6 +32,7 @@ from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.ledger import Ledger
@@ -56,10 +59,8 @@ class Till:
     wire: str
     tells: bool
     pricing: object
-    output_tokens: int | None = None
+    writes: Iterator[int] | None = None
     usd: float = 0.0
-    largest: float = 0.0
-    replies: list[int] = field(default_factory=list)
 
     @web.middleware
     async def middle(self, request, handler):
@@ -74,7 +75,6 @@ class Till:
             reply = web.json_response(body, status=reply.status, headers=headers)
         billed = self.billed(reply, body, most)
         self.usd += billed - most
-        self.largest = max(self.largest, billed)
         return reply
 
     def price(self, tokens_in, tokens_out):
@@ -88,8 +88,8 @@ class Till:
             return None
         part = body[0] if isinstance(body, list) else body
         error = reply.status != 200 or "error" in part
-        if (error and self.tells) or self.output_tokens:
-            part.update(self.usage(self.output_tokens or LONG))
+        if (error and self.tells) or self.writes:
+            part.update(self.usage(next(self.writes) if self.writes else LONG))
         return body
 
     def usage(self, tokens):
@@ -148,7 +148,7 @@ async def billing(till, faults):
         await runner.cleanup()
 
 
-async def asked(cache, till, faults, *, cap, name, calls=CALLS):
+async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None, allowance=1):
     """Ask for samples at once under a cap of so many worst cases; returns client and cap in USD."""
     entry = entry_of(till.wire)
     async with billing(till, faults) as url:
@@ -164,7 +164,9 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS):
             pricing=pricing(entry),
         )
         worst = pricing(entry).cost_usd(client._worst_case(client._request(PROMPT, slot(0))))
-        client.budget = Budget(Ledger(cache, name), cap_usd=cap * worst, trial_usd=worst)
+        client.first = first or client.first
+        ledger = Ledger(cache, name)
+        client.budget = Budget(ledger, cap_usd=cap * worst, trial_usd=allowance * worst)
 
         async def ask(number):
             try:
@@ -198,3 +200,45 @@ async def test_no_scenario_bills_more_than_the_cap(cache, scenario, wire, tells)
     assert client.meter.outcomes
     assert till.usd <= cap_usd + 1e-9
     assert till.usd <= spending.committed_usd + 1e-9
+
+
+def after(honest, *dear):
+    """So many replies within the cap, and then longer ones."""
+    return itertools.chain(itertools.repeat(1_000, honest), itertools.cycle(dear))
+
+
+@pytest.mark.parametrize("wire", MODELS)
+@pytest.mark.parametrize(
+    ("writes", "from_now_on"),
+    [
+        pytest.param(lambda: after(0, 19_500), 1.2, id="always a fifth too long"),
+        pytest.param(lambda: after(0, 64_000), 4.0, id="always four times too long"),
+        pytest.param(lambda: after(5, 31_000), 1.9, id="after honest ones"),
+        pytest.param(lambda: after(2, 17_000, 20_000, 25_000, 40_000), 2.5, id="ever longer"),
+    ],
+)
+@in_virtual_time
+async def test_a_server_that_ignores_the_output_cap_does_not_pass_the_other_one(
+    cache, wire, writes, from_now_on
+):
+    till = Till(wire, tells=False, pricing=pricing(entry_of(wire)), writes=writes())
+    name = f"https://endless/{from_now_on}/{wire}"
+    client, cap_usd = await asked(
+        cache, till, FaultPlan(), cap=10.5, name=name, calls=60, first=FirstCall(), allowance=4
+    )
+    spending = client.budget.ledger.read()
+    assert 0.6 * cap_usd < till.usd <= cap_usd
+    assert spending.spent_usd == pytest.approx(till.usd)
+    assert spending.times(client.driver) == pytest.approx(from_now_on, rel=0.05)
+    assert any("does not keep to the cap of 16000 output" in note for note in client.meter.notes)
+
+
+@pytest.mark.parametrize("wire", MODELS)
+@in_virtual_time
+async def test_the_last_reply_alone_can_pass_the_cap_and_nothing_is_asked_after_it(cache, wire):
+    till = Till(wire, tells=False, pricing=pricing(entry_of(wire)), writes=after(3, 64_000))
+    name = f"https://at-the-end/{wire}"
+    client, cap_usd = await asked(cache, till, FaultPlan(), cap=1.5, name=name, first=FirstCall())
+    dearest = till.price(40, 64_000)
+    assert cap_usd < till.usd < cap_usd + dearest
+    assert client.meter.outcomes.total() == 4
