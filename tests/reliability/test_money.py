@@ -244,3 +244,67 @@ async def test_a_dry_run_makes_no_file(merge_runner, tmp_path):
     before = sorted(path.name for path in tmp_path.rglob("*"))
     assert (await merge_runner(*SWEEP, "--dry-run")).code == 0
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
+
+
+async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(merge_runner):
+    async def middle(request, handler):
+        reply = await handler(request)
+        if server.requests in (3, 5):
+            return web.Response(status=502, text="<html>502 Bad Gateway</html>")
+        return reply
+
+    async with watched(middle) as server:
+        env = account(server)
+        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
+        assert (await merge_runner(*sweep, **env)).code == 0
+    told = await merge_runner("ledger")
+    driver = f"o3 at {server.url.removeprefix('http://')}"
+    assert "baseline/o3/set0: 0." in told.out
+    assert f"for 2 attempts of {driver}: server_error, 20" in told.out
+    assert "(as L_4_0 rep 1 " in told.out
+    (account_before,) = json.loads((await merge_runner("ledger", "--json")).out)
+    assert account_before["open_attempts"] == account_before["reasons"][0]["attempts"] == 2
+    asked = await merge_runner("ledger", "--release", "baseline/o3/set0")
+    assert asked.code == 2
+    assert "--max-cost may be passed by as much" in asked.err
+    assert "add --yes" in asked.err
+    unknown = await merge_runner("ledger", "--release", "other/o3/set0", "--yes")
+    assert (unknown.code, "valid: baseline/o3/set0" in unknown.err) == (2, True)
+    released = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes", "--json")
+    (after,) = json.loads(released.out)
+    assert (after["reserved_usd"], after["open_attempts"]) == (0, 0)
+    assert after["releases"][0]["usd"] == pytest.approx(account_before["reserved_usd"])
+    assert after["spent_usd"] == account_before["spent_usd"]
+    shown = await merge_runner("ledger")
+    assert "USD were released on 20" in shown.out
+    assert shown.out.count("server_error") == 1
+
+
+async def test_nothing_is_released_while_another_run_asks(merge_runner):
+    async def middle(request, handler):
+        if server.requests > 1:
+            arrived.set()
+            await asyncio.Event().wait()
+        return await handler(request)
+
+    arrived = asyncio.Event()
+    async with watched(middle) as server:
+        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
+        process = await merge_runner.fork(*sweep, **account(server))
+        await arrived.wait()
+        told = await merge_runner("ledger")
+        refused = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes")
+        process.kill()
+        await process.wait()
+    assert "1 attempts of o3 at" in told.out
+    assert "in flight now, or when a run was killed" in told.out
+    assert refused.code == 2
+    assert "another merge-runner works with" in refused.err
+    done = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes")
+    assert (done.code, "0.0000 set aside for 0 attempts" in done.out) == (0, True)
+
+
+async def test_a_folder_without_a_cache_has_no_ledger(merge_runner, tmp_path):
+    run = await merge_runner("ledger", "--cache", tmp_path / "none")
+    assert (run.code, "nothing was spent" in run.err) == (2, True)
+    assert not (tmp_path / "none").exists()

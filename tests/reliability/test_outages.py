@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import time
 from unittest.mock import ANY
 
 import pytest
 from aiohttp import web
 from harness import FAST, watched
+from llm.test_limiter import fullest_window
 
 from merge_runner.records import SLOT_HEADER
 
@@ -233,3 +236,36 @@ async def test_what_is_configured_wrongly_ends_the_run_at_its_first_call(
     assert advice in run.summary["messages"][0]
     assert run.summary["set_aside_usd"] == (0 if "does not speak" not in advice else ANY)
     assert run.summary["trials"]["failed"] == 0
+
+
+async def test_two_sweeps_on_one_key_share_its_limits(merge_runner):
+    times = []
+
+    async def middle(request, handler):
+        times.append(time.monotonic())
+        return await handler(request)
+
+    sweep = ("sweep", "baseline", "--reps", 1, "--model", "o3", "--yes", "--json", "--rpm", 600)
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        runs = await asyncio.gather(
+            *(
+                merge_runner(
+                    *sweep,
+                    "--conditions",
+                    name,
+                    "--cache",
+                    name,
+                    "--db",
+                    name,
+                    "--tpm",
+                    10**9,
+                    **env,
+                )
+                for name in ("L_4_0", "N_0_0")
+            )
+        )
+    assert [run.code for run in runs] == [0, 0], [run.err for run in runs]
+    # As on a cluster: half a second's worth goes at a time, and may come a little late.
+    assert fullest_window(times, [1] * len(times), length=1.0) <= 1.5 * 10 + 1
+    assert times[-1] - times[0] >= (len(times) - 10) / 10
