@@ -257,7 +257,7 @@ async def test_two_sweeps_on_one_key_share_its_limits(merge_runner):
                     "--cache",
                     name,
                     "--db",
-                    name,
+                    f"{name}.duckdb",
                     "--tpm",
                     10**9,
                     **env,
