@@ -32,6 +32,7 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _HEAD = struct.Struct("qd")  # requests sent ever, and until when all are to wait
 _BUCKETS = struct.Struct("qq" * BUCKETS)  # the number of half a second, and its tokens
 _TIME = struct.Struct("d")
+SIZE = _HEAD.size + _BUCKETS.size + MOST_REQUESTS * _TIME.size
 
 
 class SharedLimits:
@@ -49,7 +50,7 @@ class SharedLimits:
         window_s: float = WINDOW_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._file = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        self._file = _opened(file)
         self._rules = request_rules(rpm, window_s) if rpm and rpm <= MOST_REQUESTS else []
         self._tpm = tpm
         self._window_s = window_s
@@ -117,8 +118,7 @@ class SharedLimits:
 
     def _head(self, now: float) -> tuple[int, float]:
         """How many were sent ever, and until when all wait."""
-        head = os.pread(self._file, _HEAD.size, 0)
-        sent, paused_until = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0.0)
+        sent, paused_until = _HEAD.unpack(os.pread(self._file, _HEAD.size, 0))
         if self._sent_at(sent, 1) > now:  # by a clock that has begun anew since
             sent, paused_until = 0, 0.0
         return sent, max(paused_until, self._paused_until)
@@ -128,8 +128,10 @@ class SharedLimits:
 
     def _sent_at(self, sent: int, back: int) -> float:
         """When the last request but so many was sent."""
-        found = os.pread(self._file, _TIME.size, self._place(sent - back)) if sent >= back else b""
-        return float(_TIME.unpack(found)[0]) if len(found) == _TIME.size else 0.0
+        if sent < back:
+            return 0.0
+        at: float = _TIME.unpack(os.pread(self._file, _TIME.size, self._place(sent - back)))[0]
+        return at
 
     @staticmethod
     def _place(number: int) -> int:
@@ -137,14 +139,13 @@ class SharedLimits:
 
     def _buckets(self, now: float) -> dict[int, int]:
         """The tokens of each half second that the window still holds, with what was owed."""
-        text = os.pread(self._file, _BUCKETS.size, _HEAD.size)
-        numbers = _BUCKETS.unpack(text) if len(text) == _BUCKETS.size else ()
+        numbers = _BUCKETS.unpack(os.pread(self._file, _BUCKETS.size, _HEAD.size))
         oldest = (now - self._window_s) / BUCKET_S - 1
         pairs = zip(numbers[::2], numbers[1::2], strict=True)
         kept = {n: tokens for n, tokens in pairs if tokens and oldest < n <= now / BUCKET_S}
         for number, tokens in self._owed:
-            if number in kept:
-                kept[number] += tokens
+            if number > oldest:
+                kept[number] = kept.get(number, 0) + tokens
         self._owed.clear()
         return kept
 
@@ -177,18 +178,36 @@ def limits_file(base_url: str, model: str, secrets: Mapping[str, str]) -> Path:
     return _own_folder() / hashlib.sha256(what.encode()).hexdigest()[:32]
 
 
+def _opened(file: Path) -> int:
+    """The file, at its whole size, so that no full disk is found in the midst of a run."""
+    try:
+        opened = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        if hasattr(os, "posix_fallocate"):  # not on macOS
+            os.posix_fallocate(opened, 0, SIZE)
+        else:
+            os.ftruncate(opened, SIZE)
+    except OSError as exc:
+        raise _unusable(file, exc) from exc
+    return opened
+
+
+def _unusable(place: Path, exc: OSError) -> UsageError:
+    return UsageError(
+        f"{place}, where sweeps share the limits of a key, cannot be used: {exc.strerror}. "
+        "Name another folder with XDG_RUNTIME_DIR"
+    )
+
+
 def _own_folder() -> Path:
     """A folder of this user alone, of this machine."""
-    parent = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
+    runtime = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
+    parent = runtime if runtime.is_dir() else Path(tempfile.gettempdir())
     folder = parent / f"merge-runner-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()
     except OSError as exc:
-        raise UsageError(
-            f"{folder}, where sweeps share the limits of a key, cannot be used: {exc.strerror}. "
-            "Name another folder with XDG_RUNTIME_DIR"
-        ) from exc
+        raise _unusable(folder, exc) from exc
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
         raise UsageError(
             f"{folder}, where sweeps share the limits of a key, is not yours alone: remove it, or "

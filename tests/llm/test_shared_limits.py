@@ -152,3 +152,18 @@ def test_a_folder_that_others_could_have_made_is_refused(kind, tmp_path, monkeyp
         folder.write_text("")
     with pytest.raises(UsageError, match="XDG_RUNTIME_DIR"):
         limits_file("https://api.openai.com/v1", "o3", KEY)
+
+
+def test_a_file_that_cannot_be_made_is_told_in_one_line(tmp_path):
+    (tmp_path / "key").symlink_to("elsewhere")
+    with pytest.raises(UsageError, match="XDG_RUNTIME_DIR"):
+        SharedLimits(tmp_path / "key", rpm=60)
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_without_the_folder_that_the_system_names_the_one_for_temporary_files_is_used(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "gone"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert limits_file("https://api.openai.com/v1", "o3", KEY).parent.parent == tmp_path
