@@ -103,7 +103,8 @@ import sys, time
 from pathlib import Path
 from merge_runner.llm.shared_limits import SharedLimits
 shared = SharedLimits(Path(sys.argv[1]), rpm=240)
-until = float(sys.argv[2])
+print("ready", flush=True)
+until = float(input())
 while time.monotonic() < until:
     wait = shared.take(0)
     if wait:
@@ -114,12 +115,17 @@ while time.monotonic() < until:
 
 
 def test_two_processes_keep_one_limit(tmp_path):
-    until = str(time.monotonic() + 2.5)
-    command = [sys.executable, "-c", SENDS, str(tmp_path / "key"), until]
-    both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    command = [sys.executable, "-c", SENDS, str(tmp_path / "key")]
+    piped = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    both = [subprocess.Popen(command, **piped) for _ in range(2)]
+    assert [process.stdout.readline() for process in both] == ["ready\n"] * 2
+    until = f"{time.monotonic() + 2}\n"
+    for process in both:
+        process.stdin.write(until)
+        process.stdin.flush()
     sent = [[float(line) for line in process.communicate()[0].split()] for process in both]
     times = sorted(sent[0] + sent[1])
-    assert min(map(len, sent)) > 0
+    assert len(times) > 5
     assert fullest_window(times, [1] * len(times), 1.0) <= 4 + 2
 
 
