@@ -213,9 +213,7 @@ class LlmClient:
                 await self.budget.admit(order)
         if self.sealed:
             return await self._make(request, order, ())
-        with self._giving_way(request, f"for the first answer of {self.driver}"):
-            alone = not self.first.passed and await self.first.turn()
-        stopped = False
+        alone, stopped = await self._goes_alone(request), False
         try:
             return await self._unless_made(request, order)
         except SweepStopped:
@@ -224,6 +222,13 @@ class LlmClient:
         finally:
             if alone and not stopped:
                 self.first.give_turn()
+
+    async def _goes_alone(self, request: ChatRequest) -> bool:
+        """Wait for the first answer of the run; True: it is for this call to bring it."""
+        if self.first.passed:
+            return False
+        with self._giving_way(request, f"for the first answer of {self.driver}"):
+            return await self.first.turn()
 
     async def _unless_made(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
         """Make a call unless another process does."""
@@ -401,11 +406,10 @@ class LlmClient:
 
     def _check_endpoint(self, raw: RawReply, verdict: Verdict) -> None:
         """End the run at its first call where no other one would fare better."""
-        why = None
-        if not self.first.passed and not (self.first.known and verdict.action == "retry"):
+        if not self.first.passed:
             why = refusal(self.name, self.entry, raw, verdict)
-        if why is not None:
-            raise EndpointRefused(f"{self.driver}: {why}")
+            if why is not None and self.first.is_final(verdict):
+                raise EndpointRefused(f"{self.driver}: {why}")
         if verdict.action == "accept":
             self.first.answered()
 

@@ -15,6 +15,7 @@ from merge_runner.llm.formats.base import as_dict, as_text
 from merge_runner.llm.verdicts import RawReply, Verdict, is_web_page
 
 NOBODY_S = 5.0
+SEVERAL = 3
 REGISTRY = "experiments/models.toml"
 REQUEST_ITSELF = (400, 413, 422, 429)
 
@@ -25,6 +26,7 @@ class FirstCall:
     def __init__(self, *, passed: bool = False, known: bool = False) -> None:
         self.passed = passed
         self.known = known
+        self._refused = 0
         self._alone = asyncio.Lock()
 
     async def turn(self) -> bool:
@@ -37,6 +39,11 @@ class FirstCall:
     def give_turn(self) -> None:
         """The call that went alone has ended, and another one may go."""
         self._alone.release()
+
+    def is_final(self, verdict: Verdict) -> bool:
+        """Whether a refusal is of all calls: who has answered before may mean this one alone."""
+        self._refused += verdict.action == "fail"
+        return not self.known or self._refused >= SEVERAL or verdict.action == "accept"
 
     def answered(self) -> None:
         """The endpoint has answered in its format."""

@@ -172,3 +172,19 @@ async def test_a_web_page_is_free_where_no_model_ever_answered_and_may_be_charge
     gateway = begin(WEB_PAGE, answer(), price=PRICE, cap=1.0, known=True)
     assert (await gateway.ask("prompt", slot())).outcome == "ok"
     assert gateway.budget.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_where_a_model_has_answered_before_one_refused_prompt_does_not_end_every_run(begin):
+    client = begin(error(400), error(400), answer(), known=True)
+    first, second, *others = await results(ask_all(client))
+    assert isinstance(first, CallFailed)
+    assert isinstance(second, CallFailed)
+    assert [reply.outcome for reply in others] == ["ok"] * 3
+    changed = begin(error(400, "unknown parameter"), known=True)
+    tasks = [asyncio.create_task(changed.ask("another", slot(n))) for n in range(9)]
+    with pytest.raises(EndpointRefused, match="unknown parameter"):
+        await tasks[2]
+    await changed.drain()
+    await results(tasks)
+    assert len(changed.transport.sent) == 3
