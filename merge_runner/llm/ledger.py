@@ -7,7 +7,7 @@ case until a user releases it, and is found in the call's list of attempts as on
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
@@ -211,11 +211,11 @@ class Ledger:
         return released
 
     def _settle(
-        self, key: str, attempts: Iterable[Attempt], worst_usd: float, actual_usd: float | None
+        self, key: str, attempts: Sequence[Attempt], worst_usd: float, actual_usd: float | None
     ) -> None:
         *earlier, one = self._opened(key) or [SetAside(worst_usd, UNNAMED, _now())]
         if actual_usd is None:
-            outcome = next((attempt.outcome for attempt in reversed([*attempts])), IN_FLIGHT)
+            outcome = attempts[-1].outcome if attempts else IN_FLIGHT
             self._write_open(key, [*earlier, replace(one, outcome=outcome)])
             return
         self._write_open(key, earlier)
@@ -227,7 +227,8 @@ class Ledger:
             spending.reserved_usd = 0.0  # what is left is rounding
         if actual_usd > worst_usd + TOLERANCE_USD:
             spending.overrun_usd += actual_usd - worst_usd
-            driver, ratio = one.asked.driver, actual_usd / (one.asked.honest_usd or worst_usd)
+            driver, honest_usd = one.asked.driver, one.asked.honest_usd or worst_usd
+            ratio = actual_usd / max(honest_usd, TOLERANCE_USD)
             spending.overruns[driver] = max(ratio, spending.times(driver))
         self._write(spending)
 
