@@ -18,7 +18,8 @@ from merge_runner.database import SCHEMA
 from merge_runner.drivers.llm_driver import LlmDriver
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import make_request
-from merge_runner.llm.limiter import BURST_S, Limiter
+from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.shared_limits import BURST_S
 from merge_runner.plan import Choice, make_plan
 from merge_runner.records import SIDES, Attempt, ChatReply, Side, Slot, TrialRecord, TrialSpec
 from merge_runner.rows import rows_of

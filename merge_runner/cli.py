@@ -275,6 +275,49 @@ def audit(
 
 
 @app.command()
+def ledger(
+    cache: CacheOption = DEFAULT_CACHE,
+    release: Annotated[
+        str | None,
+        typer.Option("--release", metavar="SWEEP", help="Count no longer what is set aside."),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before releasing.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Show what each sweep has spent, and what is set aside and why; or release that."""
+    from merge_runner import spending
+
+    if release is None:
+        found = spending.accounts(cache)
+    else:
+        aside = spending.account(cache, release).spending
+        _agree(
+            f"{aside.reserved_usd:.4f} USD are set aside for {aside.open_attempts} attempts at "
+            f"{release}. If the provider did charge for them, --max-cost may be passed by as much",
+            yes=yes,
+        )
+        found = [spending.release(cache, release)]
+    if as_json:
+        print_out(json.dumps([each.as_dict() for each in found], ensure_ascii=False))
+        return
+    for line in chain.from_iterable(each.lines() for each in found):
+        print_out(line)
+    if not found:
+        print_out("No sweep has spent anything.")
+
+
+def _agree(what: str, *, yes: bool) -> None:
+    """Say what a release means, and ask once."""
+    say(what)
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise UsageError("there is no terminal to ask at: add --yes to release it")
+    if not typer.confirm("Release it?", err=True):
+        raise UsageError("nothing was released")
+
+
+@app.command()
 def models() -> None:
     """List the registry: provider, id, key, price, known shutdown date."""
     from merge_runner.config import Price, key_status, load_models

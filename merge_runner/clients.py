@@ -20,9 +20,11 @@ from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.claims import Claims
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.prices import pricing
+from merge_runner.llm.shared_limits import SharedLimits, limits_file
 from merge_runner.llm.sharing import Desk
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.plan import Limits
@@ -47,12 +49,15 @@ class Terms:
 class Addressed:
     """Whom a sweep asks: the identities of its endpoints, and the variables of their base URLs.
 
-    ``strict`` stops at an answer of another model.
+    ``known`` are the models whose endpoint has ever answered in its format, ``passed`` those where
+    it has done so in this run. ``strict`` stops at an answer of another model.
     """
 
     endpoints: Mapping[str, str]
     urls: Mapping[str, str]
     strict: bool = False
+    known: frozenset[str] = frozenset()
+    passed: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,12 +118,28 @@ def open_desk(
                 rpm=limits.rpm or entry.rpm,
                 tpm=limits.tpm or entry.tpm,
                 pause=pauses.setdefault(endpoints[name], Pause()),
+                shared=_shared_limits(name, entry, limits, stack),
             )
             for name, entry in entries.items()
         },
         budget=Budget(terms.ledger, cap_usd=limits.max_cost_usd, trial_usd=terms.trial_usd),
         claims=claims,
     )
+
+
+def _shared_limits(
+    name: str, entry: ModelEntry, limits: Limits, stack: AsyncExitStack
+) -> SharedLimits | None:
+    """What all sweeps of this user with one key keep together; our own emulator has no key."""
+    rpm, tpm = limits.rpm or entry.rpm, limits.tpm or entry.tpm
+    own_emulator = entry.provider == "emulator" and running_emulator_url() is None
+    if own_emulator or (rpm is None and tpm is None):
+        return None
+    endpoint = resolve_endpoint(name, entry)
+    file = limits_file(endpoint.base_url, entry.id, endpoint.auth_headers)
+    shared = SharedLimits(file, rpm=rpm, tpm=tpm)
+    stack.callback(shared.close)
+    return shared
 
 
 async def reached(
@@ -165,6 +186,7 @@ def live_clients(
             budget=None if entry.price == "free" else desk.budget,
             claims=desk.claims,
             strict=addressed.strict,
+            first=FirstCall(passed=name in addressed.passed, known=name in addressed.known),
         )
     return clients
 

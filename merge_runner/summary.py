@@ -54,6 +54,7 @@ class Summary:
             "sweep_cost_usd": round(outcome.spending.spent_usd, 6),
             "set_aside_usd": round(outcome.spending.reserved_usd, 6),
             "attempts_of_unknown_cost": outcome.spending.open_attempts,
+            "overrun_usd": round(outcome.spending.overrun_usd, 6),
             "cache_cost_usd": round(outcome.cache_cost_usd, 6),
             "damaged_entries": outcome.damaged,
             "playing_s": round(outcome.playing_s, 3),
@@ -143,11 +144,16 @@ class Summary:
                 f"this sweep over all its runs: {spending.spent_usd:.4f} USD"
                 + (
                     f", and {spending.reserved_usd:.4f} set aside for {open_ones} attempts of "
-                    "unknown cost"
+                    "unknown cost (`merge-runner ledger` says why)"
                     if open_ones
                     else ""
                 )
                 + f"; all replies in {self.options.cache}: {outcome.cache_cost_usd:.4f} USD"
+            )
+        if spending.overrun_usd:
+            yield (
+                f"WARNING: replies cost {spending.overrun_usd:.4f} USD more than their worst case "
+                f"({spending.dearest}): the server does not keep to the output cap"
             )
 
     def mismatches(self) -> dict[str, int]:

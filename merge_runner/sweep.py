@@ -292,7 +292,12 @@ class Sweep:
         terms = Terms(options.limits, self._ledger, worst_trial_usd(plan))
         desk = open_desk(plan.entries, self._endpoints, self._cache, terms, stack)
         urls = await reached(plan.entries, options.emulator_options, stack)
-        addressed = Addressed(self._endpoints, urls, options.strict_model)
+        known = frozenset(
+            name
+            for name, entry in plan.entries.items()
+            if self._endpoints[name] in self._cache.facts(entry.id).totals
+        )
+        addressed = Addressed(self._endpoints, urls, options.strict_model, known)
         if options.dask is None:
             clients = live_clients(
                 plan.entries,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,10 @@ from hypothesis import settings
 from zygote import Zygote
 
 from merge_runner.store import results_digest
+
+RUNTIME = tempfile.TemporaryDirectory()
+# Limits of a key that another test used must hold up none.
+os.environ["XDG_RUNTIME_DIR"] = RUNTIME.name
 
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)

@@ -15,7 +15,7 @@ from analysis.commands import app
 
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
-    *("tables", "figures", "report", "explain", "human", "view"),
+    *("tables", "figures", "report", "explain", "human", "ledger", "view"),
 }
 # The promised options; more may be there.
 SWEEP_OPTIONS = {
@@ -59,6 +59,7 @@ def test_the_menu_is_what_was_promised():
         (["digest", "--db", "no.duckdb"], "there is no database no.duckdb"),
         (["sql", "select 1", "--format", "xml"], "csv"),
         (["recording", "export", "x.parquet"], "there is no database"),
+        (["ledger", "--cache", "none"], "there is no cache in none, so nothing was spent"),
         (["tables"], "there is no database"),
         (["tables", "--format", "xml"], "latex"),
         (["report"], "there is no database"),

@@ -15,6 +15,7 @@ import secrets
 import socket
 from collections import Counter, deque
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from distributed import Client, Future
@@ -215,7 +216,7 @@ class Coordinator:
             specs=tuple(specs),
             in_flight=session.in_flight,
             plan=self._plan,
-            addressed=self._addressed,
+            addressed=replace(self._addressed, passed=self._passed()),
             folder=self._folder,
             limited=self._limited,
             pauses_s={
@@ -224,6 +225,10 @@ class Coordinator:
                 if name not in self._limited
             },
         )
+
+    def _passed(self) -> frozenset[str]:
+        """The models that have answered in this run: no worker needs to try them alone."""
+        return frozenset(name for name in self._plan.entries if self.answers(name))
 
     async def _serve(self, comm: Comm) -> None:
         """Serve a worker's batch from its first word until it is gone."""

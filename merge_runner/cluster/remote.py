@@ -12,6 +12,7 @@ from merge_runner.cluster.link import Link
 from merge_runner.errors import RecordingError
 from merge_runner.llm.batches import Operation
 from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.ledger import Asked
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.sharing import Turns
 from merge_runner.records import Attempt
@@ -202,13 +203,16 @@ class RemoteBudget:
         """The trial has ended or is suspended."""
         self.link.tell("leave", trial)
 
-    async def reserve(self, trial: int, worst_usd: float) -> None:
-        """Set an attempt's worst case aside."""
-        await self.link.ask("reserve", trial, worst_usd)
+    async def reserve(self, trial: int, worst_usd: float, driver: str) -> float:
+        """Set an attempt's worst case aside; returns what is set aside."""
+        aside_usd: float = await self.link.ask("reserve", trial, worst_usd, driver)
+        return aside_usd
 
-    async def begin(self, key: str, attempts: list[Attempt], worst_usd: float) -> None:
+    async def begin(
+        self, key: str, attempts: list[Attempt], worst_usd: float, asked: Asked
+    ) -> None:
         """The attempt is sent now."""
-        await self.link.ask("begin", key, attempts, worst_usd)
+        await self.link.ask("begin", key, attempts, worst_usd, asked)
 
     def give_back(self, trial: int, worst_usd: float) -> None:
         """The attempt was not begun."""

@@ -11,6 +11,7 @@ from merge_runner.cluster.batch import Batch, Told
 from merge_runner.cluster.link import Link, rebuilt
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended
 from merge_runner.llm.cache import Entry
+from merge_runner.llm.ledger import Asked
 from merge_runner.llm.limiter import Permit
 from merge_runner.llm.meter import Meter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec
@@ -153,13 +154,16 @@ class Session:
         self._desk.limiters[name].pause(seconds)
         self._run.tell_pause(self, name, seconds)
 
-    async def _reserve(self, trial: int, worst_usd: float) -> None:
-        await self._desk.budget.reserve(trial, worst_usd)
+    async def _reserve(self, trial: int, worst_usd: float, driver: str) -> float:
+        aside_usd = await self._desk.budget.reserve(trial, worst_usd, driver)
         self._open_attempts += 1
-        self._queued_usd += worst_usd
+        self._queued_usd += aside_usd
+        return aside_usd
 
-    async def _begin(self, key: str, attempts: list[Attempt], worst_usd: float) -> None:
-        await self._desk.budget.begin(key, attempts, worst_usd)
+    async def _begin(
+        self, key: str, attempts: list[Attempt], worst_usd: float, asked: Asked
+    ) -> None:
+        await self._desk.budget.begin(key, attempts, worst_usd, asked)
         self._queued_usd -= worst_usd
 
     def _give_back(self, trial: int, worst_usd: float) -> None:

@@ -4,6 +4,11 @@ The worst case of an attempt is set aside when it queues for its turn, and durab
 right before it is sent. So that money ends trials instead of beginning ever more of them, a trial
 gets an allowance when it first spends: the worst case of a whole trial. Trials get theirs in the
 order of the sweep, as those before them end.
+
+A server may ignore the output cap. What a reply cost more is taken from what is left, and from then
+on as many times the worst case is set aside as the dearest reply of that driver has cost. Several
+attempts are in flight only while twice their worst cases fit, so that one reply at most, the last
+one, can pass the cap.
 """
 
 from __future__ import annotations
@@ -13,7 +18,7 @@ import contextlib
 from collections.abc import Iterable
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.ledger import TOLERANCE_USD, Ledger
+from merge_runner.llm.ledger import TOLERANCE_USD, UNNAMED, Asked, Ledger
 from merge_runner.records import Attempt
 
 PATIENCE_S = 90.0
@@ -37,6 +42,7 @@ class Budget:
         self._stuck: set[int] = set()
         self._left: set[int] = set()
         self._in_flight = 0
+        self._largest_usd = 0.0
         self._queued_usd = 0.0
         self._changed = asyncio.Event()
 
@@ -82,10 +88,14 @@ class Budget:
         self._queued_usd -= queued_usd
         self._tell()
 
-    async def reserve(self, trial: int, worst_usd: float) -> None:
-        """Set an attempt's worst case aside; waits for others, else raises TrialSuspended."""
+    async def reserve(self, trial: int, worst_usd: float, driver: str = "") -> float:
+        """Set an attempt's worst case aside; waits for others, else raises TrialSuspended.
+
+        Returns what is set aside, which is more where the driver's server ignores the output cap.
+        """
         waited_s = 0.0
-        while not self._taken(trial, worst_usd):
+        honest_usd = worst_usd
+        while not self._taken(trial, worst_usd := honest_usd * self.ledger.spending.times(driver)):
             self._stuck.add(trial)
             try:
                 if not self._in_flight and (
@@ -96,11 +106,15 @@ class Budget:
             finally:
                 self._stuck.discard(trial)
         self._in_flight += 1
+        self._largest_usd = max(self._largest_usd, worst_usd)
         self._queued_usd += worst_usd
+        return worst_usd
 
-    async def begin(self, key: str, attempts: list[Attempt], worst_usd: float) -> None:
+    async def begin(
+        self, key: str, attempts: list[Attempt], worst_usd: float, asked: Asked = UNNAMED
+    ) -> None:
         """The attempt is sent now: what is set aside for it becomes durable."""
-        if not await self.ledger.reserve(key, attempts, worst_usd, self.cap_usd):
+        if not await self.ledger.reserve(key, attempts, worst_usd, self.cap_usd, asked):
             raise self._suspended("another run of the sweep spends from the same cap")
         self._queued_usd -= worst_usd
 
@@ -128,8 +142,11 @@ class Budget:
         if self.cap_usd is None:
             return True
         own = min(worst_usd, self._allowances.get(trial, 0.0))
-        allowed = sum(self._allowances.values())
-        if self._committed_usd + allowed + worst_usd - own > self.cap_usd + TOLERANCE_USD:
+        others = self._in_flight + 1 if self._in_flight else 0
+        spare_usd = max(
+            sum(self._allowances.values()) - own, others * max(worst_usd, self._largest_usd)
+        )
+        if self._committed_usd + worst_usd + spare_usd > self.cap_usd + TOLERANCE_USD:
             return False
         if own:
             self._allowances[trial] -= own
@@ -152,6 +169,17 @@ class Budget:
         self._changed = asyncio.Event()
 
     def _suspended(self, what: str) -> TrialSuspended:
+        spending, allowed = self.ledger.spending, sum(self._allowances.values())
+        aside = spending.reserved_usd + self._queued_usd
         return TrialSuspended(
-            f"{what}, and {self._committed_usd:.4f} of {self.cap_usd:g} USD are spent or set aside"
+            f"{what}, and {self._committed_usd:.4f} of {self.cap_usd:g} USD are spent or set aside "
+            f"({spending.spent_usd:.4f} spent"
+            + (
+                f", {aside:.4f} set aside for {spending.open_attempts} attempts whose cost is not "
+                "known: `merge-runner ledger`"
+                if aside
+                else ""
+            )
+            + ")"
+            + (f"; {allowed:.4f} more are kept for the trials that have begun" if allowed else "")
         )

@@ -244,6 +244,17 @@ class ResponseCache:
         """An operation: keep a text under a name that is no call key."""
         self._disk.set(name, text)
 
+    def remove(self, name: str) -> None:
+        """An operation: forget what is under a name that is no call key."""
+        self._disk.delete(name)
+
+    def names(self, prefix: str) -> list[str]:
+        """The names that begin so, of what is no call."""
+        try:
+            return [key for key in self._disk if key.startswith(prefix)]
+        except sqlite3.Error as exc:
+            raise CacheFailed(f"the cache {self.folder} cannot be read: {exc}") from exc
+
     def entries(self) -> Iterator[Entry]:
         """All entries, of the folder and of the overlay."""
         for key in self._keys():
@@ -262,10 +273,7 @@ class ResponseCache:
 
     def cost_usd(self) -> float:
         """What all entries of the folder cost when they were made."""
-        try:
-            models = [key.removeprefix(_MODEL) for key in self._disk if key.startswith(_MODEL)]
-        except sqlite3.Error as exc:
-            raise CacheFailed(f"the cache {self.folder} cannot be read: {exc}") from exc
+        models = [name.removeprefix(_MODEL) for name in self.names(_MODEL)]
         return sum(self.facts(model).cost_usd for model in models)
 
     def close(self) -> None:

@@ -39,6 +39,14 @@ class Claims:
             return False
         return True
 
+    def take_all(self) -> bool:
+        """Claim every key until this is closed; False while another process holds any."""
+        try:
+            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            return False
+        return True
+
     async def claim(self, key: str) -> bool:
         """Claim a key; see ``take``."""
         return self.take(key)

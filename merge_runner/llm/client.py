@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from typing import Any
 
 from merge_runner.config import ModelEntry, driver_name
@@ -17,12 +18,16 @@ from merge_runner.errors import (
     EndpointRefused,
     MergeRunnerError,
     ModelSwapped,
+    ProviderDown,
     QuotaExhausted,
     RecordingError,
+    SweepStopped,
 )
 from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.first_call import NOBODY_S, FirstCall, refusal, set_base_url, set_key
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import make_request
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked
 from merge_runner.llm.meter import Meter, Wait
 from merge_runner.llm.prices import Pricing
 from merge_runner.llm.retry import (
@@ -34,7 +39,7 @@ from merge_runner.llm.retry import (
 )
 from merge_runner.llm.sharing import Claiming, Purse, Turn, Turns
 from merge_runner.llm.transport import Transport, TransportFailure
-from merge_runner.llm.verdicts import RawReply, Verdict, judge, may_be_charged
+from merge_runner.llm.verdicts import RawReply, Verdict, is_web_page, judge, may_be_charged
 from merge_runner.records import (
     SCRIPTED_HEADER,
     Attempt,
@@ -48,13 +53,16 @@ from merge_runner.served import is_other_model
 
 EMPTY_RETRIES = 2
 CLAIM_POLL_S = 0.1
+MODELS = "`merge-runner models`"
 
 
 @dataclass(slots=True)
 class _Call:
     """A call under way: its attempts so far, of which the first ``earlier`` by earlier runs.
 
-    ``worst`` bounds its tokens, ``worst_usd`` its cost; ``spent_usd`` is what the answer cost.
+    ``worst`` bounds its tokens, ``worst_usd`` its cost where the server keeps to the output cap;
+    ``aside_usd`` is set aside for the attempt, and ``spent_usd`` what the answer cost.
+    ``began`` is when the call did, on the event loop's clock.
     """
 
     request: ChatRequest
@@ -63,6 +71,8 @@ class _Call:
     earlier: int
     worst: Usage
     worst_usd: float
+    began: float
+    aside_usd: float = 0.0
     spent_usd: float | None = None
 
 
@@ -73,7 +83,8 @@ class LlmClient:
     ``endpoint`` is the identity that enters the keys. A call that is under way is shared by all
     who ask for the same key, and goes on when they are cancelled, so that what is paid for is
     kept; ``drain`` waits for it. ``claims`` keep other processes from making the same call.
-    ``budget`` is that of a model which costs money. ``sealed`` says that nothing may be asked
+    ``budget`` is that of a model which costs money. ``first`` is the run's first call to the
+    endpoint, which goes alone. ``sealed`` says that nothing may be asked
     anew; ``strict`` that an answer of another model stops the sweep.
     """
 
@@ -88,6 +99,7 @@ class LlmClient:
     claims: Claiming | None = None
     sealed: bool = False
     strict: bool = False
+    first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
     meter: Meter = field(default_factory=Meter)
     _calls: dict[str, asyncio.Task[tuple[Entry, int]]] = field(default_factory=dict)
     _stopping: bool = False
@@ -194,13 +206,32 @@ class LlmClient:
         return call
 
     async def _claimed(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
-        """Make a call unless another process does; returns the entry and its earlier attempts."""
+        """Make a call when its turn has come; returns the entry and its earlier attempts."""
         if self.budget is not None:
             # Before the claim: nobody waits for money with a call that another process needs.
             with self._giving_way(request, "for trials before it to end, under --max-cost"):
                 await self.budget.admit(order)
         if self.sealed:
             return await self._make(request, order, ())
+        alone, stopped = await self._goes_alone(request), False
+        try:
+            return await self._unless_made(request, order)
+        except SweepStopped:
+            stopped = True  # nobody else is to try the same
+            raise
+        finally:
+            if alone and not stopped:
+                self.first.give_turn()
+
+    async def _goes_alone(self, request: ChatRequest) -> bool:
+        """Wait for the first answer of the run; True: it is for this call to bring it."""
+        if self.first.passed:
+            return False
+        with self._giving_way(request, f"for the first answer of {self.driver}"):
+            return await self.first.turn()
+
+    async def _unless_made(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
+        """Make a call unless another process does."""
         while self.claims is not None and not await self.claims.claim(request.key):
             with self._giving_way(request, "for another merge-runner that makes the same call"):
                 await asyncio.sleep(CLAIM_POLL_S)
@@ -217,7 +248,8 @@ class LlmClient:
         """Make attempts until there is an answer, and save it with all of them."""
         worst = self._worst_case(request)
         worst_usd = self.pricing.cost_usd(worst) or 0.0
-        call = _Call(request, order, list(earlier), len(earlier), worst, worst_usd)
+        began = asyncio.get_running_loop().time()
+        call = _Call(request, order, list(earlier), len(earlier), worst, worst_usd, began)
 
         async def take_turn() -> Turn:
             return await self._take_turn(call)
@@ -238,6 +270,12 @@ class LlmClient:
             answered = True
         except (OutOfTime, RequestFailed) as exc:
             made = len(call.attempts) - call.earlier
+            if isinstance(exc, OutOfTime) and not self.first.passed:
+                raise ProviderDown(
+                    f"{self.driver}: {exc} to the first call of this run ({_last_failure(call)}), "
+                    f"{made} attempts: nothing else is asked. When the service answers again, run "
+                    "the same command"
+                ) from exc
             raise CallFailed(
                 f"{self.name}: {exc} ({_last_failure(call)}), {made} attempts",
                 request,
@@ -254,7 +292,7 @@ class LlmClient:
         if self.budget is None:
             return await self.cache.put(entry)
         try:
-            return await self.budget.ledger.keep(entry, call.worst_usd, call.spent_usd)
+            return await self.budget.ledger.keep(entry, call.aside_usd, call.spent_usd)
         finally:
             self.budget.settled(call.order)
 
@@ -268,14 +306,14 @@ class LlmClient:
         """Money first: a permit must be used when it is given, or the limits do not hold."""
         if self.budget is not None:
             with self._giving_way(call.request, "for calls in flight to be paid, under --max-cost"):
-                await self.budget.reserve(call.order, call.worst_usd)
+                call.aside_usd = await self.budget.reserve(call.order, call.worst_usd, self.driver)
         permit: Turn | None = None
         try:
             with self._giving_way(call.request, "for a turn under the rate limits"):
                 permit = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
         finally:
             if permit is None and self.budget is not None:
-                self.budget.give_back(call.order, call.worst_usd)
+                self.budget.give_back(call.order, call.aside_usd)
         return permit
 
     @contextmanager
@@ -297,6 +335,8 @@ class LlmClient:
         await self._begin(call)
         started_at, started = datetime.now(UTC), time.perf_counter()
         spent: float | None = None
+        raw: RawReply | None = None
+        verdict: Verdict | None = None
         try:
             raw = await self.transport.send(
                 call.request, attempt=number, timeout_s=min(self.entry.timeout_s, seconds_left)
@@ -306,16 +346,18 @@ class LlmClient:
             spent = record.cost_usd
             self._settle_tokens(permit, record.usage)
         except TransportFailure as exc:
-            verdict = None
             free = self.entry.price == "free" or not exc.sent
             spent = 0.0 if free else None
             record = Attempt(number, exc.outcome, error=str(exc), cost_usd=spent)
         record = _timed(record, started_at, time.perf_counter() - started)
         call.attempts.append(record)
         self.meter.count_attempt(record)
+        self._tell_overrun(call, spent)
         try:
-            if verdict is None:
+            if raw is None or verdict is None:
+                self._give_up_on_nobody(call)
                 raise TryAgain(record.error or record.outcome)
+            self._check_endpoint(raw, verdict)
             self._act_on(verdict, call)
         except MergeRunnerError:
             await self._settle_failed(call, spent)
@@ -327,17 +369,49 @@ class LlmClient:
         if self.budget is None:
             return
         try:
-            await self.budget.begin(call.request.key, call.attempts, call.worst_usd)
+            asked = Asked(self.driver, _who(call.request.slot), call.worst_usd)
+            await self.budget.begin(call.request.key, call.attempts, call.aside_usd, asked)
         except MergeRunnerError:
-            self.budget.give_back(call.order, call.worst_usd)
+            self.budget.give_back(call.order, call.aside_usd)
             raise
 
     async def _settle_failed(self, call: _Call, spent_usd: float | None) -> None:
         if self.budget is not None:
             await self.budget.ledger.settle(
-                call.request.key, call.attempts, call.worst_usd, spent_usd
+                call.request.key, call.attempts, call.aside_usd, spent_usd
             )
-            self.budget.settled(call.order, call.worst_usd if spent_usd == 0 else 0.0)
+            self.budget.settled(call.order, call.aside_usd if spent_usd == 0 else 0.0)
+
+    def _tell_overrun(self, call: _Call, spent_usd: float | None) -> None:
+        if self.budget is None or (spent_usd or 0.0) <= call.aside_usd + TOLERANCE_USD:
+            return
+        self.meter.notes.append(
+            f"{self.driver}: {_who(call.request.slot)}: the reply cost {spent_usd:.4f} USD, and "
+            f"{call.aside_usd:.4f} were set aside for it: the server does not keep to the cap of "
+            f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
+        )
+
+    def _give_up_on_nobody(self, call: _Call) -> None:
+        """Where nothing was ever answered and nobody listens, waiting helps for seconds at most."""
+        waited_s = asyncio.get_running_loop().time() - call.began
+        if (
+            not self.first.passed
+            and call.attempts[-1].outcome == "no_connection"
+            and waited_s >= NOBODY_S
+        ):
+            raise EndpointRefused(
+                f"{self.driver}: nobody answers there ({_last_failure(call)}): check the network, "
+                f"or {set_base_url(self.name, self.entry)}"
+            )
+
+    def _check_endpoint(self, raw: RawReply, verdict: Verdict) -> None:
+        """End the run at its first call where no other one would fare better."""
+        if not self.first.passed:
+            why = refusal(self.name, self.entry, raw, verdict)
+            if why is not None and self.first.is_final(verdict):
+                raise EndpointRefused(f"{self.driver}: {why}")
+        if verdict.action == "accept":
+            self.first.answered()
 
     def _act_on(self, verdict: Verdict, call: _Call) -> None:
         attempts = call.attempts[call.earlier :]
@@ -374,10 +448,16 @@ class LlmClient:
 
     def _refusal_advice(self, verdict: Verdict) -> str:
         if verdict.outcome == "not_allowed":
-            return "the endpoint does not accept the key; check it"
+            return f"the endpoint does not accept the key; {set_key(self.name, self.entry)}"
         shutdown = self.entry.shutdown
         retired = f", which was announced to shut down on {shutdown}" if shutdown else ""
-        return f"the endpoint has no model {self.entry.id!r}{retired}; see `merge-runner models`"
+        other = "" if self._own_host else f", or {set_base_url(self.name, self.entry)}"
+        return f"the endpoint has no model {self.entry.id!r}{retired}; see {MODELS}{other}"
+
+    @property
+    def _own_host(self) -> str | None:
+        """The provider whose own host is asked; None: another server in its format."""
+        return self.entry.provider if self.endpoint == self.entry.provider else None
 
     def _record(self, number: int, raw: RawReply, verdict: Verdict) -> Attempt:
         usage = verdict.reading.usage
@@ -390,9 +470,18 @@ class LlmClient:
             usage=usage,
             reply=raw.body,
             error=verdict.message,
-            cost_usd=self.pricing.cost_usd(usage) if may_be_charged(raw) else 0.0,
+            cost_usd=self._cost_usd(raw, usage),
             scripted=SCRIPTED_HEADER in raw.headers or says_scripted(raw.body),
         )
+
+    def _cost_usd(self, raw: RawReply, usage: Usage) -> float | None:
+        """What a reply cost: by its usage, also in an error; None where that is not known."""
+        if self.entry.price == "free":
+            return 0.0
+        if usage.input_tokens and usage.output_tokens is not None:
+            return self.pricing.cost_usd(usage)
+        stray = raw.status == 200 and is_web_page(raw) and not self.first.known
+        return 0.0 if stray or not may_be_charged(raw, self._own_host) else None
 
     def _worst_case(self, request: ChatRequest) -> Usage:
         """An upper bound on a request's tokens: no tokeniser makes more tokens than bytes."""

@@ -1,43 +1,123 @@
 """What a sweep has spent, over all its runs: a durable number beside the replies it paid for.
 
 Before each attempt at a paid call the worst case is set aside, in one transaction with a note of
-the attempt. A process that dies leaves both: its attempt counts with the worst case for ever, and
-is found in the call's list of attempts as one of unknown fate.
+the attempt and of the reason. A process that dies leaves them: its attempt counts with the worst
+case until a user releases it, and is found in the call's list of attempts as one of unknown fate.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import CHECKSUM_LENGTH, Entry, ResponseCache, checksum
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
-_SPENT = "spent "
+IN_FLIGHT, UNRECORDED = "in flight", "not recorded"
+EXAMPLES = 3
+_SPENT, _OPEN = "spent ", "open "
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Who is asked, for which slot, and what that costs at most where the output cap is kept."""
+
+    driver: str = ""
+    slot: str = ""
+    honest_usd: float | None = None
+
+
+UNNAMED = Asked()
+
+
+@dataclass(frozen=True, slots=True)
+class SetAside:
+    """One attempt of unknown cost; ``outcome`` is IN_FLIGHT also where its process died."""
+
+    usd: float
+    asked: Asked
+    since: str
+    outcome: str = IN_FLIGHT
+
+
+@dataclass(slots=True)
+class Reason:
+    """Why something is set aside: ``attempts`` at one driver that came to the same outcome.
+
+    ``first`` and ``last`` are UTC in ISO 8601; ``slots`` are some of those that it was for.
+    """
+
+    driver: str
+    outcome: str
+    attempts: int = 0
+    usd: float = 0.0
+    first: str = ""
+    last: str = ""
+    slots: list[str] = field(default_factory=list)
+
+    def add(self, one: SetAside) -> None:
+        """Count an attempt."""
+        self.attempts += 1
+        self.usd += one.usd
+        self.first = min(self.first or one.since, one.since)
+        self.last = max(self.last, one.since)
+        if one.asked.slot not in self.slots and len(self.slots) < EXAMPLES:
+            self.slots.append(one.asked.slot)
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """What a user no longer counts, on his own responsibility, and why it had been set aside."""
+
+    at: str
+    usd: float
+    attempts: int
+    reasons: tuple[Reason, ...]
 
 
 @dataclass(slots=True)
 class Spending:
     """In USD: what attempts cost, and what is set aside for those whose cost is not known.
 
-    ``open_attempts`` are in flight, or nobody knows what became of them.
+    ``open_attempts`` are in flight, or nobody knows what became of them. ``overrun_usd`` is by how
+    much replies cost more than their worst case, ``overruns`` the largest such ratio by driver.
     """
 
     spent_usd: float = 0.0
     reserved_usd: float = 0.0
     open_attempts: int = 0
+    overrun_usd: float = 0.0
+    overruns: dict[str, float] = field(default_factory=dict)
+    releases: list[Release] = field(default_factory=list)
 
     @property
     def committed_usd(self) -> float:
         """What may have been spent, at worst."""
         return self.spent_usd + self.reserved_usd
 
+    def times(self, driver: str) -> float:
+        """How often the worst case is set aside: more than once where a server ignores the cap."""
+        return self.overruns.get(driver, 1.0)
+
+    @property
+    def dearest(self) -> str:
+        """How much more than their worst case replies cost at most, by driver, in words."""
+        ratios = self.overruns.items()
+        return ", ".join(f"{driver} up to {ratio:.2f} times as much" for driver, ratio in ratios)
+
 
 _SPENDING = TypeAdapter(Spending)
+_SET_ASIDE = TypeAdapter(list[SetAside])
+
+
+def scopes(cache: ResponseCache) -> list[str]:
+    """The names of all ledgers in a cache."""
+    return sorted(name.removeprefix(_SPENT) for name in cache.names(_SPENT))
 
 
 class Ledger:
@@ -50,10 +130,16 @@ class Ledger:
         self.spending = Spending()
         self._cache = cache
         self._name = _SPENT + scope
+        self._open = f"{_OPEN}{scope} "
         self.read()
 
     async def reserve(
-        self, key: str, attempts: list[Attempt], worst_usd: float, cap_usd: float | None
+        self,
+        key: str,
+        attempts: list[Attempt],
+        worst_usd: float,
+        cap_usd: float | None,
+        asked: Asked = UNNAMED,
     ) -> bool:
         """Set the worst case of a call's next attempt aside; False if that exceeds the cap."""
 
@@ -65,6 +151,7 @@ class Ledger:
             spending.reserved_usd += worst_usd
             spending.open_attempts += 1
             self._write(spending)
+            self._write_open(key, [*self._opened(key), SetAside(worst_usd, asked, _now())])
             self._cache.keep_unanswered(key, (*attempts, _begun(len(attempts) + 1)))
             return True
 
@@ -80,25 +167,85 @@ class Ledger:
         """
 
         def operation() -> None:
-            self._settle(worst_usd, actual_usd)
+            self._settle(key, attempts, worst_usd, actual_usd)
             self._cache.keep_unanswered(key, tuple(attempts))
 
         await self._cache.write(operation)
 
     async def keep(self, entry: Entry, worst_usd: float, actual_usd: float | None) -> Entry:
         """Keep an answered call, and settle its last attempt with it."""
-        return await self._cache.put(entry, lambda: self._settle(worst_usd, actual_usd))
+        key, attempts = entry.request.key, entry.attempts
+        return await self._cache.put(
+            entry, lambda: self._settle(key, attempts, worst_usd, actual_usd)
+        )
 
-    def _settle(self, worst_usd: float, actual_usd: float | None) -> None:
+    def reasons(self) -> list[Reason]:
+        """Why something is set aside, the largest sum first."""
+        found: dict[tuple[str, str], Reason] = {}
+        for name in self._cache.names(self._open):
+            for one in self._opened(name.removeprefix(self._open)):
+                driver = one.asked.driver
+                found.setdefault((driver, one.outcome), Reason(driver, one.outcome)).add(one)
+        spending = self.read()
+        attempts = spending.open_attempts - sum(reason.attempts for reason in found.values())
+        if attempts > 0:
+            usd = spending.reserved_usd - sum(reason.usd for reason in found.values())
+            found["", UNRECORDED] = Reason("", UNRECORDED, attempts, usd)
+        return sorted(found.values(), key=lambda reason: -reason.usd)
+
+    def release(self) -> Release:
+        """Count no longer what is set aside; nobody may be asking meanwhile."""
+
+        def operation() -> Release:
+            spending = self.read()
+            reasons = tuple(self.reasons())
+            released = Release(_now(), spending.reserved_usd, spending.open_attempts, reasons)
+            spending.reserved_usd, spending.open_attempts = 0.0, 0
+            spending.releases.append(released)
+            self._write(spending)
+            for name in self._cache.names(self._open):
+                self._cache.remove(name)
+            return released
+
+        released: Release = self._cache.run_now([operation])[0]
+        return released
+
+    def _settle(
+        self, key: str, attempts: Sequence[Attempt], worst_usd: float, actual_usd: float | None
+    ) -> None:
+        *earlier, one = self._opened(key) or [SetAside(worst_usd, UNNAMED, _now())]
         if actual_usd is None:
+            outcome = attempts[-1].outcome if attempts else IN_FLIGHT
+            self._write_open(key, [*earlier, replace(one, outcome=outcome)])
             return
+        self._write_open(key, earlier)
         spending = self.read()
         spending.spent_usd += actual_usd
         spending.reserved_usd = max(0.0, spending.reserved_usd - worst_usd)
         spending.open_attempts -= 1
         if not spending.open_attempts:
             spending.reserved_usd = 0.0  # what is left is rounding
+        if actual_usd > worst_usd + TOLERANCE_USD:
+            spending.overrun_usd += actual_usd - worst_usd
+            driver, honest_usd = one.asked.driver, one.asked.honest_usd or worst_usd
+            ratio = actual_usd / max(honest_usd, TOLERANCE_USD)
+            spending.overruns[driver] = max(ratio, spending.times(driver))
         self._write(spending)
+
+    def _opened(self, key: str) -> list[SetAside]:
+        """The attempts at a call that have no known cost, the one in flight last."""
+        text = self._cache.read(self._open + key)
+        try:
+            return [] if text is None else _SET_ASIDE.validate_json(text)
+        except ValidationError:
+            return []  # damaged: the sums, which count, lie elsewhere
+
+    def _write_open(self, key: str, attempts: list[SetAside]) -> None:
+        if attempts:
+            text = _SET_ASIDE.dump_json(attempts).decode()
+            self._cache.replace(self._open + key, text)
+        else:
+            self._cache.remove(self._open + key)
 
     def read(self) -> Spending:
         """The state of now."""
@@ -127,6 +274,10 @@ def _begun(number: int) -> Attempt:
     return Attempt(
         number=number,
         outcome="unknown",
-        started_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        started_at=_now(),
         error="the run ended before a reply was seen; it may have been charged",
     )
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -2,7 +2,8 @@
 
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
 only the dispatcher ever asks it, and not before it has room. Tokens are counted in a sliding window
-of a minute: an estimate at dispatch, settled to the actual usage afterwards.
+of a minute: an estimate at dispatch, settled to the actual usage afterwards. What other processes
+send with the same key counts too, see shared_limits.py.
 """
 
 from __future__ import annotations
@@ -14,9 +15,8 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from merge_runner.errors import UsageError
+from merge_runner.llm.shared_limits import WINDOW_S, SharedLimits, request_rules
 
-WINDOW_S = 60.0
-BURST_S = 0.5
 CLOCK_STEP_S = 1e-6
 
 
@@ -63,7 +63,9 @@ class Limiter:
         tpm: int | None = None,
         pause: Pause | None = None,
         window_s: float = WINDOW_S,
+        shared: SharedLimits | None = None,
     ) -> None:
+        self._shared = shared
         self.limited = rpm is not None or tpm is not None
         self._tpm = tpm
         self._window_s = window_s
@@ -100,6 +102,8 @@ class Limiter:
         """Correct a permit's tokens; see Permit.settle."""
         if permit.counts:
             self._tokens_in_window += tokens - permit.tokens
+            if self._shared is not None:
+                self._shared.settle(permit.dispatched_at, tokens - permit.tokens)
         permit.tokens = tokens
         self._changed.set()
 
@@ -107,6 +111,8 @@ class Limiter:
         """Dispatch nothing for a while: the server asked everybody on this key to wait."""
         now = asyncio.get_running_loop().time()
         self._pause.until = max(self._pause.until, now + seconds)
+        if self._shared is not None:
+            self._shared.pause(seconds)
 
     @property
     def paused_s(self) -> float:
@@ -118,6 +124,8 @@ class Limiter:
         loop = asyncio.get_running_loop()
         while waiter := self._head():
             wait = self._blocked_for(waiter, loop.time())
+            if wait <= 0 and self._shared is not None:
+                wait = self._shared.take(waiter.tokens)
             if wait > 0:
                 await self._wait(wait)
                 continue
@@ -177,9 +185,4 @@ class _Throttle:
 
 
 def _throttles(rpm: int, window_s: float) -> list[_Throttle]:
-    """Two that hold together: an even flow, and at most ``rpm`` in a window wherever it begins.
-
-    Half a second's worth goes at a time: a whole window at once would trip finer limits.
-    """
-    burst = max(1, int(rpm * BURST_S / window_s))
-    return [_Throttle(burst, burst * window_s / rpm), _Throttle(rpm, window_s)]
+    return [_Throttle(*rule) for rule in request_rules(rpm, window_s)]

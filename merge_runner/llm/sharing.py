@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from merge_runner.llm.cache import Entry
+from merge_runner.llm.ledger import Asked
 from merge_runner.records import Attempt
 
 
@@ -75,11 +76,13 @@ class Purse(Protocol):
         """The trial has ended or is suspended."""
         ...
 
-    async def reserve(self, trial: int, worst_usd: float) -> None:
-        """Set an attempt's worst case aside."""
+    async def reserve(self, trial: int, worst_usd: float, driver: str) -> float:
+        """Set an attempt's worst case aside; returns what is set aside."""
         ...
 
-    async def begin(self, key: str, attempts: list[Attempt], worst_usd: float) -> None:
+    async def begin(
+        self, key: str, attempts: list[Attempt], worst_usd: float, asked: Asked
+    ) -> None:
         """The attempt is sent now."""
         ...
 

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats.base import (
@@ -35,7 +35,9 @@ QUOTA_CODES = frozenset(
 )
 # Anthropic reports these as invalid requests.
 SPENT = ("credit balance is too low", "spend limit")
-TOO_LATE = frozenset({408, 504, 524})
+TOO_LATE = frozenset({408, 499, 504, 524})
+# Azure charges for a prompt that it has looked at, also where it then refuses it with status 400.
+LOOKED_AT = frozenset({"content_filter", "context_length_exceeded"})
 TRANSIENT = {
     408: "request_timeout",
     409: "conflict",
@@ -78,15 +80,36 @@ class Verdict:
     pause: bool = False
 
 
-def may_be_charged(raw: RawReply) -> bool:
-    """Whether a reply may stand for work that is charged.
+def may_be_charged(raw: RawReply, provider: str | None) -> bool:
+    """Whether a reply that tells no usage may stand for work that is charged.
 
-    A provider's own error is not; that of a gateway, or one for want of time, may follow an answer
-    that was made.
+    A refusal before any work is not, nor an error in the documented form of the ``provider`` whose
+    own host answered (None: another server). That of a gateway, or one for want of time, may
+    follow an answer that was made.
     """
-    if raw.status == 200 or raw.status in TOO_LATE:
+    payload = _first(_json(raw.body))
+    if raw.status < 300 or raw.status in TOO_LATE or '"usage' in raw.body:
         return True
-    return raw.status >= 500 and not isinstance(_json(raw.body), (dict, list))
+    if raw.status >= 500:
+        return provider is None or not _in_its_form(provider, as_dict(payload))
+    return provider is None and bool(error_info(payload, "").names & LOOKED_AT)
+
+
+def is_web_page(raw: RawReply) -> bool:
+    """Whether what answers is a web site: no service of any format sends this as an answer."""
+    return raw.body.lstrip("\ufeff \t\r\n")[:9].lower().startswith(("<!doctype", "<html"))
+
+
+def _in_its_form(provider: str, payload: dict[str, Any]) -> bool:
+    """Whether an error has the members that the provider documents for all of its own."""
+    error = as_dict(payload.get("error"))
+    members = {
+        "openai": {"message", "type", "code"},
+        "gemini": {"message", "code", "status"},
+        "anthropic": {"message", "type"},
+        "openrouter": {"message", "code"},
+    }.get(provider)
+    return members is not None and members <= error.keys()
 
 
 def judge(raw: RawReply, wire: WireFormat) -> Verdict:
@@ -94,9 +117,18 @@ def judge(raw: RawReply, wire: WireFormat) -> Verdict:
     payload = _json(raw.body)
     if raw.status == 200:
         return _judge_success(raw, payload, wire)
-    if isinstance(payload, list):  # Gemini wraps its errors where it streams
-        payload = payload[0] if payload else None
-    return _judge_error(raw.status, raw, payload)
+    payload = _first(payload)
+    verdict = _judge_error(raw.status, raw, payload)
+    # What an error says to have used is billed.
+    usage = wire.read(as_dict(payload)).usage
+    return replace(verdict, reading=replace(verdict.reading, usage=usage))
+
+
+def _first(payload: object) -> object:
+    """Gemini wraps its errors in a list where it streams."""
+    if isinstance(payload, list):
+        return payload[0] if payload else None
+    return payload
 
 
 def _json(body: str) -> object:

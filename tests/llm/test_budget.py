@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget
-from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.cache import ResponseCache, checksum
+from merge_runner.llm.ledger import Asked, Ledger
+from merge_runner.records import Attempt
 
 CAP = 100
 calls = st.lists(
@@ -230,3 +231,108 @@ async def test_a_damaged_record_of_spending_is_told_and_not_believed(ledger, cac
     await cache.write(lambda: cache.replace(ledger._name, text.replace("0.25", "0.15")))
     with pytest.raises(UsageError, match="so that no cap could hold"):
         ledger.read()
+
+
+O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
+
+
+async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
+    for key, outcome in (("a", "timeout"), ("b", "timeout"), ("c", "server_error")):
+        await ledger.reserve(key, [], 0.25, None, O3)
+        await ledger.settle(key, [Attempt(1, outcome)], 0.25, None)
+    await ledger.reserve("d", [], 0.125, None, O3)
+    await ledger.reserve("paid", [], 0.25, None, O3)
+    await ledger.settle("paid", [Attempt(1, "server_error")], 0.25, 0.1)
+    reasons = ledger.reasons()
+    assert [(r.outcome, r.attempts, r.usd) for r in reasons] == [
+        ("timeout", 2, 0.5),
+        ("server_error", 1, 0.25),
+        ("in flight", 1, 0.125),
+    ]
+    assert sum(r.usd for r in reasons) == pytest.approx(ledger.read().reserved_usd)
+    assert {(r.driver, *r.slots) for r in reasons} == {(O3.driver, O3.slot)}
+    assert reasons[0].first <= reasons[0].last
+
+
+async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
+    for number, outcome in enumerate(("timeout", "connection_lost", "bad_body"), 1):
+        attempts = [Attempt(n, "x") for n in range(1, number)]
+        await ledger.reserve("key", attempts, 0.25, None, O3)
+        actual = 0.0 if outcome == "connection_lost" else None
+        await ledger.settle("key", [*attempts, Attempt(number, outcome)], 0.25, actual)
+    assert {r.outcome: r.attempts for r in ledger.reasons()} == {"timeout": 1, "bad_body": 1}
+
+
+async def test_what_is_released_counts_no_longer_and_stays_visible(ledger, cache):
+    await attempt(Budget(ledger, cap_usd=1.0), 1, 0.75, None)
+    with pytest.raises(TrialSuspended):
+        await Budget(ledger, cap_usd=1.0).reserve(1, 0.5)
+    released = ledger.release()
+    assert (released.usd, released.attempts) == (0.75, 1)
+    again = Ledger(cache, ledger._name.removeprefix("spent "))
+    assert (again.spending.committed_usd, again.reasons()) == (0, [])
+    assert again.spending.releases == [released]
+    await Budget(again, cap_usd=1.0).reserve(1, 0.5)
+
+
+async def test_a_ledger_of_an_earlier_version_is_read_and_says_that_it_noted_no_reason(
+    ledger, cache
+):
+    text = '{"spent_usd":0.5,"reserved_usd":0.25,"open_attempts":2}'
+    await cache.write(lambda: cache.replace(ledger._name, checksum(text) + text))
+    assert ledger.read().committed_usd == 0.75
+    (reason,) = ledger.reasons()
+    assert (reason.outcome, reason.attempts, reason.usd) == ("not recorded", 2, 0.25)
+    await ledger.reserve("key", [], 0.25, None, O3)
+    assert {r.outcome: r.attempts for r in ledger.reasons()} == {"not recorded": 2, "in flight": 1}
+
+
+async def test_a_damaged_reason_changes_no_sum(ledger, cache):
+    await attempt(Budget(ledger), 1, 0.5, None)
+    await cache.write(lambda: cache.replace(ledger._open + "key", "[{"))
+    assert ledger.read().reserved_usd == 0.5
+    assert [r.outcome for r in ledger.reasons()] == ["not recorded"]
+    await attempt(Budget(ledger), 1, 0.5, 0.25)
+    assert ledger.read().committed_usd == 0.75
+
+
+async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
+    budget = Budget(ledger, cap_usd=10.0)
+    aside = await budget.reserve(1, 0.25, O3.driver)
+    await budget.begin("key", [], aside, O3)
+    await ledger.settle("key", [Attempt(1, "server_error")], aside, 0.75)
+    budget.settled(1)
+    assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
+    assert ledger.spending.dearest == "o3 at gateway up to 3.00 times as much"
+    next_run = Budget(Ledger(cache, ledger._name.removeprefix("spent ")), cap_usd=10.0)
+    assert await next_run.reserve(1, 0.25, O3.driver) == 0.75
+    assert await next_run.reserve(1, 0.25, "another driver") == 0.25
+    # A reply within what is now set aside does not count as another overrun of it.
+    await next_run.begin("other", [], 0.75, O3)
+    await ledger.settle("other", [Attempt(1, "server_error")], 0.75, 0.5)
+    assert ledger.spending.times(O3.driver) == 3
+
+
+async def test_several_are_in_flight_only_while_twice_their_worst_cases_fit(ledger):
+    budget = Budget(ledger, cap_usd=1.0)
+    await budget.reserve(1, 0.25)
+    await budget.reserve(2, 0.25)  # 2 x 0.5 fit
+    third = await soon(budget.reserve(3, 0.25))
+    assert not third.done()
+    budget.give_back(1, 0.25)
+    await third
+    third.result()
+
+
+async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):
+    budget = Budget(ledger, cap_usd=5.0, trial_usd=2.0)
+    await attempt(budget, 1, 1.0, 0.5)
+    await attempt(budget, 1, 0.5, None)
+    await budget.admit(2)
+    with pytest.raises(TrialSuspended) as caught:
+        await asyncio.gather(budget.reserve(1, 4.0), budget.reserve(2, 4.0))
+    assert str(caught.value) == (
+        "the next call may cost 4.0000 USD, and 1.0000 of 5 USD are spent or set aside (0.5000 "
+        "spent, 0.5000 set aside for 1 attempts whose cost is not known: `merge-runner ledger`); "
+        "2.5000 more are kept for the trials that have begun"
+    )

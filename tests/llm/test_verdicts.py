@@ -5,7 +5,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.verdicts import RawReply, judge
+from merge_runner.llm.verdicts import RawReply, is_web_page, judge, may_be_charged
 
 OPENAI_QUOTA = (
     "You exceeded your current quota, please check your plan and billing details. For more "
@@ -541,3 +541,78 @@ def test_no_body_makes_it_raise(wire, status, body):
     verdict = judged(wire, status, body)
     assert verdict.action in ("accept", "retry", "fail", "quota", "refused")
     assert verdict.outcome
+
+
+OPENAI_ERROR = {"error": {"message": "m", "type": "server_error", "param": None, "code": None}}
+GEMINI_ERROR = {"error": {"code": 503, "message": "m", "status": "UNAVAILABLE"}}
+ANTHROPIC_ERROR = {"type": "error", "error": {"type": "overloaded_error", "message": "m"}}
+
+
+@pytest.mark.parametrize(
+    ("provider", "status", "body", "charged"),
+    [
+        ("openai", 500, OPENAI_ERROR, False),
+        ("gemini", 503, GEMINI_ERROR, False),
+        ("gemini", 503, [GEMINI_ERROR], False),
+        ("anthropic", 529, ANTHROPIC_ERROR, False),
+        ("openrouter", 502, {"error": {"code": 502, "message": "m"}}, False),
+        # In no form that the provider documents, so that a proxy may have made it.
+        ("openai", 500, {"error": {"message": "m"}}, True),
+        ("openai", 502, "<html>502 Bad Gateway</html>", True),
+        ("anthropic", 500, OPENAI_ERROR | {"error": "m"}, True),
+        ("local", 500, OPENAI_ERROR, True),
+        # For want of time, perhaps after the work.
+        ("openai", 408, OPENAI_ERROR, True),
+        ("gemini", 504, GEMINI_ERROR, True),
+        (None, 499, OPENAI_ERROR, True),
+        # Another server in the provider's format.
+        (None, 500, OPENAI_ERROR, True),
+        (None, 503, "", True),
+        # Before any work.
+        (None, 429, OPENAI_ERROR, False),
+        (None, 401, "", False),
+        (None, 404, "<html>", False),
+        (None, 302, "", False),
+        # What is not counted, or not to be understood.
+        ("openai", 200, OPENAI_ERROR, True),
+        (None, 201, "", True),
+        ("openai", 500, OPENAI_ERROR | {"usage": {"prompt_tokens": 5}}, True),
+        (None, 429, OPENAI_ERROR | {"usage": "much"}, True),
+        # Azure charges for a prompt that its filter has read.
+        (None, 400, {"error": {"code": "content_filter", "message": "m"}}, True),
+        (None, 400, {"error": {"code": "context_length_exceeded", "message": "m"}}, True),
+        ("openai", 400, {"error": {"code": "context_length_exceeded", "message": "m"}}, False),
+        (None, 400, {"error": {"code": "unsupported_value", "message": "m"}}, False),
+    ],
+)
+def test_what_may_be_charged_though_no_usage_is_told(provider, status, body, charged):
+    text = body if isinstance(body, str) else json.dumps(body)
+    assert may_be_charged(RawReply(status, {}, text), provider) == charged
+
+
+@pytest.mark.parametrize("status", [400, 429, 500, 503])
+def test_usage_in_an_error_is_read_in_every_format(status):
+    bodies = {
+        "openai-chat": {"usage": {"prompt_tokens": 7, "completion_tokens": 9}},
+        "openai-responses": {"usage": {"input_tokens": 7, "output_tokens": 9}},
+        "anthropic": {"usage": {"input_tokens": 7, "output_tokens": 9}},
+        "gemini": {"usageMetadata": {"promptTokenCount": 7, "candidatesTokenCount": 9}},
+    }
+    for wire, told in bodies.items():
+        body = json.dumps({"error": {"message": "m"}} | told)
+        usage = judge(RawReply(status, {}, body), FORMATS[wire]).reading.usage
+        assert (usage.input_tokens, usage.output_tokens) == (7, 9)
+
+
+@pytest.mark.parametrize(
+    ("body", "page"),
+    [
+        ("<!DOCTYPE html><p>", True),
+        ("\ufeff\n <HTML lang=en>", True),
+        ('{"html": "<html>"}', False),
+        ("<hr>", False),
+        ("", False),
+    ],
+)
+def test_a_web_page_is_told_from_all_else(body, page):
+    assert is_web_page(RawReply(200, {}, body)) == page

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import time
+from unittest.mock import ANY
 
 import pytest
 from aiohttp import web
 from harness import FAST, watched
+from llm.test_limiter import fullest_window
 
 from merge_runner.records import SLOT_HEADER
 
@@ -33,13 +37,17 @@ def configured(folder, deadline_s):
 
 
 class Service:
-    """Answers while it works."""
+    """Answers while it works, and one call more: a run's first one, which goes alone."""
 
     def __init__(self, *, working):
         self.working = working
+        self.one_more = True
 
     async def middle(self, request, handler):
-        return await handler(request) if self.working else down(request)
+        if self.working or self.one_more:
+            self.one_more = self.working
+            return await handler(request)
+        return down(request)
 
 
 def down(request):
@@ -103,7 +111,9 @@ async def test_nobody_listens(merge_runner, tmp_path):
     run = await merge_runner(*sweep, EMULATOR_BASE_URL="http://127.0.0.1:9/v1")
     assert run.code == 1
     assert "Traceback" not in run.err
-    assert "no call was answered" in run.err
+    assert "no answer within 1 s to the first call of this run" in run.err
+    assert run.summary["attempts"].keys() == {"no_connection"}
+    assert run.summary["trials"]["failed"] == 0
 
 
 async def test_waits_are_told(merge_runner, tmp_path):
@@ -153,10 +163,11 @@ async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
 
 
 async def test_one_dead_model_of_a_pair_stops_the_sweep(merge_runner, tmp_path):
+    dead_service = Service(working=False)
+
     async def middle(request, handler):
-        return (
-            down(request) if (await request.json())["model"] == "dead" else await handler(request)
-        )
+        dead = (await request.json())["model"] == "dead"
+        return await (dead_service.middle(request, handler) if dead else handler(request))
 
     configured(tmp_path, deadline_s=0.6)
     dead = MODELS.format(deadline_s=0.6).replace("[patient]", "[bad]")
@@ -185,3 +196,76 @@ async def test_recorded_trials_do_not_hide_an_outage(merge_runner, tmp_path):
     assert "no call was answered in between" in run.err
     assert run.summary["trials"]["failed"] <= 13
     assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] <= 6
+
+
+def refused(status, message, **error):
+    return web.json_response({"error": {"message": message, **error}}, status=status)
+
+
+@pytest.mark.parametrize(
+    ("reply", "advice"),
+    [
+        (lambda: refused(401, "Incorrect API key", code="invalid_api_key"), "set OPENAI_API_KEY"),
+        (lambda: refused(404, "No such model", code="model_not_found"), "`merge-runner models`"),
+        (
+            lambda: refused(400, "Unsupported value", param="reasoning_effort"),
+            "look at `parameters.reasoning_effort` of [o3] in experiments/models.toml",
+        ),
+        (
+            lambda: web.Response(text="<!DOCTYPE html><p>Welcome!", content_type="text/html"),
+            "a web page answers there, and no language model: set OPENAI_BASE_URL",
+        ),
+        (
+            lambda: web.json_response({"status": "up"}),
+            "does not speak openai-chat: set OPENAI_BASE",
+        ),
+        (lambda: web.Response(status=405, text="Not allowed"), "set OPENAI_BASE_URL"),
+    ],
+)
+async def test_what_is_configured_wrongly_ends_the_run_at_its_first_call(
+    merge_runner, reply, advice
+):
+    async def middle(request, handler):
+        return reply()
+
+    sweep = ("sweep", "baseline", "--reps", 2, "--model", "o3", "--yes", "--json", *FAST)
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--max-cost", 20, **env)
+    assert (run.code, server.requests) == (2, 1), run.err
+    assert advice in run.summary["messages"][0]
+    assert run.summary["set_aside_usd"] == (0 if "does not speak" not in advice else ANY)
+    assert run.summary["trials"]["failed"] == 0
+
+
+async def test_two_sweeps_on_one_key_share_its_limits(merge_runner):
+    times = []
+
+    async def middle(request, handler):
+        times.append(time.monotonic())
+        return await handler(request)
+
+    sweep = ("sweep", "baseline", "--reps", 1, "--model", "o3", "--yes", "--json", "--rpm", 600)
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        runs = await asyncio.gather(
+            *(
+                merge_runner(
+                    *sweep,
+                    "--conditions",
+                    name,
+                    "--cache",
+                    name,
+                    "--db",
+                    f"{name}.duckdb",
+                    "--tpm",
+                    10**9,
+                    **env,
+                )
+                for name in ("L_4_0", "N_0_0")
+            )
+        )
+    assert [run.code for run in runs] == [0, 0], [run.err for run in runs]
+    # As on a cluster: half a second's worth goes at a time, and may come a little late.
+    assert fullest_window(times, [1] * len(times), length=1.0) <= 1.5 * 10 + 1
+    assert times[-1] - times[0] >= (len(times) - 10) / 10

@@ -42,18 +42,21 @@ async def test_strange_characters_and_counts_are_stored_and_shown_harmlessly(mer
 
 
 async def test_an_error_in_a_servers_words_speaks_to_no_terminal(merge_runner):
-    def middle(request, handler):
+    async def middle(request, handler):
+        if server.requests == answered_first:
+            return await handler(request)
         error = {"error": {"message": f"no {ESCAPE} [/red] [link=x]", "code": "bad"}}
-
-        async def refuse():
-            return web.json_response(error, status=400)
-
-        return refuse()
+        return web.json_response(error, status=400)
 
     async with watched(middle) as server:
-        run = await merge_runner(*ONE, EMULATOR_BASE_URL=f"{server.url}/v1")
-    assert run.code == 1
-    assert "\x1b" not in run.out + run.err
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        answered_first = 0
+        ended = await merge_runner(*ONE, **env)
+        answered_first = server.requests + 1
+        run = await merge_runner(*ONE, **env)
+    assert (ended.code, run.code) == (2, 1)
+    assert "\x1b" not in ended.out + ended.err + run.out + run.err
+    assert "[/red] [link=x]" in ended.err
     assert "[/red] [link=x]" in run.out
 
 

@@ -25,6 +25,7 @@ class AnthropicMessages:
     """``POST /v1/messages`` with the API version as a header."""
 
     retries_empty = False
+    members = frozenset({"content"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
         """One user message; ``max_tokens`` is required."""

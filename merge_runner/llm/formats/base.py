@@ -43,6 +43,9 @@ class WireFormat(Protocol):
     retries_empty: bool
     """Whether an empty answer is a known fault of the service that asking again may mend."""
 
+    members: frozenset[str]
+    """Those of which an answer has one, whatever it says."""
+
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
         """The request for a prompt."""
         ...

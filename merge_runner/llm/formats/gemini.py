@@ -41,6 +41,7 @@ class GeminiGenerateContent:
 
     # A STOP without content is a known intermittent fault of Gemini 2.5 Pro.
     retries_empty = True
+    members = frozenset({"candidates", "promptFeedback", "usageMetadata"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
         """One user turn; the cap covers thoughts and visible tokens."""

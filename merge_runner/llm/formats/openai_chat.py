@@ -21,6 +21,7 @@ class OpenAIChat:
     """``POST /chat/completions``; the path can be overridden, as Azure's classic form needs."""
 
     retries_empty = False
+    members = frozenset({"choices"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
         """One user message; the cap covers reasoning and visible tokens."""

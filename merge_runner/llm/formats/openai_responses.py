@@ -21,6 +21,7 @@ class OpenAIResponses:
     """``POST /responses``, not stored at the provider."""
 
     retries_empty = False
+    members = frozenset({"output", "status"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
         """The prompt as the whole input; the cap covers reasoning and visible tokens."""

@@ -1,0 +1,102 @@
+"""The first live call of a run goes alone: a wrong key, URL or parameter is found by one call.
+
+The others wait until an endpoint has answered it. Where no other call would fare better the run
+ends, with one line that says what to set.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+from merge_runner.config import PROVIDERS, ModelEntry
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.base import as_dict, as_text
+from merge_runner.llm.verdicts import RawReply, Verdict, is_web_page
+
+NOBODY_S = 5.0
+SEVERAL = 3
+REGISTRY = "experiments/models.toml"
+REQUEST_ITSELF = (400, 413, 422, 429)
+
+
+class FirstCall:
+    """Whether an endpoint has answered: ``passed`` in this run, ``known`` ever, in its format."""
+
+    def __init__(self, *, passed: bool = False, known: bool = False) -> None:
+        self.passed = passed
+        self.known = known
+        self._refused = 0
+        self._alone = asyncio.Lock()
+
+    async def turn(self) -> bool:
+        """Wait until a call may go; True: it goes alone, until ``give_turn``."""
+        await self._alone.acquire()
+        if self.passed:
+            self._alone.release()
+        return not self.passed
+
+    def give_turn(self) -> None:
+        """The call that went alone has ended, and another one may go."""
+        self._alone.release()
+
+    def is_final(self, verdict: Verdict) -> bool:
+        """Whether a refusal is of all calls: who has answered before may mean this one alone."""
+        self._refused += verdict.action == "fail"
+        return not self.known or self._refused >= SEVERAL or verdict.action == "accept"
+
+    def answered(self) -> None:
+        """The endpoint has answered in its format."""
+        self.passed = self.known = True
+
+
+def in_format(raw: RawReply, entry: ModelEntry) -> bool:
+    """Whether an accepted reply has anything of an answer in the entry's format."""
+    members = FORMATS[entry.format].members
+    return raw.status != 200 or bool(members & as_dict(json.loads(raw.body)).keys())
+
+
+def refusal(name: str, entry: ModelEntry, raw: RawReply, verdict: Verdict) -> str | None:
+    """Why no other call of a run would fare better, and what to set; None: one might."""
+    if is_web_page(raw) and raw.status == 200:
+        return f"a web page answers there, and no language model: {set_base_url(name, entry)}"
+    if verdict.action == "accept" and not in_format(raw, entry):
+        return f"what answers there does not speak {entry.format}: {set_base_url(name, entry)}"
+    if verdict.action != "fail" or "invalid_prompt" in raw.body:
+        return None
+    if raw.status not in (200, *REQUEST_ITSELF):
+        return f"no language model answers there: {set_base_url(name, entry)} ({verdict.message})"
+    return f"the request is refused: {_set_parameter(name, entry, raw)} ({verdict.message})"
+
+
+def set_base_url(name: str, entry: ModelEntry) -> str:
+    """Where the base URL of an entry stands."""
+    variable = PROVIDERS[entry.provider].base_url_env
+    if entry.base_url is not None or variable is None:
+        return f"correct `base_url` of [{name}] in {REGISTRY}"
+    ending = " (with /v1 at its end)" if entry.format.startswith("openai") else ""
+    return f"set {variable} to the base URL of the service{ending}, or unset it"
+
+
+def set_key(name: str, entry: ModelEntry) -> str:
+    """Where the key of an entry stands."""
+    variables = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
+    return f"set {' or '.join(variables) or f'`key_env` of [{name}] in {REGISTRY}'} to a valid one"
+
+
+def _set_parameter(name: str, entry: ModelEntry, raw: RawReply) -> str:
+    """Where the parameter stands that an error names."""
+    error = as_dict(as_dict(_loaded(raw.body)).get("error"))
+    said = f"{as_text(error.get('param'))} {as_text(error.get('message'))}"
+    named = next((f"parameters.{each}" for each in entry.parameters if each in said), None)
+    if named is None and any(words in said for words in ("max_", "tokens", "Request too large")):
+        named = "max_output_tokens"
+    return f"look at {f'`{named}` of ' if named else ''}[{name}] in {REGISTRY}"
+
+
+def _loaded(body: str) -> object:
+    try:
+        loaded: object = json.loads(body)
+    except (ValueError, RecursionError):
+        return None
+    return loaded

@@ -1,0 +1,190 @@
+"""The first live call of a run goes alone, and ends it where no other one would fare better."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from test_client import (  # noqa: F401 # fixtures
+    PRICE,
+    Server,
+    answer,
+    error,
+    make,
+    raw,
+    slot,
+    ticks,
+)
+from virtual_time import in_virtual_time, now_s
+
+from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.first_call import FirstCall
+from merge_runner.llm.transport import TransportFailure
+
+WEB_PAGE = raw("\n<!DOCTYPE html><html>Welcome</html>")
+REFUSED = TransportFailure("no_connection", "refused", sent=False)
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """Opened anew in each loop: many write at once."""
+    opened = ResponseCache(tmp_path)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def begin(make):  # noqa: F811
+    """A client whose run begins."""
+
+    def begin(*replies, known=False, **changes):
+        client = make(*replies, **changes)
+        client.first = FirstCall(known=known)
+        return client
+
+    return begin
+
+
+def ask_all(client, number=5):
+    return [asyncio.create_task(client.ask("prompt", slot(n))) for n in range(1, number + 1)]
+
+
+async def results(tasks):
+    return await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@in_virtual_time
+async def test_the_others_wait_until_the_first_call_is_answered(begin):
+    client = begin(answer())
+    client.transport.open.clear()
+    asked = ask_all(client)
+    await ticks()
+    assert len(client.transport.sent) == 1
+    assert [wait.what for wait in client.meter.waits.values()] == [
+        "for the first answer of my-model"
+    ] * 4
+    client.transport.open.set()
+    await asyncio.gather(*asked)
+    assert len(client.transport.sent) == 5
+    assert set(client.transport.times) == {0}, "they then go at once"
+
+
+@in_virtual_time
+async def test_what_passes_is_tried_again_by_one_call_alone(begin):
+    client = begin(error(503), error(429), TransportFailure("timeout", "no reply"), answer())
+    await asyncio.gather(*ask_all(client))
+    assert len(client.transport.sent) == 3 + 5
+    first_three = client.transport.times[:4]
+    assert first_three == sorted(set(first_three)), "one at a time"
+
+
+@pytest.mark.parametrize(
+    ("reply", "advice"),
+    [
+        (error(401), "set OPENAI_API_KEY to a valid one"),
+        (error(404), "see `merge-runner models`"),
+        (raw({"error": {"message": "m", "param": "temperature"}}, 400), r"look at \[my-model\] in"),
+        (error(400, "max_tokens is too large"), r"`max_output_tokens` of \[my-model\]"),
+        (error(405), "set OPENAI_BASE_URL"),
+        (raw("moved", 301), "set OPENAI_BASE_URL"),
+        (WEB_PAGE, "a web page answers there"),
+        (raw({"status": "up"}), "does not speak openai-chat"),
+    ],
+)
+@in_virtual_time
+async def test_a_wrong_configuration_is_told_by_one_call(begin, reply, advice):
+    client = begin(reply)
+    tasks = ask_all(client)
+    with pytest.raises(EndpointRefused, match=advice) as caught:
+        await tasks[0]
+    await client.drain()
+    assert len(client.transport.sent) == 1
+    assert "\n" not in str(caught.value)
+    assert all(isinstance(result, BaseException) for result in await results(tasks))
+
+
+@in_virtual_time
+async def test_where_nobody_listens_the_run_ends_within_seconds(begin):
+    client = begin(REFUSED)
+    with pytest.raises(EndpointRefused, match=r"nobody answers there \(refused\).*OPENAI_BASE_URL"):
+        await client.ask("prompt", slot())
+    assert 5 <= now_s() < 12
+
+
+@in_virtual_time
+async def test_a_server_that_just_starts_is_waited_for(begin):
+    client = begin(REFUSED, REFUSED, answer())
+    assert (await client.ask("prompt", slot())).outcome == "ok"
+
+
+@in_virtual_time
+async def test_no_answer_to_the_first_call_within_its_deadline_ends_the_run(begin):
+    client = begin(error(503, "down"), deadline_s=60)
+    tasks = ask_all(client)
+    with pytest.raises(ProviderDown, match=r"no answer within 60 s to the first call.*down"):
+        await tasks[0]
+    sent = len(client.transport.sent)
+    await client.drain()
+    await results(tasks)
+    assert len(client.transport.sent) == sent
+
+
+@in_virtual_time
+async def test_a_prompt_that_is_refused_for_its_content_fails_alone(begin):
+    flagged = raw({"error": {"message": "flagged", "code": "invalid_prompt"}}, 400)
+    client = begin(flagged, answer())
+    tasks = ask_all(client, 3)
+    first, *others = await results(tasks)
+    assert isinstance(first, CallFailed)
+    assert [reply.outcome for reply in others] == ["ok", "ok"]
+
+
+@in_virtual_time
+async def test_an_answer_that_is_recorded_needs_no_first_call(begin):
+    await begin(answer()).ask("prompt", slot())
+    client = begin(error(401))
+    assert (await client.ask("prompt", slot())).cached
+    assert client.transport.sent == []
+
+
+@in_virtual_time
+async def test_a_first_call_that_is_given_up_lets_the_next_one_go(begin):
+    client = begin(answer())
+    client.transport.open.clear()
+    asked = ask_all(client, 2)
+    await ticks()
+    for call in client._calls.values():
+        call.cancel()
+        break
+    await ticks()
+    assert len(client.transport.sent) == 2
+    client.transport.open.set()
+    await results(asked)
+
+
+@in_virtual_time
+async def test_a_web_page_is_free_where_no_model_ever_answered_and_may_be_charged_elsewhere(begin):
+    stray = begin(WEB_PAGE, price=PRICE, cap=1.0)
+    with pytest.raises(EndpointRefused):
+        await stray.ask("prompt", slot())
+    assert stray.budget.ledger.read().committed_usd == 0
+    gateway = begin(WEB_PAGE, answer(), price=PRICE, cap=1.0, known=True)
+    assert (await gateway.ask("prompt", slot())).outcome == "ok"
+    assert gateway.budget.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_where_a_model_has_answered_before_one_refused_prompt_does_not_end_every_run(begin):
+    client = begin(error(400), error(400), answer(), known=True)
+    first, second, *others = await results(ask_all(client))
+    assert isinstance(first, CallFailed)
+    assert isinstance(second, CallFailed)
+    assert [reply.outcome for reply in others] == ["ok"] * 3
+    changed = begin(error(400, "unknown parameter"), known=True)
+    tasks = [asyncio.create_task(changed.ask("another", slot(n))) for n in range(9)]
+    with pytest.raises(EndpointRefused, match="unknown parameter"):
+        await tasks[2]
+    await changed.drain()
+    await results(tasks)
+    assert len(changed.transport.sent) == 3
