@@ -152,7 +152,9 @@ def live_clients(
     clients = {}
     for name, entry in entries.items():
         endpoint = resolve_endpoint(name, entry, with_base_urls(addressed.urls))
-        transport = HttpTransport(endpoint, connections=connections)
+        transport = HttpTransport(
+            endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 2**20)
+        )
         stack.push_async_callback(transport.close)
         clients[name] = LlmClient(
             name=name,

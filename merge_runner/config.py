@@ -143,7 +143,7 @@ class ModelEntry(Frozen):
     ``price`` is ``free``, ``genai-prices`` (the
     table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
     minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of
-    ``--dry-run`` alone.
+    ``--dry-run`` alone. A reply longer than ``max_reply_mb`` (2^20 bytes, unpacked) is refused.
     """
 
     provider: str
@@ -164,6 +164,7 @@ class ModelEntry(Frozen):
     auth: Literal["bearer", "api-key"] | None = None
     timeout_s: Positive = 600.0
     deadline_s: Positive = 1200.0
+    max_reply_mb: Positive = 16.0
     typical_output_tokens: Count = 1000
     typical_latency_s: Positive = 10.0
     note: str = ""
