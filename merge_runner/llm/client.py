@@ -22,6 +22,7 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.base import Reading
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.meter import Meter, Wait
 from merge_runner.llm.prices import Pricing
@@ -306,7 +307,7 @@ class LlmClient:
             spent = record.cost_usd
             self._settle_tokens(permit, record.usage)
         except TransportFailure as exc:
-            verdict = None
+            verdict = Verdict(exc.action, exc.outcome, Reading("error"), str(exc))
             free = self.entry.price == "free" or not exc.sent
             spent = 0.0 if free else None
             record = Attempt(number, exc.outcome, error=str(exc), cost_usd=spent)
@@ -314,8 +315,6 @@ class LlmClient:
         call.attempts.append(record)
         self.meter.count_attempt(record)
         try:
-            if verdict is None:
-                raise TryAgain(record.error or record.outcome)
             self._act_on(verdict, call)
         except MergeRunnerError:
             await self._settle_failed(call, spent)
@@ -360,7 +359,8 @@ class LlmClient:
         if verdict.action == "retry":
             raise TryAgain(message, verdict.delay_s)
         if verdict.action == "fail":
-            raise RequestFailed("the request was rejected")
+            which = "reply" if verdict.outcome == "reply_refused" else "request"
+            raise RequestFailed(f"the {which} was rejected")
         if verdict.action == "quota":
             raise QuotaExhausted(
                 f"{self.driver}: the account's quota is exhausted ({message}). Every reply so far "
@@ -375,6 +375,11 @@ class LlmClient:
     def _refusal_advice(self, verdict: Verdict) -> str:
         if verdict.outcome == "not_allowed":
             return "the endpoint does not accept the key; check it"
+        if verdict.outcome == "bad_certificate":
+            return (
+                "the endpoint's certificate is not to be trusted, and nothing was sent; check the "
+                "base URL, or set SSL_CERT_FILE to the certificates of who signed it"
+            )
         shutdown = self.entry.shutdown
         retired = f", which was announced to shut down on {shutdown}" if shutdown else ""
         return f"the endpoint has no model {self.entry.id!r}{retired}; see `merge-runner models`"

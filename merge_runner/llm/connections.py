@@ -51,16 +51,13 @@ class Listener(ResponseHandler):
         if data and not self._asked:
             self._trust.doubted = True
             self.abort()
-            self.set_exception(
-                aiohttp.ClientConnectionError("the server spoke before it was asked")
-            )
         else:
             super().data_received(data)
 
     def fall_silent(self) -> bool:
         """The answer is whole: until the next request nothing may come; False if more has."""
         self._asked = False
-        if len(self) or self._tail or self._begins_another():
+        if len(self) or self._begins_another():
             self._trust.doubted = True
             return False
         return True
@@ -104,5 +101,5 @@ class Connections(aiohttp.TCPConnector):
         self, key: ConnectionKey, protocol: ResponseHandler, *, should_close: bool = False
     ) -> None:
         assert isinstance(protocol, Listener)
-        should_close = should_close or not protocol.fall_silent() or self._trust.one_each
+        should_close = should_close or not protocol.fall_silent()
         super()._release(key, protocol, should_close=should_close)

@@ -82,5 +82,16 @@ async def call_with_retries(
                 finally:
                     used_s += loop.time() - started
     except RetryError as exc:
-        raise OutOfTime(f"no answer within {deadline_s:.0f} s") from exc.last_attempt.exception()
+        last = exc.last_attempt.exception()
+        raise OutOfTime(_why_given_up(last, deadline_s)) from last
     raise AssertionError("unreachable: the loop returns or raises")
+
+
+def _why_given_up(last: BaseException | None, deadline_s: float) -> str:
+    asked_s = last.delay_s if isinstance(last, TryAgain) else None
+    if asked_s is None or asked_s < deadline_s:
+        return f"no answer within {deadline_s:.0f} s"
+    return (
+        f"the server asks to wait {asked_s:.0f} s, longer than a call's deadline of "
+        f"{deadline_s:.0f} s: run the same command again after that"
+    )
