@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
 from tenacity import AsyncRetrying, RetryCallState, RetryError, retry_if_exception_type
-from tenacity.wait import wait_exponential_jitter
 
 from merge_runner.errors import MergeRunnerError
 
 AnswerT = TypeVar("AnswerT")
 TurnT = TypeVar("TurnT")
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
-_BACKOFF = wait_exponential_jitter(
-    initial=FIRST_BACKOFF_S, max=LONGEST_BACKOFF_S, jitter=FIRST_BACKOFF_S
-)
 
 
 class TryAgain(MergeRunnerError):
@@ -37,7 +34,7 @@ class OutOfTime(MergeRunnerError):
 
 def backoff_s(attempts: int) -> float:
     """The wait after so many failed attempts, without jitter."""
-    return float(min(FIRST_BACKOFF_S * 2 ** (attempts - 1), LONGEST_BACKOFF_S))
+    return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
 
 
 async def call_with_retries(
@@ -59,7 +56,9 @@ async def call_with_retries(
     def wait(state: RetryCallState) -> float:
         error = state.outcome.exception() if state.outcome else None
         asked = error.delay_s if isinstance(error, TryAgain) else None
-        return max(asked or 0.0, _BACKOFF(state))
+        jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
+        backoff = min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
+        return max(asked or 0.0, backoff)
 
     def stop(state: RetryCallState) -> bool:
         return used_s + state.upcoming_sleep >= deadline_s

@@ -112,14 +112,17 @@ async def test_bytes_that_the_loop_had_no_time_to_read_never_answer_the_next_req
     come = threading.Event()
 
     def serve():
-        for answer in (chat("a"), chat("b")):
-            connection, _ = listening.accept()
-            connection.recv(65536)
-            connection.sendall(ok(answer))
-            if answer == chat("a"):
-                time.sleep(0.05)  # until the client has read it
-                connection.sendall(ok(chat("late")))
-                come.set()
+        first, _ = listening.accept()
+        with first:
+            first.recv(65536)
+            first.sendall(ok(chat("a")))
+            time.sleep(0.05)  # until the client has read it
+            first.sendall(ok(chat("late")))
+            come.set()
+            second, _ = listening.accept()
+            with second:
+                second.recv(65536)
+                second.sendall(ok(chat("b")))
 
     with socket.create_server(("127.0.0.1", 0)) as listening:
         listening.settimeout(5)
