@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from merge_runner.config import (
     ModelEntry,
     base_urls,
+    check_network,
     resolve_endpoint,
     running_emulator_url,
     with_base_urls,
@@ -152,6 +153,7 @@ def live_clients(
     clients = {}
     for name, entry in entries.items():
         endpoint = resolve_endpoint(name, entry, with_base_urls(addressed.urls))
+        check_network(endpoint.base_url)
         transport = HttpTransport(
             endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 2**20)
         )

@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 import itertools
 import secrets
+import ssl
 from typing import Any
 
 import aiohttp
 import httpx
 from httpx_aiohttp import AiohttpTransport, HttpxAiohttpClient
 
-from merge_runner.config import Endpoint
+from merge_runner.config import LOOPBACK, Endpoint
+from merge_runner.errors import UsageError
 from merge_runner.llm.bodies import ENCODING, read_body
 from merge_runner.llm.connections import Connections, Trust
 from merge_runner.llm.keys import canonical_json
@@ -23,7 +25,6 @@ from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 # A shorter dummy key may be part of any text.
 SHORTEST_SECRET = 8
 NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
-LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 # By these many servers and gateways say back what they were sent.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 2**24
@@ -89,13 +90,7 @@ class HttpTransport:
         self._trust = Trust()
         self._own = secrets.token_hex(8) + "-"
         self._ids = map(str, itertools.count(1))
-        limits = httpx.Limits(max_connections=connections, max_keepalive_connections=connections)
-        self._client = StrictClient(
-            self._trust,
-            limits=limits,
-            mounts={f"all://{host}": None for host in LOOPBACK},
-            timeout=None,  # every attempt runs under its own timeout
-        )
+        self._client = _client(endpoint.base_url, connections, self._trust)
         self._headers = {
             **self._client.headers,
             "accept-encoding": ENCODING,
@@ -177,3 +172,32 @@ class HttpTransport:
     async def close(self) -> None:
         """Close all connections."""
         await self._client.aclose()
+
+
+def _client(base_url: str, connections: int, trust: Trust) -> StrictClient:
+    """A client with the proxies and certificates of the environment; raises UsageError."""
+    url = httpx.URL(base_url)
+    by_loopback = url.host in LOOPBACK
+    # One that trusts nobody, where there is nobody to trust: to load the certificates takes long.
+    trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        if url.scheme == "https" or not by_loopback:
+            trusted = httpx.create_ssl_context()
+    except OSError as exc:
+        raise UsageError(
+            f"the certificates that SSL_CERT_FILE names cannot be read ({exc.strerror or exc}): "
+            "correct it or unset it"
+        ) from exc
+    try:
+        return StrictClient(
+            trust,
+            verify=trusted,
+            trust_env=not by_loopback,  # of which there are left the proxies
+            limits=httpx.Limits(max_connections=connections, max_keepalive_connections=connections),
+            timeout=None,  # every attempt runs under its own timeout
+        )
+    except (ValueError, httpx.InvalidURL) as exc:
+        raise UsageError(
+            "the proxies of HTTP_PROXY, HTTPS_PROXY, ALL_PROXY and NO_PROXY cannot be read: "
+            "correct them or unset them"
+        ) from exc
