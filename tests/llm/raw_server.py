@@ -24,6 +24,9 @@ import struct
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 
+from merge_runner.llm.keys import make_request
+from merge_runner.records import ChatRequest, Slot
+
 # A reply that every client of the format openai-chat takes for an answer.
 CHAT = json.dumps(
     {
@@ -33,6 +36,19 @@ CHAT = json.dumps(
         "usage": {"prompt_tokens": 1, "completion_tokens": 1},
     }
 ).encode()
+
+
+def a_request(number: int = 0) -> ChatRequest:
+    """What a client sends to any such server."""
+    return make_request(
+        provider="openai",
+        endpoint="openai",
+        model="m",
+        path="/chat/completions",
+        headers={},
+        body={"prompt": f"number {number}"},
+        slot=Slot("N_0_0", 1, "left", number, 0),
+    )
 
 
 def head(status: int = 200, **headers: object) -> bytes:

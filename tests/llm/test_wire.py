@@ -10,25 +10,11 @@ import threading
 import time
 
 import pytest
-from raw_server import head, ok, raw_server
+from raw_server import a_request, head, ok, raw_server
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.keys import make_request
 from merge_runner.llm.transport import TransportFailure
-from merge_runner.records import Slot
-
-
-def request_for(number=0):
-    return make_request(
-        provider="openai",
-        endpoint="openai",
-        model="m",
-        path="/chat/completions",
-        headers={},
-        body={"prompt": f"number {number}"},
-        slot=Slot("N_0_0", 1, "left", number, 0),
-    )
 
 
 @contextlib.asynccontextmanager
@@ -48,7 +34,7 @@ def chat(text):
 async def ask(transport, number=0, timeout_s=5.0):
     """The text that answers, or the outcome of the failure."""
     try:
-        reply = await transport.send(request_for(number), attempt=1, timeout_s=timeout_s)
+        reply = await transport.send(a_request(number), attempt=1, timeout_s=timeout_s)
     except TransportFailure as exc:
         return exc.outcome
     return json.loads(reply.body)["choices"][0]["message"]["content"]

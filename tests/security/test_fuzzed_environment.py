@@ -10,24 +10,17 @@ import httpx
 import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from raw_server import a_request
 
 from merge_runner.config import ModelEntry, check_network, resolve_endpoint
 from merge_runner.errors import UsageError
 from merge_runner.llm.connections import Connections
 from merge_runner.llm.http import HttpTransport
+from merge_runner.llm.transport import TransportFailure
 
 ENTRY = ModelEntry(provider="openai", format="openai-chat", id="m", max_output_tokens=10)
 SECRET = "sk-Zx81Qp55"
 PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "http_proxy", "https_proxy", "all_proxy")
-REQUEST = make_request(
-    provider="openai",
-    endpoint="openai",
-    model="m",
-    path="/chat/completions",
-    headers={},
-    body={},
-    slot=Slot("N_0_0", 1, "left", 0, 0),
-)
 HOSTS = st.one_of(
     st.sampled_from(
         [
@@ -112,7 +105,7 @@ async def asked(variables):
     check_network(endpoint.base_url, variables)
     transport = HttpTransport(endpoint, connections=1)
     with pytest.raises(TransportFailure) as failure:
-        await transport.send(REQUEST, attempt=1, timeout_s=5)
+        await transport.send(a_request(), attempt=1, timeout_s=5)
     await transport.close()
     return failure.value.outcome
 

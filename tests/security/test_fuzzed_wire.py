@@ -8,16 +8,14 @@ import math
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from raw_server import CHAT, raw_server
+from raw_server import CHAT, a_request, raw_server
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.delays import MOST_S, server_delay_s
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.keys import make_request
 from merge_runner.llm.transport import TransportFailure
 from merge_runner.llm.verdicts import RawReply, judge, may_be_charged
-from merge_runner.records import Slot
 
 DELAYS = (
     *("retry-after", "retry-after-ms", "x-should-retry", "x-ratelimit-remaining-requests"),
@@ -117,20 +115,11 @@ def test_fuzz_of_replies_every_reply_has_a_verdict(status, headers, body, wire):
 @pytest.fixture(scope="module")
 def answered():
     """What the transport makes of the bytes that a server answers with: its outcome or status."""
-    request = make_request(
-        provider="openai",
-        endpoint="openai",
-        model="m",
-        path="/chat/completions",
-        headers={},
-        body={},
-        slot=Slot("N_0_0", 1, "left", 0, 0),
-    )
 
     async def ask(transport, answers, raw):
         answers[:] = [raw]
         try:
-            return (await transport.send(request, attempt=1, timeout_s=0.1)).status
+            return (await transport.send(a_request(), attempt=1, timeout_s=0.1)).status
         except TransportFailure as exc:
             return exc.outcome
 
