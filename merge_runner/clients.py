@@ -155,7 +155,7 @@ def live_clients(
         endpoint = resolve_endpoint(name, entry, with_base_urls(addressed.urls))
         check_network(endpoint.base_url)
         transport = HttpTransport(
-            endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 2**20)
+            endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 1e6)
         )
         stack.push_async_callback(transport.close)
         clients[name] = LlmClient(

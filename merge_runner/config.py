@@ -148,7 +148,7 @@ class ModelEntry(Frozen):
     ``price`` is ``free``, ``genai-prices`` (the
     table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
     minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of
-    ``--dry-run`` alone. A reply longer than ``max_reply_mb`` (2^20 bytes, unpacked) is refused.
+    ``--dry-run`` alone. A reply longer than ``max_reply_mb`` (unpacked) is refused.
     """
 
     provider: str
@@ -363,18 +363,19 @@ def check_network(base_url: str, environment: Mapping[str, str] | None = None) -
 
 def _check_proxy(variable: str, value: str) -> None:
     """The value is not shown: it may have a password."""
+    scheme, separator, _ = value.partition("://")
+    if separator and scheme.isalnum() and scheme.lower() not in ("http", "https"):
+        raise UsageError(
+            f"{variable} names a {scheme[:20]}:// proxy, and only http:// and https:// ones can be "
+            "used: unset it, or put one of these (privoxy, for one) before a SOCKS proxy"
+        )
     try:
-        parts = urlsplit(value if "://" in value else f"http://{value}")
-        usable = parts.port != 0 and is_host(parts.hostname or "") and value.isprintable()
+        parts = urlsplit(value if separator else f"http://{value}")
+        usable = parts.port != 0 and is_host(parts.hostname or "")
     except ValueError:
         usable = False
-    if not usable or " " in value or not value.isascii():
+    if not usable or " " in value or not (value.isascii() and value.isprintable()):
         raise UsageError(f"{variable} is no URL of a proxy: set it to http://HOST:PORT or unset it")
-    if parts.scheme not in ("http", "https"):
-        raise UsageError(
-            f"{variable} names a {parts.scheme}:// proxy, and only http:// and https:// ones can "
-            "be used: unset it, or put one of these (privoxy, for one) before a SOCKS proxy"
-        )
 
 
 def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | None:

@@ -6,6 +6,7 @@ import asyncio
 import re
 import zlib
 from collections.abc import AsyncIterator
+from itertools import accumulate
 
 from merge_runner.llm.transport import TransportFailure
 
@@ -14,9 +15,9 @@ ENCODING = "gzip"
 PIECE = 2**18
 # No provider's reply has ten levels, and each program that reads one has a limit of its own.
 MOST_LEVELS = 100
-_STRING = re.compile(r'"(?:[^"\\]|\\.)*"', re.S)
-_INNERMOST = re.compile(r"\[\]|\{\}")
-_NO_BRACKET = {code: None for code in range(128) if chr(code) not in "[]{}"}
+MOST_VALUES = 1_000_000
+# Strings, in which brackets are none, and all other characters.
+_NO_BRACKETS = re.compile(r'"[^"]*"|[^][{}"]+')
 
 
 async def read_body(chunks: AsyncIterator[bytes], encoding: str, most_bytes: int) -> str:
@@ -29,11 +30,11 @@ async def read_body(chunks: AsyncIterator[bytes], encoding: str, most_bytes: int
     async for piece in _unpacked(chunks, encoding):
         size += len(piece)
         if size > most_bytes:
-            raise refused(f"it is longer than {most_bytes / 2**20:g} MB (max_reply_mb)")
+            raise refused(f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)")
         pieces.append(piece)
     text = b"".join(pieces).decode(errors="replace")
-    if nests_too_deep(text):
-        raise refused(f"it nests deeper than {MOST_LEVELS} levels")
+    if why := _why_refused(text):
+        raise refused(why)
     return text
 
 
@@ -67,14 +68,13 @@ async def _unpacked(chunks: AsyncIterator[bytes], encoding: str) -> AsyncIterato
         raise TransportFailure("connection_lost", f"the reply is cut within its {encoding}")
 
 
-def nests_too_deep(text: str) -> bool:
-    """Whether JSON has more levels than an honest reply; what is no JSON may be either."""
+def _why_refused(text: str) -> str | None:
+    """What makes JSON too much to be read in little time and memory; what is none is never so."""
+    if sum(map(text.count, "[{,")) > MOST_VALUES:
+        return f"it holds more than {MOST_VALUES:,} values"
     if text.count("[") + text.count("{") <= MOST_LEVELS:
-        return False
-    brackets = _STRING.sub("", text).translate(_NO_BRACKET)
-    for _ in range(MOST_LEVELS):
-        fewer = _INNERMOST.sub("", brackets)
-        if fewer == brackets:
-            return False  # all gone, or no JSON
-        brackets = fewer
-    return bool(brackets)
+        return None
+    unescaped = text.replace(r"\\", "").replace(r"\"", "")
+    steps = (1 if bracket in "[{" else -1 for bracket in _NO_BRACKETS.sub("", unescaped))
+    deepest = max(accumulate(steps), default=0)
+    return f"it nests deeper than {MOST_LEVELS} levels" if deepest > MOST_LEVELS else None

@@ -27,7 +27,7 @@ SHORTEST_SECRET = 8
 NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
 # By these many servers and gateways say back what they were sent.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
-MOST_BYTES = 2**24
+MOST_BYTES = 16_000_000
 
 
 class NoCookies(httpx.Cookies):
