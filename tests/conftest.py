@@ -16,7 +16,7 @@ from merge_runner.store import results_digest
 
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)
-# For an hour of one's own: `pytest -n0 tests/security --hypothesis-profile=100000 -k fuzz`.
+# For an hour of one's own; docs/reliability.md has the command.
 settings.register_profile("100000", max_examples=100_000, derandomize=False, deadline=None)
 settings.load_profile("gate")
 
