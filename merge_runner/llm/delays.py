@@ -20,7 +20,7 @@ _PARTS = re.compile(_PART, re.I)
 _DURATION = re.compile(rf"{_PART}(?:(?:,|\s|and)*{_PART})*", re.I)
 _PROTOBUF_DURATION = re.compile(r"(\d+(?:\.\d+)?)s")
 # A header that is sent several times has all its values in one, and a date has a comma of its own.
-_LISTED = re.compile(r"(?:[a-z]{3,9},)?[^,]+", re.I)
+_LISTED = re.compile(r"(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*,)?[^,]+", re.I)
 # A server that asks for longer means for good, and no clock counts that far.
 MOST_S = 366 * 86400.0
 _IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_DURATION.pattern})", re.I)
