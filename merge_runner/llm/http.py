@@ -103,6 +103,9 @@ class HttpTransport:
         try:
             async with asyncio.timeout(timeout_s):
                 return await self._exchange(request, attempt)
+        except TransportFailure:
+            self._trust.doubted = True
+            raise
         except TimeoutError as exc:
             self._trust.doubted = True
             raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
@@ -146,7 +149,6 @@ class HttpTransport:
         ours = [part for part in said if part.startswith(self._own)]
         self._trust.tied = bool(ours)
         if set(ours) - {own_id}:
-            self._trust.doubted = True
             raise TransportFailure("wrong_answer", "the server sent the answer to another request")
 
     def _failure(self, error: Exception) -> TransportFailure:
@@ -166,7 +168,12 @@ class HttpTransport:
 
     def _url(self, path: str) -> httpx.URL:
         if path not in self._urls:
-            self._urls[path] = httpx.URL(self._endpoint.base_url + path)
+            try:
+                self._urls[path] = httpx.URL(self._endpoint.base_url + path)
+            except httpx.InvalidURL as exc:
+                raise UsageError(
+                    f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml"
+                ) from exc
         return self._urls[path]
 
     async def close(self) -> None:
