@@ -23,8 +23,7 @@ _NO_BRACKETS = re.compile(r'"[^"]*"|[^][{}"]+')
 async def read_body(chunks: AsyncIterator[bytes], encoding: str, most_bytes: int) -> str:
     """The text of a body that comes in chunks; raises TransportFailure.
 
-    JSON is UTF-8, whatever a header says. Beside the text itself little memory is used, and the
-    event loop is never held for longer than a piece takes to unpack.
+    JSON is UTF-8, whatever a header says. The event loop goes on between any two pieces.
     """
     pieces, size = [], 0
     async for piece in _unpacked(chunks, encoding):
@@ -69,7 +68,9 @@ async def _unpacked(chunks: AsyncIterator[bytes], encoding: str) -> AsyncIterato
 
 
 def _why_refused(text: str) -> str | None:
-    """What makes JSON too much to be read in little time and memory; what is none is never so."""
+    """What makes JSON too much to be read in little time and memory; what is none is not read."""
+    if text.lstrip()[:1] not in ("[", "{"):
+        return None
     if sum(map(text.count, "[{,")) > MOST_VALUES:
         return f"it holds more than {MOST_VALUES:,} values"
     if text.count("[") + text.count("{") <= MOST_LEVELS:

@@ -210,6 +210,11 @@ async def test_levels_up_to_the_bound_are_taken_and_more_are_refused(inner, own)
     assert "nests deeper" in await refused(ok(nested(MOST_LEVELS - own + 1, inner).encode()))
 
 
+async def test_a_page_is_no_json_and_its_brackets_are_no_levels():
+    page = "<html><script>" + "if(a){b[" * 500 + "</script>"
+    assert (await answered(ok(page.encode(), 502))).body == page
+
+
 BRIEF = {
     "brackets": b"[" * (8 * MB) + b"]" * (8 * MB),
     "lists": b"[" + b"[]," * (5 * MB) + b"1]",
