@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from merge_runner.config import (
     ModelEntry,
     base_urls,
+    check_network,
     resolve_endpoint,
     running_emulator_url,
     with_base_urls,
@@ -173,7 +174,10 @@ def live_clients(
     clients = {}
     for name, entry in entries.items():
         endpoint = resolve_endpoint(name, entry, with_base_urls(addressed.urls))
-        transport = HttpTransport(endpoint, connections=connections)
+        check_network(endpoint.base_url)
+        transport = HttpTransport(
+            endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 1e6)
+        )
         stack.push_async_callback(transport.close)
         clients[name] = LlmClient(
             name=name,

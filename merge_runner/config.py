@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import os
 import re
@@ -28,6 +29,10 @@ from merge_runner.errors import UsageError
 from merge_runner.places import PROJECT
 from merge_runner.texts import one_line
 
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
+LONGEST_URL, LONGEST_HOST = 2000, 253
+_LABEL = re.compile(r"[a-z0-9_-]{1,63}", re.I)
 MOST_STEPS = MOST_REPETITIONS = 100_000
 
 
@@ -143,7 +148,7 @@ class ModelEntry(Frozen):
     ``price`` is ``free``, ``genai-prices`` (the
     table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
     minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of
-    ``--dry-run`` alone.
+    ``--dry-run`` alone. A reply longer than ``max_reply_mb`` (unpacked) is refused.
     """
 
     provider: str
@@ -164,6 +169,7 @@ class ModelEntry(Frozen):
     auth: Literal["bearer", "api-key"] | None = None
     timeout_s: Positive = 600.0
     deadline_s: Positive = 1200.0
+    max_reply_mb: Positive = 16.0
     typical_output_tokens: Count = 1000
     typical_latency_s: Positive = 10.0
     note: str = ""
@@ -301,15 +307,24 @@ def key_status(
 
 def normalised_url(url: str) -> str:
     """A base URL in one spelling: lower-case scheme and host, no default port, no last slash."""
+    url = url.strip()
+    # What may be a secret is not shown, and the registry's entry is stored.
+    shown = "what stands there" if "@" in url else repr(url[:60])
+    if len(url) > LONGEST_URL or not (url.isascii() and url.isprintable()) or " " in url:
+        raise UsageError(
+            f"{shown} is no base URL: it must be of ASCII characters without spaces, {LONGEST_URL} "
+            "at most; write a name of other letters as xn--..."
+        )
     try:
-        parts = urlsplit(url.strip())
+        parts = urlsplit(url)
         port_number = parts.port
     except ValueError as exc:
-        raise UsageError(f"{url!r} is no base URL: {exc}") from exc
+        raise UsageError(f"{shown} is no base URL: there can be no such host or port") from exc
     if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise UsageError(f"{url!r} is no base URL: it must begin with http:// or https://")
+        raise UsageError(f"{shown} is no base URL: it must begin with http:// or https://")
+    if not is_host(parts.hostname) or port_number == 0:
+        raise UsageError(f"{shown} is no base URL: there can be no such host or port")
     if "@" in parts.netloc or parts.query or parts.fragment:
-        # Not shown: what stands there may be a secret, and the registry's entry is stored.
         raise UsageError(
             f"the base URL of {parts.hostname} has a user name, a password or a part after ? or #, "
             "which are not sent: set the provider's key variable"
@@ -318,6 +333,49 @@ def normalised_url(url: str) -> str:
     default_port = 443 if parts.scheme == "https" else 80
     port = "" if port_number in (None, default_port) else f":{port_number}"
     return f"{parts.scheme}://{host}{port}{parts.path.rstrip('/')}"
+
+
+def is_host(name: str) -> bool:
+    """Whether a name or an address is one that a host can have."""
+    if ":" in name or re.fullmatch(r"\d+(\.\d+){3}", name):
+        try:
+            return "%" not in str(ipaddress.ip_address(name))
+        except ValueError:
+            return False
+    labels = name.removesuffix(".").split(".")
+    return len(name) <= LONGEST_HOST and all(map(_LABEL.fullmatch, labels))
+
+
+def check_network(base_url: str, environment: Mapping[str, str] | None = None) -> None:
+    """Raise UsageError where a variable keeps an endpoint from being reached.
+
+    Loopback never goes through a proxy, so that theirs do not matter there.
+    """
+    env = os.environ if environment is None else environment
+    if urlsplit(base_url).hostname not in LOOPBACK:
+        for variable, value in env.items():
+            if variable.lower() in PROXY_VARIABLES and value:
+                _check_proxy(variable, value)
+    folders = env.get("SSL_CERT_DIR", "")
+    if folders and not any(Path(folder).is_dir() for folder in folders.split(":")):
+        raise UsageError("SSL_CERT_DIR names no folder that exists: correct it or unset it")
+
+
+def _check_proxy(variable: str, value: str) -> None:
+    """The value is not shown: it may have a password."""
+    scheme, separator, _ = value.partition("://")
+    if separator and scheme.isalnum() and scheme.lower() not in ("http", "https"):
+        raise UsageError(
+            f"{variable} names a {scheme[:20]}:// proxy, and only http:// and https:// ones can be "
+            "used: unset it, or put one of these (privoxy, for one) before a SOCKS proxy"
+        )
+    try:
+        parts = urlsplit(value if separator else f"http://{value}")
+        usable = parts.port != 0 and is_host(parts.hostname or "")
+    except ValueError:
+        usable = False
+    if not usable or " " in value or not (value.isascii() and value.isprintable()):
+        raise UsageError(f"{variable} is no URL of a proxy: set it to http://HOST:PORT or unset it")
 
 
 def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | None:

@@ -39,6 +39,7 @@ STATUS_FAULTS = {
 UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
 ENDINGS: dict[str, Ending] = {"refused": "refused", "empty": "empty"}
 MALFORMED = "M\n\nI would rather describe my plan in words than write a list of numbers."
+ID_HEADER = "x-request-id"
 # Lingering for no time at all sends a reset instead of an orderly end.
 RESET_AT_CLOSE = struct.pack("ii", 1, 0)
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -136,9 +137,14 @@ class Emulator:
         return web.Response(status=500)
 
 
-async def _say_scripted(_: web.Request, response: web.StreamResponse) -> None:
-    """Every response says that a stand-in made it, also one that refuses, or is no JSON."""
+async def _say_scripted(request: web.Request, response: web.StreamResponse) -> None:
+    """Every response says that a stand-in made it, also one that refuses, or is no JSON.
+
+    And to which request it is the answer, as many gateways do.
+    """
     response.headers[SCRIPTED_HEADER] = "true"
+    if ID_HEADER in request.headers:
+        response.headers[ID_HEADER] = request.headers[ID_HEADER]
 
 
 @web.middleware

@@ -26,6 +26,7 @@ from merge_runner.errors import (
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.first_call import NOBODY_S, FirstCall, refusal, set_base_url, set_key
 from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.base import Reading
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
 from merge_runner.llm.meter import Meter, Wait
@@ -336,7 +337,6 @@ class LlmClient:
         started_at, started = datetime.now(UTC), time.perf_counter()
         spent: float | None = None
         raw: RawReply | None = None
-        verdict: Verdict | None = None
         try:
             raw = await self.transport.send(
                 call.request, attempt=number, timeout_s=min(self.entry.timeout_s, seconds_left)
@@ -346,6 +346,7 @@ class LlmClient:
             spent = record.cost_usd
             self._settle_tokens(permit, record.usage)
         except TransportFailure as exc:
+            verdict = Verdict(exc.action, exc.outcome, Reading("error"), str(exc))
             free = self.entry.price == "free" or not exc.sent
             spent = 0.0 if free else None
             record = Attempt(number, exc.outcome, error=str(exc), cost_usd=spent)
@@ -354,10 +355,10 @@ class LlmClient:
         self.meter.count_attempt(record)
         self._tell_overrun(call, spent)
         try:
-            if raw is None or verdict is None:
+            if raw is None:
                 self._give_up_on_nobody(call)
-                raise TryAgain(record.error or record.outcome)
-            self._check_endpoint(raw, verdict)
+            else:
+                self._check_endpoint(raw, verdict)
             self._act_on(verdict, call)
         except MergeRunnerError:
             await self._settle_failed(call, spent)
@@ -434,7 +435,8 @@ class LlmClient:
         if verdict.action == "retry":
             raise TryAgain(message, verdict.delay_s)
         if verdict.action == "fail":
-            raise RequestFailed("the request was rejected")
+            which = "reply" if verdict.outcome == "reply_refused" else "request"
+            raise RequestFailed(f"the {which} was rejected")
         if verdict.action == "quota":
             raise QuotaExhausted(
                 f"{self.driver}: the account's quota is exhausted ({message}). Every reply so far "
@@ -449,6 +451,11 @@ class LlmClient:
     def _refusal_advice(self, verdict: Verdict) -> str:
         if verdict.outcome == "not_allowed":
             return f"the endpoint does not accept the key; {set_key(self.name, self.entry)}"
+        if verdict.outcome == "bad_certificate":
+            return (
+                "the endpoint's certificate is not to be trusted, and nothing was sent; check the "
+                "base URL, or set SSL_CERT_FILE to the certificates of who signed it"
+            )
         shutdown = self.entry.shutdown
         retired = f", which was announced to shut down on {shutdown}" if shutdown else ""
         other = "" if self._own_host else f", or {set_base_url(self.name, self.entry)}"

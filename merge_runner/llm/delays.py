@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from typing import Any
+from typing import Any, TypeGuard
 
 from merge_runner.llm.formats.base import as_text, error_info
 
@@ -19,6 +19,10 @@ _PART = (
 _PARTS = re.compile(_PART, re.I)
 _DURATION = re.compile(rf"{_PART}(?:(?:,|\s|and)*{_PART})*", re.I)
 _PROTOBUF_DURATION = re.compile(r"(\d+(?:\.\d+)?)s")
+# A header that is sent several times has all its values in one, and a date has a comma of its own.
+_LISTED = re.compile(r"(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*,)?[^,]+", re.I)
+# A server that asks for longer means for good, and no clock counts that far.
+MOST_S = 366 * 86400.0
 _IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_DURATION.pattern})", re.I)
 # Azure counts on below zero.
 _NONE_REMAINS = re.compile(r"0|-\d+")
@@ -31,20 +35,32 @@ def server_delay_s(
 
     Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), Gemini's
     RetryInfo, "try again in 1.574s" or "retry after 5 minutes" in the message, then the reset
-    times of exhausted limits.
+    times of exhausted limits. Of several values of a header the longest counts, and of a delay a
+    year at most.
     ``headers`` have lower-case names; ``now`` gives the UTC time.
     """
     clock = now or (lambda: datetime.now(UTC))
     error = error_info(payload, "")
     candidates = (
-        _scaled(headers.get("retry-after-ms"), 1000),
-        _retry_after(headers.get("retry-after"), clock),
+        _longest(headers, "retry-after-ms", lambda text: _scaled(text, 1000)),
+        _longest(headers, "retry-after", lambda text: _retry_after(text, clock)),
         _retry_info(error.details),
         _in_text(error.message),
         _openai_resets(headers),
         _anthropic_resets(headers, clock),
     )
-    return next((d for d in candidates if d is not None and 0 < d < float("inf")), None)
+    return next((min(d, MOST_S) for d in candidates if _usable(d)), None)
+
+
+def _usable(delay_s: float | None) -> TypeGuard[float]:
+    return delay_s is not None and 0 < delay_s < float("inf")
+
+
+def _longest(
+    headers: Mapping[str, str], name: str, read: Callable[[str], float | None]
+) -> float | None:
+    values = _LISTED.findall(headers.get(name, ""))
+    return max(filter(_usable, map(read, values)), default=None)
 
 
 def duration_s(text: str) -> float | None:
@@ -65,13 +81,13 @@ def _scaled(text: str | None, per_second: float) -> float | None:
         return None
 
 
-def _retry_after(text: str | None, clock: Callable[[], datetime]) -> float | None:
+def _retry_after(text: str, clock: Callable[[], datetime]) -> float | None:
     seconds = _scaled(text, 1)
-    if seconds is not None or not text:
+    if seconds is not None:
         return seconds
     try:
         return _until(parsedate_to_datetime(text), clock)
-    except ValueError:
+    except (ValueError, OverflowError):  # the latter: a zone that is further away than time is long
         return None
 
 

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
+import secrets
+import ssl
 from typing import Any
 
 import aiohttp
 import httpx
 from httpx_aiohttp import AiohttpTransport, HttpxAiohttpClient
 
-from merge_runner.config import Endpoint
+from merge_runner.config import LOOPBACK, Endpoint
+from merge_runner.errors import UsageError
+from merge_runner.llm.bodies import ENCODING, read_body
+from merge_runner.llm.connections import Connections, Trust
 from merge_runner.llm.keys import canonical_json
+from merge_runner.llm.masking import Mask
 from merge_runner.llm.transport import TransportFailure
 from merge_runner.llm.verdicts import RawReply
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
@@ -18,7 +25,9 @@ from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 # A shorter dummy key may be part of any text.
 SHORTEST_SECRET = 8
 NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
-LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+# By these many servers and gateways say back what they were sent.
+ID_HEADERS = ("x-request-id", "x-client-request-id")
+MOST_BYTES = 16_000_000
 
 
 class NoCookies(httpx.Cookies):
@@ -28,97 +37,174 @@ class NoCookies(httpx.Cookies):
         """Leave them where they are."""
 
 
-class CookielessClient(HttpxAiohttpClient):
-    """Keeps no cookie, neither of its own nor of the connections'."""
+class StrictClient(HttpxAiohttpClient):
+    """Keeps no cookie, neither of its own nor of the connections', and no doubtful connection."""
 
-    def __init__(self, **options: Any) -> None:  # noqa: ANN401 # those of httpx.AsyncClient
+    def __init__(self, trust: Trust, **options: Any) -> None:  # noqa: ANN401 # those of httpx.AsyncClient
+        self._trust = trust
         super().__init__(**options)
         self._cookies = NoCookies()
 
     def _init_transport(self, *args: Any, **options: Any) -> httpx.AsyncBaseTransport:  # noqa: ANN401
-        return _cookieless(super()._init_transport(*args, **options))
+        return self._strict(super()._init_transport(*args, **options))
 
     def _init_proxy_transport(self, *args: Any, **options: Any) -> httpx.AsyncBaseTransport:  # noqa: ANN401
-        return _cookieless(super()._init_proxy_transport(*args, **options))
+        return self._strict(super()._init_proxy_transport(*args, **options))
 
+    def _strict(self, transport: httpx.AsyncBaseTransport) -> httpx.AsyncBaseTransport:
+        """The same transport with a session of our own."""
+        assert isinstance(transport, AiohttpTransport)
+        limits, ssl_context = transport.limits, transport.ssl_context
 
-def _cookieless(transport: httpx.AsyncBaseTransport) -> httpx.AsyncBaseTransport:
-    """The same transport with a session that ignores cookies."""
-    assert isinstance(transport, AiohttpTransport)
-    limits, ssl_context = transport.limits, transport.ssl_context
+        def session() -> aiohttp.ClientSession:
+            connector = Connections(
+                self._trust,
+                limit=limits.max_connections or 0,
+                keepalive_timeout=limits.keepalive_expiry,
+                ssl=ssl_context,
+            )
+            return aiohttp.ClientSession(connector=connector, cookie_jar=aiohttp.DummyCookieJar())
 
-    def session() -> aiohttp.ClientSession:
-        connector = aiohttp.TCPConnector(
-            limit=limits.max_connections or 0,
-            keepalive_timeout=limits.keepalive_expiry,
-            ssl=ssl_context,
-        )
-        return aiohttp.ClientSession(connector=connector, cookie_jar=aiohttp.DummyCookieJar())
-
-    transport.client = session
-    return transport
+        transport.client = session
+        return transport
 
 
 class HttpTransport:
     """Sends requests to one endpoint over at most ``connections`` connections.
 
-    Proxies are those that httpx reads from the environment; loopback never goes through one.
-    Our own emulator, and nobody else, is told the slot.
+    A reply of more than ``most_bytes`` is refused. Proxies are those that httpx reads from the
+    environment; loopback never goes through one. Our own emulator, and nobody else, is told the
+    slot; all are told a random id of the attempt, and an answer that names another is none.
     """
 
-    def __init__(self, endpoint: Endpoint, *, connections: int) -> None:
+    def __init__(
+        self, endpoint: Endpoint, *, connections: int, most_bytes: int = MOST_BYTES
+    ) -> None:
         self._endpoint = endpoint
-        self._secrets = [
+        self._most_bytes = most_bytes
+        self._mask = Mask(
             secret
             for value in endpoint.auth_headers.values()
             if len(secret := value.removeprefix("Bearer ")) >= SHORTEST_SECRET
-        ]
-        limits = httpx.Limits(max_connections=connections, max_keepalive_connections=connections)
-        self._client = CookielessClient(
-            limits=limits,
-            mounts={f"all://{host}": None for host in LOOPBACK},
-            timeout=None,  # every attempt runs under its own timeout
         )
-        self._headers = {**self._client.headers, "content-type": "application/json"}
+        self._trust = Trust()
+        self._own = secrets.token_hex(8) + "-"
+        self._ids = map(str, itertools.count(1))
+        self._client = _client(endpoint.base_url, connections, self._trust)
+        self._headers = {
+            **self._client.headers,
+            "accept-encoding": ENCODING,
+            "content-type": "application/json",
+        }
         self._urls: dict[str, httpx.URL] = {}
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Post the hashed bytes; raises TransportFailure."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await self._exchange(request, attempt)
+        except TransportFailure:
+            self._trust.doubted = True
+            raise
+        except TimeoutError as exc:
+            self._trust.doubted = True
+            raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
+        except (httpx.RequestError, aiohttp.ClientError) as exc:
+            raise self._failure(exc) from exc
+
+    async def _exchange(self, request: ChatRequest, attempt: int) -> RawReply:
+        own_id = self._own + next(self._ids)
+        asked = self._asked(request, attempt, own_id)
+        reply = await self._client.send(asked, stream=True)
+        try:
+            self._check_id(reply, own_id)
+            encoding = reply.headers.get("content-encoding", "")
+            body = await read_body(reply.aiter_raw(), encoding, self._most_bytes)
+        finally:
+            await reply.aclose()
+        # A provider may echo the key in an error; it must not get into a log or a database.
+        headers = {name.lower(): value for name, value in reply.headers.items()}
+        return RawReply(reply.status_code, headers, self._mask(body))
+
+    def _asked(self, request: ChatRequest, attempt: int, own_id: str) -> httpx.Request:
+        """The request, made without the client, which would put it together anew each time."""
         headers = {**self._headers, **request.headers, **self._endpoint.auth_headers}
+        headers |= dict.fromkeys(ID_HEADERS, own_id)
         if self._endpoint.provider == "emulator":
             headers[SLOT_HEADER] = canonical_json(request.slot.as_dict())
             headers[ATTEMPT_HEADER] = str(attempt)
-        # Made without the client, which would put the same together from its defaults each time.
-        asked = httpx.Request(
+        if self._trust.one_each:
+            headers["connection"] = "close"
+        return httpx.Request(
             "POST",
             self._url(request.path),
             headers=headers,
             content=request.body.encode(),
             extensions=NO_TIMEOUT,
         )
-        try:
-            async with asyncio.timeout(timeout_s):
-                reply = await self._client.send(asked)
-        except TimeoutError as exc:
-            raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
-        except (httpx.RequestError, aiohttp.ClientError) as exc:
-            # The libraries report refused, reset and cut connections alike, and pass on some
-            # errors of the other's: whatever it is, there is no reply.
-            reason = str(exc) or type(exc).__name__
-            if isinstance(exc.__cause__ or exc, aiohttp.ClientConnectorError):
-                raise TransportFailure("no_connection", reason, sent=False) from exc
-            raise TransportFailure("connection_lost", reason) from exc
-        body = reply.text
-        # A provider may echo the key in an error; it must not get into a log or a database.
-        for secret in self._secrets:
-            body = body.replace(secret, "[key]")
-        return RawReply(reply.status_code, {k.lower(): v for k, v in reply.headers.items()}, body)
+
+    def _check_id(self, reply: httpx.Response, own_id: str) -> None:
+        """Refuse the answer to another of our requests, where the server says whose it is."""
+        said = [part.strip() for h in ID_HEADERS for part in reply.headers.get(h, "").split(",")]
+        ours = [part for part in said if part.startswith(self._own)]
+        self._trust.tied = bool(ours)
+        if set(ours) - {own_id}:
+            raise TransportFailure("wrong_answer", "the server sent the answer to another request")
+
+    def _failure(self, error: Exception) -> TransportFailure:
+        """What an error of the libraries means.
+
+        They report refused, reset and cut connections alike, and pass on some errors of the
+        other's: whatever it is, there is no reply.
+        """
+        reason = self._mask(str(error)) or type(error).__name__
+        cause = error.__cause__ or error
+        if isinstance(cause, aiohttp.ClientConnectorCertificateError):
+            return TransportFailure("bad_certificate", reason, sent=False, action="refused")
+        if isinstance(cause, aiohttp.ClientConnectorError):
+            return TransportFailure("no_connection", reason, sent=False)
+        self._trust.doubted = True
+        return TransportFailure("connection_lost", reason)
 
     def _url(self, path: str) -> httpx.URL:
         if path not in self._urls:
-            self._urls[path] = httpx.URL(self._endpoint.base_url + path)
+            try:
+                self._urls[path] = httpx.URL(self._endpoint.base_url + path)
+            except httpx.InvalidURL as exc:
+                raise UsageError(
+                    f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml"
+                ) from exc
         return self._urls[path]
 
     async def close(self) -> None:
         """Close all connections."""
         await self._client.aclose()
+
+
+def _client(base_url: str, connections: int, trust: Trust) -> StrictClient:
+    """A client with the proxies and certificates of the environment; raises UsageError."""
+    url = httpx.URL(base_url)
+    by_loopback = url.host in LOOPBACK
+    # One that trusts nobody, where there is nobody to trust: to load the certificates takes long.
+    trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        if url.scheme == "https" or not by_loopback:
+            trusted = httpx.create_ssl_context()
+    except OSError as exc:
+        raise UsageError(
+            f"the certificates that SSL_CERT_FILE names cannot be read ({exc.strerror or exc}): "
+            "correct it or unset it"
+        ) from exc
+    try:
+        return StrictClient(
+            trust,
+            verify=trusted,
+            trust_env=not by_loopback,  # of which there are left the proxies
+            limits=httpx.Limits(max_connections=connections, max_keepalive_connections=connections),
+            timeout=None,  # every attempt runs under its own timeout
+        )
+    except (ValueError, httpx.InvalidURL) as exc:
+        raise UsageError(
+            "the proxies of HTTP_PROXY, HTTPS_PROXY, ALL_PROXY and NO_PROXY cannot be read: "
+            "correct them or unset them"
+        ) from exc

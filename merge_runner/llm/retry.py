@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
 from tenacity import AsyncRetrying, RetryCallState, RetryError, retry_if_exception_type
-from tenacity.wait import wait_exponential_jitter
 
 from merge_runner.errors import MergeRunnerError
 
 AnswerT = TypeVar("AnswerT")
 TurnT = TypeVar("TurnT")
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
-_BACKOFF = wait_exponential_jitter(
-    initial=FIRST_BACKOFF_S, max=LONGEST_BACKOFF_S, jitter=FIRST_BACKOFF_S
-)
 
 
 class TryAgain(MergeRunnerError):
@@ -37,7 +34,7 @@ class OutOfTime(MergeRunnerError):
 
 def backoff_s(attempts: int) -> float:
     """The wait after so many failed attempts, without jitter."""
-    return float(min(FIRST_BACKOFF_S * 2 ** (attempts - 1), LONGEST_BACKOFF_S))
+    return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
 
 
 async def call_with_retries(
@@ -59,7 +56,9 @@ async def call_with_retries(
     def wait(state: RetryCallState) -> float:
         error = state.outcome.exception() if state.outcome else None
         asked = error.delay_s if isinstance(error, TryAgain) else None
-        return max(asked or 0.0, _BACKOFF(state))
+        jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
+        backoff = min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
+        return max(asked or 0.0, backoff)
 
     def stop(state: RetryCallState) -> bool:
         return used_s + state.upcoming_sleep >= deadline_s
@@ -82,5 +81,16 @@ async def call_with_retries(
                 finally:
                     used_s += loop.time() - started
     except RetryError as exc:
-        raise OutOfTime(f"no answer within {deadline_s:.0f} s") from exc.last_attempt.exception()
+        last = exc.last_attempt.exception()
+        raise OutOfTime(_why_given_up(last, deadline_s)) from last
     raise AssertionError("unreachable: the loop returns or raises")
+
+
+def _why_given_up(last: BaseException | None, deadline_s: float) -> str:
+    asked_s = last.delay_s if isinstance(last, TryAgain) else None
+    if asked_s is None or asked_s < deadline_s:
+        return f"no answer within {deadline_s:.0f} s"
+    return (
+        f"the server asks to wait {asked_s:.0f} s, longer than a call's deadline of "
+        f"{deadline_s:.0f} s: run the same command again after that"
+    )

@@ -5,20 +5,24 @@ from __future__ import annotations
 from typing import Protocol
 
 from merge_runner.errors import MergeRunnerError, ReplayMiss
-from merge_runner.llm.verdicts import RawReply
+from merge_runner.llm.verdicts import Action, RawReply
 from merge_runner.records import ChatRequest
 
 
 class TransportFailure(MergeRunnerError):
     """An attempt brought no reply; ``outcome`` names it in the calls table.
 
-    ``sent`` is False where the request surely never left: nobody can charge for it.
+    ``sent`` is False where the request surely never left: nobody can charge for it. ``action`` is
+    that of a Verdict.
     """
 
-    def __init__(self, outcome: str, message: str, *, sent: bool = True) -> None:
+    def __init__(
+        self, outcome: str, message: str, *, sent: bool = True, action: Action = "retry"
+    ) -> None:
         super().__init__(message)
         self.outcome = outcome
         self.sent = sent
+        self.action = action
 
 
 class Transport(Protocol):

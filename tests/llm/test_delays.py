@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.llm.delays import duration_s, server_delay_s
+from merge_runner.llm.delays import MOST_S, duration_s, server_delay_s
 
 NOW = datetime(2026, 10, 21, 7, 28, 0, tzinfo=UTC)
 
@@ -205,6 +205,29 @@ def test_the_order_of_the_sources(first):
 def test_a_source_that_says_nothing_usable_gives_way_to_the_next(name, useless):
     assert delay({name: useless}, message("Please try again in 4s.")) == 4
     assert delay({name: useless}) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "seconds"),
+    [
+        ("7, 3600", 3600),
+        ("3600,7", 3600),
+        ("soon, 7, nan, -1, inf", 7),
+        ("Wed, 21 Oct 2026 07:28:30 GMT, 7", 30),
+        ("7, Wed, 21 Oct 2026 07:28:30 GMT", 30),
+        ("Wednesday, 21-Oct-26 07:28:30 GMT, Wed, 21 Oct 2026 07:28:40 GMT", 40),
+        ("99999999999", MOST_S),
+        ("Fri, 31 Dec 9999 23:59:59 GMT", MOST_S),
+        ("Wed, 21 Oct 2026 07:28:30 +99999999999999999999", None),
+        ("Wed, 21 Oct 2026 07:28:30 +9999, 7", 7),
+    ],
+)
+def test_of_several_delays_the_longest_counts(values, seconds):
+    assert delay({"retry-after": values}) == seconds
+
+
+def test_of_several_delays_in_ms_the_longest_counts_too():
+    assert delay({"retry-after-ms": "250, 1500", "retry-after": "7"}) == 1.5
 
 
 def test_a_date_that_has_passed_is_no_delay():

@@ -15,6 +15,7 @@ from merge_runner.config import Endpoint, ModelEntry, Scenario, resolve_endpoint
 from merge_runner.emulator.faults import FaultPlan, transient_faults
 from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.server import serve
+from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http import HttpTransport
@@ -246,6 +247,13 @@ async def test_a_redirect_is_not_followed_so_that_the_key_stays(recorder):
     reply = await send(endpoint_at(recorder.url, auth_headers={"x-api-key": KEY}))
     assert reply.status == 307
     assert len(recorder.requests) == 1
+
+
+async def test_a_path_that_no_url_can_have_is_told_and_nothing_is_sent(recorder):
+    request = request_for(path="/v1beta/models/a\nb:generateContent")
+    with pytest.raises(UsageError, match=r"can be no path: correct the entry"):
+        await send(endpoint_at(recorder.url), request)
+    assert recorder.requests == []
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])

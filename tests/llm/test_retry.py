@@ -1,8 +1,10 @@
 import asyncio
+from pathlib import Path
 
 import pytest
 
 from merge_runner.errors import CallFailed, QuotaExhausted, UsageError
+from merge_runner.llm import retry
 from merge_runner.llm.retry import (
     OutOfTime,
     RequestFailed,
@@ -163,3 +165,20 @@ async def test_an_error_while_waiting_for_a_turn_passes_through_without_an_attem
 
     with pytest.raises(CallFailed):
         await call_with_retries(no_turn, never, deadline_s=10.0)
+
+
+async def test_a_wait_that_the_deadline_does_not_allow_is_told(make_call):
+    call = make_call(TryAgain("HTTP 503: come back later", 3600.0))
+    with pytest.raises(OutOfTime, match="asks to wait 3600 s, longer than a call"):
+        await call.run(deadline_s=60.0)
+    assert (len(call.attempts), call.sleeps) == (1, [])
+
+
+def test_the_backoff_has_no_end_of_numbers():
+    assert backoff_s(10**9) == 60
+
+
+def test_no_newer_tenacity_warns_of_how_it_is_used():
+    """What it deprecates (names of its waits) is not used: only its loop is."""
+    used = Path(retry.__file__).read_text()
+    assert "tenacity.wait" not in used

@@ -1,0 +1,81 @@
+"""Reads the body of a reply within bounds: its size, also unpacked, and how deep it nests."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import zlib
+from collections.abc import AsyncIterator
+from itertools import accumulate
+
+from merge_runner.llm.transport import TransportFailure
+
+# What is asked for; whatever else a server chooses is refused.
+ENCODING = "gzip"
+PIECE = 2**18
+# No provider's reply has ten levels, and each program that reads one has a limit of its own.
+MOST_LEVELS = 100
+MOST_VALUES = 1_000_000
+# Strings, in which brackets are none, and all other characters.
+_NO_BRACKETS = re.compile(r'"[^"]*"|[^][{}"]+')
+
+
+async def read_body(chunks: AsyncIterator[bytes], encoding: str, most_bytes: int) -> str:
+    """The text of a body that comes in chunks; raises TransportFailure.
+
+    JSON is UTF-8, whatever a header says. The event loop goes on between any two pieces.
+    """
+    pieces, size = [], 0
+    async for piece in _unpacked(chunks, encoding):
+        size += len(piece)
+        if size > most_bytes:
+            raise refused(f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)")
+        pieces.append(piece)
+    text = b"".join(pieces).decode(errors="replace")
+    if why := _why_refused(text):
+        raise refused(why)
+    return text
+
+
+def refused(why: str) -> TransportFailure:
+    """The failure of a reply that is not taken, and not asked for again."""
+    return TransportFailure("reply_refused", f"the reply is refused: {why}", action="fail")
+
+
+async def _unpacked(chunks: AsyncIterator[bytes], encoding: str) -> AsyncIterator[bytes]:
+    """The pieces of a body without its encoding."""
+    encoding = encoding.strip().lower()
+    if encoding in ("", "identity"):
+        async for chunk in chunks:
+            yield chunk
+        return
+    if encoding not in ("gzip", "x-gzip", "deflate"):
+        raise refused(f"it is encoded as {encoding[:40]!r}, which was not asked for")
+    unpacking = zlib.decompressobj(wbits=32 + zlib.MAX_WBITS)  # tells gzip from deflate
+    cut = False
+    async for chunk in chunks:
+        packed = chunk
+        while packed:
+            try:
+                yield unpacking.decompress(packed, PIECE)
+            except zlib.error as exc:
+                raise TransportFailure("connection_lost", f"the reply is no {encoding}") from exc
+            packed = unpacking.unconsumed_tail
+            cut = not unpacking.eof
+            await asyncio.sleep(0)
+    if cut:
+        raise TransportFailure("connection_lost", f"the reply is cut within its {encoding}")
+
+
+def _why_refused(text: str) -> str | None:
+    """What makes JSON too much to be read in little time and memory; what is none is not read."""
+    if text.lstrip()[:1] not in ("[", "{"):
+        return None
+    if sum(map(text.count, "[{,")) > MOST_VALUES:
+        return f"it holds more than {MOST_VALUES:,} values"
+    if text.count("[") + text.count("{") <= MOST_LEVELS:
+        return None
+    unescaped = text.replace(r"\\", "").replace(r"\"", "")
+    steps = (1 if bracket in "[{" else -1 for bracket in _NO_BRACKETS.sub("", unescaped))
+    deepest = max(accumulate(steps), default=0)
+    return f"it nests deeper than {MOST_LEVELS} levels" if deepest > MOST_LEVELS else None

@@ -1,0 +1,60 @@
+"""Takes a secret out of what a server says back, however it is spelt."""
+
+from __future__ import annotations
+
+import re
+from base64 import b64encode
+from collections.abc import Iterable
+
+MASK = "[key]"
+# Few replies have one, and to look for every spelling takes longer than all other reading.
+_ESCAPE = re.compile(r"[\\%&](?:/|#|(?:u00|x)?[2-7][0-9A-Fa-f])")
+
+
+class Mask:
+    """Replaces secrets in texts.
+
+    Found are they as they are, with any of their characters escaped as in JSON (also in JSON within
+    JSON), in URLs or in HTML, and within what is base64, say of ``user:key``.
+    """
+
+    def __init__(self, secrets: Iterable[str]) -> None:
+        self._secrets = list(secrets)
+        patterns = ("".join(map(_spellings, secret)) for secret in self._secrets)
+        self._escaped = re.compile("|".join(patterns))
+        self._coded = {core for secret in self._secrets for core in _base64_cores(secret)}
+
+    def __call__(self, text: str) -> str:
+        """The text without the secrets."""
+        for secret in self._secrets:
+            text = text.replace(secret, MASK)
+        if self._secrets and _ESCAPE.search(text):
+            text = self._escaped.sub(MASK, text)
+        for core in self._coded:
+            if core in text:
+                # With what belongs to it alone in the neighbouring characters.
+                text = re.sub(rf"[\w+/-]?{re.escape(core)}(?:[\w+/-]{{1,2}}=*)?", MASK, text)
+        return text
+
+
+def _spellings(character: str) -> str:
+    """A pattern of the ways to write one character of a key, which is printable ASCII."""
+    code = ord(character)
+    hexadecimal = "".join(f"[{d}{d.upper()}]" if d.isalpha() else d for d in f"{code:02x}")
+    slashed = r"\\*/" if character == "/" else re.escape(character)
+    return (
+        rf"(?:{slashed}|\\+(?:u00|x){hexadecimal}|%{hexadecimal}"
+        rf"|&#0*{code};|&#[xX]0*{hexadecimal};)"
+    )
+
+
+def _base64_cores(secret: str) -> Iterable[str]:
+    """What the base64 of any text with the secret contains, in both alphabets.
+
+    A secret begins at one of three places in a group; the characters that it shares with its
+    neighbours are left out.
+    """
+    for before in range(3):
+        coded = b64encode(b"\0" * before + secret.encode()).decode()
+        core = coded[-(-before * 8 // 6) : (before + len(secret)) * 8 // 6]
+        yield from {core, core.replace("+", "-").replace("/", "_"), core.replace("/", r"\/")}
