@@ -16,8 +16,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass
-from datetime import datetime
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,9 @@ from pydantic import TypeAdapter
 from merge_runner.database import Settings, in_memory
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, Entry, ResponseCache
-from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
-from merge_runner.records import SIDES, Attempt, ChatRequest, Slot, is_scripted
+from merge_runner.llm.keys import KEY_VERSION, call_key
+from merge_runner.llm.verify import DAMAGED, check_attempts, check_body
+from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
 from merge_runner.texts import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 1"
@@ -54,15 +54,12 @@ HEADERS = TypeAdapter(dict[str, str])
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """DuckDB hands out this many rows at once, and their texts may have this many bytes."""
-LARGEST_NUMBER = 2**31 - 1
 READING: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
     "memory_limit": "1GB",  # what is unpacked counts too
     "threads": 1,
 }
-# What hostile content can raise; RecursionError for JSON that is nested too deeply.
-DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,9 +246,7 @@ def _entry(row: dict[str, Any]) -> Entry:
         raise ValueError(f"it has no {', '.join(empty)}")
     if row["side"] not in SIDES:
         raise ValueError(f"its side is none of {', '.join(SIDES)}")
-    body = json.loads(row["body"])
-    if not isinstance(body, dict) or canonical_json(body) != row["body"]:
-        raise ValueError("its request is no canonical JSON object")
+    check_body(row["body"])
     slot = Slot(
         row["condition"], row["repetition"], row["side"], row["decision"], row["sample_set"]
     )
@@ -264,8 +259,7 @@ def _entry(row: dict[str, Any]) -> Entry:
         slot=slot,
     )
     attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
-    for attempt in attempts:
-        _check(attempt)
+    check_attempts(attempts)
     request = ChatRequest(
         key=key,
         provider=row["provider"],
@@ -277,21 +271,6 @@ def _entry(row: dict[str, Any]) -> Entry:
         slot=slot,
     )
     return Entry(request, attempts)
-
-
-def _check(attempt: Attempt) -> None:
-    """Raise one of DAMAGED for what no attempt can hold and a replay or a table cannot take."""
-    numbers = (
-        *(attempt.number, attempt.http_status, attempt.latency_s, attempt.cost_usd),
-        *astuple(attempt.usage),
-    )
-    if any(number is not None and not 0 <= number <= LARGEST_NUMBER for number in numbers):
-        raise ValueError("an attempt has a number that no attempt can have")
-    if attempt.started_at is not None:
-        datetime.fromisoformat(attempt.started_at)
-    answer = json.loads(attempt.reply or "{}") if attempt.http_status == 200 else {}
-    if not isinstance(answer, dict) and attempt.outcome != "bad_body":
-        raise ValueError("a reply is no JSON object")
 
 
 def _opened(file: Path) -> duckdb.DuckDBPyConnection:

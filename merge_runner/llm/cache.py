@@ -17,17 +17,16 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import diskcache
 from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.batches import BatchWriter, Operation
-from merge_runner.llm.disk import FORMAT, format_of, open_disk, set_format
+from merge_runner.llm.disk import FORMAT, TextDisk, format_of, open_disk, set_format
 from merge_runner.llm.keys import manner, without_prompt
+from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.records import Attempt, ChatRequest, is_scripted
 
 ENTRY_VERSION = 1
-KEY_LENGTH = 64
 CHECKSUM_LENGTH = 32
 ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 # Prefixes of keys that are no call keys.
@@ -151,11 +150,8 @@ class ResponseCache:
         return self._read_overlay() if self._read_overlay else {}
 
     def get(self, key: str) -> Entry | None:
-        """The entry of a call key; raises RecordingError for a damaged one."""
-        if key in self._overlay:
-            return self._overlay[key]
-        text = self.read(key)
-        return None if text is None else _unsealed(text)
+        """The entry of a call key; raises RecordingError for one that is damaged or made up."""
+        return self._overlay.get(key) or self._kept(key)
 
     async def put(self, entry: Entry, also: Operation | None = None) -> Entry:
         """Keep an entry; returns the one that is kept when it is durable.
@@ -182,16 +178,15 @@ class ResponseCache:
 
         Returns the names of those that were.
         """
-        names = {key: _unsealed, _UNANSWERED + key: _attempts}
+        checks = {key: self._kept, _UNANSWERED + key: self.unanswered}
 
         def damaged() -> list[str]:
-            return [name for name, check in names.items() if self._is_damaged(name, check)]
+            return [name for name, check in checks.items() if _is_damaged(check, key)]
 
         def operation() -> list[str]:
             found = damaged()  # another process may have mended it
             for name in found:
-                self._disk.set(_DAMAGED + name, self._disk[name])
-                self._disk.delete(name)
+                self._disk.set_aside(name, _DAMAGED + name)
             return found
 
         moved: list[str] = self.run_now([operation])[0] if damaged() else []
@@ -217,37 +212,34 @@ class ResponseCache:
     def run_now(self, operations: list[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread."""
         try:
-            with self._disk.transact(retry=True):
+            with self._disk.transaction():
                 results = [operation() for operation in operations]
                 self._count(self._new)
-        except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
-            raise CacheFailed(
-                f"the cache {self.folder} cannot be written: {exc}. Every reply up to now is kept, "
-                "those in flight are lost; when that is mended, run the same command again"
+        except (OSError, sqlite3.Error) as exc:
+            raise self._failed(
+                f"written: {exc}. Every reply up to now is kept, those in flight are lost; when "
+                "that is mended, run the same command again"
             ) from exc
         finally:
             self._new = []
         return results
 
     def read(self, name: str) -> str | None:
-        """The text under a name; raises CacheFailed where the folder cannot be read."""
-        try:
-            text: str | None = self._disk.get(name)
-        except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
-            raise CacheFailed(
-                f"the cache {self.folder} cannot be read: {exc}. Mend or move it; the database and "
-                "any exported recording are not affected"
-            ) from exc
-        return text
+        """The text under a name.
+
+        Raises RecordingError where it is no text, CacheFailed where the folder cannot be read.
+        """
+        with self._readable():
+            return self._disk.get(name)
 
     def replace(self, name: str, text: str) -> None:
         """An operation: keep a text under a name that is no call key."""
         self._disk.set(name, text)
 
-    def entries(self) -> Iterator[Entry]:
-        """All entries, of the folder and of the overlay."""
-        for key in self._keys():
-            yield _unsealed(self._disk[key])
+    def entries(self, left_out: list[str] | None = None) -> Iterator[Entry]:
+        """All entries, of the folder and of the overlay; see ``entries_of``."""
+        with self._readable():
+            yield from entries_of(self._disk, [] if left_out is None else left_out)
         yield from self._overlay.values()
 
     def recorded_endpoints(self, model: str) -> list[str]:
@@ -262,11 +254,9 @@ class ResponseCache:
 
     def cost_usd(self) -> float:
         """What all entries of the folder cost when they were made."""
-        try:
-            models = [key.removeprefix(_MODEL) for key in self._disk if key.startswith(_MODEL)]
-        except sqlite3.Error as exc:
-            raise CacheFailed(f"the cache {self.folder} cannot be read: {exc}") from exc
-        return sum(self.facts(model).cost_usd for model in models)
+        with self._readable():
+            names = self._disk.names(_MODEL)
+        return sum(self.facts(name.removeprefix(_MODEL)).cost_usd for name in names)
 
     def close(self) -> None:
         """Close the folder."""
@@ -274,23 +264,39 @@ class ResponseCache:
 
     def _keep(self, entry: Entry) -> Entry:
         key = entry.request.key
-        if not self._disk.add(key, _sealed(entry)):
-            return _unsealed(self._disk[key])
+        try:
+            if kept := self._kept(key):
+                return kept
+        except RecordingError:
+            self._disk.set_aside(key, _DAMAGED + key)
+        self._disk.add(key, _sealed(entry))
         self._disk.delete(_UNANSWERED + key)
         self._new.append(entry)
         return entry
 
-    def _is_damaged(self, name: str, check: Callable[[str], object]) -> bool:
-        text = self.read(name)
-        try:
-            if text is not None:
-                check(text)
-        except RecordingError:
-            return True
-        return False
+    def _kept(self, key: str) -> Entry | None:
+        text = self.read(key)
+        return None if text is None else _unsealed(key, text)
 
-    def _keys(self) -> Iterator[str]:
-        return (key for key in self._disk if len(key) == KEY_LENGTH and " " not in key)
+    @contextlib.contextmanager
+    def _readable(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, sqlite3.Error) as exc:
+            raise self._failed(
+                f"read: {exc}. Mend or move it; the database and any exported recording are not "
+                f"affected, and `merge-runner recording import {self.folder}` takes what can be "
+                "read of it into another, named with --cache"
+            ) from exc
+
+    def _failed(self, how: str) -> CacheFailed:
+        if self._disk.in_place:
+            return CacheFailed(f"the cache {self.folder} cannot be {how}")
+        return CacheFailed(
+            f"the cache {self.folder} was removed, moved or replaced while it was in use, and what "
+            "it kept with it. Put it back if you can, and run the same command again: what is in "
+            "no cache is asked again. The database is not affected"
+        )
 
     def _count(self, entries: Iterable[Entry]) -> None:
         """Within a transaction: add entries to the facts about their models."""
@@ -308,34 +314,44 @@ class ResponseCache:
 
     def _bring_up_to_date(self) -> None:
         """Earlier formats knew less of each model: count anew."""
-        with self._disk.transact(retry=True):
+        with self._disk.transaction():
             if format_of(self._disk) == FORMAT:
                 return  # another process was quicker
-            for key in [key for key in self._disk if key.startswith((_OLD_ENDPOINTS, _MODEL))]:
-                del self._disk[key]
-            self._count(self._undamaged())
+            for name in self._disk.names(_OLD_ENDPOINTS) + self._disk.names(_MODEL):
+                self._disk.delete(name)
+            self._count(entries_of(self._disk, []))
             set_format(self._disk)
 
     def _facts(self, model: str) -> ModelFacts | None:
         """The facts about a model; None where they are damaged."""
-        text = self.read(_MODEL + model)
         try:
+            text = self.read(_MODEL + model)
             return ModelFacts() if text is None else _FACTS.validate_json(text)
-        except ValidationError:
+        except (RecordingError, ValidationError):
             return None
 
     def _counted_anew(self, model: str) -> ModelFacts:
         facts = ModelFacts()
-        for entry in self._undamaged():
+        for entry in entries_of(self._disk, []):  # a damaged one is told when it is needed
             if entry.request.model == model:
                 facts.add(entry)
         return facts
 
-    def _undamaged(self) -> Iterator[Entry]:
-        """A damaged entry is reported when it is needed, not before."""
-        for key in self._keys():
-            with contextlib.suppress(RecordingError):
-                yield _unsealed(self._disk[key])
+
+def entries_of(disk: TextDisk, left_out: list[str]) -> Iterator[Entry]:
+    """The entries of a folder, maybe somebody else's, each verified.
+
+    What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
+    """
+    for row in disk.calls():
+        try:
+            if isinstance(row, RecordingError):
+                raise row
+            entry = _unsealed(*row)
+            check_body(entry.request.body)
+            yield entry
+        except (RecordingError, UsageError, *DAMAGED) as exc:
+            left_out.append(str(exc))
 
 
 def _sealed(entry: Entry) -> str:
@@ -344,13 +360,21 @@ def _sealed(entry: Entry) -> str:
     return checksum(text) + text
 
 
-def _unsealed(text: str) -> Entry:
-    """A stored entry; those of the first format have no checksum. Raises RecordingError."""
+def _unsealed(key: str, text: str) -> Entry:
+    """A stored entry; those of the first format have no checksum.
+
+    Raises RecordingError unless it is whole and that of its key, so that none is used for another.
+    """
     if not text.startswith("{"):
         told, text = text[:CHECKSUM_LENGTH], text[CHECKSUM_LENGTH:]
         if told != checksum(text):
             raise RecordingError("the recorded reply is damaged: its checksum is wrong")
-    return Entry.from_json(text)
+    entry = Entry.from_json(text)
+    try:
+        check_call(key, entry.request, entry.attempts)
+    except DAMAGED as exc:
+        raise RecordingError(f"the recorded reply is damaged: {exc}") from exc
+    return entry
 
 
 def _attempts(text: str) -> tuple[Attempt, ...]:
@@ -358,6 +382,14 @@ def _attempts(text: str) -> tuple[Attempt, ...]:
         return ATTEMPTS.validate_json(text)
     except ValidationError as exc:
         raise RecordingError("the list of earlier attempts is damaged") from exc
+
+
+def _is_damaged(check: Callable[[str], object], key: str) -> bool:
+    try:
+        check(key)
+    except RecordingError:
+        return True
+    return False
 
 
 def checksum(text: str) -> str:
