@@ -83,8 +83,11 @@ class Summary:
 def export_recording(
     file: Path, cache: ResponseCache, keys: list[str], provenance: dict[str, str]
 ) -> int:
-    """Write the entries of these keys; returns their number. Raises RecordingError."""
-    missing = [key for key in keys if cache.get(key) is None]
+    """Write the entries of these keys; returns their number. Raises RecordingError.
+
+    Damaged ones are left out, and told by the error when the others are written.
+    """
+    damaged, missing = _lacking(cache, keys)
     if missing:
         raise RecordingError(
             f"{len(missing)} of {len(keys)} replies are not in the cache {cache.folder}, the first "
@@ -93,7 +96,8 @@ def export_recording(
     if file.is_dir():
         raise UsageError(f"{file} is a folder: name a file")
     partial = file.with_name(file.name + ".partial")
-    rows = sorted((_row(entry) for entry in map(cache.get, keys) if entry), key=_order)
+    whole = [key for key in keys if key not in damaged]
+    rows = sorted((_row(entry) for entry in map(cache.get, whole) if entry), key=_order)
     content = hashlib.sha256()
     for row in rows:
         content.update(_fingerprint(row[0], row[-1]))
@@ -116,6 +120,13 @@ def export_recording(
             f"(FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE 10240, KV_METADATA {{{pairs}}})"
         )
         os.replace(partial, file)
+    if damaged:
+        key, reason = next(iter(damaged.items()))
+        raise RecordingError(
+            f"{len(damaged)} of {len(keys)} replies are damaged and left out of {file}, the first "
+            f"is {key}: {reason}. The other {len(rows)} are in it; a sweep into another database, "
+            "named with --db, asks for the damaged ones again"
+        )
     return len(keys)
 
 
@@ -151,11 +162,11 @@ def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
     added = there = 0
     batch: list[Entry] = []
     for entry in read_recording(file):
-        if cache.get(entry.request.key) is None:
+        if cache.holds(entry.request.key):
+            there += 1
+        else:
             batch.append(entry)
             added += 1
-        else:
-            there += 1
         if len(batch) == BATCH:
             cache.put_now(batch)
             batch = []
@@ -188,6 +199,19 @@ def summarise(file: Path) -> Summary:
         outcomes=dict(outcomes),
         provenance=_provenance(file),
     )
+
+
+def _lacking(cache: ResponseCache, keys: list[str]) -> tuple[dict[str, str], list[str]]:
+    """The keys of damaged entries, with what is wrong with each, and those of none."""
+    damaged: dict[str, str] = {}
+    missing: list[str] = []
+    for key in keys:
+        try:
+            if cache.get(key) is None:
+                missing.append(key)
+        except RecordingError as exc:
+            damaged[key] = str(exc)
+    return damaged, missing
 
 
 @contextmanager

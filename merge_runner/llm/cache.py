@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -21,7 +20,15 @@ from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.batches import BatchWriter, Operation
-from merge_runner.llm.disk import FORMAT, TextDisk, format_of, open_disk, set_format
+from merge_runner.llm.disk import (
+    FAILURES,
+    FORMAT,
+    TextDisk,
+    format_of,
+    open_disk,
+    open_read_only,
+    set_format,
+)
 from merge_runner.llm.keys import manner, without_prompt
 from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.records import Attempt, ChatRequest, is_scripted
@@ -30,7 +37,7 @@ ENTRY_VERSION = 1
 CHECKSUM_LENGTH = 32
 ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 # Prefixes of keys that are no call keys.
-_MODEL, _UNANSWERED, _DAMAGED = "model ", "attempts ", "damaged "
+_MODEL, _UNANSWERED, _DAMAGED, _AGAIN = "model ", "attempts ", "damaged ", "again "
 _OLD_ENDPOINTS = "endpoints "
 
 
@@ -131,19 +138,24 @@ class ResponseCache:
     """The cache folder. Reads are direct; writes are batched in a thread and awaited."""
 
     def __init__(
-        self, folder: Path, *, overlay: Callable[[], Mapping[str, Entry]] | None = None
+        self,
+        folder: Path,
+        *,
+        overlay: Callable[[], Mapping[str, Entry]] | None = None,
+        read_only: bool = False,
     ) -> None:
         """Open or make the folder; ``overlay`` reads a recording, entries by key.
 
-        What the recording holds comes before what the folder holds.
+        What the recording holds comes before what the folder holds. ``read_only`` changes nothing
+        in the folder, which must be there.
         """
         self.folder = folder
         self._read_overlay = overlay
-        self._disk, version = open_disk(folder)
+        self._disk = open_read_only(folder) if read_only else open_disk(folder)
         self._writer = BatchWriter(self.run_now)
         self._new: list[Entry] = []
-        if version < FORMAT:
-            self._bring_up_to_date()
+        if not read_only and format_of(self._disk) < FORMAT:
+            self.run_now([self._bring_up_to_date])
 
     @cached_property
     def _overlay(self) -> Mapping[str, Entry]:
@@ -152,6 +164,13 @@ class ResponseCache:
     def get(self, key: str) -> Entry | None:
         """The entry of a call key; raises RecordingError for one that is damaged or made up."""
         return self._overlay.get(key) or self._kept(key)
+
+    def holds(self, key: str) -> bool:
+        """Whether there is an entry of a call key, and a whole one."""
+        try:
+            return self.get(key) is not None
+        except RecordingError:
+            return False
 
     async def put(self, entry: Entry, also: Operation | None = None) -> Entry:
         """Keep an entry; returns the one that is kept when it is durable.
@@ -199,7 +218,7 @@ class ResponseCache:
 
     def keep_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """An operation: keep the attempts at a call that has no answer yet."""
-        self._disk.set(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())
+        self._disk.set(_UNANSWERED + key, _behind_checksum(ATTEMPTS.dump_json(attempts).decode()))
 
     async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """Keep the attempts at a call that has no answer yet, durably."""
@@ -215,7 +234,7 @@ class ResponseCache:
             with self._disk.transaction():
                 results = [operation() for operation in operations]
                 self._count(self._new)
-        except (OSError, sqlite3.Error) as exc:
+        except FAILURES as exc:
             raise self._failed(
                 f"written: {exc}. Every reply up to now is kept, those in flight are lost; when "
                 "that is mended, run the same command again"
@@ -236,6 +255,34 @@ class ResponseCache:
         """An operation: keep a text under a name that is no call key."""
         self._disk.set(name, text)
 
+    def remove(self, name: str) -> None:
+        """An operation: forget what is under a name that is no call key."""
+        self._disk.delete(name)
+
+    def names(self, prefix: str) -> list[str]:
+        """The names that begin so, of what is no call."""
+        with self._readable():
+            return self._disk.names(prefix)
+
+    def read_twice(self, name: str) -> str | None:
+        """A text that was kept twice: one is enough. Raises RecordingError where none is whole."""
+        damage: RecordingError | None = None
+        for each in (name, _AGAIN + name):
+            try:
+                text = self.read(each)
+                if text is not None:
+                    return _checked(text)
+            except RecordingError as exc:
+                damage = exc
+        if damage:
+            raise damage
+        return None
+
+    def replace_twice(self, name: str, text: str) -> None:
+        """An operation: keep a text that must not be lost with a damaged row."""
+        for each in (name, _AGAIN + name):
+            self._disk.set(each, _behind_checksum(text))
+
     def entries(self, left_out: list[str] | None = None) -> Iterator[Entry]:
         """All entries, of the folder and of the overlay; see ``entries_of``."""
         with self._readable():
@@ -254,9 +301,8 @@ class ResponseCache:
 
     def cost_usd(self) -> float:
         """What all entries of the folder cost when they were made."""
-        with self._readable():
-            names = self._disk.names(_MODEL)
-        return sum(self.facts(name.removeprefix(_MODEL)).cost_usd for name in names)
+        models = [name.removeprefix(_MODEL) for name in self.names(_MODEL)]
+        return sum(self.facts(model).cost_usd for model in models)
 
     def close(self) -> None:
         """Close the folder."""
@@ -269,20 +315,20 @@ class ResponseCache:
                 return kept
         except RecordingError:
             self._disk.set_aside(key, _DAMAGED + key)
-        self._disk.add(key, _sealed(entry))
+        self._disk.add(key, _behind_checksum(entry.to_json()))
         self._disk.delete(_UNANSWERED + key)
         self._new.append(entry)
         return entry
 
     def _kept(self, key: str) -> Entry | None:
         text = self.read(key)
-        return None if text is None else _unsealed(key, text)
+        return None if text is None else _verified(key, text)
 
     @contextlib.contextmanager
     def _readable(self) -> Iterator[None]:
         try:
             yield
-        except (OSError, sqlite3.Error) as exc:
+        except FAILURES as exc:
             raise self._failed(
                 f"read: {exc}. Mend or move it; the database and any exported recording are not "
                 f"affected, and `merge-runner recording import {self.folder}` takes what can be "
@@ -310,23 +356,28 @@ class ResponseCache:
             else:
                 for entry in new:
                     known.add(entry)
-            self._disk.set(_MODEL + model, _FACTS.dump_json(known).decode())
+            self._keep_facts(model, known)
 
     def _bring_up_to_date(self) -> None:
-        """Earlier formats knew less of each model: count anew."""
-        with self._disk.transaction():
-            if format_of(self._disk) == FORMAT:
-                return  # another process was quicker
+        """An operation: those before the third knew less of each model, so count anew."""
+        if format_of(self._disk) < 3:  # or another process was quicker
             for name in self._disk.names(_OLD_ENDPOINTS) + self._disk.names(_MODEL):
                 self._disk.delete(name)
-            self._count(entries_of(self._disk, []))
-            set_format(self._disk)
+            facts: dict[str, ModelFacts] = {}
+            for entry in entries_of(self._disk, []):
+                facts.setdefault(entry.request.model, ModelFacts()).add(entry)
+            for model, known in facts.items():
+                self._keep_facts(model, known)
+        set_format(self._disk)
+
+    def _keep_facts(self, model: str, facts: ModelFacts) -> None:
+        self._disk.set(_MODEL + model, _behind_checksum(_FACTS.dump_json(facts).decode()))
 
     def _facts(self, model: str) -> ModelFacts | None:
         """The facts about a model; None where they are damaged."""
         try:
             text = self.read(_MODEL + model)
-            return ModelFacts() if text is None else _FACTS.validate_json(text)
+            return ModelFacts() if text is None else _FACTS.validate_json(_checked(text))
         except (RecordingError, ValidationError):
             return None
 
@@ -347,29 +398,19 @@ def entries_of(disk: TextDisk, left_out: list[str]) -> Iterator[Entry]:
         try:
             if isinstance(row, RecordingError):
                 raise row
-            entry = _unsealed(*row)
+            entry = _verified(*row)
             check_body(entry.request.body)
             yield entry
         except (RecordingError, UsageError, *DAMAGED) as exc:
             left_out.append(str(exc))
 
 
-def _sealed(entry: Entry) -> str:
-    """An entry as it is stored: its JSON behind a checksum."""
-    text = entry.to_json()
-    return checksum(text) + text
-
-
-def _unsealed(key: str, text: str) -> Entry:
+def _verified(key: str, text: str) -> Entry:
     """A stored entry; those of the first format have no checksum.
 
     Raises RecordingError unless it is whole and that of its key, so that none is used for another.
     """
-    if not text.startswith("{"):
-        told, text = text[:CHECKSUM_LENGTH], text[CHECKSUM_LENGTH:]
-        if told != checksum(text):
-            raise RecordingError("the recorded reply is damaged: its checksum is wrong")
-    entry = Entry.from_json(text)
+    entry = Entry.from_json(_checked(text))
     try:
         check_call(key, entry.request, entry.attempts)
     except DAMAGED as exc:
@@ -377,9 +418,27 @@ def _unsealed(key: str, text: str) -> Entry:
     return entry
 
 
+def _behind_checksum(text: str) -> str:
+    """A text as it is stored."""
+    return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH] + text
+
+
+def _checked(text: str) -> str:
+    """What was put behind a checksum; the JSON of earlier formats stands alone.
+
+    Raises RecordingError where the checksum is wrong.
+    """
+    if text.startswith(("{", "[")):
+        return text
+    content = text[CHECKSUM_LENGTH:]
+    if text != _behind_checksum(content):
+        raise RecordingError("what is recorded is damaged: its checksum is wrong")
+    return content
+
+
 def _attempts(text: str) -> tuple[Attempt, ...]:
     try:
-        return ATTEMPTS.validate_json(text)
+        return ATTEMPTS.validate_json(_checked(text))
     except ValidationError as exc:
         raise RecordingError("the list of earlier attempts is damaged") from exc
 
@@ -390,8 +449,3 @@ def _is_damaged(check: Callable[[str], object], key: str) -> bool:
     except RecordingError:
         return True
     return False
-
-
-def checksum(text: str) -> str:
-    """What tells a damaged text."""
-    return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH]

@@ -21,11 +21,13 @@ from merge_runner.errors import RecordingError, UsageError
 from merge_runner.texts import one_line
 
 FILE = "cache.db"
-FORMAT = 3
+FORMAT = 4
 _FORMAT, _OPENED = "format", "opened"
 BUSY_S = 600.0
 LONGEST = 2**28
 """A row of more bytes was made to harm."""
+# How reading and writing fail; UnicodeDecodeError where SQLite quotes what is damaged.
+FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
 # What a row says of its value: that it is a text in the row itself, or a pickle.
 _RAW, _PICKLE = 1, 4
 # How a journal ends that names a file which SQLite deletes once it has rolled the journal back.
@@ -122,16 +124,16 @@ class TextDisk:
 
         A call's name has 64 characters, without a space.
         """
-        found = self._execute(
-            "SELECT rowid FROM Cache WHERE typeof(key) != 'text' OR raw IS NOT 1 "
-            "OR length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ') ORDER BY rowid"
-        )
-        for (rowid,) in found.fetchall():
-            try:
-                for key, *value in self._rows("WHERE rowid = ?", rowid):
-                    yield _name(key), _text(*value)
-            except RecordingError as exc:
-                yield exc
+        try:
+            for (rowid,) in self._execute(
+                "SELECT rowid FROM Cache NOT INDEXED WHERE typeof(key) != 'text' OR raw IS NOT 1 "
+                "OR length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ')"
+            ):
+                yield self._call(rowid)
+        except sqlite3.OperationalError:
+            raise
+        except sqlite3.DatabaseError as exc:  # the rows behind a damaged page cannot be reached
+            yield RecordingError(f"the rest of the file is damaged: {exc}")
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -182,6 +184,13 @@ class TextDisk:
     def _execute(self, sql: str, *values: object) -> sqlite3.Cursor:
         return self._connection.execute(sql, values)
 
+    def _call(self, rowid: int) -> tuple[str, str] | RecordingError:
+        try:
+            (row,) = self._rows("WHERE rowid = ?", rowid)
+            return _name(row[0]), _text(*row[1:])
+        except RecordingError as exc:
+            return exc
+
     def _rows(self, where: str, value: object) -> list[tuple[object, ...]]:
         try:
             return self._execute(
@@ -190,7 +199,7 @@ class TextDisk:
                 value,
             ).fetchall()
         except sqlite3.DataError as exc:
-            raise RecordingError(f"the recorded reply is damaged: {exc}") from exc
+            raise RecordingError(f"what is recorded is damaged: {exc}") from exc
 
     def _insert(self, on_conflict: str, name: str, text: str) -> int:
         if not isinstance(text, str):
@@ -211,12 +220,12 @@ class TextDisk:
         return free
 
 
-def open_disk(folder: Path) -> tuple[TextDisk, int]:
-    """Open or make the folder and see that it can be written; returns its format's version too.
+def open_disk(folder: Path) -> TextDisk:
+    """Open or make the folder and see that it can be written.
 
     Raises UsageError for a folder that cannot be used, is damaged, or is of a newer format.
     """
-    with _usable(folder):
+    with usable(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)
         if not (folder / FILE).exists():
@@ -231,14 +240,14 @@ def open_disk(folder: Path) -> tuple[TextDisk, int]:
             f"the cache {folder} has format {version}, written by a newer merge-runner; this one "
             f"reads up to {FORMAT}: update merge-runner, or name another with --cache"
         )
-    return disk, version
+    return disk
 
 
 def open_read_only(folder: Path) -> TextDisk:
     """Open a folder, maybe somebody else's, to read it alone; raises UsageError."""
     if not (folder / FILE).exists():
         raise UsageError(f"there is no cache in {folder}")
-    with _usable(folder):
+    with usable(folder):
         return TextDisk(folder, read_only=True)
 
 
@@ -257,10 +266,11 @@ def set_format(disk: TextDisk) -> None:
 
 
 @contextlib.contextmanager
-def _usable(folder: Path) -> Iterator[None]:
+def usable(folder: Path) -> Iterator[None]:
+    """Raise UsageError for what SQLite and the system say of a folder."""
     try:
         yield
-    except (OSError, sqlite3.Error) as exc:
+    except FAILURES as exc:
         raise UsageError(
             f"the cache {folder} cannot be used: {exc}. Mend or move the folder, or name another "
             f"with --cache; `merge-runner recording import {folder}` takes what can be read of it "

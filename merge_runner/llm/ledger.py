@@ -7,13 +7,14 @@ is found in the call's list of attempts as one of unknown fate.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
-from merge_runner.errors import UsageError
-from merge_runner.llm.cache import CHECKSUM_LENGTH, Entry, ResponseCache, checksum
+from merge_runner.errors import RecordingError, UsageError
+from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
@@ -50,7 +51,8 @@ class Ledger:
         self.spending = Spending()
         self._cache = cache
         self._name = _SPENT + scope
-        self.read()
+        with contextlib.suppress(UsageError):  # told where money is spent
+            self.read()
 
     async def reserve(
         self, key: str, attempts: list[Attempt], worst_usd: float, cap_usd: float | None
@@ -102,24 +104,23 @@ class Ledger:
 
     def read(self) -> Spending:
         """The state of now."""
-        text = self._cache.read(self._name)
-        self.spending = Spending() if text is None else self._unsealed(text)
+        try:
+            text = self._cache.read_twice(self._name)
+            self.spending = Spending() if text is None else _SPENDING.validate_json(text)
+            if not (self.spending.spent_usd >= 0 and self.spending.reserved_usd >= 0):
+                raise RecordingError("no sweep can have spent that")
+        except (RecordingError, ValidationError) as exc:
+            raise UsageError(
+                f"the record of what this sweep has spent ({self._name!r} in the cache "
+                f"{self._cache.folder}) is damaged, so that no cap could hold: take the replies "
+                f"with `merge-runner recording import {self._cache.folder} --cache NEW`, and go "
+                "on with --cache NEW, which counts from 0"
+            ) from exc
         return self.spending
 
     def _write(self, spending: Spending) -> None:
         self.spending = spending
-        text = _SPENDING.dump_json(spending).decode()
-        self._cache.replace(self._name, checksum(text) + text)
-
-    def _unsealed(self, text: str) -> Spending:
-        told, text = text[:CHECKSUM_LENGTH], text[CHECKSUM_LENGTH:]
-        if told != checksum(text):
-            raise UsageError(
-                f"the record of what this sweep has spent ({self._name!r} in the cache "
-                f"{self._cache.folder}) is damaged, so that no cap could hold: export what is "
-                "recorded and import it into a new folder, which counts from 0, with --cache"
-            )
-        return _SPENDING.validate_json(text)
+        self._cache.replace_twice(self._name, _SPENDING.dump_json(spending).decode())
 
 
 def _begun(number: int) -> Attempt:
