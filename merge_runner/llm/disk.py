@@ -78,7 +78,11 @@ class TextDisk:
         self._local = threading.local()
         self._connections: list[sqlite3.Connection] = []
         _refuse_traps(self._file)
-        _refuse_other_layout(self._file, self._connection)
+        try:
+            _refuse_other_layout(self._file, self._connection)
+        except (UsageError, *FAILURES):
+            self.close()  # and nothing is left beside it
+            raise
         self._own = _identity(self._file)  # that of the file which was opened to be written
 
     def get(self, name: str) -> str | None:
@@ -319,6 +323,8 @@ def _connect(file: Path, mode: str) -> sqlite3.Connection:
     connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
     connection.execute("PRAGMA trusted_schema = OFF")
     connection.execute("PRAGMA cell_size_check = ON")
+    if mode == "ro":
+        connection.execute("PRAGMA writable_schema = ON")  # it reads on in a file that is cut off
     connection.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives a power cut
     connection.execute("PRAGMA mmap_size = 0")  # what is mapped counts as this process's memory
     return connection
