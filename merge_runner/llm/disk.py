@@ -345,7 +345,7 @@ def _refuse_traps(file: Path) -> None:
             f"or, to begin anew with nothing recorded and nothing spent, remove {file.parent} or "
             "name another folder with --cache"
         )
-    if _size(journal) and journal.read_bytes().endswith(_SUPER_JOURNAL):
+    if _size(journal) and _end(journal, len(_SUPER_JOURNAL)) == _SUPER_JOURNAL:
         raise UsageError(
             f"{journal} names another file, which SQLite would delete: it is not ours. Remove it, "
             f"and take the replies with `merge-runner recording import {file.parent}`"
@@ -373,6 +373,12 @@ def _beside(file: Path, ending: str) -> Path:
 
 def _size(file: Path) -> int:
     return file.stat().st_size if file.exists() else 0
+
+
+def _end(file: Path, length: int) -> bytes:
+    with file.open("rb") as opened:
+        opened.seek(max(0, _size(file) - length))
+        return opened.read()
 
 
 def _identity(file: Path) -> tuple[int, int]:
