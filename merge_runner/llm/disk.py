@@ -1,8 +1,8 @@
-"""The file under the cache: texts by name, in one SQLite file as diskcache lays it out.
+"""The file under the cache: texts by name, in the one SQLite file of a diskcache.
 
-The file may be damaged, or somebody else's, so nothing in it is executed and no name in it is
-followed. diskcache itself applies settings that it finds in a file, reads the files that rows
-name, and deletes them with their rows: its layout alone is used, which earlier versions made.
+The file may be damaged, or somebody else's. diskcache applies settings that it finds in a file,
+reads the files that rows name, and deletes them with their rows: so what it would obey is refused
+before it opens a file, rows are read by a statement of ours, and it writes texts alone.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ import contextlib
 import os
 import sqlite3
 import tempfile
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
+
+import diskcache
+from diskcache.core import MODE_PICKLE, MODE_RAW
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.texts import one_line
@@ -28,8 +30,6 @@ LONGEST = 2**28
 """A row of more bytes was made to harm."""
 # How reading and writing fail; UnicodeDecodeError where SQLite quotes what is damaged.
 FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
-# What a row says of its value: that it is a text in the row itself, or a pickle.
-_RAW, _PICKLE = 1, 4
 # How a journal ends that names a file which SQLite deletes once it has rolled the journal back.
 _SUPER_JOURNAL = bytes.fromhex("d9d505f920a163d7")
 _COUNTS = {  # what diskcache counts when a row comes, changes or goes
@@ -39,51 +39,86 @@ _COUNTS = {  # what diskcache counts when a row comes, changes or goes
     ("size", "update"): "+ NEW.size - OLD.size",
     ("size", "delete"): "- OLD.size",
 }
-LAYOUT = (
+# What diskcache makes of a file, and needs of it.
+TABLES = (
     "CREATE TABLE Settings ( key TEXT NOT NULL UNIQUE, value)",
     "CREATE TABLE Cache ( rowid INTEGER PRIMARY KEY, key BLOB, raw INTEGER, store_time REAL, "
     "expire_time REAL, access_time REAL, access_count INTEGER DEFAULT 0, tag BLOB, "
     "size INTEGER DEFAULT 0, mode INTEGER DEFAULT 0, filename TEXT, value BLOB)",
     "CREATE UNIQUE INDEX Cache_key_raw ON Cache(key, raw)",
+)
+_LAYOUT = {
+    *TABLES,
     *(
         f"CREATE TRIGGER Settings_{what}_{event} AFTER {event.upper()} ON Cache FOR EACH ROW BEGIN "  # noqa: S608 # constants
         f'UPDATE Settings SET value = value {change} WHERE key = "{what}"; END'
         for (what, event), change in _COUNTS.items()
     ),
-)
-_INDEXES = {  # which diskcache makes besides, as it is set
     *(
         f"CREATE INDEX Cache_{column} ON Cache ({column})"
         for column in ("expire_time", "store_time", "access_time", "access_count")
     ),
     "CREATE INDEX Cache_tag_rowid ON Cache(tag, rowid)",
 }
-# With others diskcache would throw replies out, where a user opens the file with it.
-_SETTINGS = {
+# All of them, so that none of the file's is applied.
+_SETTINGS = diskcache.DEFAULT_SETTINGS | {
     "eviction_policy": "none",
     "cull_limit": 0,
     "size_limit": 2**62,
-    "sqlite_synchronous": 2,
-    "disk_min_file_size": 2**40,
+    "sqlite_synchronous": 2,  # FULL: an acknowledged reply survives a power cut
+    "disk_min_file_size": 2**40,  # everything in the one SQLite file
+    "sqlite_mmap_size": 0,  # what is mapped counts as this process's memory
 }
 
 
+class _Texts(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
+    """Writes texts alone, and touches no other file."""
+
+    def store(self, value: object, read: bool, key: object = diskcache.UNKNOWN) -> Any:  # noqa: ANN401 # diskcache's signature
+        """Store a text."""
+        if not isinstance(value, str):
+            raise TypeError("the cache stores text only")
+        return super().store(value, read, key=key)
+
+    def fetch(self, mode: int, filename: str | None, value: object, read: bool) -> Any:  # noqa: ANN401 # diskcache's signature
+        """Refuse: see TextDisk.get."""
+        raise NotImplementedError
+
+    def remove(self, file_path: str) -> None:
+        """Leave a file that a row names where it is: we wrote none."""
+
+
+class _Store(diskcache.Cache):  # type: ignore[misc] # diskcache ships no types
+    """A diskcache whose connections take damaged texts as they are."""
+
+    @property
+    def _con(self) -> sqlite3.Connection:
+        known = getattr(self._local, "con", None)
+        connection: sqlite3.Connection = super()._con
+        if connection is not known:
+            _guard(connection)
+        return connection
+
+
 class TextDisk:
-    """The texts of a folder's file; a connection for each thread."""
+    """The texts of a folder's file."""
 
     def __init__(self, folder: Path, *, read_only: bool = False) -> None:
         """Open the file; raises UsageError for one that no cache has, sqlite3.Error, OSError."""
         self._file = folder / FILE
-        self._mode = "ro" if read_only else "rw"
-        self._local = threading.local()
-        self._connections: list[sqlite3.Connection] = []
         _refuse_traps(self._file)
+        self._store: _Store | None = None
+        self._reading = _reading(self._file)
         try:
-            _refuse_other_layout(self._file, self._connection)
+            _refuse_other_layout(self._file, self._reading)
         except (UsageError, *FAILURES):
             self.close()  # and nothing is left beside it
             raise
         self._own = _identity(self._file)  # that of the file which was opened to be written
+        if not read_only:
+            self._reading.close()
+            _drop_other_settings(self._file)
+            self._store = _opened(folder)
 
     def get(self, name: str) -> str | None:
         """The text under a name; raises RecordingError where it is none of ours."""
@@ -92,16 +127,15 @@ class TextDisk:
 
     def set(self, name: str, text: str) -> None:
         """Keep a text, in place of any other."""
-        self._insert("DO UPDATE SET mode = 1, filename = NULL, expire_time = NULL, "
-                     "value = excluded.value", name, text)  # fmt: skip
+        self._written.set(name, text)
 
     def add(self, name: str, text: str) -> bool:
         """Keep a text; False where there is one already."""
-        return self._insert("DO NOTHING", name, text) == 1
+        return bool(self._written.add(name, text))
 
     def delete(self, name: str) -> None:
         """Forget a text."""
-        self._execute("DELETE FROM Cache WHERE key = ? AND raw = 1", name)
+        self._written.delete(name)
 
     def set_aside(self, name: str, to: str) -> None:
         """Give what lies under a name another one, as it is: nothing of it is read."""
@@ -121,7 +155,7 @@ class TextDisk:
             prefix,
             prefix + chr(0x10FFFF),
         )
-        return [key.decode() for (key,) in found.fetchall() if _is_utf8(key)]
+        return [key for (key,) in found.fetchall() if _is_whole(key)]
 
     def calls(self) -> Iterator[tuple[str, str] | RecordingError]:
         """The name and text of every row that may be a call's; what is none of ours as the error.
@@ -142,25 +176,13 @@ class TextDisk:
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
         """All or nothing, durable at the end; raises OSError where the file is no longer there."""
-        connection = self._connection
-        connection.execute("BEGIN IMMEDIATE")
         try:
-            yield
-            if not self.in_place:
-                raise FileNotFoundError("it is no longer there")
-            connection.execute("COMMIT")
-        except BaseException:
-            with contextlib.suppress(sqlite3.Error):  # what came first is told
-                connection.execute("ROLLBACK")
-            raise
-
-    def take(self) -> None:
-        """See that the file can be written, and that diskcache throws no reply out of it."""
-        self._execute("PRAGMA journal_mode = WAL")
-        with self.transaction():
-            for pair in _SETTINGS.items():
-                self._execute("REPLACE INTO Settings VALUES (?, ?)", *pair)
-            self.set(_OPENED, "")
+            with self._written.transact():
+                yield
+                if not self.in_place:
+                    raise FileNotFoundError("it is no longer there")
+        except diskcache.Timeout as exc:
+            raise OSError("it cannot be locked to be written") from exc
 
     @property
     def in_place(self) -> bool:
@@ -171,19 +193,20 @@ class TextDisk:
             return False
 
     def close(self) -> None:
-        """Close all connections."""
-        for connection in self._connections:
-            connection.close()
-        self._connections.clear()
-        self._local = threading.local()
+        """Close what this thread has opened."""
+        self._reading.close()
+        if self._store is not None:
+            self._store.close()
 
     @property
     def _connection(self) -> sqlite3.Connection:
-        opened: sqlite3.Connection | None = getattr(self._local, "connection", None)
-        if opened is None:
-            opened = self._local.connection = _connect(self._file, self._mode)
-            self._connections.append(opened)
-        return opened
+        return self._reading if self._store is None else self._store._con
+
+    @property
+    def _written(self) -> _Store:
+        if self._store is None:
+            raise sqlite3.OperationalError("it was opened to be read alone")
+        return self._store
 
     def _execute(self, sql: str, *values: object) -> sqlite3.Cursor:
         return self._connection.execute(sql, values)
@@ -199,21 +222,11 @@ class TextDisk:
         try:
             return self._execute(
                 "SELECT CASE WHEN raw = 1 AND typeof(key) = 'text' THEN key END, "  # noqa: S608 # constants
-                f"mode, filename, typeof(value), value FROM Cache {where}",
+                f"mode, filename, value FROM Cache {where}",
                 value,
             ).fetchall()
         except sqlite3.DataError as exc:
             raise RecordingError(f"what is recorded is damaged: {exc}") from exc
-
-    def _insert(self, on_conflict: str, name: str, text: str) -> int:
-        if not isinstance(text, str):
-            raise TypeError("the cache stores text only")
-        now = time.time()
-        return self._execute(
-            "INSERT INTO Cache (key, raw, store_time, access_time, mode, value) "  # noqa: S608 # constants
-            f"VALUES (?, 1, ?, ?, {_RAW}, ?) ON CONFLICT (key, raw) {on_conflict}",
-            *(name, now, now, text),
-        ).rowcount
 
     def _free(self, name: str) -> str:
         """The name, or with the first number behind it under which nothing lies yet."""
@@ -238,7 +251,8 @@ def open_disk(folder: Path) -> TextDisk:
         disk = TextDisk(folder)
         version = format_of(disk)
         if version <= FORMAT:
-            disk.take()
+            with disk.transaction():
+                disk.set(_OPENED, "")  # it can be written
     if version > FORMAT:
         raise UsageError(
             f"the cache {folder} has format {version}, written by a newer merge-runner; this one "
@@ -285,49 +299,55 @@ def usable(folder: Path) -> Iterator[None]:
 def _make(file: Path) -> None:
     """Make the file whole or not at all, so that an empty one was not just made by somebody."""
     with tempfile.TemporaryDirectory(prefix="new-", dir=file.parent) as folder:
-        _lay_out(Path(folder) / FILE)
+        made = _opened(Path(folder))
+        made.set(_FORMAT, str(FORMAT))
+        made.close()
         try:
             os.link(Path(folder) / FILE, file)
         except FileExistsError:
             pass  # another process was quicker
         except OSError:  # a file system without links
-            _lay_out(file)
+            os.rename(Path(folder) / FILE, file)
     descriptor = os.open(file.parent, os.O_RDONLY)
     os.fsync(descriptor)
     os.close(descriptor)
 
 
-def _lay_out(file: Path) -> None:
-    with contextlib.closing(_connect(file, "rwc")) as connection:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("BEGIN IMMEDIATE")
-        if connection.execute("SELECT 1 FROM sqlite_master").fetchone() is None:
-            for statement in LAYOUT:
-                connection.execute(statement)
-            connection.execute("INSERT INTO Settings VALUES ('count', 0), ('size', 0)")
-            connection.execute(
-                "INSERT INTO Cache (key, raw, mode, value) VALUES (?, 1, ?, ?)",
-                (_FORMAT, _RAW, str(FORMAT)),
-            )
-        connection.execute("COMMIT")
+def _opened(folder: Path) -> _Store:
+    """Open a folder that holds nothing to be refused, or make its file."""
+    return _Store(str(folder), timeout=BUSY_S, disk=_Texts, **_SETTINGS)
 
 
-def _connect(file: Path, mode: str) -> sqlite3.Connection:
-    uri = f"file:{quote(str(file.resolve()))}?mode={mode}"
-    if mode == "ro" and not _size(_beside(file, "-wal")):
-        uri += "&immutable=1"  # nothing at all is written beside it
-    connection = sqlite3.connect(
-        uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
-    )
-    connection.text_factory = bytes  # a text may be damaged
+def _drop_other_settings(file: Path) -> None:
+    """Drop names that diskcache would take for its own attributes, such as its folder."""
+    known = (*_SETTINGS, *diskcache.core.METADATA)
+    places = ", ".join("?" * len(known))
+    with contextlib.closing(sqlite3.connect(file, timeout=BUSY_S, isolation_level=None)) as opened:
+        _guard(opened)
+        opened.execute(f"DELETE FROM Settings WHERE key NOT IN ({places})", known)  # noqa: S608 # constants
+
+
+def _reading(file: Path) -> sqlite3.Connection:
+    """A connection that writes nothing, neither to the file nor beside it."""
+    uri = f"file:{quote(str(file.resolve()))}?mode=ro"
+    if not _size(_beside(file, "-wal")):
+        uri += "&immutable=1"
+    connection = sqlite3.connect(uri, uri=True, timeout=BUSY_S, isolation_level=None)
+    _guard(connection)
+    connection.execute("PRAGMA writable_schema = ON")  # it reads on in a file that is cut off
+    return connection
+
+
+def _guard(connection: sqlite3.Connection) -> None:
+    """Read what may be damaged as it is, and follow nothing."""
+    connection.text_factory = _as_it_is
     connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
     connection.execute("PRAGMA trusted_schema = OFF")
     connection.execute("PRAGMA cell_size_check = ON")
-    if mode == "ro":
-        connection.execute("PRAGMA writable_schema = ON")  # it reads on in a file that is cut off
-    connection.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives a power cut
-    connection.execute("PRAGMA mmap_size = 0")  # what is mapped counts as this process's memory
-    return connection
+
+
+def _as_it_is(text: bytes) -> str:
+    return text.decode(errors="surrogateescape")
 
 
 def _refuse_traps(file: Path) -> None:
@@ -354,13 +374,13 @@ def _refuse_traps(file: Path) -> None:
 
 def _refuse_other_layout(file: Path, connection: sqlite3.Connection) -> None:
     """Raise UsageError unless the file holds a cache's tables, and nothing that could act."""
-    made = connection.execute("SELECT name, sql FROM sqlite_master WHERE sql NOT NULL").fetchall()
-    found = {sql.decode(errors="replace"): name.decode(errors="replace") for name, sql in made}
-    if missing := [statement for statement in LAYOUT[:3] if statement not in found]:
+    made = connection.execute("SELECT sql, name FROM sqlite_master WHERE sql NOT NULL").fetchall()
+    found = dict(made)
+    if missing := [statement for statement in TABLES if statement not in found]:
         raise UsageError(
             f"{file} is no cache of merge-runner: it lacks {missing[0].partition('(')[0].strip()}"
         )
-    if others := [name for sql, name in found.items() if sql not in {*LAYOUT, *_INDEXES}]:
+    if others := [name for sql, name in found.items() if sql not in _LAYOUT]:
         raise UsageError(
             f"{file} holds {one_line(others[0][:40])!r}, which no cache of merge-runner has: it is "
             "not used"
@@ -386,33 +406,31 @@ def _identity(file: Path) -> tuple[int, int]:
     return status.st_dev, status.st_ino
 
 
-def _is_utf8(text: bytes) -> bool:
+def _is_whole(text: str) -> bool:
+    """Whether a text was UTF-8; see _as_it_is."""
     try:
-        text.decode()
-    except UnicodeDecodeError:
+        text.encode()
+    except UnicodeEncodeError:
         return False
     return True
 
 
 def _name(key: object) -> str:
-    if not isinstance(key, bytes):
+    if not isinstance(key, str):
         raise RecordingError("the cache holds a key that is no text, which is not ours: refused")
-    if not _is_utf8(key):
+    if not _is_whole(key):
         raise RecordingError("the cache holds a damaged key")
-    return key.decode()
+    return key
 
 
-def _text(mode: object, filename: object, kind: object, value: object) -> str:
+def _text(mode: object, filename: object, value: object) -> str:
     """The text of a row; raises RecordingError for anything else, which is left unread."""
-    if mode == _PICKLE:
+    if mode == MODE_PICKLE:
         raise RecordingError("the cache holds a pickled value, which is not ours: refused")
     if filename is not None:
         raise RecordingError(
             "the cache names a file in place of a text, which is not ours: refused"
         )
-    if mode != _RAW or kind != b"text" or not isinstance(value, bytes):
+    if mode != MODE_RAW or not isinstance(value, str) or not _is_whole(value):
         raise RecordingError("what is recorded is damaged: it is no text")
-    try:
-        return value.decode()
-    except UnicodeDecodeError as exc:
-        raise RecordingError(f"what is recorded is damaged: it is no text ({exc.reason})") from exc
+    return value

@@ -232,7 +232,7 @@ def test_settings_in_the_file_are_not_applied(folder, tmp_path):
     )
     ((journal,),) = cache._disk._execute("PRAGMA journal_mode")
     ((synchronous,),) = cache._disk._execute("PRAGMA synchronous")
-    assert (journal, synchronous) == (b"wal", 2)
+    assert (journal, synchronous) == ("wal", 2)
     assert len(list(cache.entries())) == 4
     cache.close()
     assert list(elsewhere.iterdir()) == []
