@@ -392,17 +392,19 @@ def recording_export(
         raise UsageError(f"the sweep {found} made no call: there is nothing to record")
     row = sweep_row(db, found)
     provenance = {name: str(value) for name, value in row.items() if value is not None}
-    calls = export_recording(file, ResponseCache(cache), keys, provenance)
+    calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance)
     say(f"{calls} calls of {found} are in {file}")
 
 
 @recording_app.command("import")
 def recording_import(file: RecordingFile, cache: CacheOption = DEFAULT_CACHE) -> None:
-    """Verify a recording and add it to the cache."""
+    """Verify a recording, or the cache folder of somebody else, and add it to the cache."""
     from merge_runner.llm.cache import ResponseCache
+    from merge_runner.llm.foreign import import_folder
     from merge_runner.recording import import_recording
 
-    added, there = import_recording(file, ResponseCache(cache))
+    take = import_folder if file.is_dir() else import_recording
+    added, there = take(file, ResponseCache(cache))
     say(f"{added} calls added to {cache}, {there} were there already")
 
 

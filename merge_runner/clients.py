@@ -110,6 +110,8 @@ def open_desk(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
             )
+    if any(entry.price != "free" for entry in entries.values()):
+        terms.ledger.read()
     claims = Claims(cache.folder)
     stack.callback(claims.close)
     pauses: dict[str, Pause] = {}

@@ -48,10 +48,14 @@ class Instance:
 
     To make one takes longer than most of what is done with it, so there is one for all. After an
     error it may be of no use any more, and a new one is made.
+
+    Where it does not ``confine`` those who read, they do so themselves.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, confine: bool = True) -> None:
+        self._confine = confine
         self._connection: duckdb.DuckDBPyConnection | None = None
+        self._confined: tuple[Path, duckdb.DuckDBPyConnection] | None = None
         self._numbers = itertools.count()
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
@@ -60,13 +64,27 @@ class Instance:
             self._connection = in_memory(SETTINGS)
         return self._connection.cursor()
 
+    def confined(self, path: Path) -> duckdb.DuckDBPyConnection:
+        """A connection that reaches no other file than a database, whoever made that one.
+
+        A view or a macro in it, also one by the name of DuckDB's own functions, may read any file.
+        """
+        if not self._confine:
+            return self.cursor()
+        if self._confined is None or self._confined[0] != path:
+            made = in_memory(SETTINGS)
+            own = ", ".join(quoted(f"{path}{log}") for log in ("", ".wal"))
+            made.execute(f"SET allowed_paths = [{own}]; SET enable_external_access = false")
+            self._confined = path, made
+        return self._confined[1].cursor()
+
     def name(self) -> str:
         """A name for a file that no other one has."""
         return f"results_{next(self._numbers)}"
 
     def drop(self) -> None:
         """Make a new instance next time."""
-        self._connection = None
+        self._connection = self._confined = None
 
 
 SHARED = Instance()
@@ -104,7 +122,8 @@ def _detach(connection: duckdb.DuckDBPyConnection, name: str, instance: Instance
 def _attached(
     path: Path, read_only: bool, patience_s: float, instance: Instance
 ) -> tuple[duckdb.DuckDBPyConnection, str]:
-    connection, name = instance.cursor(), instance.name()
+    connection = instance.confined(path) if read_only else instance.cursor()
+    name = instance.name()
     mode = "READ_ONLY" if read_only else "READ_WRITE"
     began = time.monotonic()
     told = False
@@ -173,16 +192,21 @@ def unreadable_is_usage() -> Iterator[None]:
         raise UsageError(f"{exc}; {REBUILD}") from exc
     except duckdb.IOException as exc:
         raise UsageError(f"the database cannot be read: {first_line(exc)}; {REBUILD}") from exc
+    except duckdb.PermissionException as exc:
+        raise UsageError(
+            f"the database reads files besides itself, which none of merge-runner does, and is not "
+            f"read on: {first_line(exc)}"
+        ) from exc
 
 
 def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
     """The version of an existing database; raises UsageError for a newer or a foreign one."""
-    # A table: a view of this name could read any file.
+    # A table, and functions of DuckDB's: a view or a macro of such a name could read any file.
     ours = connection.execute(
-        "SELECT count(*) FROM duckdb_tables() "
-        "WHERE table_name = 'meta' AND database_name = current_database()"
+        "SELECT 1 FROM system.main.duckdb_tables() "
+        "WHERE table_name = 'meta' AND database_name = system.main.current_database()"
     ).fetchone()
-    if ours != (1,):
+    if ours is None:
         raise UsageError(f"{path} is no database of merge-runner: name another with --db")
     row = connection.execute("SELECT schema_version FROM meta").fetchone()
     if row is None:

@@ -7,7 +7,6 @@ import logging
 import os
 import platform
 import threading
-import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -142,14 +141,12 @@ def read_standing(db: Path, sweep_id: str) -> Standing | None:
 
 
 def clear_dead(db: Path) -> None:
-    """Remove what sweeps left that were killed."""
+    """Remove what sweeps left that were killed, and nothing that somebody else wrote."""
+    folder = _folder(db)
     with suppress(OSError):
-        for path in _folder(db).iterdir():
-            if path.suffix not in {".json", ".tmp"}:
-                continue
+        for path in () if folder.is_symlink() else folder.iterdir():
             standing = _read(path)
-            fresh = time.time() - path.stat().st_mtime < STALE_S
-            if not (standing.alive if standing else fresh):
+            if standing and not standing.alive:
                 path.unlink(missing_ok=True)
 
 
@@ -162,6 +159,8 @@ def _path(db: Path, sweep_id: str) -> Path:
 
 
 def _read(path: Path) -> Standing | None:
+    if not path.is_file():
+        return None  # a pipe may never end
     try:
         with path.open("rb") as file:
             return _STANDING.validate_json(file.read(MOST_BYTES))

@@ -16,8 +16,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass
-from datetime import datetime
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,9 @@ from pydantic import TypeAdapter
 from merge_runner.database import Settings, in_memory
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, Entry, ResponseCache
-from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
-from merge_runner.records import SIDES, Attempt, ChatRequest, Slot, is_scripted
+from merge_runner.llm.keys import KEY_VERSION, call_key
+from merge_runner.llm.verify import DAMAGED, check_attempts, check_body
+from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
 from merge_runner.texts import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 1"
@@ -54,15 +54,12 @@ HEADERS = TypeAdapter(dict[str, str])
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """DuckDB hands out this many rows at once, and their texts may have this many bytes."""
-LARGEST_NUMBER = 2**31 - 1
 READING: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
     "memory_limit": "1GB",  # what is unpacked counts too
     "threads": 1,
 }
-# What hostile content can raise; RecursionError for JSON that is nested too deeply.
-DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +83,11 @@ class Summary:
 def export_recording(
     file: Path, cache: ResponseCache, keys: list[str], provenance: dict[str, str]
 ) -> int:
-    """Write the entries of these keys; returns their number. Raises RecordingError."""
-    missing = [key for key in keys if cache.get(key) is None]
+    """Write the entries of these keys; returns their number. Raises RecordingError.
+
+    Damaged ones are left out, and told by the error when the others are written.
+    """
+    damaged, missing = _lacking(cache, keys)
     if missing:
         raise RecordingError(
             f"{len(missing)} of {len(keys)} replies are not in the cache {cache.folder}, the first "
@@ -96,7 +96,8 @@ def export_recording(
     if file.is_dir():
         raise UsageError(f"{file} is a folder: name a file")
     partial = file.with_name(file.name + ".partial")
-    rows = sorted((_row(entry) for entry in map(cache.get, keys) if entry), key=_order)
+    whole = [key for key in keys if key not in damaged]
+    rows = sorted((_row(entry) for entry in map(cache.get, whole) if entry), key=_order)
     content = hashlib.sha256()
     for row in rows:
         content.update(_fingerprint(row[0], row[-1]))
@@ -119,6 +120,13 @@ def export_recording(
             f"(FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE 10240, KV_METADATA {{{pairs}}})"
         )
         os.replace(partial, file)
+    if damaged:
+        key, reason = next(iter(damaged.items()))
+        raise RecordingError(
+            f"{len(damaged)} of {len(keys)} replies are damaged and left out of {file}, the first "
+            f"is {key}: {reason}. The other {len(rows)} are in it; a sweep into another database, "
+            "named with --db, asks for the damaged ones again"
+        )
     return len(keys)
 
 
@@ -154,11 +162,11 @@ def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
     added = there = 0
     batch: list[Entry] = []
     for entry in read_recording(file):
-        if cache.get(entry.request.key) is None:
+        if cache.holds(entry.request.key):
+            there += 1
+        else:
             batch.append(entry)
             added += 1
-        else:
-            there += 1
         if len(batch) == BATCH:
             cache.put_now(batch)
             batch = []
@@ -191,6 +199,19 @@ def summarise(file: Path) -> Summary:
         outcomes=dict(outcomes),
         provenance=_provenance(file),
     )
+
+
+def _lacking(cache: ResponseCache, keys: list[str]) -> tuple[dict[str, str], list[str]]:
+    """The keys of damaged entries, with what is wrong with each, and those of none."""
+    damaged: dict[str, str] = {}
+    missing: list[str] = []
+    for key in keys:
+        try:
+            if cache.get(key) is None:
+                missing.append(key)
+        except RecordingError as exc:
+            damaged[key] = str(exc)
+    return damaged, missing
 
 
 @contextmanager
@@ -249,9 +270,7 @@ def _entry(row: dict[str, Any]) -> Entry:
         raise ValueError(f"it has no {', '.join(empty)}")
     if row["side"] not in SIDES:
         raise ValueError(f"its side is none of {', '.join(SIDES)}")
-    body = json.loads(row["body"])
-    if not isinstance(body, dict) or canonical_json(body) != row["body"]:
-        raise ValueError("its request is no canonical JSON object")
+    check_body(row["body"])
     slot = Slot(
         row["condition"], row["repetition"], row["side"], row["decision"], row["sample_set"]
     )
@@ -264,8 +283,7 @@ def _entry(row: dict[str, Any]) -> Entry:
         slot=slot,
     )
     attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
-    for attempt in attempts:
-        _check(attempt)
+    check_attempts(attempts)
     request = ChatRequest(
         key=key,
         provider=row["provider"],
@@ -277,21 +295,6 @@ def _entry(row: dict[str, Any]) -> Entry:
         slot=slot,
     )
     return Entry(request, attempts)
-
-
-def _check(attempt: Attempt) -> None:
-    """Raise one of DAMAGED for what no attempt can hold and a replay or a table cannot take."""
-    numbers = (
-        *(attempt.number, attempt.http_status, attempt.latency_s, attempt.cost_usd),
-        *astuple(attempt.usage),
-    )
-    if any(number is not None and not 0 <= number <= LARGEST_NUMBER for number in numbers):
-        raise ValueError("an attempt has a number that no attempt can have")
-    if attempt.started_at is not None:
-        datetime.fromisoformat(attempt.started_at)
-    answer = json.loads(attempt.reply or "{}") if attempt.http_status == 200 else {}
-    if not isinstance(answer, dict) and attempt.outcome != "bad_body":
-        raise ValueError("a reply is no JSON object")
 
 
 def _opened(file: Path) -> duckdb.DuckDBPyConnection:

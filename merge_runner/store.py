@@ -179,7 +179,10 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
     It reaches no file and no network, and changes no setting.
     """
     # The settings hold for a whole instance, and cannot be taken back.
-    with read_database(path, Instance()) as connection, answering(connection, sql) as result:
+    with (
+        read_database(path, Instance(confine=False)) as connection,
+        answering(connection, sql) as result,
+    ):
         return [column[0] for column in result.description or ()], result.fetchall()
 
 

@@ -19,7 +19,6 @@ from merge_runner.database import unreadable_is_usage
 from merge_runner.errors import (
     MergeRunnerError,
     ProviderDown,
-    RecordingError,
     ReplayMiss,
     StoreError,
     TrialSuspended,
@@ -194,10 +193,13 @@ class Sweep:
                 await self._store_rest(flusher, outcome)
             self._explain_misses(outcome)
             try:
-                outcome.spending = self._ledger.read()
                 outcome.cache_cost_usd = self._cache.cost_usd()
+                outcome.spending = self._ledger.read()
             except MergeRunnerError as exc:
-                outcome.fail(exc.exit_code, str(exc))
+                if self._options.replay:  # which spends nothing
+                    outcome.messages.append(str(exc))
+                else:
+                    outcome.fail(exc.exit_code, str(exc))
         for meter in crew.meters.values():
             outcome.damaged += meter.damaged
             outcome.calls_live += meter.calls_live
@@ -252,13 +254,13 @@ class Sweep:
     def _explain_misses(self, outcome: Outcome) -> None:
         if not self._misses:
             return
-        try:
-            lines = explain(self._misses, self._cache.entries())
-        except RecordingError as exc:
-            names = ", ".join(sorted({miss.trial_id for miss in self._misses}))
-            lines = [f"no recorded reply in {names}; nothing to compare with: {exc}"]
-        for line in lines:
+        left_out: list[str] = []
+        for line in explain(self._misses, self._cache.entries(left_out)):
             outcome.fail(ReplayMiss.exit_code, line)
+        if left_out:
+            outcome.messages.append(
+                f"{len(left_out)} rows of the cache are left out of this, the first: {left_out[0]}"
+            )
 
     def _begin(self) -> str:
         """Add the sweep to the database, with the trials that are stored already."""

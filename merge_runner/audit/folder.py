@@ -10,7 +10,7 @@ import duckdb
 
 from merge_runner.audit.findings import Audit, Finding
 from merge_runner.database import read_database
-from merge_runner.errors import RecordingError, UsageError
+from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
 
 BATCH = 1_000
@@ -32,9 +32,7 @@ GROUP BY call_key
 
 def audit_cache(path: Path, folder: Path, sweep_id: str | None = None) -> Audit:
     """Look up every reply of a sweep, or of all; raises UsageError."""
-    if not (folder / "cache.db").is_file():
-        raise UsageError(f"there is no cache in {folder}")
-    cache = ResponseCache(folder)
+    cache = ResponseCache(folder, read_only=True)
     findings: list[Finding] = []
     calls = 0
     try:

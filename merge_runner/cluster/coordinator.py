@@ -25,7 +25,13 @@ from distributed.scheduler import KilledWorker
 from merge_runner.cluster.batch import Batch, fingerprint
 from merge_runner.cluster.session import Session
 from merge_runner.cluster.worker import play_batch
-from merge_runner.errors import ClusterFailed, MergeRunnerError, TrialSuspended, UsageError
+from merge_runner.errors import (
+    ClusterFailed,
+    MergeRunnerError,
+    RecordingError,
+    TrialSuspended,
+    UsageError,
+)
 from merge_runner.llm.meter import Meter
 from merge_runner.players import no_wait
 
@@ -296,7 +302,9 @@ async def _identity(cache: ResponseCache) -> str:
     """What tells this cache from others, and from one that was here before."""
 
     def operation() -> str:
-        known = cache.read(_IDENTITY)
+        known = None
+        with contextlib.suppress(RecordingError):  # a damaged one is none
+            known = cache.read(_IDENTITY)
         if known is None:
             cache.replace(_IDENTITY, known := secrets.token_hex(8))
         return known

@@ -10,28 +10,34 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import diskcache
 from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.batches import BatchWriter, Operation
-from merge_runner.llm.disk import FORMAT, format_of, open_disk, set_format
+from merge_runner.llm.disk import (
+    FAILURES,
+    FORMAT,
+    TextDisk,
+    format_of,
+    open_disk,
+    open_read_only,
+    set_format,
+)
 from merge_runner.llm.keys import manner, without_prompt
+from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.records import Attempt, ChatRequest, is_scripted
 
 ENTRY_VERSION = 1
-KEY_LENGTH = 64
 CHECKSUM_LENGTH = 32
 ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 # Prefixes of keys that are no call keys.
-_MODEL, _UNANSWERED, _DAMAGED = "model ", "attempts ", "damaged "
+_MODEL, _UNANSWERED, _DAMAGED, _AGAIN = "model ", "attempts ", "damaged ", "again "
 _OLD_ENDPOINTS = "endpoints "
 
 
@@ -132,30 +138,39 @@ class ResponseCache:
     """The cache folder. Reads are direct; writes are batched in a thread and awaited."""
 
     def __init__(
-        self, folder: Path, *, overlay: Callable[[], Mapping[str, Entry]] | None = None
+        self,
+        folder: Path,
+        *,
+        overlay: Callable[[], Mapping[str, Entry]] | None = None,
+        read_only: bool = False,
     ) -> None:
         """Open or make the folder; ``overlay`` reads a recording, entries by key.
 
-        What the recording holds comes before what the folder holds.
+        What the recording holds comes before what the folder holds. ``read_only`` changes nothing
+        in the folder, which must be there.
         """
         self.folder = folder
         self._read_overlay = overlay
-        self._disk, version = open_disk(folder)
+        self._disk = open_read_only(folder) if read_only else open_disk(folder)
         self._writer = BatchWriter(self.run_now)
         self._new: list[Entry] = []
-        if version < FORMAT:
-            self._bring_up_to_date()
+        if not read_only and format_of(self._disk) < FORMAT:
+            self.run_now([self._bring_up_to_date])
 
     @cached_property
     def _overlay(self) -> Mapping[str, Entry]:
         return self._read_overlay() if self._read_overlay else {}
 
     def get(self, key: str) -> Entry | None:
-        """The entry of a call key; raises RecordingError for a damaged one."""
-        if key in self._overlay:
-            return self._overlay[key]
-        text = self.read(key)
-        return None if text is None else _unsealed(text)
+        """The entry of a call key; raises RecordingError for one that is damaged or made up."""
+        return self._overlay.get(key) or self._kept(key)
+
+    def holds(self, key: str) -> bool:
+        """Whether there is an entry of a call key, and a whole one."""
+        try:
+            return self.get(key) is not None
+        except RecordingError:
+            return False
 
     async def put(self, entry: Entry, also: Operation | None = None) -> Entry:
         """Keep an entry; returns the one that is kept when it is durable.
@@ -182,16 +197,15 @@ class ResponseCache:
 
         Returns the names of those that were.
         """
-        names = {key: _unsealed, _UNANSWERED + key: _attempts}
+        checks = {key: self._kept, _UNANSWERED + key: self.unanswered}
 
         def damaged() -> list[str]:
-            return [name for name, check in names.items() if self._is_damaged(name, check)]
+            return [name for name, check in checks.items() if _is_damaged(check, key)]
 
         def operation() -> list[str]:
             found = damaged()  # another process may have mended it
             for name in found:
-                self._disk.set(_DAMAGED + name, self._disk[name])
-                self._disk.delete(name)
+                self._disk.set_aside(name, _DAMAGED + name)
             return found
 
         moved: list[str] = self.run_now([operation])[0] if damaged() else []
@@ -204,7 +218,7 @@ class ResponseCache:
 
     def keep_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """An operation: keep the attempts at a call that has no answer yet."""
-        self._disk.set(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())
+        self._disk.set(_UNANSWERED + key, _behind_checksum(ATTEMPTS.dump_json(attempts).decode()))
 
     async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """Keep the attempts at a call that has no answer yet, durably."""
@@ -217,28 +231,25 @@ class ResponseCache:
     def run_now(self, operations: list[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread."""
         try:
-            with self._disk.transact(retry=True):
+            with self._disk.transaction():
                 results = [operation() for operation in operations]
                 self._count(self._new)
-        except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
-            raise CacheFailed(
-                f"the cache {self.folder} cannot be written: {exc}. Every reply up to now is kept, "
-                "those in flight are lost; when that is mended, run the same command again"
+        except FAILURES as exc:
+            raise self._failed(
+                f"written: {exc}. Every reply up to now is kept, those in flight are lost; when "
+                "that is mended, run the same command again"
             ) from exc
         finally:
             self._new = []
         return results
 
     def read(self, name: str) -> str | None:
-        """The text under a name; raises CacheFailed where the folder cannot be read."""
-        try:
-            text: str | None = self._disk.get(name)
-        except (OSError, sqlite3.Error, diskcache.Timeout) as exc:
-            raise CacheFailed(
-                f"the cache {self.folder} cannot be read: {exc}. Mend or move it; the database and "
-                "any exported recording are not affected"
-            ) from exc
-        return text
+        """The text under a name.
+
+        Raises RecordingError where it is no text, CacheFailed where the folder cannot be read.
+        """
+        with self._readable():
+            return self._disk.get(name)
 
     def replace(self, name: str, text: str) -> None:
         """An operation: keep a text under a name that is no call key."""
@@ -250,15 +261,32 @@ class ResponseCache:
 
     def names(self, prefix: str) -> list[str]:
         """The names that begin so, of what is no call."""
-        try:
-            return [key for key in self._disk if key.startswith(prefix)]
-        except sqlite3.Error as exc:
-            raise CacheFailed(f"the cache {self.folder} cannot be read: {exc}") from exc
+        with self._readable():
+            return self._disk.names(prefix)
 
-    def entries(self) -> Iterator[Entry]:
-        """All entries, of the folder and of the overlay."""
-        for key in self._keys():
-            yield _unsealed(self._disk[key])
+    def read_twice(self, name: str) -> str | None:
+        """A text that was kept twice: one is enough. Raises RecordingError where none is whole."""
+        damage: RecordingError | None = None
+        for each in (name, _AGAIN + name):
+            try:
+                text = self.read(each)
+                if text is not None:
+                    return _checked(text)
+            except RecordingError as exc:
+                damage = exc
+        if damage:
+            raise damage
+        return None
+
+    def replace_twice(self, name: str, text: str) -> None:
+        """An operation: keep a text that must not be lost with a damaged row."""
+        for each in (name, _AGAIN + name):
+            self._disk.set(each, _behind_checksum(text))
+
+    def entries(self, left_out: list[str] | None = None) -> Iterator[Entry]:
+        """All entries, of the folder and of the overlay; see ``entries_of``."""
+        with self._readable():
+            yield from entries_of(self._disk, [] if left_out is None else left_out)
         yield from self._overlay.values()
 
     def recorded_endpoints(self, model: str) -> list[str]:
@@ -282,23 +310,39 @@ class ResponseCache:
 
     def _keep(self, entry: Entry) -> Entry:
         key = entry.request.key
-        if not self._disk.add(key, _sealed(entry)):
-            return _unsealed(self._disk[key])
+        try:
+            if kept := self._kept(key):
+                return kept
+        except RecordingError:
+            self._disk.set_aside(key, _DAMAGED + key)
+        self._disk.add(key, _behind_checksum(entry.to_json()))
         self._disk.delete(_UNANSWERED + key)
         self._new.append(entry)
         return entry
 
-    def _is_damaged(self, name: str, check: Callable[[str], object]) -> bool:
-        text = self.read(name)
-        try:
-            if text is not None:
-                check(text)
-        except RecordingError:
-            return True
-        return False
+    def _kept(self, key: str) -> Entry | None:
+        text = self.read(key)
+        return None if text is None else _verified(key, text)
 
-    def _keys(self) -> Iterator[str]:
-        return (key for key in self._disk if len(key) == KEY_LENGTH and " " not in key)
+    @contextlib.contextmanager
+    def _readable(self) -> Iterator[None]:
+        try:
+            yield
+        except FAILURES as exc:
+            raise self._failed(
+                f"read: {exc}. Mend or move it; the database and any exported recording are not "
+                f"affected, and `merge-runner recording import {self.folder}` takes what can be "
+                "read of it into another, named with --cache"
+            ) from exc
+
+    def _failed(self, how: str) -> CacheFailed:
+        if self._disk.in_place:
+            return CacheFailed(f"the cache {self.folder} cannot be {how}")
+        return CacheFailed(
+            f"the cache {self.folder} was removed, moved or replaced while it was in use, and what "
+            "it kept with it. Put it back if you can, and run the same command again: what is in "
+            "no cache is asked again. The database is not affected"
+        )
 
     def _count(self, entries: Iterable[Entry]) -> None:
         """Within a transaction: add entries to the facts about their models."""
@@ -312,62 +356,96 @@ class ResponseCache:
             else:
                 for entry in new:
                     known.add(entry)
-            self._disk.set(_MODEL + model, _FACTS.dump_json(known).decode())
+            self._keep_facts(model, known)
 
     def _bring_up_to_date(self) -> None:
-        """Earlier formats knew less of each model: count anew."""
-        with self._disk.transact(retry=True):
-            if format_of(self._disk) == FORMAT:
-                return  # another process was quicker
-            for key in [key for key in self._disk if key.startswith((_OLD_ENDPOINTS, _MODEL))]:
-                del self._disk[key]
-            self._count(self._undamaged())
-            set_format(self._disk)
+        """An operation: those before the third knew less of each model, so count anew."""
+        if format_of(self._disk) < 3:  # or another process was quicker
+            for name in self._disk.names(_OLD_ENDPOINTS) + self._disk.names(_MODEL):
+                self._disk.delete(name)
+            facts: dict[str, ModelFacts] = {}
+            for entry in entries_of(self._disk, []):
+                facts.setdefault(entry.request.model, ModelFacts()).add(entry)
+            for model, known in facts.items():
+                self._keep_facts(model, known)
+        set_format(self._disk)
+
+    def _keep_facts(self, model: str, facts: ModelFacts) -> None:
+        self._disk.set(_MODEL + model, _behind_checksum(_FACTS.dump_json(facts).decode()))
 
     def _facts(self, model: str) -> ModelFacts | None:
         """The facts about a model; None where they are damaged."""
-        text = self.read(_MODEL + model)
         try:
-            return ModelFacts() if text is None else _FACTS.validate_json(text)
-        except ValidationError:
+            text = self.read(_MODEL + model)
+            return ModelFacts() if text is None else _FACTS.validate_json(_checked(text))
+        except (RecordingError, ValidationError):
             return None
 
     def _counted_anew(self, model: str) -> ModelFacts:
         facts = ModelFacts()
-        for entry in self._undamaged():
+        for entry in entries_of(self._disk, []):  # a damaged one is told when it is needed
             if entry.request.model == model:
                 facts.add(entry)
         return facts
 
-    def _undamaged(self) -> Iterator[Entry]:
-        """A damaged entry is reported when it is needed, not before."""
-        for key in self._keys():
-            with contextlib.suppress(RecordingError):
-                yield _unsealed(self._disk[key])
+
+def entries_of(disk: TextDisk, left_out: list[str]) -> Iterator[Entry]:
+    """The entries of a folder, maybe somebody else's, each verified.
+
+    What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
+    """
+    for row in disk.calls():
+        try:
+            if isinstance(row, RecordingError):
+                raise row
+            entry = _verified(*row)
+            check_body(entry.request.body)
+            yield entry
+        except (RecordingError, UsageError, *DAMAGED) as exc:
+            left_out.append(str(exc))
 
 
-def _sealed(entry: Entry) -> str:
-    """An entry as it is stored: its JSON behind a checksum."""
-    text = entry.to_json()
-    return checksum(text) + text
+def _verified(key: str, text: str) -> Entry:
+    """A stored entry; those of the first format have no checksum.
+
+    Raises RecordingError unless it is whole and that of its key, so that none is used for another.
+    """
+    entry = Entry.from_json(_checked(text))
+    try:
+        check_call(key, entry.request, entry.attempts)
+    except DAMAGED as exc:
+        raise RecordingError(f"the recorded reply is damaged: {exc}") from exc
+    return entry
 
 
-def _unsealed(text: str) -> Entry:
-    """A stored entry; those of the first format have no checksum. Raises RecordingError."""
-    if not text.startswith("{"):
-        told, text = text[:CHECKSUM_LENGTH], text[CHECKSUM_LENGTH:]
-        if told != checksum(text):
-            raise RecordingError("the recorded reply is damaged: its checksum is wrong")
-    return Entry.from_json(text)
+def _behind_checksum(text: str) -> str:
+    """A text as it is stored."""
+    return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH] + text
+
+
+def _checked(text: str) -> str:
+    """What was put behind a checksum; the JSON of earlier formats stands alone.
+
+    Raises RecordingError where the checksum is wrong.
+    """
+    if text.startswith(("{", "[")):
+        return text
+    content = text[CHECKSUM_LENGTH:]
+    if text != _behind_checksum(content):
+        raise RecordingError("what is recorded is damaged: its checksum is wrong")
+    return content
 
 
 def _attempts(text: str) -> tuple[Attempt, ...]:
     try:
-        return ATTEMPTS.validate_json(text)
+        return ATTEMPTS.validate_json(_checked(text))
     except ValidationError as exc:
         raise RecordingError("the list of earlier attempts is damaged") from exc
 
 
-def checksum(text: str) -> str:
-    """What tells a damaged text."""
-    return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH]
+def _is_damaged(check: Callable[[str], object], key: str) -> bool:
+    try:
+        check(key)
+    except RecordingError:
+        return True
+    return False

@@ -22,7 +22,9 @@ class Claims:
         """Raises UsageError where the folder's file system has no locks."""
         self._closed = False
         try:
-            self._file = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            # No link is followed: it would make a file wherever it leads.
+            flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+            self._file = os.open(folder / LOCK_FILE, flags, 0o600)
             if self.take(_TRIED):
                 self.release(_TRIED)
         except OSError as exc:

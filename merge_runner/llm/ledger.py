@@ -7,14 +7,15 @@ case until a user releases it, and is found in the call's list of attempts as on
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
 from pydantic import TypeAdapter, ValidationError
 
-from merge_runner.errors import UsageError
-from merge_runner.llm.cache import CHECKSUM_LENGTH, Entry, ResponseCache, checksum
+from merge_runner.errors import RecordingError, UsageError
+from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
@@ -131,7 +132,8 @@ class Ledger:
         self._cache = cache
         self._name = _SPENT + scope
         self._open = f"{_OPEN}{scope} "
-        self.read()
+        with contextlib.suppress(UsageError):  # told where money is spent
+            self.read()
 
     async def reserve(
         self,
@@ -234,10 +236,10 @@ class Ledger:
 
     def _opened(self, key: str) -> list[SetAside]:
         """The attempts at a call that have no known cost, the one in flight last."""
-        text = self._cache.read(self._open + key)
         try:
+            text = self._cache.read(self._open + key)
             return [] if text is None else _SET_ASIDE.validate_json(text)
-        except ValidationError:
+        except (RecordingError, ValidationError):
             return []  # damaged: the sums, which count, lie elsewhere
 
     def _write_open(self, key: str, attempts: list[SetAside]) -> None:
@@ -249,24 +251,23 @@ class Ledger:
 
     def read(self) -> Spending:
         """The state of now."""
-        text = self._cache.read(self._name)
-        self.spending = Spending() if text is None else self._unsealed(text)
+        try:
+            text = self._cache.read_twice(self._name)
+            self.spending = Spending() if text is None else _SPENDING.validate_json(text)
+            if not (self.spending.spent_usd >= 0 and self.spending.reserved_usd >= 0):
+                raise RecordingError("no sweep can have spent that")
+        except (RecordingError, ValidationError) as exc:
+            raise UsageError(
+                f"the record of what this sweep has spent ({self._name!r} in the cache "
+                f"{self._cache.folder}) is damaged, so that no cap could hold: take the replies "
+                f"with `merge-runner recording import {self._cache.folder} --cache NEW`, and go "
+                "on with --cache NEW, which counts from 0"
+            ) from exc
         return self.spending
 
     def _write(self, spending: Spending) -> None:
         self.spending = spending
-        text = _SPENDING.dump_json(spending).decode()
-        self._cache.replace(self._name, checksum(text) + text)
-
-    def _unsealed(self, text: str) -> Spending:
-        told, text = text[:CHECKSUM_LENGTH], text[CHECKSUM_LENGTH:]
-        if told != checksum(text):
-            raise UsageError(
-                f"the record of what this sweep has spent ({self._name!r} in the cache "
-                f"{self._cache.folder}) is damaged, so that no cap could hold: export what is "
-                "recorded and import it into a new folder, which counts from 0, with --cache"
-            )
-        return _SPENDING.validate_json(text)
+        self._cache.replace_twice(self._name, _SPENDING.dump_json(spending).decode())
 
 
 def _begun(number: int) -> Attempt:

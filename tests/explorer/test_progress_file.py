@@ -98,6 +98,25 @@ def test_a_living_sweep_of_the_same_database_keeps_its_file(tmp_path):
     assert (read_standing(db, "a").pid, read_standing(db, "b")) == (os.getpid(), None)
 
 
+def test_only_what_a_killed_sweep_wrote_is_tidied_up(tmp_path):
+    """A folder from elsewhere may lead to one of the user's, or hold files of other programs."""
+    db, documents = tmp_path / "m.duckdb", tmp_path / "documents"
+    ProgressFile(db, "a").write(standing("a", pid=NO_PROCESS))
+    (tmp_path / "m.duckdb.progress").rename(documents)
+    for name in ("notes.json", "thesis.tmp"):
+        (documents / name).write_text("{}")
+        os.utime(documents / name, (0, 0))
+    before = sorted(documents.iterdir())
+    (tmp_path / "m.duckdb.progress").symlink_to(documents)
+    clear_dead(db)
+    assert sorted(documents.iterdir()) == before
+    (tmp_path / "m.duckdb.progress").unlink()
+    documents.rename(tmp_path / "m.duckdb.progress")
+    clear_dead(db)
+    left = {path.name for path in (tmp_path / "m.duckdb.progress").iterdir()}
+    assert left == {"notes.json", "thesis.tmp"}
+
+
 def test_an_older_state_never_takes_the_place_of_a_newer_one_nor_comes_after_the_end(tmp_path):
     db = tmp_path / "m.duckdb"
     file, old = ProgressFile(db, "s"), standing()

@@ -227,8 +227,19 @@ async def test_a_call_that_goes_on_after_its_trial_gets_no_money(ledger):
 
 async def test_a_damaged_record_of_spending_is_told_and_not_believed(ledger, cache):
     await attempt(Budget(ledger), 1, 0.5, 0.25)
+    places = (ledger._name, f"again {ledger._name}")
     text = cache.read(ledger._name)
-    await cache.write(lambda: cache.replace(ledger._name, text.replace("0.25", "0.15")))
+    for place in places:  # in one alone it is mended by the other
+        cache.run_now([lambda place=place: cache.replace(place, text.replace("0.25", "0.15"))])
+        if place == places[0]:
+            assert ledger.read().spent_usd == 0.25
+    with pytest.raises(UsageError, match="so that no cap could hold"):
+        ledger.read()
+
+
+@pytest.mark.parametrize("text", ['{"spent_usd": -9}', '{"reserved_usd": NaN}', "[]", "{"])
+async def test_spending_that_nobody_can_have_spent_is_not_believed(ledger, cache, text):
+    await cache.write(lambda: cache.replace_twice(ledger._name, text))
     with pytest.raises(UsageError, match="so that no cap could hold"):
         ledger.read()
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
+import sqlite3
 import sys
 
 import pytest
 from harness import watched
 
+from merge_runner.plan import Choice, make_plan
 from merge_runner.store import results_digest
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
@@ -145,6 +148,76 @@ async def test_a_damaged_reply_is_asked_again_in_a_sweep_and_never_in_a_replay(
     with stock(tmp_path / "cache/responses") as cache:
         assert cache[f"damaged {key}"] == damaged
     assert results_digest(tmp_path / "new") == quiet
+
+
+async def test_one_bit_that_makes_no_text_blocks_nothing_else(merge_runner, tmp_path):
+    part = ("baseline", "--reps", 1, "--conditions", "N_0_0,L_4_0")
+    folder = tmp_path / "cache/responses"
+    async with watched() as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        assert (await merge_runner("sweep", *part, **env)).code == 0
+        with sqlite3.connect(folder / "cache.db") as database:
+            # The top bit of the last byte, which is part of no character then.
+            ((key, row),) = database.execute(
+                'SELECT key, rowid FROM Cache WHERE value LIKE \'%"N_0_0"%"decision":4%\' LIMIT 1'
+            )
+            ((value,),) = database.execute(f"SELECT value FROM Cache WHERE rowid = {row}")
+            bent = value[:-1].encode() + bytes([ord(value[-1]) ^ 0x80])
+            database.execute(
+                "UPDATE Cache SET value = CAST(? AS TEXT) WHERE rowid = ?", [bent, row]
+            )
+        database.close()
+        asked = server.requests
+        dry = await merge_runner("sweep", *part, "--dry-run", "--json", "--db", "new", **env)
+        assert (dry.code, dry.summary["trials"]) == (0, 1)
+        replay = await merge_runner("replay", *part, "--json", "--db", "replayed", **env)
+        assert replay.code == 1
+        (failed,) = replay.summary["failed"].values()
+        assert key in failed
+        assert "no text" in failed
+        export = await merge_runner("recording", "export", "rest.parquet", **env)
+        assert export.code == 1
+        assert key in line(export)
+        assert (await merge_runner("recording", "verify", "rest.parquet")).code == 0
+        audit = await merge_runner("audit", "--cache", folder, **env)
+        assert audit.code == 1
+        assert (audit.out + audit.err).count("no text") == 1
+        assert server.requests == asked
+        run = await merge_runner("sweep", *part, "--json", "--db", "new", **env)
+        assert run.code == 0, run.err
+        assert run.summary["damaged_entries"] == [key]
+        assert server.requests == asked + 1
+        whole = ("recording", "export", "all.parquet", "--db", "new")
+        assert (await merge_runner(*whole, **env)).code == 0
+
+
+async def test_a_damaged_record_of_spending_stops_no_replay(merge_runner, tmp_path, stock):
+    part = ("baseline", "--reps", 1, "--conditions", "N_0_0", "--json")
+    assert (await merge_runner("sweep", *part)).code == 0
+    plan = make_plan(Choice("baseline", "emulator"))
+    with stock(tmp_path / "cache/responses") as cache:
+        cache[f"spent {plan.ledger}"] = "damaged"
+    assert (await merge_runner("sweep", *part, "--dry-run", "--db", "new")).code == 0
+    replay = await merge_runner("replay", *part, "--db", "new")
+    assert replay.code == 0, replay.err
+    assert "no cap could hold" in replay.err
+
+
+async def test_a_cache_that_goes_away_during_a_run_is_not_said_to_keep_everything(
+    merge_runner, tmp_path
+):
+    folder = tmp_path / "cache/responses"
+
+    async def middle(request, handler):
+        if server.requests == 9:
+            shutil.rmtree(folder)
+        return await handler(request)
+
+    async with watched(middle) as server:
+        run = await merge_runner(*SWEEP, EMULATOR_BASE_URL=f"{server.url}/v1")
+    assert run.code == 1
+    assert "was removed, moved or replaced" in line(run)
+    assert "is kept" not in run.err
 
 
 async def test_a_damaged_cache_file_is_told_in_one_line(merge_runner, tmp_path):

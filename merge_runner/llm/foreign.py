@@ -1,0 +1,37 @@
+"""Replies of a cache folder from elsewhere: each is verified, and nothing else of it is used."""
+
+from __future__ import annotations
+
+import contextlib
+from itertools import islice
+from pathlib import Path
+
+from merge_runner.errors import RecordingError, UsageError
+from merge_runner.llm.cache import ResponseCache, entries_of
+from merge_runner.llm.disk import open_read_only, usable
+
+BATCH = 1_000
+
+
+def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
+    """Add what the cache lacks; returns (added, already there). The folder is only read.
+
+    Raises RecordingError, when all others are added, if any was damaged or none of ours.
+    """
+    if folder.resolve() == cache.folder.resolve():
+        raise UsageError(f"{folder} is the cache itself: name another one with --cache")
+    added = there = 0
+    left_out: list[str] = []
+    with usable(folder), contextlib.closing(open_read_only(folder)) as disk:
+        entries = entries_of(disk, left_out)
+        while batch := list(islice(entries, BATCH)):
+            new = [entry for entry in batch if not cache.holds(entry.request.key)]
+            cache.put_now(new)
+            added += len(new)
+            there += len(batch) - len(new)
+    if left_out:
+        raise RecordingError(
+            f"{added} calls of {folder} added to {cache.folder}, {there} were there already, and "
+            f"{len(left_out)} rows are left out, the first: {left_out[0]}"
+        )
+    return added, there

@@ -1,0 +1,62 @@
+"""What a recorded call must be to be used, whoever wrote it: it may be damaged, or made up."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+
+from merge_runner.llm.keys import call_key, canonical_json
+from merge_runner.records import Attempt, ChatRequest
+
+# What content can raise that no program of ours wrote; RecursionError where JSON is nested deeply.
+DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
+LARGEST_NUMBER = 2**31 - 1
+MOST_TOKENS = 2**33
+
+
+def check_call(key: str, request: ChatRequest, attempts: tuple[Attempt, ...]) -> None:
+    """Raise one of DAMAGED unless it is the call of a key, with attempts that can be."""
+    content = call_key(
+        endpoint=request.endpoint,
+        path=request.path,
+        headers=request.headers,
+        body=request.body,
+        slot=request.slot,
+    )
+    if not key == request.key == content:
+        raise ValueError("its content does not belong to its key")
+    check_attempts(attempts)
+
+
+def check_body(body: str) -> None:
+    """Raise one of DAMAGED for the body of a request that we would not send."""
+    value = json.loads(body)
+    if not isinstance(value, dict) or canonical_json(value) != body:
+        raise ValueError("its request is no canonical JSON object")
+
+
+def check_attempts(attempts: tuple[Attempt, ...]) -> None:
+    """Raise one of DAMAGED for what no attempts hold and a replay or a table cannot take."""
+    for attempt in attempts:
+        _check_numbers(attempt)
+        if attempt.started_at is not None:
+            datetime.fromisoformat(attempt.started_at)
+        is_answer = attempt.outcome != "bad_body" or attempt is attempts[-1]
+        if attempt.http_status == 200 and is_answer:
+            _check_reply(attempt.reply or "{}")
+
+
+def _check_numbers(attempt: Attempt) -> None:
+    usage = attempt.usage
+    tokens = (usage.input_tokens, usage.cached_input_tokens, usage.output_tokens)
+    numbers = (attempt.number, attempt.http_status, attempt.latency_s, attempt.cost_usd)
+    if not (
+        all(number is None or 0 <= number <= LARGEST_NUMBER for number in numbers)
+        and all(n is None or 0 <= n <= MOST_TOKENS for n in (*tokens, usage.reasoning_tokens))
+    ):
+        raise ValueError("an attempt has a number that no attempt can have")
+
+
+def _check_reply(text: str) -> None:
+    if not isinstance(json.loads(text), dict):
+        raise ValueError("a reply is no JSON object")

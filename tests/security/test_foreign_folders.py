@@ -1,0 +1,420 @@
+"""A cache folder from elsewhere: whatever it holds, only its replies are read, each verified."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import sqlite3
+import struct
+
+import diskcache
+import pytest
+
+from merge_runner.errors import RecordingError, UsageError
+from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.claims import Claims
+from merge_runner.llm.foreign import import_folder
+from merge_runner.llm.keys import make_request
+from merge_runner.records import Attempt, Slot
+
+SECRET = "what nobody else may read"
+PART = ("baseline", "--reps", 1, "--conditions", "N_0_0")
+
+
+def entry(number=0, reply="{}"):
+    request = make_request(
+        provider="openai",
+        endpoint="openai",
+        model="m",
+        path="/chat/completions",
+        headers={},
+        body={"prompt": number},
+        slot=Slot("A1", 1, "left", number, 0),
+    )
+    return Entry(request, (Attempt(1, "ok", 200, reply=reply),))
+
+
+FIRST, SECOND = entry(1), entry(2)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with two replies, as anybody may hand it over."""
+    cache = ResponseCache(tmp_path / "theirs")
+    cache.put_now([FIRST, SECOND])
+    cache.close()
+    return tmp_path / "theirs"
+
+
+@pytest.fixture
+def own(tmp_path):
+    cache = ResponseCache(tmp_path / "own")
+    yield cache
+    cache.close()
+
+
+@pytest.fixture
+def victim(tmp_path):
+    """A file of the user's, which no cache may touch."""
+    file = tmp_path / "diary.txt"
+    file.write_text(SECRET)
+    yield file
+    assert file.read_text() == SECRET
+    assert not file.is_symlink()
+
+
+@contextlib.contextmanager
+def database(folder):
+    with contextlib.closing(sqlite3.connect(folder / "cache.db")) as opened, opened:
+        yield opened
+
+
+def everything_in(folder):
+    """Every file of a folder, with its content."""
+    return {each.name: each.read_bytes() for each in folder.iterdir()}
+
+
+def whole(folder):
+    """What is in a folder when its journal is written back."""
+    with database(folder) as opened:
+        opened.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    return b"".join(everything_in(folder).values())
+
+
+# diskcache's modes: a value in the row, bytes, a text, or a pickle in the file.
+@pytest.mark.parametrize("mode", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("leads", ["absolutely", "up", "by a link", "inside"])
+def test_a_file_that_a_row_names_is_neither_read_nor_deleted(folder, victim, mode, leads):
+    inside = folder / "aa/bb/value.val"
+    inside.parent.mkdir(parents=True)
+    name = {
+        "absolutely": str(victim),
+        "up": f"../{victim.name}",
+        "by a link": "aa/bb/value.val",
+        "inside": "aa/bb/value.val",
+    }[leads]
+    if leads == "by a link":
+        inside.symlink_to(victim)
+    else:
+        inside.write_text(SECRET)
+    key = FIRST.request.key
+    with database(folder) as opened:
+        opened.execute(
+            "UPDATE Cache SET mode = ?, filename = ?, value = NULL WHERE key = ?", [mode, name, key]
+        )
+    cache = ResponseCache(folder)
+    with pytest.raises(RecordingError, match="not ours"):
+        cache.get(key)
+    assert cache.set_damage_aside(key) == [key]
+    assert cache.put_now([FIRST]) == [FIRST]
+    assert list(cache.entries()) == [SECOND, FIRST]
+    cache.run_now([lambda: cache.remove(f"damaged {key}")])
+    cache.close()
+    assert inside.read_text() == SECRET
+    shutil.rmtree(folder / "aa")
+    assert SECRET.encode() not in whole(folder)
+
+
+def journal_that_names(file, other):
+    """A journal that SQLite rolls back, and deletes the other file with it."""
+    magic = bytes.fromhex("d9d505f920a163d7")
+    pages = file.stat().st_size // 4096
+    head = magic + struct.pack(">IIIII", 0, 123, pages, 512, 4096)
+    name = str(other).encode()
+    tail = struct.pack(">I", 2**30 // 4096 + 1) + name
+    return head.ljust(512, b"\0") + tail + struct.pack(">II", len(name), sum(name)) + magic
+
+
+def test_a_journal_that_names_a_file_of_the_users_is_refused(folder, victim):
+    file = folder / "cache.db"
+    (folder / "cache.db-journal").write_bytes(journal_that_names(file, victim))
+    for opening in (ResponseCache, lambda each: ResponseCache(each, read_only=True)):
+        with pytest.raises(UsageError, match="names another file"):
+            opening(folder)
+
+
+def test_the_journal_would_delete_it(folder, tmp_path):
+    """Or else the test above would show nothing."""
+    other = tmp_path / "other.txt"
+    other.write_text(SECRET)
+    file = folder / "cache.db"
+    (folder / "cache.db-journal").write_bytes(journal_that_names(file, other))
+    with database(folder) as opened:
+        opened.execute("SELECT count(*) FROM sqlite_master")
+    assert not other.exists()
+
+
+@pytest.mark.parametrize("name", ["cache.db", "cache.db-wal", "cache.db-shm", "cache.db-journal"])
+def test_a_link_in_the_folder_is_not_followed(folder, victim, tmp_path, name):
+    (folder / name).unlink(missing_ok=True)
+    for target in (victim, tmp_path / "nothing"):
+        (folder / name).symlink_to(target)
+        with pytest.raises(UsageError, match="leads elsewhere"):
+            ResponseCache(folder)
+        (folder / name).unlink()
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_a_file_of_locks_that_leads_elsewhere_makes_none_there(folder, tmp_path):
+    (folder / "claims.lock").symlink_to(tmp_path / "made")
+    with pytest.raises(UsageError, match="cannot be locked"):
+        Claims(folder)
+    assert not (tmp_path / "made").exists()
+
+
+def test_a_pipe_in_place_of_the_file_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "cache.db")
+    with pytest.raises(UsageError, match="leads elsewhere"):
+        ResponseCache(tmp_path)
+
+
+STRANGE = {
+    "a trigger": "CREATE TRIGGER t AFTER UPDATE ON Cache BEGIN DELETE FROM Cache; END",
+    "a view": "CREATE VIEW v AS SELECT * FROM Cache",
+    "a virtual table": "CREATE VIRTUAL TABLE f USING fts5(a)",
+    "another table": "CREATE TABLE places (url)",
+    "an index over an expression": "CREATE INDEX i ON Cache (abs(rowid))",
+    "a name that speaks to a terminal": 'CREATE TABLE "\x1b[2J" (a)',
+}
+
+
+@pytest.mark.parametrize("statement", STRANGE.values(), ids=STRANGE)
+def test_what_no_cache_has_is_refused_and_left_alone(folder, statement):
+    with database(folder) as opened:
+        opened.execute(statement)
+    before = everything_in(folder)
+    with pytest.raises(UsageError, match="which no cache of merge-runner has") as caught:
+        ResponseCache(folder)
+    assert "\x1b" not in str(caught.value)
+    assert everything_in(folder) == before
+
+
+@pytest.mark.parametrize("table", ["Cache", "Settings"])
+def test_a_view_in_place_of_a_table_is_refused(folder, table):
+    with database(folder) as opened:
+        opened.execute(f"ALTER TABLE {table} RENAME TO other")
+        opened.execute(f"CREATE VIEW {table} AS SELECT * FROM other")
+    with pytest.raises(UsageError, match="is no cache of merge-runner"):
+        ResponseCache(folder)
+
+
+def test_the_database_of_another_program_is_left_alone(tmp_path):
+    with database(tmp_path) as opened:
+        opened.execute("CREATE TABLE bookmarks (url)")
+    before = everything_in(tmp_path)
+    with pytest.raises(UsageError, match="is no cache of merge-runner"):
+        ResponseCache(tmp_path)
+    assert everything_in(tmp_path) == before
+
+
+def test_settings_in_the_file_are_not_applied(folder, tmp_path):
+    """diskcache would go to another folder, and throw replies out."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    with database(folder) as opened:
+        opened.executemany(
+            "REPLACE INTO Settings VALUES (?, ?)",
+            [
+                ("_directory", str(elsewhere)),
+                ("disk__directory", str(elsewhere)),
+                ("disk_min_file_size", 0),
+                ("sqlite_journal_mode", "delete"),
+                ("sqlite_SYNCHRONOUS", 0),
+                ("eviction_policy", "least-recently-stored"),
+                ("size_limit", 1),
+            ],
+        )
+    cache = ResponseCache(folder)
+    cache.put_now(
+        [entry(number, json.dumps("x" * 9_000).join(('{"a":', "}"))) for number in (3, 4)]
+    )
+    ((journal,),) = cache._disk._execute("PRAGMA journal_mode")
+    ((synchronous,),) = cache._disk._execute("PRAGMA synchronous")
+    assert (journal, synchronous) == ("wal", 2)
+    assert len(list(cache.entries())) == 4
+    cache.close()
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_stock_diskcache_still_reads_what_is_written(folder):
+    with diskcache.Cache(str(folder)) as stock:
+        assert Entry.from_json(stock[FIRST.request.key][32:]) == FIRST
+        assert len(stock) == len(list(stock))
+        assert stock.check() == []
+
+
+@pytest.mark.parametrize("left", ["nothing", "no table", "a journal of writes alone"])
+def test_a_file_that_is_empty_is_not_taken_for_new(folder, left):
+    """Or what a sweep has spent would begin at 0 again."""
+    file = folder / "cache.db"
+    file.unlink()
+    if left == "a journal of writes alone":
+        (folder / "cache.db-wal").write_bytes(b"x" * 100)
+    else:
+        file.touch()
+    if left == "no table":
+        with database(folder) as opened:
+            opened.execute("PRAGMA user_version = 1")
+    before = everything_in(folder)
+    with pytest.raises(UsageError, match=r"is empty|is no cache of merge-runner"):
+        ResponseCache(folder)
+    assert everything_in(folder) == before
+
+
+def test_a_new_folder_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
+    """A process that dies while it makes the file leaves none that is empty."""
+
+    def dies(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.link", dies)
+    with pytest.raises(KeyboardInterrupt):
+        ResponseCache(tmp_path / "new")
+    assert not (tmp_path / "new/cache.db").exists()
+    monkeypatch.undo()
+    ResponseCache(tmp_path / "new").close()
+
+
+def test_a_file_system_without_links_does_as_well(tmp_path, monkeypatch):
+    def refuses(*_):
+        raise PermissionError
+
+    monkeypatch.setattr("os.link", refuses)
+    for _ in range(2):
+        cache = ResponseCache(tmp_path)
+        assert cache.put_now([FIRST]) == [FIRST]
+        cache.close()
+
+
+def test_a_folder_is_imported_without_a_byte_written_to_it(folder, own):
+    before = everything_in(folder)
+    assert import_folder(folder, own) == (2, 0)
+    assert import_folder(folder, own) == (0, 2)
+    assert list(own.entries()) == [FIRST, SECOND]
+    assert everything_in(folder) == before
+    assert own.names("spent ") == []
+
+
+def test_a_folder_is_imported_with_what_its_last_run_has_not_written_back(folder, own, tmp_path):
+    theirs = ResponseCache(folder)
+    theirs.put_now([entry(3)])
+    shutil.copytree(folder, tmp_path / "copied")
+    theirs.close()
+    assert (tmp_path / "copied/cache.db-wal").stat().st_size
+    assert import_folder(tmp_path / "copied", own) == (3, 0)
+
+
+MADE_UP = {
+    "an answer to another question": ("key", SECOND.request.key),
+    "a changed question": ("body", '{"prompt":7}'),
+    "another endpoint": ("endpoint", "http://elsewhere"),
+    "another model's path": ("path", "/responses"),
+    "another slot": ("slot", {"condition": "A1", "repetition": 2, "side": "left", "decision": 1,
+                              "sample_set": 0}),
+    "another version": ("headers", {"anthropic-version": "1"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("field", "value"), MADE_UP.values(), ids=MADE_UP)
+def test_an_answer_is_never_used_for_another_question(folder, own, field, value):
+    """Whether the folder is used as it is, or imported."""
+    key = FIRST.request.key
+    text = json.loads(FIRST.to_json())
+    text["entry"]["request"][field] = value
+    plant(folder, key, text)
+    cache = ResponseCache(folder)
+    with pytest.raises(RecordingError, match="does not belong to its key"):
+        cache.get(key)
+    cache.close()
+    with pytest.raises(RecordingError, match=r"1 calls of .* 1 rows are left out"):
+        import_folder(folder, own)
+    assert list(own.entries()) == [SECOND]
+
+
+def plant(folder, key, content):
+    """An entry without a checksum, as the first version wrote it."""
+    with database(folder) as opened:
+        done = opened.execute(
+            "UPDATE Cache SET value = ? WHERE key = ?", [json.dumps(content), key]
+        )
+        assert done.rowcount == 1
+
+
+ODD_ATTEMPTS = [
+    {"reply": "no JSON"},
+    {"reply": "[]"},
+    {"reply": "[" * 100_000},
+    {"number": -1},
+    {"http_status": 2**40},
+    {"cost_usd": -5.0},
+    {"started_at": "yesterday"},
+    {"usage": {"input_tokens": -1}},
+]
+
+
+@pytest.mark.parametrize("odd", ODD_ATTEMPTS, ids=map(repr, range(len(ODD_ATTEMPTS))))
+def test_an_attempt_that_no_run_makes_is_refused(folder, own, odd):
+    text = json.loads(FIRST.to_json())
+    text["entry"]["attempts"][0].update(odd)
+    plant(folder, FIRST.request.key, text)
+    with pytest.raises(RecordingError, match="1 rows are left out"):
+        import_folder(folder, own)
+    cache = ResponseCache(folder)
+    with pytest.raises(RecordingError):
+        cache.get(FIRST.request.key)
+    cache.close()
+
+
+def test_a_request_that_nobody_sends_is_refused(folder, own):
+    """Its key is right, but its body is no JSON object."""
+    made = make_request(
+        provider="openai", endpoint="openai", model="m", path="/p", headers={}, body=["x"],
+        slot=Slot("A1", 1, "left", 1, 0),
+    )  # fmt: skip
+    with database(folder) as opened:
+        opened.execute(
+            "UPDATE Cache SET key = ?, value = ? WHERE key = ?",
+            [made.key, Entry(made, FIRST.attempts).to_json(), FIRST.request.key],
+        )
+    with pytest.raises(RecordingError, match="no canonical JSON object"):
+        import_folder(folder, own)
+
+
+def test_an_import_mends_what_is_damaged_here(folder, own):
+    own.put_now([FIRST])
+    with database(own.folder) as opened:
+        opened.execute("UPDATE Cache SET value = 'x' WHERE key = ?", [FIRST.request.key])
+    assert import_folder(folder, own) == (2, 0)
+    assert own.get(FIRST.request.key) == FIRST
+
+
+@pytest.mark.parametrize("kept", [0.5, 0.9])
+def test_of_a_file_that_is_cut_off_is_taken_what_can_be_read(folder, own, kept):
+    cache = ResponseCache(folder)
+    cache.put_now([entry(number, json.dumps({"a": "x" * 3000})) for number in range(3, 40)])
+    cache.close()
+    file = folder / "cache.db"
+    file.write_bytes(file.read_bytes()[: int(file.stat().st_size * kept)])
+    with pytest.raises((RecordingError, UsageError)):
+        import_folder(folder, own)
+    assert list(own.entries())
+
+
+async def test_the_command_takes_a_folder_and_says_what_it_left(merge_runner, tmp_path):
+    assert (await merge_runner("sweep", *PART)).code == 0
+    (tmp_path / "cache/responses").rename(tmp_path / "theirs")
+    nothing = await merge_runner("recording", "import", "results")
+    assert nothing.code == 2
+    assert "there is no cache in results" in nothing.err
+    with database(tmp_path / "theirs") as opened:
+        opened.execute("UPDATE Cache SET value = 7 WHERE value LIKE '%\"decision\":4%'")
+    taken = await merge_runner("recording", "import", "theirs")
+    assert taken.code == 1
+    assert "2 rows are left out" in taken.err
+    replay = await merge_runner("replay", *PART, "--db", "new", "--json")
+    assert replay.summary["calls"]["cached"] > 0
+    own = await merge_runner("recording", "import", "cache/responses")
+    assert own.code == 2
+    assert "is the cache itself" in own.err
