@@ -16,7 +16,13 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
 from merge_runner.errors import RecordingError, TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget
@@ -259,7 +265,9 @@ class CacheMachine(RuleBasedStateMachine):
                 assert process.cache.unanswered(REQUESTS[question].key) == attempts
 
 
-CacheMachine.TestCase.settings = settings(
-    max_examples=EXAMPLES, stateful_step_count=30, deadline=None
-)
-test_nothing_answered_is_asked_again_and_the_cap_holds_in_any_order = CacheMachine.TestCase
+def test_nothing_answered_is_asked_again_and_the_cap_holds_in_any_order():
+    """Nor is more spent than is counted, and every stored byte is what was answered."""
+    run_state_machine_as_test(
+        CacheMachine,
+        settings=settings(max_examples=EXAMPLES, stateful_step_count=30, deadline=None),
+    )
