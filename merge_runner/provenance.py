@@ -8,7 +8,7 @@ from importlib.metadata import version
 
 from merge_runner.places import PROJECT
 
-PACKAGES = ("merge-runner", "diskcache", "duckdb", "httpx", "httpx-aiohttp", "pydantic", "tenacity")
+PACKAGES = ("merge-runner", "duckdb", "httpx", "httpx-aiohttp", "pydantic", "tenacity")
 
 
 def versions() -> dict[str, str]:
