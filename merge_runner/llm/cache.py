@@ -248,8 +248,10 @@ class ResponseCache:
 
         Raises RecordingError where it is no text, CacheFailed where the folder cannot be read.
         """
-        with self._readable():
+        try:
             return self._disk.get(name)
+        except FAILURES as exc:
+            raise self._unreadable(exc) from exc
 
     def replace(self, name: str, text: str) -> None:
         """An operation: keep a text under a name that is no call key."""
@@ -329,11 +331,14 @@ class ResponseCache:
         try:
             yield
         except FAILURES as exc:
-            raise self._failed(
-                f"read: {exc}. Mend or move it; the database and any exported recording are not "
-                f"affected, and `merge-runner recording import {self.folder}` takes what can be "
-                "read of it into another, named with --cache"
-            ) from exc
+            raise self._unreadable(exc) from exc
+
+    def _unreadable(self, exc: Exception) -> CacheFailed:
+        return self._failed(
+            f"read: {exc}. Mend or move it; the database and any exported recording are not "
+            f"affected, and `merge-runner recording import {self.folder}` takes what can be read "
+            "of it into another, named with --cache"
+        )
 
     def _failed(self, how: str) -> CacheFailed:
         if self._disk.in_place:

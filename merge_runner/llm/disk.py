@@ -58,6 +58,11 @@ _INDEXES = {  # which diskcache makes besides, as it is set
     ),
     "CREATE INDEX Cache_tag_rowid ON Cache(tag, rowid)",
 }
+_GET = "SELECT mode, filename, typeof(value), value FROM Cache WHERE key = ? AND raw = 1"
+_CALL = (
+    "SELECT CASE WHEN raw = 1 AND typeof(key) = 'text' THEN key END, mode, filename, "
+    "typeof(value), value FROM Cache WHERE rowid = ?"
+)
 # With others diskcache would throw replies out, where a user opens the file with it.
 _SETTINGS = {
     "eviction_policy": "none",
@@ -87,8 +92,11 @@ class TextDisk:
 
     def get(self, name: str) -> str | None:
         """The text under a name; raises RecordingError where it is none of ours."""
-        rows = self._rows("WHERE key = ? AND raw = 1", name)
-        return _text(*rows[0][1:]) if rows else None
+        try:
+            row = self._connection.execute(_GET, (name,)).fetchone()
+        except sqlite3.DataError as exc:
+            raise RecordingError(f"what is recorded is damaged: {exc}") from exc
+        return None if row is None else _text(*row)
 
     def set(self, name: str, text: str) -> None:
         """Keep a text, in place of any other."""
@@ -190,20 +198,12 @@ class TextDisk:
 
     def _call(self, rowid: int) -> tuple[str, str] | RecordingError:
         try:
-            (row,) = self._rows("WHERE rowid = ?", rowid)
-            return _name(row[0]), _text(*row[1:])
+            key, *row = self._execute(_CALL, rowid).fetchone()
+            return _name(key), _text(*row)
+        except sqlite3.DataError as exc:
+            return RecordingError(f"what is recorded is damaged: {exc}")
         except RecordingError as exc:
             return exc
-
-    def _rows(self, where: str, value: object) -> list[tuple[object, ...]]:
-        try:
-            return self._execute(
-                "SELECT CASE WHEN raw = 1 AND typeof(key) = 'text' THEN key END, "  # noqa: S608 # constants
-                f"mode, filename, typeof(value), value FROM Cache {where}",
-                value,
-            ).fetchall()
-        except sqlite3.DataError as exc:
-            raise RecordingError(f"what is recorded is damaged: {exc}") from exc
 
     def _insert(self, on_conflict: str, name: str, text: str) -> int:
         if not isinstance(text, str):
@@ -326,6 +326,7 @@ def _connect(file: Path, mode: str) -> sqlite3.Connection:
     if mode == "ro":
         connection.execute("PRAGMA writable_schema = ON")  # it reads on in a file that is cut off
     connection.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives a power cut
+    connection.execute("PRAGMA cache_size = 8192")  # pages: a replay reads all over the file
     connection.execute("PRAGMA mmap_size = 0")  # what is mapped counts as this process's memory
     return connection
 
