@@ -437,7 +437,7 @@ def _checked(text: str) -> str:
         return text
     content = text[CHECKSUM_LENGTH:]
     if text != _behind_checksum(content):
-        raise RecordingError("what is recorded is damaged: its checksum is wrong")
+        raise RecordingError("the recorded reply is damaged: its checksum is wrong")
     return content
 
 

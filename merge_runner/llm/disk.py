@@ -95,7 +95,7 @@ class TextDisk:
         try:
             row = self._connection.execute(_GET, (name,)).fetchone()
         except sqlite3.DataError as exc:
-            raise RecordingError(f"what is recorded is damaged: {exc}") from exc
+            raise RecordingError(f"the recorded reply is damaged: {exc}") from exc
         return None if row is None else _text(*row)
 
     def set(self, name: str, text: str) -> None:
@@ -201,7 +201,7 @@ class TextDisk:
             key, *row = self._execute(_CALL, rowid).fetchone()
             return _name(key), _text(*row)
         except sqlite3.DataError as exc:
-            return RecordingError(f"what is recorded is damaged: {exc}")
+            return RecordingError(f"the recorded reply is damaged: {exc}")
         except RecordingError as exc:
             return exc
 
@@ -412,8 +412,10 @@ def _text(mode: object, filename: object, kind: object, value: object) -> str:
             "the cache names a file in place of a text, which is not ours: refused"
         )
     if mode != _RAW or kind != b"text" or not isinstance(value, bytes):
-        raise RecordingError("what is recorded is damaged: it is no text")
+        raise RecordingError("the recorded reply is damaged: it is no text")
     try:
         return value.decode()
     except UnicodeDecodeError as exc:
-        raise RecordingError(f"what is recorded is damaged: it is no text ({exc.reason})") from exc
+        raise RecordingError(
+            f"the recorded reply is damaged: it is no text ({exc.reason})"
+        ) from exc
