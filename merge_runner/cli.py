@@ -73,6 +73,9 @@ NameArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="experiments/NAME.toml, or a path.")
 ]
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
+ImportedFile = Annotated[
+    Path, typer.Argument(metavar="FILE", help="A recording (.parquet), or a cache folder.")
+]
 RecordingOption = Annotated[
     Path | None,
     typer.Option("--recording", help="Replay from this file too, without importing it."),
@@ -397,7 +400,7 @@ def recording_export(
 
 
 @recording_app.command("import")
-def recording_import(file: RecordingFile, cache: CacheOption = DEFAULT_CACHE) -> None:
+def recording_import(file: ImportedFile, cache: CacheOption = DEFAULT_CACHE) -> None:
     """Verify a recording, or the cache folder of somebody else, and add it to the cache."""
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.foreign import import_folder

@@ -35,6 +35,13 @@ REBUILD = (
 )
 
 
+def spill_folder() -> Path:
+    """Where DuckDB may write besides its database, also where it is confined to that."""
+    folder = Path(str(SETTINGS["temp_directory"]))
+    folder.mkdir(mode=0o700, exist_ok=True)
+    return folder
+
+
 def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
     """A database of its own, in memory."""
     connection = duckdb.connect(config=settings)

@@ -13,7 +13,7 @@ import duckdb
 
 from analysis.explorer.child import csv_cell
 from analysis.explorer.reading import PATIENCE_S, reading
-from merge_runner.database import SCHEMA, Instance
+from merge_runner.database import SCHEMA, Instance, spill_folder
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.plan import stand_in
 from merge_runner.records import SIDES
@@ -379,7 +379,7 @@ class Catalogue:
     def export(self, wanted: Filter, sort: str, form: str) -> bytes:
         """All trials of a filter as CSV or Parquet."""
         where, values = wanted.where()
-        with tempfile.TemporaryDirectory() as folder, self._lock:
+        with tempfile.TemporaryDirectory(dir=spill_folder()) as folder, self._lock:
             path = Path(folder) / f"trials.{form}"
             assert self._connection is not None, "it was never refreshed"
             chosen = self._connection.sql(
@@ -399,7 +399,7 @@ class Catalogue:
     def _begin(self, file: int) -> None:
         """Forget everything."""
         self._instance.drop()
-        self._connection = self._instance.cursor()
+        self._connection = self._instance.confined(self.db)
         self._connection.execute(SCHEMA.read_text(encoding="utf-8"))
         self._connection.execute(LISTED + GROUPED)
         self._file, self._stamp = file, None

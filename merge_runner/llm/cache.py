@@ -248,8 +248,10 @@ class ResponseCache:
 
         Raises RecordingError where it is no text, CacheFailed where the folder cannot be read.
         """
-        with self._readable():
+        try:
             return self._disk.get(name)
+        except FAILURES as exc:
+            raise self._unreadable(exc) from exc
 
     def replace(self, name: str, text: str) -> None:
         """An operation: keep a text under a name that is no call key."""
@@ -263,6 +265,11 @@ class ResponseCache:
         """The names that begin so, of what is no call."""
         with self._readable():
             return self._disk.names(prefix)
+
+    def names_kept_twice(self, prefix: str) -> list[str]:
+        """The names that begin so, of texts that are kept twice."""
+        again = (name.removeprefix(_AGAIN) for name in self.names(_AGAIN + prefix))
+        return sorted({*self.names(prefix), *again})
 
     def read_twice(self, name: str) -> str | None:
         """A text that was kept twice: one is enough. Raises RecordingError where none is whole."""
@@ -301,7 +308,7 @@ class ResponseCache:
 
     def cost_usd(self) -> float:
         """What all entries of the folder cost when they were made."""
-        models = [name.removeprefix(_MODEL) for name in self.names(_MODEL)]
+        models = (name.removeprefix(_MODEL) for name in self.names_kept_twice(_MODEL))
         return sum(self.facts(model).cost_usd for model in models)
 
     def close(self) -> None:
@@ -329,11 +336,14 @@ class ResponseCache:
         try:
             yield
         except FAILURES as exc:
-            raise self._failed(
-                f"read: {exc}. Mend or move it; the database and any exported recording are not "
-                f"affected, and `merge-runner recording import {self.folder}` takes what can be "
-                "read of it into another, named with --cache"
-            ) from exc
+            raise self._unreadable(exc) from exc
+
+    def _unreadable(self, exc: Exception) -> CacheFailed:
+        return self._failed(
+            f"read: {exc}. Mend or move it; the database and any exported recording are not "
+            f"affected, and `merge-runner recording import {self.folder}` takes what can be read "
+            "of it into another, named with --cache"
+        )
 
     def _failed(self, how: str) -> CacheFailed:
         if self._disk.in_place:
@@ -371,13 +381,13 @@ class ResponseCache:
         set_format(self._disk)
 
     def _keep_facts(self, model: str, facts: ModelFacts) -> None:
-        self._disk.set(_MODEL + model, _behind_checksum(_FACTS.dump_json(facts).decode()))
+        self.replace_twice(_MODEL + model, _FACTS.dump_json(facts).decode())
 
     def _facts(self, model: str) -> ModelFacts | None:
         """The facts about a model; None where they are damaged."""
         try:
-            text = self.read(_MODEL + model)
-            return ModelFacts() if text is None else _FACTS.validate_json(_checked(text))
+            text = self.read_twice(_MODEL + model)
+            return ModelFacts() if text is None else _FACTS.validate_json(text)
         except (RecordingError, ValidationError):
             return None
 
@@ -432,7 +442,7 @@ def _checked(text: str) -> str:
         return text
     content = text[CHECKSUM_LENGTH:]
     if text != _behind_checksum(content):
-        raise RecordingError("what is recorded is damaged: its checksum is wrong")
+        raise RecordingError("the recorded reply is damaged: its checksum is wrong")
     return content
 
 

@@ -60,6 +60,11 @@ _LAYOUT = {
     ),
     "CREATE INDEX Cache_tag_rowid ON Cache(tag, rowid)",
 }
+_GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
+_CALL = (
+    "SELECT CASE WHEN raw = 1 AND typeof(key) = 'text' THEN key END, mode, filename, value "
+    "FROM Cache WHERE rowid = ?"
+)
 # All of them, so that none of the file's is applied.
 _SETTINGS = diskcache.DEFAULT_SETTINGS | {
     "eviction_policy": "none",
@@ -122,8 +127,11 @@ class TextDisk:
 
     def get(self, name: str) -> str | None:
         """The text under a name; raises RecordingError where it is none of ours."""
-        rows = self._rows("WHERE key = ? AND raw = 1", name)
-        return _text(*rows[0][1:]) if rows else None
+        try:
+            row = self._connection.execute(_GET, (name,)).fetchone()
+        except sqlite3.DataError as exc:
+            raise RecordingError(f"the recorded reply is damaged: {exc}") from exc
+        return None if row is None else _text(*row)
 
     def set(self, name: str, text: str) -> None:
         """Keep a text, in place of any other."""
@@ -213,20 +221,12 @@ class TextDisk:
 
     def _call(self, rowid: int) -> tuple[str, str] | RecordingError:
         try:
-            (row,) = self._rows("WHERE rowid = ?", rowid)
-            return _name(row[0]), _text(*row[1:])
+            key, *row = self._execute(_CALL, rowid).fetchone()
+            return _name(key), _text(*row)
+        except sqlite3.DataError as exc:
+            return RecordingError(f"the recorded reply is damaged: {exc}")
         except RecordingError as exc:
             return exc
-
-    def _rows(self, where: str, value: object) -> list[tuple[object, ...]]:
-        try:
-            return self._execute(
-                "SELECT CASE WHEN raw = 1 AND typeof(key) = 'text' THEN key END, "  # noqa: S608 # constants
-                f"mode, filename, value FROM Cache {where}",
-                value,
-            ).fetchall()
-        except sqlite3.DataError as exc:
-            raise RecordingError(f"what is recorded is damaged: {exc}") from exc
 
     def _free(self, name: str) -> str:
         """The name, or with the first number behind it under which nothing lies yet."""
@@ -432,5 +432,5 @@ def _text(mode: object, filename: object, value: object) -> str:
             "the cache names a file in place of a text, which is not ours: refused"
         )
     if mode != MODE_RAW or not isinstance(value, str) or not _is_whole(value):
-        raise RecordingError("what is recorded is damaged: it is no text")
+        raise RecordingError("the recorded reply is damaged: it is no text")
     return value

@@ -118,7 +118,7 @@ _SET_ASIDE = TypeAdapter(list[SetAside])
 
 def scopes(cache: ResponseCache) -> list[str]:
     """The names of all ledgers in a cache."""
-    return sorted(name.removeprefix(_SPENT) for name in cache.names(_SPENT))
+    return [name.removeprefix(_SPENT) for name in cache.names_kept_twice(_SPENT)]
 
 
 class Ledger:

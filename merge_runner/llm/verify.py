@@ -48,13 +48,15 @@ def check_attempts(attempts: tuple[Attempt, ...]) -> None:
 
 def _check_numbers(attempt: Attempt) -> None:
     usage = attempt.usage
-    tokens = (usage.input_tokens, usage.cached_input_tokens, usage.output_tokens)
     numbers = (attempt.number, attempt.http_status, attempt.latency_s, attempt.cost_usd)
-    if not (
-        all(number is None or 0 <= number <= LARGEST_NUMBER for number in numbers)
-        and all(n is None or 0 <= n <= MOST_TOKENS for n in (*tokens, usage.reasoning_tokens))
+    tokens = (usage.input_tokens, usage.cached_input_tokens, usage.output_tokens)
+    for most, counts in (
+        (LARGEST_NUMBER, numbers),
+        (MOST_TOKENS, (*tokens, usage.reasoning_tokens)),
     ):
-        raise ValueError("an attempt has a number that no attempt can have")
+        for count in counts:
+            if count is not None and not 0 <= count <= most:
+                raise ValueError("an attempt has a number that no attempt can have")
 
 
 def _check_reply(text: str) -> None:

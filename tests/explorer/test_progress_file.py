@@ -117,6 +117,16 @@ def test_only_what_a_killed_sweep_wrote_is_tidied_up(tmp_path):
     assert left == {"notes.json", "thesis.tmp"}
 
 
+def test_the_name_of_a_sweep_leads_out_of_no_folder(tmp_path):
+    db, name = tmp_path / "m.duckdb", "../outside"
+    ProgressFile(db, "a").write(standing("a"))
+    ProgressFile(tmp_path / "x", "y").write(standing(name))
+    (tmp_path / "x.progress/y.json").rename(tmp_path / "outside.json")
+    assert read_standing(db, name) is None
+    ProgressFile(db, name).remove()
+    assert (tmp_path / "outside.json").exists()
+
+
 def test_an_older_state_never_takes_the_place_of_a_newer_one_nor_comes_after_the_end(tmp_path):
     db = tmp_path / "m.duckdb"
     file, old = ProgressFile(db, "s"), standing()

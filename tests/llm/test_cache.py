@@ -515,7 +515,7 @@ def test_any_one_changed_byte_of_any_row_never_blocks_the_rest(model_folder, dat
                 assert cache.put_now([each]) == [each]
             assert {each.request.key for each in cache.entries()} == {e.request.key for e in FULL}
             assert cache.unanswered(entry(9).request.key) in (entry(9).attempts, ())
-            assert cache.facts("m").cost_usd >= 2
+            assert cache.cost_usd() >= 2
             assert cache.recorded_endpoints("m") == ["openai"]
             assert Ledger(cache, "s").read().reserved_usd == 3
 

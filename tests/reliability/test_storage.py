@@ -86,7 +86,9 @@ async def test_a_read_only_folder_is_told_before_anything_is_asked(
 
 
 @pytest.mark.slow
-async def test_a_database_that_another_program_holds_for_a_while_is_waited_for(merge_runner, tmp_path):
+async def test_a_database_that_another_program_holds_for_a_while_is_waited_for(
+    merge_runner, tmp_path
+):
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         await merge_runner(*SWEEP, "--conditions", "N_0_0", **env)

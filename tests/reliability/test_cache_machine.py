@@ -1,0 +1,273 @@
+"""Cache, ledger and claims in any order of calls, kills, damage and second processes.
+
+`HYPOTHESIS_EXAMPLES=2000 pytest -n0 tests/reliability/test_cache_machine.py` plays many more.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import sqlite3
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+from merge_runner.errors import RecordingError, TrialSuspended, UsageError
+from merge_runner.llm.budget import Budget
+from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.claims import Claims
+from merge_runner.llm.keys import make_request
+from merge_runner.llm.ledger import Ledger
+from merge_runner.records import Attempt, Slot
+
+QUESTIONS = 4
+PROCESSES = 2
+WORST_USD = 10
+# Nothing is cut off from its power here, so nothing needs to wait for a disk.
+IN_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None
+EXAMPLES = int(os.environ.get("HYPOTHESIS_EXAMPLES", "25"))
+REQUESTS = [
+    make_request(
+        provider="openai",
+        endpoint="openai",
+        model="m",
+        path="/p",
+        headers={},
+        body={"prompt": number},
+        slot=Slot("A1", 1, "left", number, 0),
+    )
+    for number in range(QUESTIONS)
+]
+questions = st.integers(0, QUESTIONS - 1)
+processes = st.integers(0, PROCESSES - 1)
+costs = st.integers(0, WORST_USD)
+
+
+class Process:
+    """One merge-runner on the folder: what it has open, and the calls that it has in flight."""
+
+    def __init__(self, folder: Path, cap_usd: float) -> None:
+        self.cache = ResponseCache(folder)
+        self.claims = Claims(folder)
+        self.budget = Budget(Ledger(self.cache, "s"), cap_usd=cap_usd)
+        self.flying: dict[int, list[Attempt]] = {}
+
+    def known(self, question: int) -> tuple[Entry | None, tuple[Attempt, ...]]:
+        """What a client that has claimed a call knows of it."""
+        key = REQUESTS[question].key
+        try:
+            return self.cache.get(key), self.cache.unanswered(key)
+        except RecordingError:
+            self.cache.set_damage_aside(key)
+            return self.cache.get(key), self.cache.unanswered(key)
+
+    def die(self) -> None:
+        """Leave everything as it lies: the kernel closes the files, and nothing is put in order."""
+        self.claims.close()
+        self.cache.close()
+
+
+class CacheMachine(RuleBasedStateMachine):
+    """``answered`` holds the entries that were kept, until their row is damaged.
+
+    ``tried`` holds the attempts that were kept for a call without an answer, where these are known;
+    ``charged_usd`` is what the server has charged, of which the program may know nothing; ``bent``
+    is the one of the ledger's two places that is damaged, until it is next written.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.place = Path(tempfile.mkdtemp(dir=IN_MEMORY))
+        self.cap_usd = 3.0 * WORST_USD
+        self.charged_usd = 0.0
+        self.answered: dict[int, Entry] = {}
+        self.tried: dict[int, tuple[Attempt, ...]] = {}
+        self.bent: str | None = None
+        self.made = 0
+        self.loop = asyncio.new_event_loop()
+        self.running: dict[int, Process] = {}
+
+    def teardown(self) -> None:
+        for process in self.running.values():
+            process.die()
+        self.loop.close()
+        shutil.rmtree(self.place)
+
+    def wait(self, job):
+        return self.loop.run_until_complete(asyncio.wait_for(job, 20))
+
+    def process(self, number: int) -> Process:
+        if number not in self.running:
+            self.running[number] = Process(self.place, self.cap_usd)
+        return self.running[number]
+
+    def claimed(self, number: int, question: int) -> bool:
+        """POSIX locks are those of a process, and both are played in this one."""
+        return not any(question in each.flying for each in self.running.values())
+
+    @rule(number=processes, question=questions)
+    def ask(self, number, question):
+        """Begin an attempt, where no entry is kept, nobody else asks, and the cap allows it."""
+        process = self.process(number)
+        if not self.claimed(number, question) or not process.claims.take(REQUESTS[question].key):
+            return
+        entry, earlier = process.known(question)
+        if question in self.answered:
+            assert entry == self.answered[question], "what is answered is not asked again"
+            process.claims.release(REQUESTS[question].key)
+            return
+        assert entry is None
+        if self.paid_for(process, question, list(earlier)):
+            self.tried.pop(question, None)
+            self.bent = None
+            process.flying[question] = list(earlier)
+        else:
+            process.claims.release(REQUESTS[question].key)
+
+    def paid_for(self, process: Process, question: int, earlier: list[Attempt]) -> bool:
+        """Set the worst case aside; False where there is no money, or none before others end."""
+
+        async def at_once():
+            waiting = asyncio.create_task(process.budget.reserve(question, WORST_USD))
+            for _ in range(3):
+                await asyncio.sleep(0)
+            if not waiting.done():
+                waiting.cancel()
+            await waiting
+            await process.budget.begin(REQUESTS[question].key, earlier, WORST_USD)
+
+        try:
+            self.wait(at_once())
+        except (TrialSuspended, asyncio.CancelledError):
+            return False
+        return True
+
+    def landed(self, number: int, data) -> tuple[Process, int, list[Attempt]]:
+        process = self.running[number]
+        question = data.draw(st.sampled_from(sorted(process.flying)))
+        return process, question, process.flying.pop(question)
+
+    def in_flight(self) -> list[int]:
+        return [number for number, process in self.running.items() if process.flying]
+
+    @precondition(in_flight)
+    @rule(data=st.data(), cost=costs)
+    def answer(self, data, cost):
+        process, question, attempts = self.landed(
+            data.draw(st.sampled_from(self.in_flight())), data
+        )
+        self.made += 1
+        self.charged_usd += cost
+        reply = f'{{"text": "ä {self.made}"}}'
+        attempts.append(Attempt(len(attempts) + 1, "ok", 200, reply=reply, cost_usd=float(cost)))
+        entry = Entry(REQUESTS[question], tuple(attempts))
+        kept = self.wait(process.budget.ledger.keep(entry, WORST_USD, float(cost)))
+        process.budget.settled(question)
+        process.claims.release(REQUESTS[question].key)
+        self.bent = None
+        assert kept == entry
+        self.answered[question] = entry
+        self.tried[question] = ()
+
+    @precondition(in_flight)
+    @rule(data=st.data(), cost=costs, known=st.booleans())
+    def fail(self, data, cost, known):
+        """An attempt brings no answer, and what it cost is told or not."""
+        process, question, attempts = self.landed(
+            data.draw(st.sampled_from(self.in_flight())), data
+        )
+        self.charged_usd += cost
+        told = float(cost) if known else None
+        attempts.append(Attempt(len(attempts) + 1, "server_error", 500, cost_usd=told))
+        key = REQUESTS[question].key
+        self.wait(process.budget.ledger.settle(key, attempts, WORST_USD, told))
+        process.budget.settled(question)
+        process.claims.release(key)
+        if known:
+            self.bent = None
+        self.tried[question] = tuple(attempts)
+
+    @precondition(lambda self: self.running)
+    @rule(data=st.data(), cost=costs)
+    def kill(self, data, cost):
+        """The server charges for what is in flight all the same."""
+        number = data.draw(st.sampled_from(sorted(self.running)))
+        process = self.running.pop(number)
+        self.charged_usd += cost * len(process.flying)
+        process.die()
+
+    @rule(more=st.integers(1, 4 * WORST_USD))
+    def raise_the_cap(self, more):
+        """The same command with a higher --max-cost."""
+        self.cap_usd += more
+        for process in self.running.values():
+            process.budget.cap_usd = self.cap_usd
+
+    @precondition(lambda self: (self.place / "cache.db").exists())
+    @rule(data=st.data())
+    def damage(self, data):
+        """One byte of one row changes on the disk."""
+        with contextlib.closing(sqlite3.connect(self.place / "cache.db")) as database, database:
+            rows = database.execute("SELECT rowid, key FROM Cache ORDER BY rowid").fetchall()
+            calls = [row for row in rows if len(row[1]) == 64 or row[1].startswith("attempts ")]
+            others = [row for row in rows if row[1] != "format" and not self.last_place(row[1])]
+            rowid, name = data.draw(st.sampled_from(calls or others) | st.sampled_from(others))
+            ((content,),) = database.execute(
+                "SELECT CAST(value AS BLOB) FROM Cache WHERE rowid = ?", [rowid]
+            )
+            changed = bytearray(content or b"x")
+            changed[data.draw(st.integers(0, len(changed) - 1))] ^= data.draw(st.integers(1, 255))
+            database.execute(
+                "UPDATE Cache SET value = CAST(? AS TEXT) WHERE rowid = ?", [bytes(changed), rowid]
+            )
+        if "spent" in name:
+            self.bent = name
+        for question, request in enumerate(REQUESTS):
+            if request.key == name:
+                self.answered.pop(question, None)
+            if name == f"attempts {request.key}":
+                self.tried.pop(question, None)
+
+    def last_place(self, name: str) -> bool:
+        """What is kept twice is lost with both, and with neither alone."""
+        return self.bent is not None and "spent" in name and name != self.bent
+
+    @invariant()
+    def the_sum_never_passes_the_cap(self):
+        if not self.running:
+            return
+        ledger = Ledger(next(iter(self.running.values())).cache, "s")
+        try:
+            counted_usd = ledger.read().committed_usd
+        except UsageError:
+            pytest.fail("one damaged row is never the loss of what is spent")
+        assert self.charged_usd <= counted_usd + 1e-6
+        assert counted_usd <= self.cap_usd + 1e-6
+
+    @invariant()
+    def every_stored_byte_is_what_was_answered(self):
+        for process in self.running.values():
+            found = {entry.request.key: entry for entry in process.cache.entries()}
+            assert found == {REQUESTS[q].key: entry for q, entry in self.answered.items()}
+            for question, attempts in self.tried.items():
+                assert process.cache.unanswered(REQUESTS[question].key) == attempts
+
+
+def test_nothing_answered_is_asked_again_and_the_cap_holds_in_any_order():
+    """Nor is more spent than is counted, and every stored byte is what was answered."""
+    run_state_machine_as_test(
+        CacheMachine,
+        settings=settings(max_examples=EXAMPLES, stateful_step_count=30, deadline=None),
+    )
