@@ -351,9 +351,9 @@ class Sweep:
             if flusher.differing:
                 outcome.fail(
                     StoreError.exit_code,
-                    f"{len(flusher.differing)} trials ended otherwise than those stored in "
-                    f"{self._options.db}, which are left as they are: "
-                    f"{', '.join(flusher.differing[:SHOWN])}. Replay into another --db.",
+                    f"{len(flusher.differing)} trials are stored otherwise in {self._options.db}, "
+                    f"which is left as it is: {_differing(flusher.differing)}. Replay into "
+                    "another --db.",
                 )
         except StoreError as exc:
             outcome.fail(exc.exit_code, str(exc))
@@ -408,6 +408,12 @@ class Sweep:
                 "Set the base URL variable of its provider to the one to replay."
             )
         return recorded[0]
+
+
+def _differing(trials: Mapping[str, Sequence[str]]) -> str:
+    """The first trials that are stored otherwise, each with the columns."""
+    shown = list(trials.items())[:SHOWN]
+    return "; ".join(f"{trial_id} ({', '.join(columns)})" for trial_id, columns in shown)
 
 
 async def _drained(crew: Crew, work: asyncio.Task[None]) -> None:

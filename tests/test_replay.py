@@ -209,19 +209,22 @@ async def test_a_named_recording_comes_before_what_the_cache_holds(merge_runner,
     assert results_digest(tmp_path / "r.duckdb") == digests[0]
 
 
-async def test_a_replay_that_ends_otherwise_than_the_stored_trials_says_so(merge_runner, tmp_path):
+async def test_a_replay_into_stored_trials_names_each_column_that_differs(merge_runner, tmp_path):
     part = ("--reps", 1, "--conditions", "N_0_0,L_4_0")
     assert (await merge_runner(*REPLAY, *part)).code == 0
     assert (await merge_runner(*REPLAY, *part)).code == 0
     with duckdb.connect(str(tmp_path / "results/merge.duckdb")) as connection:
         connection.execute(
-            "UPDATE states SET velocity_mps = velocity_mps + 0.001 "
+            "UPDATE states SET acceleration_mps2 = acceleration_mps2 + 0.001 "
             "WHERE trial_id LIKE '%N_0_0%' AND step = 7"
         )
+        connection.execute("UPDATE decisions SET rationale = 'no' WHERE trial_id LIKE '%L_4_0%'")
     again = await merge_runner(*REPLAY, *part)
     assert again.code == 1
-    assert "1 trials ended otherwise than those stored" in again.err
-    assert "emulator/baseline/N_0_0/rep01" in again.err
+    (line,) = (line for line in again.err.splitlines() if "stored otherwise" in line)
+    assert "2 trials are stored otherwise in results/merge.duckdb" in line
+    assert "emulator/baseline/N_0_0/rep01 (states.acceleration_mps2)" in line
+    assert "emulator/baseline/L_4_0/rep01 (decisions.rationale)" in line
 
 
 async def test_a_damaged_reply_fails_its_trial_alone(merge_runner, tmp_path):
