@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import duckdb
@@ -14,6 +14,12 @@ from merge_runner.rows import Row
 TrialKey = tuple[str, str]
 """(trial_id, spec_hash)"""
 
+Span = tuple[int, int]
+"""The first and the last row number."""
+
+_OF_THESE = (
+    "SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)"
+)
 # What tells the rows of a trial apart.
 PLACES: dict[str, tuple[str, ...]] = {
     "trials": (),
@@ -50,11 +56,16 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """Rows of one table by trial, with the names of their columns."""
+    """Rows of one table by trial, with the names of their columns; ``hashed`` are texts' hashes."""
 
     table: str
     names: tuple[str, ...]
-    rows: dict[TrialKey, list[Row]]
+    hashed: tuple[str, ...] = ()
+    rows: dict[TrialKey, list[Row]] = field(default_factory=dict)
+
+    def named(self, key: TrialKey) -> Iterator[dict[str, Any]]:
+        """The rows of a trial, each by the names of its columns."""
+        return (dict(zip(self.names, row, strict=True)) for row in self.rows.get(key, ()))
 
     def differences(
         self,
@@ -65,7 +76,7 @@ class Stored:
         tolerance: float = 0.0,
     ) -> Iterator[Difference]:
         """What a trial's stored rows have otherwise than the wanted ones."""
-        stored, made = self.rows.get(key, []), [self._hashed(row) for row in wanted]
+        stored, made = self.rows.get(key, []), [self._as_stored(row) for row in wanted]
         at = [self.names.index(name) for name in PLACES[self.table]]
         old = {tuple(row[i] for i in at): row for row in stored}
         new = {tuple(row[i] for i in at): row for row in made}
@@ -90,9 +101,9 @@ class Stored:
                     new[first][index],
                 )
 
-    def _hashed(self, row: Row) -> Row:
+    def _as_stored(self, row: Row) -> Row:
         values = list(row)
-        for name in LONG.get(self.table, ()):
+        for name in self.hashed:
             index = self.names.index(name)
             if values[index] is not None:
                 values[index] = hashlib.sha256(values[index].encode()).hexdigest()
@@ -100,22 +111,54 @@ class Stored:
 
 
 def stored_rows(
-    connection: duckdb.DuckDBPyConnection, table: str, keys: Sequence[TrialKey]
+    connection: duckdb.DuckDBPyConnection,
+    table: str,
+    keys: Sequence[TrialKey],
+    span: Span | None = None,
 ) -> Stored:
     """The rows of these trials, with the hashes of long texts in place of them."""
     hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in LONG.get(table, ()))
-    result = connection.execute(
-        f"SELECT *{f' REPLACE ({hashes})' if hashes else ''} FROM {table} "  # noqa: S608 # constants
-        "SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) "
-        "USING (trial_id, spec_hash)",
-        [[key[0] for key in keys], [key[1] for key in keys]],
-    )
+    columns = f"* REPLACE ({hashes})" if hashes else "*"
+    result = rows_of_trials(connection, columns, table, keys, span)
     names = tuple(column[0] for column in result.description or ())
     trial_id, spec_hash = names.index("trial_id"), names.index("spec_hash")
-    rows: dict[TrialKey, list[Row]] = {}
+    stored = Stored(table, names, LONG.get(table, ()))
     for row in result.fetchall():
-        rows.setdefault((row[trial_id], row[spec_hash]), []).append(row)
-    return Stored(table, names, rows)
+        stored.rows.setdefault((row[trial_id], row[spec_hash]), []).append(row)
+    return stored
+
+
+def rows_of_trials(
+    connection: duckdb.DuckDBPyConnection,
+    columns: str,
+    table: str,
+    keys: Sequence[TrialKey],
+    span: Span | None = None,
+) -> duckdb.DuckDBPyConnection:
+    """A query for the rows of these trials, to be fetched.
+
+    A trial's rows lie together: where is asked first, or told, so that no others are read.
+    """
+    names = [[key[0] for key in keys], [key[1] for key in keys]]
+    first, last = (
+        span
+        or connection.execute(
+            f"SELECT min(rowid), max(rowid) FROM {table} {_OF_THESE}",  # noqa: S608 # constants
+            names,
+        ).fetchall()[0]
+    )
+    return connection.execute(
+        f"SELECT {columns} FROM {table} {_OF_THESE} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # constants
+        [*names, first, last],
+    )
+
+
+def spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, Span]:
+    """Where the rows of each trial lie."""
+    rows = connection.execute(
+        f"SELECT trial_id, spec_hash, min(rowid), max(rowid) FROM {table} GROUP BY ALL"  # noqa: S608 # constants
+    ).fetchall()
+    return {(trial_id, spec_hash): (first, last) for trial_id, spec_hash, first, last in rows}
 
 
 def _same(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table

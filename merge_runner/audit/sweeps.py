@@ -12,6 +12,7 @@ import duckdb
 from pydantic import ValidationError
 
 from merge_runner.audit.checks import CHECKS
+from merge_runner.audit.derived import Derived, check_derived
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Audit, Finding, Sharing
 from merge_runner.audit.replies import (
@@ -144,6 +145,7 @@ def _audit(
 ) -> Audit:
     connection.execute(AUDITED, [sweep.sweep_id])
     slots = Slots()
+    derived = Derived()
     models: list[tuple[Any, ...]] = []
     try:
         config = SweepConfig.model_validate_json(sweep.config)
@@ -154,6 +156,7 @@ def _audit(
         claims = sweep.ended if finished is None else finished
         slots = check_slots(connection, sweep.sweep_id, config, specs, finished=claims)
         models = [(name, m.id, m.provider) for name, m in config.models.items()]
+        derived = check_derived(connection, specs, config)
     connection.execute("DELETE FROM entries")
     _fill(connection, "entries", models)
     findings = [
@@ -162,13 +165,14 @@ def _audit(
         *check_traces(connection, specs),
         *check_hashes(connection),
         *check_sharing(connection),
+        *derived.findings,
     ]
     return Audit(
         subject=sweep.sweep_id,
-        counts=slots.counts | _counts(connection, COUNTS),
+        counts=slots.counts | _counts(connection, COUNTS) | {"derived anew": derived.trials},
         findings=tuple(replace(finding, sweep=sweep.sweep_id) for finding in findings),
         sharings=tuple(_taken_over(connection, sweep.sweep_id)),
-        notes=(*slots.notes, *_alike_notes(connection)),
+        notes=(*slots.notes, *_alike_notes(connection), *derived.notes),
     )
 
 
