@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import duckdb
 
@@ -16,6 +16,10 @@ TrialKey = tuple[str, str]
 
 Span = tuple[int, int]
 """The first and the last row number."""
+Spans = dict[str, Span]
+Read = TypeVar("Read")
+BATCH = 16
+"""Trials at once: their replies are in memory together."""
 
 _OF_THESE = (
     "SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)"
@@ -153,8 +157,43 @@ def rows_of_trials(
     )
 
 
-def spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, Span]:
-    """Where the rows of each trial lie."""
+def in_batches(
+    connection: duckdb.DuckDBPyConnection,
+    keys: Iterable[TrialKey],
+    tables: Collection[str],
+    read: Callable[[list[TrialKey], Spans], Read],
+) -> Iterator[Read]:
+    """What ``read`` makes of some trials at a time, with where the rows of each table lie.
+
+    So few at a time that they fit into the database's memory.
+    """
+    where = {table: _spans(connection, table) for table in tables}
+    nowhere = (0, -1)
+    ordered = sorted(keys, key=lambda key: [spans.get(key, nowhere) for spans in where.values()])
+    first, size = 0, BATCH
+    while batch := ordered[first : first + size]:
+        found = {
+            table: [spans[key] for key in batch if key in spans] or [nowhere]
+            for table, spans in where.items()
+        }
+        try:
+            made = read(
+                batch,
+                {
+                    t: (min(a for a, _ in spans), max(b for _, b in spans))
+                    for t, spans in found.items()
+                },
+            )
+        except duckdb.OutOfMemoryException:
+            if size == 1:
+                raise
+            size //= 2
+        else:
+            first += size
+            yield made
+
+
+def _spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, Span]:
     rows = connection.execute(
         f"SELECT trial_id, spec_hash, min(rowid), max(rowid) FROM {table} GROUP BY ALL"  # noqa: S608 # constants
     ).fetchall()

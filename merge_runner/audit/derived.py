@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import duckdb
@@ -22,11 +23,11 @@ from merge_runner.compared import (
     LONG,
     PLACES,
     Difference,
-    Span,
+    Spans,
     Stored,
     TrialKey,
+    in_batches,
     rows_of_trials,
-    spans,
     stored_rows,
 )
 from merge_runner.config import Scenario
@@ -53,11 +54,22 @@ from merge_runner.rows import decision_rows, state_rows, trial_row
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
-BATCH = 16
-"""Trials at once: their replies are in memory together."""
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
 SHOWN = 60
+# The columns that neither a reply nor a spec tells: docs/audit.md says of each why. A cache tells
+# those of ``calls`` but ``cached``.
+NOT_DERIVED = (
+    "calls.cached",
+    "calls.started_at",
+    "calls.latency_s",
+    "calls.cost_usd",
+    "sweeps.ended_at",
+    "sweeps.exit_code",
+    "sweeps.git_commit",
+    "sweeps.git_dirty",
+    "sweeps.versions",
+)
 # What a reader is told could not be derived.
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
@@ -157,11 +169,9 @@ def check_derived(
     """Derive the audited trials anew, and compare every column that replies and specs tell."""
     found = Derived()
     audited = connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall()
-    where = {table: spans(connection, table) for table in PLACES}
-    keys = sorted(audited, key=lambda key: where["trials"].get(key, (0, 0)))
+    batches = in_batches(connection, audited, PLACES, partial(_tables, connection))
     with ThreadPoolExecutor(max_workers=1) as thread:  # a loop of its own: one may run here
-        for start in range(0, len(keys), BATCH):
-            tables = _tables(connection, keys[start : start + BATCH], where)
+        for tables in batches:
             trials = list(_trials(tables, specs, config, found))
             records = thread.submit(asyncio.run, _all_played(trials)).result()
             for trial, record in zip(trials, records, strict=True):
@@ -175,24 +185,16 @@ async def _all_played(trials: list[_Trial]) -> list[TrialRecord | _NotStored]:
 
 
 def _tables(
-    connection: duckdb.DuckDBPyConnection,
-    keys: list[TrialKey],
-    where: Mapping[str, Mapping[TrialKey, Span]],
+    connection: duckdb.DuckDBPyConnection, keys: list[TrialKey], spans: Spans
 ) -> dict[str, Stored]:
     """What is stored of these trials; of ``calls`` what replies tell, and the replies."""
-    found = {table: [spans[key] for key in keys if key in spans] for table, spans in where.items()}
-    span = {
-        table: (min(span[0] for span in spans), max(span[1] for span in spans))
-        for table, spans in found.items()
-        if spans
-    }
     tables = {
-        table: stored_rows(connection, table, keys, span.get(table))
+        table: stored_rows(connection, table, keys, spans[table])
         for table in ("trials", "states", "decisions")
     }
     calls = Stored("calls", COLUMNS)
     columns = f"trial_id, spec_hash, {', '.join(COLUMNS)}"
-    rows = rows_of_trials(connection, columns, "calls", keys, span.get("calls"))
+    rows = rows_of_trials(connection, columns, "calls", keys, spans["calls"])
     for trial_id, spec_hash, *values in rows.fetchall():
         calls.rows.setdefault((trial_id, spec_hash), []).append(tuple(values))
     return {**tables, "calls": calls}
