@@ -349,12 +349,19 @@ def recording_export(
     sweep_id: Annotated[
         str | None, typer.Option("--sweep", help="A sweep_id; the newest sweep if not given.")
     ] = None,
+    sign: Annotated[
+        Path | None,
+        typer.Option("--sign", metavar="KEY", help="Sign it with ssh-keygen or minisign."),
+    ] = None,
 ) -> None:
     """Write what a sweep asked and was answered into one file."""
+    from merge_runner import signing
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.recording import export_recording
     from merge_runner.store import sweep_row, used_call_keys
 
+    if sign is not None:
+        signing.tool_for(sign)
     found, keys = used_call_keys(db, sweep_id)
     if not keys:
         raise UsageError(f"the sweep {found} made no call: there is nothing to record")
@@ -362,6 +369,8 @@ def recording_export(
     provenance = {name: str(value) for name, value in row.items() if value is not None}
     calls = export_recording(file, ResponseCache(cache), keys, provenance)
     say(f"{calls} calls of {found} are in {file}")
+    if sign is not None:
+        say(f"signed: {signing.sign(file, sign)}")
 
 
 @recording_app.command("import")
@@ -375,11 +384,23 @@ def recording_import(file: RecordingFile, cache: CacheOption = DEFAULT_CACHE) ->
 
 
 @recording_app.command("verify")
-def recording_verify(file: RecordingFile) -> None:
-    """Check that every reply belongs to its key."""
+def recording_verify(
+    file: RecordingFile,
+    signers: Annotated[
+        Path | None,
+        typer.Option(help="Whose signature it must have: allowed signers, or a minisign key."),
+    ] = None,
+) -> None:
+    """Check that a file is as it was exported, and by whom."""
+    from merge_runner import signing
     from merge_runner.recording import summarise
 
-    say(f"{file} is whole: {summarise(file).calls} calls, as they were exported")
+    found = summarise(file)
+    say(f"{file} is whole: {found.calls} calls, as they were exported")
+    for note in found.notes:
+        say(f"note: {note}")
+    if signers is not None:
+        say(signing.verified(file, signers))
 
 
 @recording_app.command("info")

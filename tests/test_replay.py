@@ -15,10 +15,12 @@ import pytest
 from harness import FAST, PROJECT, RECORDING, environment, watched
 
 from merge_runner.emulator.faults import FaultPlan
+from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.recording import export_recording, read_recording
+from merge_runner.recording import export_recording, import_recording, read_recording, summarise
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.store import results_digest
+from merge_runner.texts import quoted
 
 # The digest of the committed recording: results, and so this text, never change by themselves.
 GOLDEN = (PROJECT / "tests/golden/emulator-baseline.digest").read_text()
@@ -131,12 +133,12 @@ async def test_an_exported_sweep_goes_round_through_a_file(merge_runner, tmp_pat
     assert digest[1] == 2
 
 
-def changed(recording, file, change: str) -> None:
-    """Rewrite a recording with one thing changed and its metadata kept."""
+def changed(recording, file, change: str = "SELECT 1", **metadata: str) -> None:
+    """Rewrite a recording with one thing changed and the rest of its metadata kept."""
     with duckdb.connect() as connection:
         told = connection.execute(f"FROM parquet_kv_metadata('{recording}')").fetchall()
-        kept = {k.decode(): v.decode() for _, k, v in told if k != b"config"}
-        pairs = ", ".join(f"{k}: '{v}'" for k, v in kept.items() if "'" not in v)
+        kept = {k.decode(): v.decode() for _, k, v in told} | metadata
+        pairs = ", ".join(f"{k}: {quoted(v)}" for k, v in kept.items())
         connection.execute(f"CREATE TABLE calls AS FROM '{recording}'")
         connection.execute(change)
         connection.execute(f"COPY calls TO '{file}' (FORMAT parquet, KV_METADATA {{{pairs}}})")
@@ -176,6 +178,54 @@ async def test_a_recording_that_was_tampered_with_is_refused_whole(
         assert "Traceback" not in run.err
     left = await merge_runner("replay", "baseline", "--reps", 1, "--conditions", "N_0_0")
     assert left.code == 4, "nothing of it entered the cache"
+
+
+@pytest.fixture(scope="module")
+def told(prepare, tmp_path_factory):
+    """A recording of a sweep that says where it comes from."""
+    folder = tmp_path_factory.mktemp("told")
+    part = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
+    assert prepare(folder, *part).code == 0
+    assert prepare(folder, "recording", "export", "told.parquet").code == 0
+    return folder / "told.parquet"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["git_commit", "git_dirty", "config", "started_at", "ended_at", "exit_code", "name", "versions",
+     "sweep_id", "provenance_sha256", "added"],
+)  # fmt: skip
+def test_a_recording_that_says_something_else_of_its_origin_is_refused(told, tmp_path, name):
+    origin = summarise(told).provenance
+    assert name in origin or name == "added"
+    changed(told, tmp_path / "same.parquet")
+    assert summarise(tmp_path / "same.parquet").covered
+    changed(told, tmp_path / "bad.parquet", **{name: origin.get(name, "") + " "})
+    with pytest.raises(RecordingError, match="what it says of where it comes from"):
+        summarise(tmp_path / "bad.parquet")
+    cache = ResponseCache(tmp_path / "cache")
+    with pytest.raises(RecordingError):
+        import_recording(tmp_path / "bad.parquet", cache)
+    assert list(cache.entries()) == []
+
+
+async def test_a_recording_of_the_first_format_is_taken_and_what_its_hash_lacks_is_said(
+    merge_runner, told, tmp_path
+):
+    first = {"format": "merge-runner recording 1", "git_commit": "anybody's"}
+    changed(told, tmp_path / "first.parquet", **first)
+    verified = await merge_runner("recording", "verify", "first.parquet")
+    assert verified.code == 0
+    says = "its hash does not cover what it says of where it comes from"
+    assert says in verified.err
+    assert says in (await merge_runner("audit", "--recording", "first.parquet")).out
+    assert (await merge_runner("recording", "info", "first.parquet")).summary["covered"] is False
+    new = await merge_runner("recording", "verify", told)
+    assert says not in new.err
+    changed(told, tmp_path / "later.parquet", format="merge-runner recording 3")
+    later = await merge_runner("recording", "verify", "later.parquet")
+    assert later.code == 1
+    assert "has the format 'merge-runner recording 3'" in later.err
 
 
 async def test_a_recording_holds_no_secret(merge_runner, tmp_path):

@@ -85,7 +85,10 @@ def audit_recording(file: Path) -> Audit:
             **{f"answers {name}": count for name, count in sorted(summary.outcomes.items())},
         },
         findings=tuple(findings),
-        notes=() if config else ("it does not say of what sweep it is: trials are not compared",),
+        notes=(
+            *summary.notes,
+            *(() if config else ("it does not say of what sweep it is: trials are not compared",)),
+        ),
     )
 
 
