@@ -98,7 +98,8 @@ class _NotStored(Exception):  # what happened, and no error of the program
 class _Trial:
     """A trial as it is stored.
 
-    Not derived are its prompts unless ``prompts``, and if ``as_stored`` a program's decisions.
+    ``scripted`` says that the sweep asks the emulator. Not derived are its prompts unless
+    ``prompts``, and if ``as_stored`` a program's decisions.
     """
 
     key: TrialKey
@@ -106,6 +107,7 @@ class _Trial:
     scenario: Scenario
     attempts: list[Answer]
     plans: dict[tuple[str, int], Decision]
+    scripted: bool
     prompts: bool = True
     as_stored: bool = False
     drivers: dict[Side, Driver] = field(default_factory=dict)
@@ -123,7 +125,7 @@ class _Trial:
             repetition=row["rep"],
             sample_set=row["sample_set"],
             order=0,
-            scripted=any(attempt.wanted["scripted"] for attempt in self.attempts),
+            scripted=self.scripted or any(a.wanted["scripted"] for a in self.attempts),
         )
         try:
             return await play_trial(spec, self.scenario, self.drivers)
@@ -221,6 +223,7 @@ def _trials(
             spec.scenario,
             [read_answer(c, wires[c["side"]]) for c in calls if c["side"] in wires],
             {(d["side"], d["decision"]): _decided(d) for d in decisions},
+            scripted=any(model.provider == "emulator" for model in config.models.values()),
         )
         _seat(trial, spec)
         found.left_out[OTHER_PROMPTS] += not trial.prompts
