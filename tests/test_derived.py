@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
 import pytest
 from harness import PROJECT, as_a_model, watched
 
-from merge_runner.audit import NOT_DERIVED, audit_cache, audit_database
+from merge_runner.audit import NOT_DERIVED, audit_cache, audit_database, audit_recording
 from merge_runner.database import SCHEMA, in_memory
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.recording import export_recording
 
 FAULTS = """
 seed = 4
@@ -207,3 +210,31 @@ async def test_each_format_is_read_anew_as_it_was_read(merge_runner, tmp_path, m
     assert "calls.output_tokens" in finding.text
     change(db, "UPDATE calls SET scripted = true WHERE decision = 5 AND side = 'left'")
     assert any("trials.scripted" in finding.text for finding in findings(db))
+
+
+async def test_answers_that_were_exchanged_before_they_were_kept_are_found(
+    merge_runner, tmp_path, made
+):
+    """All agrees with them then: only that the emulator says what it answers tells of it."""
+    folder = shutil.copytree(made / "cache/responses", tmp_path / "swapped")
+    cache = ResponseCache(folder)
+    entries = {entry.request.slot.decision: entry for entry in cache.entries()}
+    cache.close()
+    first, second = entries[2], entries[5]
+    swapped = [
+        *(entry for number, entry in entries.items() if number not in (2, 5)),
+        replace(first, attempts=second.attempts),
+        replace(second, attempts=first.attempts),
+    ]
+    shutil.rmtree(folder)
+    cache = ResponseCache(folder)
+    cache.put_now(swapped)
+    keys = [entry.request.key for entry in swapped]
+    export_recording(tmp_path / "swapped.parquet", cache, keys, {})
+    cache.close()
+    (finding, *_) = audit_recording(tmp_path / "swapped.parquet").findings
+    assert (finding.kind, finding.decision) == ("derived", 2)
+    # The trial goes another way after the first of them, so that it ends for want of a reply.
+    await merge_runner("replay", *MIXED[1:], "--cache", "swapped")
+    texts = {f.decision: f.text for f in findings(tmp_path / "results/merge.duckdb")}
+    assert "the answer to another request" in texts[2]

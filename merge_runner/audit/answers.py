@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.llm.formats.base import Reading, WireFormat
 from merge_runner.llm.verdicts import RawReply, judge
-from merge_runner.records import says_scripted
+from merge_runner.records import ANSWERED_FIELD, says_scripted
 from merge_runner.rows import Row
 
 ANSWERS = ("ok", "refusal", "truncated", "empty")
@@ -25,7 +26,7 @@ READ = (
     "reasoning_tokens",
     "scripted",
 )
-COLUMNS = (*PLACE, *READ, "call_key", "provider", "http_status", "reply")
+COLUMNS = (*PLACE, *READ, "call_key", "provider", "http_status", "started_at", "latency_s", "reply")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,7 @@ class Answer:
     row: dict[str, Any]
     wanted: dict[str, Any]
     text: str | None
+    payload: object = None
 
     @property
     def derived(self) -> Row:
@@ -55,12 +57,23 @@ def read_answer(row: dict[str, Any], wire: WireFormat) -> Answer:
         reading = wire.read(payload)
         if reading.outcome != "error":
             wanted = {**_told(reading), **told, "outcome": reading.outcome, "error": None}
-            return Answer(row, wanted, reading.text)
+            return Answer(row, wanted, reading.text, payload)
     if row["outcome"] not in ANSWERS:
         return Answer(row, told, None)
     verdict = judge(RawReply(row["http_status"] or 0, {}, body), wire)
     wanted = {**_told(verdict.reading), **told, "outcome": verdict.outcome}
     return Answer(row, {**wanted, "error": verdict.message}, "")
+
+
+def answers_another(payload: object, body_sha256: str, slot: Mapping[str, Any]) -> bool:
+    """Whether a reply says that it is the answer to another request, as the emulator's tell.
+
+    A slot stands there only if the server was told one.
+    """
+    told = payload.get(ANSWERED_FIELD) if isinstance(payload, dict) else None
+    if not isinstance(told, dict):
+        return False
+    return told.get("body_sha256") != body_sha256 or told.get("slot") not in (None, slot)
 
 
 def _told(reading: Reading) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import duckdb
 
-from merge_runner.audit.answers import COLUMNS, Answer, read_answer
+from merge_runner.audit.answers import COLUMNS, Answer, answers_another, read_answer
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Finding
 from merge_runner.compared import (
@@ -70,6 +70,7 @@ NOT_DERIVED = (
     "sweeps.git_dirty",
     "sweeps.versions",
 )
+ASKED = "sha256(request::VARCHAR) AS asked"
 # What a reader is told could not be derived.
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
@@ -131,6 +132,13 @@ class _Trial:
             return await play_trial(spec, self.scenario, self.drivers)
         except _NotStored as exc:
             return exc
+
+    def slot(self, row: Mapping[str, Any]) -> dict[str, str | int]:
+        """The slot of a row of ``calls``."""
+        own = self.row
+        return Slot(
+            own["condition"], own["rep"], row["side"], row["decision"], own["sample_set"]
+        ).as_dict()
 
     def model(self, side: Side) -> LlmDriver:
         """A language model that gives the stored replies."""
@@ -194,8 +202,8 @@ def _tables(
         table: stored_rows(connection, table, keys, spans[table])
         for table in ("trials", "states", "decisions")
     }
-    calls = Stored("calls", COLUMNS)
-    columns = f"trial_id, spec_hash, {', '.join(COLUMNS)}"
+    calls = Stored("calls", (*COLUMNS, "asked"))
+    columns = f"trial_id, spec_hash, {', '.join(COLUMNS)}, {ASKED}"
     rows = rows_of_trials(connection, columns, "calls", keys, spans["calls"])
     for trial_id, spec_hash, *values in rows.fetchall():
         calls.rows.setdefault((trial_id, spec_hash), []).append(tuple(values))
@@ -270,6 +278,11 @@ def _findings(
     if isinstance(record, _NotStored):
         yield Finding("derived", f"it cannot be driven anew: {record}", trial=trial.key[0])
         return
+    for answer in trial.attempts:
+        if answers_another(answer.payload, answer.row["asked"], trial.slot(answer.row)):
+            text = "its reply is, as the server says in it, the answer to another request"
+            place = (answer.row["side"], answer.row["decision"])
+            yield Finding("derived", text, None, trial.key[0], *place)
     ignored = set() if trial.prompts else {"prompt", "prompt_hash"}
     if record.status == "failed":
         ignored.add("error")  # the reason, in words
