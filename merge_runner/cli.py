@@ -249,11 +249,11 @@ def audit(
         Path | None, typer.Option("--recording", help="Check this file, and no database.")
     ] = None,
     cache: Annotated[
-        Path | None, typer.Option("--cache", help="Look every reply up in this folder too.")
+        Path | None, typer.Option("--cache", help="Compare every attempt with this folder too.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that every sample is there, once, and that every reply belongs to its request."""
+    """Check that each sample is there, once, and that all else follows from the replies."""
     from merge_runner.audit import (
         NOT_DERIVED,
         audit_cache,

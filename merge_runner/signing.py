@@ -30,7 +30,7 @@ def tool_for(key: Path) -> str:
 
 
 def sign(file: Path, key: Path) -> Path:
-    """Sign a file with a private key, or that of a public one in an agent; the signature's path."""
+    """Sign a file with a private key, or with the agent that holds it; returns the signature."""
     tool = tool_for(key)
     signature = _signature(file, tool)
     if tool == SSH:
@@ -38,7 +38,7 @@ def sign(file: Path, key: Path) -> Path:
         signature.write_bytes(_run(tool, options, file, asks=True))
     else:
         _run(tool, ["-S", "-s", key.resolve(), "-m", file.resolve(), "-x", signature], asks=True)
-    return signature
+    return file.with_name(signature.name)
 
 
 def verified(file: Path, signers: Path) -> str:

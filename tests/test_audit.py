@@ -13,7 +13,7 @@ from pathlib import Path
 import duckdb
 import pytest
 from aiohttp import web
-from harness import FAST, RECORDING, watched
+from harness import FAST, PROJECT, RECORDING, watched
 from recordings import drive, write_folder
 from typer.testing import CliRunner
 
@@ -623,6 +623,23 @@ async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tm
     found = audit("--db", tmp_path / "results/merge.duckdb")
     assert found.code == 0
     assert "word for word as before: are they samples?" in found.notes
+
+
+async def test_another_models_answers_end_an_audit_with_1_and_no_sweep(merge_runner):
+    async def other(request, handler):
+        return web.json_response(json.loads((await handler(request)).body) | {"model": "gpt-0"})
+
+    part = ("sweep", "baseline", "--conditions", "L_4_8", "--reps", 1)
+    async with watched(other) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        assert (await merge_runner(*part, **env)).code == 0
+        found = await merge_runner("audit")
+        assert found.code == 1
+        assert "served: " in found.out
+        strict = await merge_runner(*part, "--strict-model", "--db", "strict.duckdb", **env)
+        assert strict.code == 1
+    exit_codes = (PROJECT / "README.md").read_text().partition("## Exit codes")[2]
+    assert "another model's answers end `merge-runner audit` with 1" in exit_codes
 
 
 def test_a_database_of_humans_alone_passes_and_says_that_there_is_no_sweep(prepare, tmp_path):

@@ -26,7 +26,7 @@ READ = (
     "reasoning_tokens",
     "scripted",
 )
-COLUMNS = (*PLACE, *READ, "call_key", "provider", "http_status", "started_at", "latency_s", "reply")
+COLUMNS = (*PLACE, *READ, "call_key", "provider", "http_status", "reply")
 
 
 @dataclass(frozen=True, slots=True)
