@@ -61,7 +61,8 @@ def stored():
         appender.append_rows(rows)
         appender.append_rows([tuple("g" if v == "h" else v for v in row) for row in rows])
         appender.flush()
-    return connection
+    yield connection
+    connection.close()
 
 
 def differing(connection, **how) -> list[str]:
@@ -75,13 +76,13 @@ def differing(connection, **how) -> list[str]:
 
 
 def columns():
-    connection = in_memory({})
-    connection.execute(SCHEMA.read_text())
-    return connection.execute(
-        "SELECT table_name, column_name, data_type FROM duckdb_columns() "
-        "WHERE table_name IN ('trials', 'states', 'decisions', 'calls') "
-        "AND column_name NOT IN ('trial_id', 'spec_hash')"
-    ).fetchall()
+    with in_memory({}) as connection:
+        connection.execute(SCHEMA.read_text())
+        return connection.execute(
+            "SELECT table_name, column_name, data_type FROM duckdb_columns() "
+            "WHERE table_name IN ('trials', 'states', 'decisions', 'calls') "
+            "AND column_name NOT IN ('trial_id', 'spec_hash')"
+        ).fetchall()
 
 
 def test_what_is_stored_as_it_was_played_differs_in_nothing(stored):

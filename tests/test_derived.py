@@ -66,12 +66,12 @@ def findings(db: Path, cache: Path | None = None) -> list:
 
 
 def columns() -> list[tuple[str, str, str]]:
-    connection = in_memory({})
-    connection.execute(SCHEMA.read_text())
-    return connection.execute(
-        "SELECT table_name, column_name, data_type FROM duckdb_columns() "
-        "WHERE table_name IN (SELECT table_name FROM duckdb_tables()) AND table_name <> 'meta'"
-    ).fetchall()
+    with in_memory({}) as connection:
+        connection.execute(SCHEMA.read_text())
+        return connection.execute(
+            "SELECT table_name, column_name, data_type FROM duckdb_columns() "
+            "WHERE table_name IN (SELECT table_name FROM duckdb_tables()) AND table_name <> 'meta'"
+        ).fetchall()
 
 
 COLUMNS = columns()
