@@ -252,28 +252,39 @@ def audit(
         Path | None, typer.Option("--recording", help="Check this file, and no database.")
     ] = None,
     cache: Annotated[
-        Path | None, typer.Option("--cache", help="Look every reply up in this folder too.")
+        Path | None, typer.Option("--cache", help="Compare every attempt with this folder too.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that every sample is there, once, and that every reply belongs to its request."""
-    from merge_runner.audit import audit_cache, audit_database, audit_recording, audit_sweep
+    """Check that each sample is there, once, and that all else follows from the replies."""
+    from merge_runner.audit import (
+        NOT_DERIVED,
+        audit_cache,
+        audit_database,
+        audit_recording,
+        audit_sweep,
+    )
 
+    untold: list[str] = []
     if recording is not None:
         if sweep_id is not None or cache is not None:
             raise UsageError("--recording is checked by itself: without --sweep and --cache")
         audits = [audit_recording(recording)]
     else:
         audits = audit_database(db) if sweep_id is None else [audit_sweep(db, sweep_id)]
+        untold = list(NOT_DERIVED)
         if cache is not None:
             audits.append(audit_cache(db, cache, sweep_id))
+            untold = [name for name in untold if name == "calls.cached" or "calls" not in name]
     ok = all(found.ok for found in audits)
     if as_json:
-        whole = {"ok": ok, "audits": [found.as_dict() for found in audits]}
+        whole = {"ok": ok, "not_derived": untold, "audits": [found.as_dict() for found in audits]}
         print_out(json.dumps(whole, ensure_ascii=False))
     else:
         for line in chain.from_iterable(found.lines() for found in audits):
             print_out(line)
+        if untold:
+            print_out(f"not checked, since no reply and no spec tells: {', '.join(untold)}")
     sys.exit(0 if ok else 1)
 
 
@@ -384,12 +395,19 @@ def recording_export(
     sweep_id: Annotated[
         str | None, typer.Option("--sweep", help="A sweep_id; the newest sweep if not given.")
     ] = None,
+    sign: Annotated[
+        Path | None,
+        typer.Option("--sign", metavar="KEY", help="Sign it with ssh-keygen or minisign."),
+    ] = None,
 ) -> None:
     """Write what a sweep asked and was answered into one file."""
+    from merge_runner import signing
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.recording import export_recording
     from merge_runner.store import sweep_row, used_call_keys
 
+    if sign is not None:
+        signing.tool_for(sign)
     found, keys = used_call_keys(db, sweep_id)
     if not keys:
         raise UsageError(f"the sweep {found} made no call: there is nothing to record")
@@ -397,6 +415,8 @@ def recording_export(
     provenance = {name: str(value) for name, value in row.items() if value is not None}
     calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance)
     say(f"{calls} calls of {found} are in {file}")
+    if sign is not None:
+        say(f"signed: {signing.sign(file, sign)}")
 
 
 @recording_app.command("import")
@@ -412,11 +432,23 @@ def recording_import(file: ImportedFile, cache: CacheOption = DEFAULT_CACHE) -> 
 
 
 @recording_app.command("verify")
-def recording_verify(file: RecordingFile) -> None:
-    """Check that every reply belongs to its key."""
+def recording_verify(
+    file: RecordingFile,
+    signers: Annotated[
+        Path | None,
+        typer.Option(help="Whose signature it must have: allowed signers, or a minisign key."),
+    ] = None,
+) -> None:
+    """Check that a file is as it was exported, and by whom."""
+    from merge_runner import signing
     from merge_runner.recording import summarise
 
-    say(f"{file} is whole: {summarise(file).calls} calls, as they were exported")
+    found = summarise(file)
+    say(f"{file} is whole: {found.calls} calls, as they were exported")
+    for note in found.notes:
+        say(f"note: {note}")
+    if signers is not None:
+        say(signing.verified(file, signers))
 
 
 @recording_app.command("info")

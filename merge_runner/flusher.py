@@ -23,11 +23,12 @@ class Flusher:
     """Collects ended trials and stores them about once a second.
 
     What cannot be stored waits in memory while the trials go on; where it is only slow, they wait
-    for it. ``differing`` lists the trials that are stored already, with another result.
+    for it. ``differing`` names the trials that are stored already with other values, and in
+    which columns.
     """
 
     def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
-        self.differing: list[str] = []
+        self.differing: dict[str, list[str]] = {}
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
@@ -81,7 +82,7 @@ class Flusher:
         """Write one batch; False if that did not work."""
         batch, self._pending = self._pending[:BATCH], self._pending[BATCH:]
         try:
-            self.differing += await asyncio.to_thread(
+            self.differing |= await asyncio.to_thread(
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
             )
         except StoreError as exc:

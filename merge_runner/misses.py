@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -11,6 +12,8 @@ from merge_runner.llm.transport import SealedTransport
 from merge_runner.records import ChatRequest, Slot, TrialRecord
 
 SHOWN = 70
+# Misses that differ in numbers alone have one cause.
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,10 +33,11 @@ def misses_of(record: TrialRecord, sealed: SealedTransport) -> Iterator[Miss]:
 
 
 def explain(misses: list[Miss], recorded: Iterable[Entry]) -> list[str]:
-    """One text per miss: trial, side, decision, and what differs from the nearest request.
+    """What differs from the nearest request: one text for all misses that differ alike.
 
-    Nearest is a request of the same slot, else of the same place in another repetition, else
-    any; among those of one slot the one with the fewest differences.
+    It names the first trial, side and decision, and how many more there are. Nearest is a request
+    of the same slot, else of the same place in another repetition, else any; among those of one
+    slot the one with the fewest differences.
     """
     wanted = {miss.request.slot for miss in misses}
     same_slot: dict[Slot, list[ChatRequest]] = {}
@@ -43,7 +47,22 @@ def explain(misses: list[Miss], recorded: Iterable[Entry]) -> list[str]:
         if request.slot in wanted:
             same_slot.setdefault(request.slot, []).append(request)
         same_place.setdefault(_place(request.slot), request)
-    return [_explained(miss, same_slot, same_place) for miss in misses]
+    alike: dict[str, list[tuple[Miss, str]]] = {}
+    for miss in misses:
+        text = _explained(miss, same_slot, same_place)
+        alike.setdefault(_NUMBER.sub("0", text), []).append((miss, text))
+    return [_told(group) for group in alike.values()]
+
+
+def _told(group: list[tuple[Miss, str]]) -> str:
+    """The first of misses that differ alike, and how many there are."""
+    (first, text), *others = group
+    slot = first.request.slot
+    told = f"{first.trial_id}, {slot.side}, decision {slot.decision}: {text}"
+    if not others:
+        return told
+    trials = len({miss.trial_id for miss, _ in group})
+    return f"{told}; {len(group)} calls of {trials} trials differ like this"
 
 
 def _explained(
@@ -52,14 +71,13 @@ def _explained(
     same_place: dict[tuple[str, str, int], ChatRequest],
 ) -> str:
     request, slot = miss.request, miss.request.slot
-    where = f"{miss.trial_id}, {slot.side}, decision {slot.decision}"
     others = same_slot.get(slot) or [
         same_place.get(_place(slot)) or next(iter(same_place.values()), request)
     ]
     nearest = min((list(_differences(other, request)) for other in others), key=len)
     if not nearest:
-        return f"{where}: nothing is recorded at all"
-    return f"{where}: the nearest recorded request differs in {'; '.join(nearest)}"
+        return "nothing is recorded at all"
+    return f"the nearest recorded request differs in {'; '.join(nearest)}"
 
 
 def _place(slot: Slot) -> tuple[str, str, int]:

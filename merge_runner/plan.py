@@ -16,7 +16,7 @@ from merge_runner.config import (
     load_sweep,
     pair_name,
 )
-from merge_runner.drivers import projected_order
+from merge_runner.drivers.programs import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import canonical_json
@@ -27,11 +27,6 @@ from merge_runner.simulator.conditions import CONDITIONS
 SPEC_VERSION = 2  # since then one valid array in a reply is enough
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 PROMPTS_PER_DRIVER = 10.5
-# The programs that drive, with the parameters of their rules.
-PROGRAMS: dict[str, dict[str, float]] = {
-    "constant": {},
-    "projected-order": projected_order.PARAMETERS,
-}
 EMULATOR = "emulator"
 
 
@@ -169,7 +164,12 @@ class Plan:
     def _driver(self, name: str, endpoints: Mapping[str, str]) -> dict[str, object]:
         entry = self.entries.get(name)
         if entry is None:
-            return {"program": name, "parameters": PROGRAMS[name]}
+            program = PROGRAMS[name]
+            return {
+                "program": name,
+                "parameters": dict(program.parameters),
+                "source": program.source,
+            }
         sent = FORMATS[entry.format].request(entry, "")
         return {
             "endpoint": endpoints[name],

@@ -10,9 +10,8 @@ from functools import partial
 from typing import Protocol
 
 from merge_runner.drivers.base import Driver
-from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.llm_driver import LlmDriver
-from merge_runner.drivers.projected_order import ProjectedOrderDriver
+from merge_runner.drivers.programs import PROGRAMS
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
@@ -131,10 +130,8 @@ class Players:
 
     def _driver(self, spec: TrialSpec, side: Side) -> Driver:
         name, scenario = self.plan.sides[side], self.plan.scenario
-        if name == "constant":
-            return ConstantDriver(scenario)
-        if name == "projected-order":
-            return ProjectedOrderDriver(scenario, side)
+        if name in PROGRAMS:
+            return PROGRAMS[name].make(scenario, side)
         client = self.clients[name]
 
         async def ask(prompt: str, number: int) -> ChatReply:

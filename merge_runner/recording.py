@@ -26,12 +26,19 @@ from pydantic import TypeAdapter
 from merge_runner.database import Settings, in_memory
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, Entry, ResponseCache
-from merge_runner.llm.keys import KEY_VERSION, call_key
+from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
 from merge_runner.llm.verify import DAMAGED, check_attempts, check_body
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
 from merge_runner.texts import first_line, one_line, quoted
 
-FORMAT = "merge-runner recording 1"
+FORMAT = "merge-runner recording 2"
+# Its hash does not cover where the recording comes from.
+FIRST_FORMAT = "merge-runner recording 1"
+UNCOVERED = (
+    "it was exported by an earlier version: its hash does not cover what it says of where it comes "
+    "from"
+)
+PROVENANCE_HASH = "provenance_sha256"
 COLUMNS = {
     "call_key": "VARCHAR",
     "provider": "VARCHAR",
@@ -66,7 +73,8 @@ READING: Settings = {
 class Summary:
     """What a recording holds: calls, of which a scripted stand-in answered some, and the rest.
 
-    ``cost_usd`` is what its replies cost when they were made.
+    ``cost_usd`` is what its replies cost when they were made. ``covered`` says that the hash of the
+    file covers the provenance, too: that of the first format does not.
     """
 
     calls: int
@@ -78,6 +86,12 @@ class Summary:
     endpoints: dict[str, int]
     outcomes: dict[str, int]
     provenance: dict[str, str]
+    covered: bool
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader should know beside that it is whole."""
+        return [] if self.covered else [UNCOVERED]
 
 
 def export_recording(
@@ -108,6 +122,7 @@ def export_recording(
         "calls": str(len(rows)),
         "content_sha256": content.hexdigest(),
     }
+    metadata[PROVENANCE_HASH] = _provenance_hash(metadata)
     with _written(file), in_memory({}) as connection:
         columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
         connection.execute(f"CREATE TABLE calls ({columns})")
@@ -153,6 +168,11 @@ def read_recording(file: Path) -> Iterator[Entry]:
             f"{file} is not as it was exported: it holds {number} calls of {told.get('calls')}, "
             "and its content has another hash"
         )
+    if told.get("format") != FIRST_FORMAT and told.get(PROVENANCE_HASH) != _provenance_hash(told):
+        raise RecordingError(
+            f"{file} is not as it was exported: what it says of where it comes from has another "
+            "hash"
+        )
 
 
 def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
@@ -188,6 +208,7 @@ def summarise(file: Path) -> Summary:
         served[entry.attempts[-1].model_served or "unknown"] += 1
         endpoints[entry.request.endpoint] += 1
         outcomes[entry.attempts[-1].outcome] += 1
+    provenance = _provenance(file)
     return Summary(
         calls=calls,
         scripted=scripted,
@@ -197,7 +218,8 @@ def summarise(file: Path) -> Summary:
         models_served=dict(served),
         endpoints=dict(endpoints),
         outcomes=dict(outcomes),
-        provenance=_provenance(file),
+        provenance=provenance,
+        covered=provenance.get("format") != FIRST_FORMAT,
     )
 
 
@@ -231,6 +253,12 @@ def _order(row: tuple[Any, ...]) -> tuple[Any, ...]:
 def _fingerprint(key: str, attempts: str) -> bytes:
     """What the hash of a recording covers of a row: the key covers the rest."""
     return f"{key} {attempts}\n".encode()
+
+
+def _provenance_hash(metadata: dict[str, str]) -> str:
+    """What covers all that a file says of itself."""
+    told = {name: text for name, text in metadata.items() if name != PROVENANCE_HASH}
+    return hashlib.sha256(canonical_json(told).encode()).hexdigest()
 
 
 def _row(entry: Entry) -> tuple[Any, ...]:
@@ -320,7 +348,13 @@ def _opened(file: Path) -> duckdb.DuckDBPyConnection:
             f"{file} is no recording of ours: it has the columns {_listed(found)}; "
             f"a recording has {_listed(COLUMNS)}"
         )
-    version = _metadata(file, connection).get("key_version")
+    told = _metadata(file, connection)
+    version = told.get("key_version")
+    if told.get("format") not in (FORMAT, FIRST_FORMAT):
+        raise RecordingError(
+            f"{file} has the format {one_line(repr(told.get('format')))}, and this program reads "
+            f"{FIRST_FORMAT!r} and {FORMAT!r}"
+        )
     if version != str(KEY_VERSION):
         raise RecordingError(
             f"{file} has keys of version {version!r}, this program reads version {KEY_VERSION}"

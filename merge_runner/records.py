@@ -21,6 +21,9 @@ ATTEMPT_HEADER = "x-merge-runner-attempt"
 # A scripted stand-in says what it is in every reply: by this header, and by this field of the body.
 SCRIPTED_HEADER = "x-merge-runner-scripted"
 SCRIPTED_FIELD = "merge_runner_scripted"
+# And to what it answers, so that an exchanged answer is known: the hash of the request's body, and
+# the slot if it was told one.
+ANSWERED_FIELD = "merge_runner_request"
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,6 @@ from typing import Any
 from merge_runner.records import (
     Attempt,
     ChatRequest,
-    DecisionRow,
-    FailedCall,
     TrialRecord,
     is_scripted,
 )
@@ -99,36 +97,43 @@ def decision_rows(record: TrialRecord) -> Iterator[Row]:
 
 def call_rows(record: TrialRecord) -> Iterator[Row]:
     """Rows of ``calls``: every attempt of every call, also of those that failed."""
+    key = (record.spec.trial_id, record.spec.spec_hash)
     for row in record.decisions:
         reply = row.decision.reply
         if reply is not None:
             for attempt in reply.attempts:
-                yield _call_row(record, row, reply.request, attempt, reply.earlier)
+                cached = attempt.number <= reply.earlier
+                yield call_row(*key, row.side, row.number, reply.request, attempt, cached=cached)
     for failed in record.failed_calls:
         for attempt in failed.attempts:
-            yield _call_row(record, failed, failed.request, attempt, failed.earlier)
+            cached = attempt.number <= failed.earlier
+            yield call_row(*key, failed.side, failed.number, failed.request, attempt, cached=cached)
 
 
-def _call_row(
-    record: TrialRecord,
-    place: DecisionRow | FailedCall,
+def call_row(
+    trial_id: str,
+    spec_hash: str,
+    side: str,
+    decision: int,
     request: ChatRequest,
     attempt: Attempt,
-    earlier: int,
+    *,
+    cached: bool,
 ) -> Row:
+    """The row of an attempt at a decision's call."""
     return (
         request.key,
-        record.spec.trial_id,
-        record.spec.spec_hash,
-        place.side,
-        place.number,
+        trial_id,
+        spec_hash,
+        side,
+        decision,
         attempt.number,
         request.provider,
         request.model,
         attempt.model_served,
         attempt.http_status,
         attempt.outcome,
-        attempt.number <= earlier,
+        cached,
         attempt.started_at and datetime.fromisoformat(attempt.started_at).replace(tzinfo=None),
         attempt.latency_s,
         attempt.usage.input_tokens,

@@ -15,6 +15,7 @@ from typing import Any
 
 import duckdb
 
+from merge_runner.compared import PLACES, TrialKey, stored_rows
 from merge_runner.database import (
     PATIENCE_S,
     SCHEMA,
@@ -32,8 +33,8 @@ from merge_runner.rows import Row, rows_of, state_rows, trial_row
 from merge_runner.served import other_models, sql_of
 from merge_runner.texts import first_line
 
-TrialKey = tuple[str, str]
-"""(trial_id, spec_hash)"""
+# What a run has of its own: whether it made an attempt itself, and when the attempt was made.
+OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,10 +109,10 @@ class Store:
 
     def write(
         self, sweep_id: str, records: Sequence[TrialRecord], *, patience_s: float
-    ) -> list[str]:
+    ) -> dict[str, list[str]]:
         """Store whole trials of a sweep; one that has ended already is compared and linked.
 
-        Returns the ids of those that were played to another end than the stored one.
+        Returns the ids of those that are stored otherwise, with the columns in which they are.
         """
         # Made before anybody is kept waiting, though a trial that is stored already needs none.
         rows = [rows_of(record) for record in records]
@@ -124,13 +125,12 @@ class Store:
                 for made, key in zip(rows, keys, strict=True)
                 if stored.get(key, "failed") == "failed"
             ]
-            differing = [
-                record.spec.trial_id
-                for record, key in zip(records, keys, strict=True)
-                if stored.get(key, "failed") != "failed"
-                and record.status != "failed"
-                and not _same(connection, record)
-            ]
+            again = {
+                key: made
+                for record, made, key in zip(records, rows, keys, strict=True)
+                if stored.get(key, "failed") != "failed" and record.status != "failed"
+            }
+            differing = _differing(connection, again)
             _append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
             for table in ("trials", "states", "decisions", "calls"):
                 _append(connection, table, chain.from_iterable(made[table] for made in new))
@@ -401,22 +401,17 @@ def _stored(
     return found
 
 
-def _same(connection: duckdb.DuckDBPyConnection, record: TrialRecord) -> bool:
-    """Whether the stored trial has the same states and the same plans."""
-    key = (record.spec.trial_id, record.spec.spec_hash)
-
-    def stored(columns: str, table: str, order: str) -> list[tuple[Any, ...]]:
-        return connection.execute(
-            f"SELECT {columns} FROM {table} WHERE trial_id = ? AND spec_hash = ? ORDER BY {order}",  # noqa: S608 # constants
-            key,
-        ).fetchall()
-
-    states = sorted((s.step, s.side, s.position_m, s.velocity_mps) for s in record.states)
-    plans = sorted((d.number, d.side, list(d.decision.applied)) for d in record.decisions)
-    return (
-        stored("step, side, position_m, velocity_mps", "states", "step, side") == states
-        and stored("decision, side, applied", "decisions", "decision, side") == plans
-    )
+def _differing(
+    connection: duckdb.DuckDBPyConnection, played: dict[TrialKey, dict[str, list[Row]]]
+) -> dict[str, list[str]]:
+    """Which trials are stored otherwise than they were played, and in which columns."""
+    found: dict[str, list[str]] = {}
+    for table in PLACES if played else ():
+        stored = stored_rows(connection, table, list(played))
+        for key, made in played.items():
+            for difference in stored.differences(key, made[table], ignored=OF_A_RUN):
+                found.setdefault(key[0], []).append(difference.name)
+    return found
 
 
 def _delete(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:

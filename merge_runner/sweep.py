@@ -358,9 +358,9 @@ class Sweep:
             if flusher.differing:
                 outcome.fail(
                     StoreError.exit_code,
-                    f"{len(flusher.differing)} trials ended otherwise than those stored in "
-                    f"{self._options.db}, which are left as they are: "
-                    f"{', '.join(flusher.differing[:SHOWN])}. Replay into another --db.",
+                    f"{len(flusher.differing)} trials are stored otherwise in {self._options.db}, "
+                    f"which is left as it is: {_differing(flusher.differing)}. Replay into "
+                    "another --db.",
                 )
         except StoreError as exc:
             outcome.fail(exc.exit_code, str(exc))
@@ -370,7 +370,10 @@ class Sweep:
         try:
             outcome.facts = sweep_facts(self._options.db, outcome.sweep_id)
             outcome.audit = audit_sweep(
-                self._options.db, outcome.sweep_id, finished=outcome.exit_code == 0
+                self._options.db,
+                outcome.sweep_id,
+                finished=outcome.exit_code == 0,
+                derive=False,  # these trials have just been driven
             )
             # Another model's answers are told apart from this, and only --strict-model stops there.
             findings = [f for f in outcome.audit.findings if f.kind != "served"]
@@ -415,6 +418,12 @@ class Sweep:
                 "Set the base URL variable of its provider to the one to replay."
             )
         return recorded[0]
+
+
+def _differing(trials: Mapping[str, Sequence[str]]) -> str:
+    """The first trials that are stored otherwise, each with the columns."""
+    shown = list(trials.items())[:SHOWN]
+    return "; ".join(f"{trial_id} ({', '.join(columns)})" for trial_id, columns in shown)
 
 
 async def _drained(crew: Crew, work: asyncio.Task[None]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import duckdb
 import pytest
 from aiohttp import web
-from harness import FAST, RECORDING, watched
+from harness import FAST, PROJECT, RECORDING, watched
 from recordings import drive, write_folder
 from typer.testing import CliRunner
 
@@ -64,8 +64,18 @@ class Audited:
     audits: list[dict]
 
     @property
-    def findings(self) -> list[dict]:
+    def all_findings(self) -> list[dict]:
         return [finding for audit in self.audits for finding in audit["findings"]]
+
+    @property
+    def findings(self) -> list[dict]:
+        """Those of the checks that share no rule with the program."""
+        return [finding for finding in self.all_findings if finding["kind"] != "derived"]
+
+    @property
+    def derived(self) -> list[dict]:
+        """Those of what is derived anew by the program's own rules."""
+        return [finding for finding in self.all_findings if finding["kind"] == "derived"]
 
     @property
     def kinds(self) -> set[str]:
@@ -79,7 +89,7 @@ class Audited:
 def audit(*arguments: object) -> Audited:
     run = CliRunner().invoke(app, ["audit", *map(str, arguments), "--json"])
     told = json.loads(run.stdout)
-    assert told["ok"] == (run.exit_code == 0) == (not Audited(0, told["audits"]).findings)
+    assert told["ok"] == (run.exit_code == 0) == (not Audited(0, told["audits"]).all_findings)
     return Audited(run.exit_code, told["audits"])
 
 
@@ -541,17 +551,21 @@ def test_what_an_unfinished_sweep_lacks_is_a_note(db):
 def test_what_another_sweep_has_played_since_is_not_missing(db):
     with duckdb.connect(str(db)) as connection:
         connection.execute(
-            "INSERT INTO sweeps SELECT * REPLACE ('stopped' AS sweep_id, "
+            "INSERT INTO sweeps SELECT * REPLACE (name || '-emulator-' || "
+            "strftime(started_at - INTERVAL 1 HOUR, '%Y%m%dT%H%M%S%f') AS sweep_id, "
             "started_at - INTERVAL 1 HOUR AS started_at) FROM sweeps "
             f"WHERE sweep_id = {SWEEP}"
         )
-        connection.execute(f"INSERT INTO sweep_trials SELECT 'stopped', trial_id, spec_hash "
+        (stopped,) = connection.execute(
+            "SELECT sweep_id FROM sweeps ORDER BY started_at LIMIT 1"
+        ).fetchone()
+        connection.execute(f"INSERT INTO sweep_trials SELECT '{stopped}', trial_id, spec_hash "
                            f"FROM sweep_trials WHERE {OF_PAIR}")  # fmt: skip
     found = audit("--db", db)
     assert found.code == 0
     assert "7 of its trials were played by another sweep" in found.notes
     assert found.audits[1]["sharings"][0] == {
-        "what": "trials", "first": found.audits[1]["subject"], "second": "stopped", "count": 1,
+        "what": "trials", "first": found.audits[1]["subject"], "second": stopped, "count": 1,
     }  # fmt: skip
 
 
@@ -609,6 +623,23 @@ async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tm
     found = audit("--db", tmp_path / "results/merge.duckdb")
     assert found.code == 0
     assert "word for word as before: are they samples?" in found.notes
+
+
+async def test_another_models_answers_end_an_audit_with_1_and_no_sweep(merge_runner):
+    async def other(request, handler):
+        return web.json_response(json.loads((await handler(request)).body) | {"model": "gpt-0"})
+
+    part = ("sweep", "baseline", "--conditions", "L_4_8", "--reps", 1)
+    async with watched(other) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        assert (await merge_runner(*part, **env)).code == 0
+        found = await merge_runner("audit")
+        assert found.code == 1
+        assert "served: " in found.out
+        strict = await merge_runner(*part, "--strict-model", "--db", "strict.duckdb", **env)
+        assert strict.code == 1
+    exit_codes = (PROJECT / "README.md").read_text().partition("## Exit codes")[2]
+    assert "another model's answers end `merge-runner audit` with 1" in exit_codes
 
 
 def test_a_database_of_humans_alone_passes_and_says_that_there_is_no_sweep(prepare, tmp_path):

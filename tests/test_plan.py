@@ -121,7 +121,7 @@ def test_a_bad_sweep_file_gets_one_line_with_the_valid_choices(tmp_path, text, s
 def test_a_program_is_known_by_the_parameters_of_its_rule(monkeypatch):
     plan = make_plan(Choice("baseline", "projected-order"))
     before = hashes(plan, {})
-    monkeypatch.setitem(PROGRAMS["projected-order"], "target_gap_m", 5.0)
+    monkeypatch.setitem(PROGRAMS["projected-order"].parameters, "target_gap_m", 5.0)
     assert hashes(plan, {}) != before
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -15,10 +17,12 @@ import pytest
 from harness import FAST, PROJECT, RECORDING, environment, watched
 
 from merge_runner.emulator.faults import FaultPlan
+from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.recording import export_recording, read_recording
+from merge_runner.recording import export_recording, import_recording, read_recording, summarise
 from merge_runner.simulator.conditions import CONDITIONS
 from merge_runner.store import results_digest
+from merge_runner.texts import quoted
 
 # The digest of the committed recording: results, and so this text, never change by themselves.
 GOLDEN = (PROJECT / "tests/golden/emulator-baseline.digest").read_text()
@@ -88,7 +92,7 @@ def test_a_replay_imports_no_http_library():
     assert done.stdout.strip() == "[]"
 
 
-async def test_missing_replies_are_all_listed_with_what_differs_and_the_rest_finishes(
+async def test_missing_replies_are_counted_with_what_differs_and_the_rest_finishes(
     merge_runner, small
 ):
     lacking = ("replay", "baseline", "--recording", small, "--json")
@@ -96,19 +100,35 @@ async def test_missing_replies_are_all_listed_with_what_differs_and_the_rest_fin
     assert run.code == 4
     assert run.summary["trials"]["failed"] == 11
     assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] == 11
-    misses = [m for m in run.summary["messages"] if "decision 0" in m]
-    assert len(misses) == 22, "both sides of every trial that lacks its first reply"
-    text = (
-        "emulator/baseline/N_0_0/rep02, left, decision 0: the nearest recorded request differs in "
+    (told,) = run.summary["messages"]
+    assert re.fullmatch(
+        r"emulator/baseline/\w+-?\d_-?\d/rep02, left, decision 0: the nearest recorded request "
+        r"differs in repetition \(recorded 1, wanted 2\); 22 calls of 11 trials differ like this",
+        told,
     )
-    found = next(m for m in misses if m.startswith(text))
-    assert found == text + "repetition (recorded 1, wanted 2)"
     part = ("--reps", 1, "--conditions", "N_0_0")
     ablated = await merge_runner(*lacking, *part, "--variants", "A1")
     assert ablated.code == 4
     assert "body.messages[0].content (recorded 'History of the last 2 s" in ablated.err
     other = await merge_runner(*lacking, *part, "--sample-set", 2)
     assert "sample_set (recorded 0, wanted 2)" in other.err
+
+
+async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, small, tmp_path):
+    for folder in ("merge_runner", "experiments"):
+        shutil.copytree(PROJECT / folder, tmp_path / "edited" / folder)
+    blocks = tmp_path / "edited/merge_runner/prompts/blocks.py"
+    blocks.write_text(blocks.read_text().replace("- Your speed:", "- Your spead:"))
+    run = await merge_runner.start(
+        "replay", "baseline", "--recording", small, "--reps", 1, "--json",
+        PYTHONPATH=str(tmp_path / "edited"),
+    )  # fmt: skip
+    out, _ = await run.communicate()
+    assert run.returncode == 4
+    (told,) = json.loads(out)["messages"]
+    assert "recorded '- Your speed: 1" in told
+    assert "wanted '- Your spead: 1" in told
+    assert told.endswith("; 22 calls of 11 trials differ like this")
 
 
 async def test_an_exported_sweep_goes_round_through_a_file(merge_runner, tmp_path):
@@ -131,12 +151,12 @@ async def test_an_exported_sweep_goes_round_through_a_file(merge_runner, tmp_pat
     assert digest[1] == 2
 
 
-def changed(recording, file, change: str) -> None:
-    """Rewrite a recording with one thing changed and its metadata kept."""
+def changed(recording, file, change: str = "SELECT 1", **metadata: str) -> None:
+    """Rewrite a recording with one thing changed and the rest of its metadata kept."""
     with duckdb.connect() as connection:
         told = connection.execute(f"FROM parquet_kv_metadata('{recording}')").fetchall()
-        kept = {k.decode(): v.decode() for _, k, v in told if k != b"config"}
-        pairs = ", ".join(f"{k}: '{v}'" for k, v in kept.items() if "'" not in v)
+        kept = {k.decode(): v.decode() for _, k, v in told} | metadata
+        pairs = ", ".join(f"{k}: {quoted(v)}" for k, v in kept.items())
         connection.execute(f"CREATE TABLE calls AS FROM '{recording}'")
         connection.execute(change)
         connection.execute(f"COPY calls TO '{file}' (FORMAT parquet, KV_METADATA {{{pairs}}})")
@@ -178,6 +198,54 @@ async def test_a_recording_that_was_tampered_with_is_refused_whole(
     assert left.code == 4, "nothing of it entered the cache"
 
 
+@pytest.fixture(scope="module")
+def told(prepare, tmp_path_factory):
+    """A recording of a sweep that says where it comes from."""
+    folder = tmp_path_factory.mktemp("told")
+    part = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
+    assert prepare(folder, *part).code == 0
+    assert prepare(folder, "recording", "export", "told.parquet").code == 0
+    return folder / "told.parquet"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["git_commit", "git_dirty", "config", "started_at", "ended_at", "exit_code", "name", "versions",
+     "sweep_id", "provenance_sha256", "added"],
+)  # fmt: skip
+def test_a_recording_that_says_something_else_of_its_origin_is_refused(told, tmp_path, name):
+    origin = summarise(told).provenance
+    assert name in origin or name == "added"
+    changed(told, tmp_path / "same.parquet")
+    assert summarise(tmp_path / "same.parquet").covered
+    changed(told, tmp_path / "bad.parquet", **{name: origin.get(name, "") + " "})
+    with pytest.raises(RecordingError, match="what it says of where it comes from"):
+        summarise(tmp_path / "bad.parquet")
+    cache = ResponseCache(tmp_path / "cache")
+    with pytest.raises(RecordingError):
+        import_recording(tmp_path / "bad.parquet", cache)
+    assert list(cache.entries()) == []
+
+
+async def test_a_recording_of_the_first_format_is_taken_and_what_its_hash_lacks_is_said(
+    merge_runner, told, tmp_path
+):
+    first = {"format": "merge-runner recording 1", "git_commit": "anybody's"}
+    changed(told, tmp_path / "first.parquet", **first)
+    verified = await merge_runner("recording", "verify", "first.parquet")
+    assert verified.code == 0
+    says = "its hash does not cover what it says of where it comes from"
+    assert says in verified.err
+    assert says in (await merge_runner("audit", "--recording", "first.parquet")).out
+    assert (await merge_runner("recording", "info", "first.parquet")).summary["covered"] is False
+    new = await merge_runner("recording", "verify", told)
+    assert says not in new.err
+    changed(told, tmp_path / "later.parquet", format="merge-runner recording 3")
+    later = await merge_runner("recording", "verify", "later.parquet")
+    assert later.code == 1
+    assert "has the format 'merge-runner recording 3'" in later.err
+
+
 async def test_a_recording_holds_no_secret(merge_runner, tmp_path):
     async with watched() as server:
         env = {"OPENAI_API_KEY": "sk-very-secret-1", "OPENAI_BASE_URL": f"{server.url}/v1"}
@@ -209,19 +277,22 @@ async def test_a_named_recording_comes_before_what_the_cache_holds(merge_runner,
     assert results_digest(tmp_path / "r.duckdb") == digests[0]
 
 
-async def test_a_replay_that_ends_otherwise_than_the_stored_trials_says_so(merge_runner, tmp_path):
+async def test_a_replay_into_stored_trials_names_each_column_that_differs(merge_runner, tmp_path):
     part = ("--reps", 1, "--conditions", "N_0_0,L_4_0")
     assert (await merge_runner(*REPLAY, *part)).code == 0
     assert (await merge_runner(*REPLAY, *part)).code == 0
     with duckdb.connect(str(tmp_path / "results/merge.duckdb")) as connection:
         connection.execute(
-            "UPDATE states SET velocity_mps = velocity_mps + 0.001 "
+            "UPDATE states SET acceleration_mps2 = acceleration_mps2 + 0.001 "
             "WHERE trial_id LIKE '%N_0_0%' AND step = 7"
         )
+        connection.execute("UPDATE decisions SET rationale = 'no' WHERE trial_id LIKE '%L_4_0%'")
     again = await merge_runner(*REPLAY, *part)
     assert again.code == 1
-    assert "1 trials ended otherwise than those stored" in again.err
-    assert "emulator/baseline/N_0_0/rep01" in again.err
+    (line,) = (line for line in again.err.splitlines() if "stored otherwise" in line)
+    assert "2 trials are stored otherwise in results/merge.duckdb" in line
+    assert "emulator/baseline/N_0_0/rep01 (states.acceleration_mps2)" in line
+    assert "emulator/baseline/L_4_0/rep01 (decisions.rationale)" in line
 
 
 async def test_a_damaged_reply_fails_its_trial_alone(merge_runner, tmp_path):

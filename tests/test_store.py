@@ -83,21 +83,23 @@ def test_a_failed_trial_is_replaced_and_an_ended_one_never(store, path):
     assert store.ended_trials([("m/baseline/L_4_0/rep01", "h")]) == set()
     assert sweep_facts(path, "s1").failed == [("m/baseline/L_4_0/rep01", "it broke")]
     store.write("s1", [record], patience_s=1)
-    assert store.write("s1", [failed(record)], patience_s=1) == []
+    assert store.write("s1", [failed(record)], patience_s=1) == {}
     assert rows(path, "select status, error from trials") == [("finished", None)]
     assert rows(path, "select count(*) from states") == [(len(record.states),)]
 
 
 def test_a_trial_that_ends_otherwise_than_the_stored_one_is_named_and_not_stored(store, path):
     record = played()
-    assert store.write("s1", [record], patience_s=1) == []
-    assert store.write("s1", [record], patience_s=1) == []
+    assert store.write("s1", [record], patience_s=1) == {}
+    assert store.write("s1", [record], patience_s=1) == {}
     other = replace(played("L_4_8"), spec=record.spec)
-    assert store.write("s1", [other], patience_s=1) == ["m/baseline/L_4_0/rep01"]
+    assert store.write("s1", [other], patience_s=1).keys() == {"m/baseline/L_4_0/rep01"}
     plan = record.decisions[3].decision
     swerve = replace(record.decisions[3], decision=replace(plan, applied=(0.5,) * 5))
     decided = replace(record, decisions=(*record.decisions[:3], swerve, *record.decisions[4:]))
-    assert store.write("s1", [decided], patience_s=1) == ["m/baseline/L_4_0/rep01"]
+    assert store.write("s1", [decided], patience_s=1) == {
+        "m/baseline/L_4_0/rep01": ["decisions.applied"]
+    }
     assert rows(path, "select count(*) from states") == [(len(record.states),)]
 
 

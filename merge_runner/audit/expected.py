@@ -26,6 +26,7 @@ class ModelFacts(_Facts):
 
     id: str
     provider: str
+    format: str = ""
     aliases: tuple[str, ...] = ()
     parameters: dict[str, JsonValue] = {}
     path: str | None = None

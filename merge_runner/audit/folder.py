@@ -1,71 +1,87 @@
-"""Whether a cache folder holds the replies of a database, so that a replay will work."""
+"""Whether a cache folder holds the attempts of a database, so that a replay will work."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import duckdb
 
 from merge_runner.audit.findings import Audit, Finding
+from merge_runner.compared import Spans, TrialKey, in_batches, rows_of_trials
 from merge_runner.database import read_database
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.records import ChatRequest, Slot
+from merge_runner.rows import call_row
 
-BATCH = 1_000
-# The answer to every call that a decision used, once, with the first place that used it.
-ANSWERS = """
-SELECT call_key, min_by((trial_id, side, decision), (trial_id, decision, side)),
-    any_value(request::VARCHAR), any_value(reply::VARCHAR)
-FROM calls SEMI JOIN decisions USING (trial_id, spec_hash, side, decision, call_key)
-SEMI JOIN (SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = coalesce(?, sweep_id))
-    USING (trial_id, spec_hash)
-ANTI JOIN (SELECT trial_id, spec_hash, side, decision, max(attempt) AS attempt FROM calls
-    GROUP BY ALL) AS answers
-    ON answers.trial_id = calls.trial_id AND answers.spec_hash = calls.spec_hash
-    AND answers.side = calls.side AND answers.decision = calls.decision
-    AND answers.attempt > calls.attempt
-GROUP BY call_key
+TRIALS = """
+SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = coalesce(?, sweep_id)
 """
 
 
 def audit_cache(path: Path, folder: Path, sweep_id: str | None = None) -> Audit:
-    """Look up every reply of a sweep, or of all; raises UsageError."""
+    """Look up every attempt of a sweep, or of all; raises UsageError."""
     cache = ResponseCache(folder, read_only=True)
     findings: list[Finding] = []
-    calls = 0
+    keys: set[str] = set()
     try:
         with read_database(path) as connection:
-            for key, (trial_id, side, decision), request, reply in _answers(connection, sweep_id):
-                calls += 1
-                problem = _problem(cache, key, request, reply)
-                if problem:
-                    findings.append(Finding("cache", problem, sweep_id, trial_id, side, decision))
+            trials = connection.execute(TRIALS, [sweep_id]).fetchall()
+            read = partial(_attempts, connection)
+            for rows in in_batches(connection, trials, ["calls"], read):
+                for row in rows:
+                    keys.add(row["call_key"])
+                    if problem := _problem(cache, row):
+                        place = (row["trial_id"], row["side"], row["decision"])
+                        findings.append(Finding("cache", problem, sweep_id, *place))
     finally:
         cache.close()
-    return Audit(str(folder), {"calls": calls}, tuple(findings))
+    return Audit(str(folder), {"calls": len(keys)}, tuple(findings))
 
 
-def _answers(
-    connection: duckdb.DuckDBPyConnection, sweep_id: str | None
-) -> Iterator[tuple[str, tuple[str, str, int], str, str | None]]:
-    rows = connection.execute(ANSWERS, [sweep_id])
-    while batch := rows.fetchmany(BATCH):
-        yield from batch
+def _attempts(
+    connection: duckdb.DuckDBPyConnection, keys: list[TrialKey], spans: Spans
+) -> list[dict[str, Any]]:
+    rows = rows_of_trials(connection, "*", "calls", keys, spans["calls"])
+    names = [column[0] for column in rows.description or ()]
+    return [dict(zip(names, row, strict=True)) for row in rows.fetchall()]
 
 
-def _problem(cache: ResponseCache, key: str, request: str, reply: str | None) -> str | None:
+def _problem(cache: ResponseCache, row: dict[str, Any]) -> str | None:
+    """In what the cache has an attempt otherwise."""
+    key, number, cached = row["call_key"], row["attempt"], row["cached"]
+    place = (row["trial_id"], row["spec_hash"], row["side"], row["decision"])
     try:
         entry = cache.get(key)
+        attempts = entry.attempts if entry else cache.unanswered(key)
     except RecordingError as exc:
         return str(exc)
-    if entry is None:
-        return f"its reply is not in the cache ({key})"
-    if entry.request.body != request:
-        return f"the cache holds another request ({key})"
-    kept = entry.attempts[-1].reply
-    # The table holds a reply that is no JSON as a JSON string.
-    if reply not in (kept, json.dumps(kept)):
-        return f"the cache holds another reply than the database ({key})"
-    return None
+    if not 1 <= number <= len(attempts):
+        return f"its {f'attempt {number}' if attempts else 'reply'} is not in the cache ({key})"
+    request = entry.request if entry else _asked(row)
+    wanted = call_row(*place, request, attempts[number - 1], cached=cached)
+    differing = [
+        name
+        for (name, old), new in zip(row.items(), wanted, strict=True)
+        # Older versions stored no clock times.
+        if old != new and not (name == "started_at" and old is None)
+    ]
+    if not differing:
+        return None
+    return f"the cache holds another {', '.join(differing)} than the database ({key})"
+
+
+def _asked(row: dict[str, Any]) -> ChatRequest:
+    """The request of a row, of whose call the cache holds attempts alone."""
+    return ChatRequest(
+        key=row["call_key"],
+        provider=row["provider"],
+        endpoint="",
+        model=row["model_requested"],
+        path="",
+        headers={},
+        body=row["request"],
+        slot=Slot("", 0, row["side"], row["decision"], 0),
+    )

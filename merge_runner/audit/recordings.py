@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
+from merge_runner.audit.answers import answers_another
 from merge_runner.audit.expected import SweepConfig
 from merge_runner.audit.findings import Audit, Finding
 from merge_runner.audit.replies import CONSTANT_IDS
@@ -54,6 +55,7 @@ class Contents:
     )
     served: Counter[tuple[str, str]] = field(default_factory=Counter)
     misnumbered: list[ChatRequest] = field(default_factory=list)
+    exchanged: list[ChatRequest] = field(default_factory=list)
 
 
 def audit_recording(file: Path) -> Audit:
@@ -73,6 +75,8 @@ def audit_recording(file: Path) -> Audit:
         *_served(contents, config),
         *(_at(request, "attempt", "its attempts are out of order, or one follows an answer")
           for request in contents.misnumbered),
+        *(_at(request, "derived", "its reply is, as the server says in it, another's answer")
+          for request in contents.exchanged),
         *_missing(tracks, config, ended=_ended(summary.provenance)),
     ]  # fmt: skip
     return Audit(
@@ -85,7 +89,10 @@ def audit_recording(file: Path) -> Audit:
             **{f"answers {name}": count for name, count in sorted(summary.outcomes.items())},
         },
         findings=tuple(findings),
-        notes=() if config else ("it does not say of what sweep it is: trials are not compared",),
+        notes=(
+            *summary.notes,
+            *(() if config else ("it does not say of what sweep it is: trials are not compared",)),
+        ),
     )
 
 
@@ -108,6 +115,9 @@ def _gather(entry: Entry, contents: Contents) -> None:
     for attempt in entry.attempts:
         if attempt.http_status == 200 and attempt.model_served is not None:
             contents.served[request.model, attempt.model_served] += 1
+    asked = hashlib.sha256(request.body.encode()).hexdigest()
+    if any(answers_another(_json(a.reply), asked, slot.as_dict()) for a in entry.attempts):
+        contents.exchanged.append(request)
     numbers = [attempt.number for attempt in entry.attempts]
     early = any(a.outcome in ("ok", "refusal", "truncated") for a in entry.attempts[:-1])
     if early or numbers != list(range(1, len(numbers) + 1)):
@@ -116,16 +126,18 @@ def _gather(entry: Entry, contents: Contents) -> None:
 
 def _reply_id(attempt: Attempt) -> str | None:
     """The provider's id of a reply of status 200; None where it has none."""
-    if attempt.http_status != 200 or not attempt.reply:
-        return None
-    try:
-        reply: Any = json.loads(attempt.reply)
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(reply, dict):
+    reply = _json(attempt.reply)
+    if attempt.http_status != 200 or not isinstance(reply, dict):
         return None
     found = reply.get("id") or reply.get("responseId")
     return found if isinstance(found, str) else None
+
+
+def _json(text: str | None) -> object:
+    try:
+        return json.loads(text or "null")
+    except (ValueError, RecursionError):
+        return None
 
 
 def _config(provenance: dict[str, str]) -> SweepConfig | None:

@@ -20,6 +20,7 @@ FROM (SELECT trial_id, spec_hash, count(*) AS links FROM sweep_trials WHERE swee
 LEFT JOIN trials USING (trial_id, spec_hash)
 ORDER BY trial_id, spec_hash
 """
+NAMED = "SELECT name, started_at FROM sweeps WHERE sweep_id = ?"
 ENDED = """
 SELECT DISTINCT trial_id FROM trials SEMI JOIN sweep_trials USING (trial_id, spec_hash)
 JOIN (SELECT unnest(?) AS trial_id) USING (trial_id)
@@ -68,6 +69,10 @@ def check_slots(
     Of a sweep that does not claim to be ``finished`` what is missing or failed is a note.
     """
     found = Slots()
+    for name, started_at in connection.execute(NAMED, [sweep_id]).fetchall():
+        if sweep_id != f"{name}-{config.model}-{started_at:%Y%m%dT%H%M%S%f}":
+            text = "its id is not made of its name, its drivers and when it started"
+            found.findings.append(Finding("config", text, sweep=sweep_id))
     rows = [Row(*values) for values in connection.execute(TRIALS, [sweep_id]).fetchall()]
     finding = partial(Finding, sweep=sweep_id)
     seen: dict[str, str] = {}

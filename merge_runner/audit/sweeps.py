@@ -12,6 +12,7 @@ import duckdb
 from pydantic import ValidationError
 
 from merge_runner.audit.checks import CHECKS
+from merge_runner.audit.derived import Derived, check_derived
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Audit, Finding, Sharing
 from merge_runner.audit.replies import (
@@ -94,11 +95,14 @@ class _Sweep:
     ended: bool
 
 
-def audit_sweep(path: Path, sweep_id: str, *, finished: bool | None = None) -> Audit:
+def audit_sweep(
+    path: Path, sweep_id: str, *, finished: bool | None = None, derive: bool = True
+) -> Audit:
     """Audit one sweep of a database.
 
     ``finished`` says whether the sweep claims to have played everything, so that a missing or
-    failed trial is a finding; without it a sweep that has ended claims so. Raises UsageError.
+    failed trial is a finding; without it a sweep that has ended claims so. ``derive`` says whether
+    its trials are driven anew, which takes the longest by far. Raises UsageError.
     """
     with _reading(path) as connection:
         known = _sweeps(connection)
@@ -107,7 +111,7 @@ def audit_sweep(path: Path, sweep_id: str, *, finished: bool | None = None) -> A
             names = ", ".join(sweep.sweep_id for sweep in known) or "none"
             raise UsageError(f"{path} holds no sweep {sweep_id}; valid: {names}")
         specs = _prepare(connection)
-        audit = _audit(connection, sweep, specs, finished=finished)
+        audit = _audit(connection, sweep, specs, finished=finished, derive=derive)
         return replace(audit, sharings=(*audit.sharings, *calls_in_common(connection)))
 
 
@@ -141,9 +145,11 @@ def _audit(
     specs: Mapping[str, Spec],
     *,
     finished: bool | None = None,
+    derive: bool = True,
 ) -> Audit:
     connection.execute(AUDITED, [sweep.sweep_id])
     slots = Slots()
+    derived = Derived()
     models: list[tuple[Any, ...]] = []
     try:
         config = SweepConfig.model_validate_json(sweep.config)
@@ -154,6 +160,7 @@ def _audit(
         claims = sweep.ended if finished is None else finished
         slots = check_slots(connection, sweep.sweep_id, config, specs, finished=claims)
         models = [(name, m.id, m.provider) for name, m in config.models.items()]
+        derived = check_derived(connection, specs, config) if derive else derived
     connection.execute("DELETE FROM entries")
     _fill(connection, "entries", models)
     findings = [
@@ -162,13 +169,16 @@ def _audit(
         *check_traces(connection, specs),
         *check_hashes(connection),
         *check_sharing(connection),
+        *derived.findings,
     ]
     return Audit(
         subject=sweep.sweep_id,
-        counts=slots.counts | _counts(connection, COUNTS),
+        counts=slots.counts
+        | _counts(connection, COUNTS)
+        | ({"derived anew": derived.trials} if derive else {}),
         findings=tuple(replace(finding, sweep=sweep.sweep_id) for finding in findings),
         sharings=tuple(_taken_over(connection, sweep.sweep_id)),
-        notes=(*slots.notes, *_alike_notes(connection)),
+        notes=(*slots.notes, *_alike_notes(connection), *derived.notes),
     )
 
 

@@ -22,7 +22,14 @@ from merge_runner.emulator.scenarios.base import Scene
 from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
 from merge_runner.errors import UsageError
-from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_HEADER, SIDES, SLOT_HEADER, Slot
+from merge_runner.records import (
+    ANSWERED_FIELD,
+    ATTEMPT_HEADER,
+    SCRIPTED_HEADER,
+    SIDES,
+    SLOT_HEADER,
+    Slot,
+)
 from merge_runner.simulator.conditions import CONDITIONS
 
 HOST = "127.0.0.1"
@@ -109,6 +116,10 @@ class Emulator:
         text = MALFORMED if fault == "malformed" else answer(prompt, slot)
         ending = ENDINGS.get(fault, "stop") if fault else "stop"
         reply = answer_in(wire, reply_id[:24], model, prompt, text, ending)
+        reply.body[ANSWERED_FIELD] = {
+            "body_sha256": hashlib.sha256(raw).hexdigest(),
+            "slot": slot and slot.as_dict(),
+        }
         if fault == "truncated_json":
             return web.Response(body=dumps(reply.body)[:-20], content_type="application/json")
         return _play(scene, reply) if scene else _send(reply)

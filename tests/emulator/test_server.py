@@ -15,7 +15,7 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS
 from merge_runner.prompts.parse import parse_reply
-from merge_runner.records import SCRIPTED_FIELD, SCRIPTED_HEADER, says_scripted
+from merge_runner.records import ANSWERED_FIELD, SCRIPTED_FIELD, SCRIPTED_HEADER, says_scripted
 
 WIRES = ("openai-chat", "openai-responses", "gemini", "anthropic")
 PATHS = {
@@ -58,7 +58,8 @@ async def ask(url, wire, prompt, headers=None):
 
 def without_ids(body):
     """A reply without what tells it from the same one to another request."""
-    return json.loads(re.sub(r'"[a-z_-]*[0-9a-f]{24}"', '"ID"', json.dumps(body)))
+    alike = {name: value for name, value in body.items() if name != ANSWERED_FIELD}
+    return json.loads(re.sub(r'"[a-z_-]*[0-9a-f]{24}"', '"ID"', json.dumps(alike)))
 
 
 def error_names(wire, body):

@@ -1,0 +1,100 @@
+"""What a stored attempt says, read anew from its reply."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from merge_runner.llm.formats.base import Reading, WireFormat
+from merge_runner.llm.verdicts import RawReply, judge
+from merge_runner.records import ANSWERED_FIELD, says_scripted
+from merge_runner.rows import Row
+
+ANSWERS = ("ok", "refusal", "truncated", "empty")
+# A row of ``calls`` as it is read here; ``READ`` of it is what its reply tells.
+PLACE = ("decision", "side", "attempt")
+READ = (
+    "outcome",
+    "error",
+    "model_served",
+    "finish_reason",
+    "input_tokens",
+    "cached_input_tokens",
+    "output_tokens",
+    "reasoning_tokens",
+    "scripted",
+)
+COLUMNS = (*PLACE, *READ, "call_key", "provider", "http_status", "reply")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """An attempt: what its row should hold, and the text that was answered, None without one."""
+
+    row: dict[str, Any]
+    wanted: dict[str, Any]
+    text: str | None
+    payload: object = None
+
+    @property
+    def derived(self) -> Row:
+        """The row as it should be."""
+        return tuple({**self.row, **self.wanted}.values())
+
+
+def read_answer(row: dict[str, Any], wire: WireFormat) -> Answer:
+    """Read the reply of a row.
+
+    An attempt that failed stays as it is, since its name rests on headers that are not stored;
+    also of an answer the header alone may have said that a stand-in made it.
+    """
+    body = _body(row["reply"])
+    payload = _json(body)
+    told = {"scripted": row["scripted"] or row["provider"] == "emulator" or says_scripted(body)}
+    if row["http_status"] == 200 and isinstance(payload, dict):
+        reading = wire.read(payload)
+        if reading.outcome != "error":
+            wanted = {**_told(reading), **told, "outcome": reading.outcome, "error": None}
+            return Answer(row, wanted, reading.text, payload)
+    if row["outcome"] not in ANSWERS:
+        return Answer(row, told, None)
+    verdict = judge(RawReply(row["http_status"] or 0, {}, body), wire)
+    wanted = {**_told(verdict.reading), **told, "outcome": verdict.outcome}
+    return Answer(row, {**wanted, "error": verdict.message}, "")
+
+
+def answers_another(payload: object, body_sha256: str, slot: Mapping[str, Any]) -> bool:
+    """Whether a reply says that it is the answer to another request, as the emulator's tell.
+
+    A slot stands there only if the server was told one.
+    """
+    told = payload.get(ANSWERED_FIELD) if isinstance(payload, dict) else None
+    if not isinstance(told, dict):
+        return False
+    return told.get("body_sha256") != body_sha256 or told.get("slot") not in (None, slot)
+
+
+def _told(reading: Reading) -> dict[str, Any]:
+    return {
+        "model_served": reading.model_served,
+        "finish_reason": reading.finish_reason,
+        "input_tokens": reading.usage.input_tokens,
+        "cached_input_tokens": reading.usage.cached_input_tokens,
+        "output_tokens": reading.usage.output_tokens,
+        "reasoning_tokens": reading.usage.reasoning_tokens,
+    }
+
+
+def _body(reply: str | None) -> str:
+    """The body as it came: what the table would not take as JSON lies there as a JSON string."""
+    value = _json(reply or "")
+    return value if isinstance(value, str) else reply or ""
+
+
+def _json(text: str) -> object:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None

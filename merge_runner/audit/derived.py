@@ -1,0 +1,319 @@
+"""What is stored, derived anew: each reply is read, and each trial driven by it, once more.
+
+This tells what was changed after it was stored. It takes the program's own drivers, formats and
+world for it: whether these are right is asked by the other checks, which share no rule with them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import duckdb
+
+from merge_runner.audit.answers import COLUMNS, Answer, answers_another, read_answer
+from merge_runner.audit.expected import Spec, SweepConfig
+from merge_runner.audit.findings import Finding
+from merge_runner.compared import (
+    LONG,
+    PLACES,
+    Difference,
+    Spans,
+    Stored,
+    TrialKey,
+    in_batches,
+    rows_of_trials,
+    stored_rows,
+)
+from merge_runner.config import Scenario
+from merge_runner.drivers.base import Driver
+from merge_runner.drivers.llm_driver import LlmDriver
+from merge_runner.drivers.programs import PROGRAMS
+from merge_runner.errors import CallFailed
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.base import WireFormat
+from merge_runner.plan import SPEC_VERSION
+from merge_runner.prompts.blocks import VARIANTS, block_digests
+from merge_runner.records import (
+    SIDES,
+    ChatReply,
+    ChatRequest,
+    Decision,
+    Observation,
+    Side,
+    Slot,
+    TrialRecord,
+    TrialSpec,
+)
+from merge_runner.rows import decision_rows, state_rows, trial_row
+from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.trial import play_trial
+
+TOLERANCE = 1e-9
+"""Numbers may differ by this much, as between the arithmetic of two machines."""
+SHOWN = 60
+# The columns that neither a reply nor a spec tells: docs/audit.md says of each why. A cache tells
+# those of ``calls`` but ``cached``.
+NOT_DERIVED = (
+    "calls.cached",
+    "calls.started_at",
+    "calls.latency_s",
+    "calls.cost_usd",
+    "sweeps.ended_at",
+    "sweeps.exit_code",
+    "sweeps.git_commit",
+    "sweeps.git_dirty",
+    "sweeps.versions",
+)
+ASKED = "sha256(request::VARCHAR) AS asked"
+# What a reader is told could not be derived.
+OTHER_RULES = "anything, since another version of the program made them by other rules"
+OTHER_PROMPTS = "the prompts, made of other texts than this version has"
+OTHER_PROGRAM = "the decisions of a program that is not as it was"
+
+
+@dataclass(slots=True)
+class Derived:
+    """What was found, in how many trials, and what of how many could not be derived."""
+
+    findings: list[Finding] = field(default_factory=list)
+    trials: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def notes(self) -> list[str]:
+        """What could not be derived, for a reader."""
+        return [f"not derived anew in {n} trials: {w}" for w, n in self.left_out.items() if n]
+
+
+class _NotStored(Exception):  # what happened, and no error of the program
+    """What a decision would be derived from is not stored."""
+
+
+@dataclass(slots=True)
+class _Trial:
+    """A trial as it is stored.
+
+    ``scripted`` says that the sweep asks the emulator. Not derived are its prompts unless
+    ``prompts``, and if ``as_stored`` a program's decisions.
+    """
+
+    key: TrialKey
+    row: dict[str, Any]
+    scenario: Scenario
+    attempts: list[Answer]
+    plans: dict[tuple[str, int], Decision]
+    scripted: bool
+    prompts: bool = True
+    as_stored: bool = False
+    drivers: dict[Side, Driver] = field(default_factory=dict)
+
+    async def played(self) -> TrialRecord | _NotStored:
+        """The trial, driven anew."""
+        row = self.row
+        spec = TrialSpec(
+            *self.key,
+            source=row["source"],
+            model_left=row["model_left"],
+            model_right=row["model_right"],
+            variant=row["variant"],
+            condition=row["condition"],
+            repetition=row["rep"],
+            sample_set=row["sample_set"],
+            order=0,
+            scripted=self.scripted or any(a.wanted["scripted"] for a in self.attempts),
+        )
+        try:
+            return await play_trial(spec, self.scenario, self.drivers)
+        except _NotStored as exc:
+            return exc
+
+    def slot(self, row: Mapping[str, Any]) -> dict[str, str | int]:
+        """The slot of a row of ``calls``."""
+        own = self.row
+        return Slot(
+            own["condition"], own["rep"], row["side"], row["decision"], own["sample_set"]
+        ).as_dict()
+
+    def model(self, side: Side) -> LlmDriver:
+        """A language model that gives the stored replies."""
+        ordered = sorted(self.attempts, key=lambda attempt: attempt.row["attempt"])
+        last = {a.row["decision"]: a for a in ordered if a.row["side"] == side}
+
+        async def ask(_: str, number: int) -> ChatReply:
+            slot = Slot(self.row["condition"], self.row["rep"], side, number, 0)
+            answer = last.get(number)
+            key = answer.row["call_key"] if answer else ""
+            request = ChatRequest(key, "", "", "", "", {}, "", slot)
+            if answer is not None and answer.text is not None:
+                return ChatReply(answer.text, answer.wanted["outcome"], request, (), 0)
+            if self.row["status"] == "failed":
+                raise CallFailed("no answer", request)
+            raise _NotStored(f"the reply to decision {number} on the {side} is not stored")
+
+        return LlmDriver(ask, self.row["variant"] if self.prompts else "baseline", self.scenario)
+
+
+@dataclass(frozen=True, slots=True)
+class _AsStored:
+    """Drives the stored plans of a side."""
+
+    trial: _Trial
+    side: Side
+
+    async def decide(self, _: Observation, number: int) -> Decision:
+        """The stored decision; raises _NotStored."""
+        if (self.side, number) not in self.trial.plans:
+            raise _NotStored(f"decision {number} on the {self.side} is not stored")
+        return self.trial.plans[self.side, number]
+
+
+def check_derived(
+    connection: duckdb.DuckDBPyConnection, specs: Mapping[str, Spec], config: SweepConfig
+) -> Derived:
+    """Derive the audited trials anew, and compare every column that replies and specs tell."""
+    found = Derived()
+    audited = connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall()
+    batches = in_batches(connection, audited, PLACES, partial(_tables, connection))
+    with ThreadPoolExecutor(max_workers=1) as thread:  # a loop of its own: one may run here
+        for tables in batches:
+            trials = list(_trials(tables, specs, config, found))
+            records = thread.submit(asyncio.run, _all_played(trials)).result()
+            for trial, record in zip(trials, records, strict=True):
+                found.findings += _findings(trial, record, tables)
+            found.trials += len(trials)
+    return found
+
+
+async def _all_played(trials: list[_Trial]) -> list[TrialRecord | _NotStored]:
+    return [await trial.played() for trial in trials]
+
+
+def _tables(
+    connection: duckdb.DuckDBPyConnection, keys: list[TrialKey], spans: Spans
+) -> dict[str, Stored]:
+    """What is stored of these trials; of ``calls`` what replies tell, and the replies."""
+    tables = {
+        table: stored_rows(connection, table, keys, spans[table])
+        for table in ("trials", "states", "decisions")
+    }
+    calls = Stored("calls", (*COLUMNS, "asked"))
+    columns = f"trial_id, spec_hash, {', '.join(COLUMNS)}, {ASKED}"
+    rows = rows_of_trials(connection, columns, "calls", keys, spans["calls"])
+    for trial_id, spec_hash, *values in rows.fetchall():
+        calls.rows.setdefault((trial_id, spec_hash), []).append(tuple(values))
+    return {**tables, "calls": calls}
+
+
+def _trials(
+    tables: Mapping[str, Stored], specs: Mapping[str, Spec], config: SweepConfig, found: Derived
+) -> Iterator[_Trial]:
+    """The trials that can be derived; what is left out is counted, or told by other checks."""
+    wires = _wires(config)
+    for key in tables["trials"].rows:
+        spec = specs.get(key[1])
+        (row,) = tables["trials"].named(key)
+        if spec is None or spec.scenario is None or row["condition"] not in CONDITIONS:
+            continue
+        known = all(side in wires for side in SIDES if spec.asks(side))
+        if spec.content.get("spec_version") != SPEC_VERSION or not known:
+            found.left_out[OTHER_RULES] += 1
+            continue
+        calls, decisions = tables["calls"].named(key), tables["decisions"].named(key)
+        trial = _Trial(
+            key,
+            row,
+            spec.scenario,
+            [read_answer(c, wires[c["side"]]) for c in calls if c["side"] in wires],
+            {(d["side"], d["decision"]): _decided(d) for d in decisions},
+            scripted=any(model.provider == "emulator" for model in config.models.values()),
+        )
+        _seat(trial, spec)
+        found.left_out[OTHER_PROMPTS] += not trial.prompts
+        found.left_out[OTHER_PROGRAM] += trial.as_stored
+        yield trial
+
+
+def _wires(config: SweepConfig) -> dict[str, WireFormat]:
+    """The formats of the models, by side."""
+    models = {side: config.models.get(name) for side, name in config.sides.items()}
+    return {
+        side: FORMATS[model.format]
+        for side, model in models.items()
+        if model is not None and model.format in FORMATS
+    }
+
+
+def _decided(row: Mapping[str, Any]) -> Decision:
+    """What a program is stored to have decided."""
+    return Decision(
+        row["plan"], tuple(row["applied"]), failure=row["failure"], fallback=row["fallback"]
+    )
+
+
+def _seat(trial: _Trial, spec: Spec) -> None:
+    """Give the trial its drivers; a program that is another one by now drives as it is stored."""
+    variant, blocks = trial.row["variant"], spec.content.get("prompt_blocks")
+    trial.prompts = not blocks or (variant in VARIANTS and block_digests(variant) == blocks)
+    for side in SIDES:
+        told = spec.driver(side)
+        program = PROGRAMS.get(told.get("program", ""))
+        if spec.asks(side):
+            trial.drivers[side] = trial.model(side)
+        elif program is not None and program.source == told.get("source"):
+            trial.drivers[side] = program.make(trial.scenario, side)
+        else:
+            trial.drivers[side] = _AsStored(trial, side)
+            trial.as_stored = True
+
+
+def _findings(
+    trial: _Trial, record: TrialRecord | _NotStored, tables: Mapping[str, Stored]
+) -> Iterator[Finding]:
+    if isinstance(record, _NotStored):
+        yield Finding("derived", f"it cannot be driven anew: {record}", trial=trial.key[0])
+        return
+    for answer in trial.attempts:
+        if answers_another(answer.payload, answer.row["asked"], trial.slot(answer.row)):
+            text = "its reply is, as the server says in it, the answer to another request"
+            place = (answer.row["side"], answer.row["decision"])
+            yield Finding("derived", text, None, trial.key[0], *place)
+    ignored = set() if trial.prompts else {"prompt", "prompt_hash"}
+    if record.status == "failed":
+        ignored.add("error")  # the reason, in words
+    for table, rows in (
+        ("trials", [trial_row(record)]),
+        ("states", state_rows(record)),
+        ("decisions", decision_rows(record)),
+        ("calls", [attempt.derived for attempt in trial.attempts]),
+    ):
+        for difference in tables[table].differences(
+            trial.key, rows, ignored=ignored, tolerance=TOLERANCE
+        ):
+            yield _finding(trial.key[0], difference)
+
+
+def _finding(trial_id: str, found: Difference) -> Finding:
+    place = found.place
+    at = f" at step {place['step']}" if "step" in place else ""
+    more = f", and {found.rows - 1} more in the trial" if found.rows > 1 else ""
+    if found.column is None:
+        text = f"{found.name} are missing or too many{at}{more}"
+    elif found.column in LONG.get(found.table, ()):
+        text = f"{found.name} is not what it is derived anew{more}"
+    else:
+        stored, wanted = _short(found.stored), _short(found.wanted)
+        text = f"{found.name}{at} is {stored}, and {wanted} derived anew{more}"
+    return Finding(
+        "derived", text, trial=trial_id, side=place.get("side"), decision=place.get("decision")
+    )
+
+
+def _short(value: object) -> str:
+    text = "NULL" if value is None else str(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
