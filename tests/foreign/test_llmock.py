@@ -69,7 +69,8 @@ async def client_of(llmock, tmp_path, monkeypatch):
 
 
 def ask(client, decision=0):
-    return client.ask("Where do you go?", Slot("N_0_0", 1, "left", decision, 0))
+    # By its body a grader tells a call from another one that is tried again.
+    return client.ask(f"Where do you go at {decision} s?", Slot("N_0_0", 1, "left", decision, 0))
 
 
 def asks(llmock, model):
@@ -136,13 +137,15 @@ async def test_an_answer_that_comes_too_late_is_nobodys(llmock, client_of):
     assert {reply.text for reply in (*replies, *later)} == {"in time"}
 
 
-async def test_a_real_quota_costs_few_refusals(llmock, client_of):
-    llmock.limits(rpm=60)
+async def test_a_real_quota_costs_few_refusals(llmock, llmock_server, client_of):
+    llmock.limits(rpm=240)
+    for _ in range(240):
+        llmock_server.state.limiter.admit("anthropic", "", 0)  # others used it up
     client = client_of("anthropic", "m")
-    replies = await asyncio.gather(*(ask(client, decision) for decision in range(61)))
+    replies = await asyncio.gather(*(ask(client, decision) for decision in range(4)))
     assert {reply.outcome for reply in replies} == {"ok"}
     refused = sum(request.status == 429 for request in llmock.requests)
-    assert 1 <= refused <= 5  # it rounds the wait that it asks for
+    assert 1 <= refused <= 12
     llmock.assert_resilient(strict=True)
 
 
