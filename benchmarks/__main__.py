@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import fnmatch
 import json
 import os
 import platform
@@ -39,6 +38,7 @@ from benchmarks.explorer import explorer, explorer_floor
 from benchmarks.goals import judged
 from benchmarks.peers import installed, peer_cached, peer_cold, peer_resume
 from benchmarks.processes import served
+from benchmarks.soak import soak
 
 PEERS = (
     Case("inspect-ai, 0 ms", 1, peer_cold),
@@ -78,6 +78,8 @@ CASES = (
     ),
     Case("explorer of 11,000", 1, explorer(max(STUDIES))),
     Case("floor, explorer of 11,000", 1, explorer_floor),
+    Case("soak of 200", 1, soak(200, lives_s=3), is_long=True),
+    Case("soak of 10,000", 1, soak(10_000, lives_s=30), is_long=True),
     *PEERS,
 )
 
@@ -89,11 +91,7 @@ def main() -> None:
     parser.add_argument("--skip", default="", help="cases whose name does not fit this one")
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks.json"))
     args = parser.parse_args()
-    cases = [
-        case
-        for case in CASES
-        if fnmatch.fnmatch(case.name, args.only) and not fnmatch.fnmatch(case.name, args.skip)
-    ]
+    cases = [case for case in CASES if case.chosen(args.only, args.skip)]
     if not installed():
         _say("inspect-ai is not compared with: `make bench` installs it")
         cases = [case for case in cases if case not in PEERS]

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 
 from benchmarks.processes import PROGRAM, PYTHON, RUNNER, Run, Server, run
@@ -102,11 +103,17 @@ class Bench:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A case, and how often it is run."""
+    """A case, and how often it is run; one that takes long only where it is named."""
 
     name: str
     rounds: int
     measure: Callable[[Bench], Figures]
+    is_long: bool = False
+
+    def chosen(self, only: str, skip: str) -> bool:
+        """Whether these patterns of names choose it."""
+        fits = self.name == only or (not self.is_long and fnmatch(self.name, only))
+        return fits and not fnmatch(self.name, skip)
 
 
 def figures_of(ran: Run, *, calls: int | None = None) -> Figures:

@@ -210,5 +210,21 @@ GOALS = (
         lambda m: m("explorer of 11,000", "trial_ms"),
         unit="ms",
     ),
+    Goal(
+        "soak: answered calls asked again",
+        0,
+        lambda m: m("soak of 10,000", "answered_asked_again"),
+    ),
+    Goal(
+        "soak: attempts made twice",
+        0,
+        lambda m: m("soak of 10,000", "attempts_made_twice"),
+    ),
+    Goal(
+        "soak: billed beyond the ledger",
+        0,
+        lambda m: m("soak of 10,000", "beyond_ledger_usd"),
+        unit="USD",
+    ),
     Goal("--help", 0.15, lambda m: m("--help", "wall_s"), unit="s"),
 )

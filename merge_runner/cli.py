@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import gc
 import json
 import math
@@ -17,7 +16,7 @@ import typer
 
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.places import DEFAULT_CACHE, DEFAULT_DB
-from merge_runner.texts import in_spreadsheet, printable
+from merge_runner.texts import csv_writer, in_spreadsheet, printable
 
 if TYPE_CHECKING:
     from merge_runner.emulator.faults import FaultPlan
@@ -227,8 +226,7 @@ def sql(
         records = [dict(zip(names, row, strict=True)) for row in rows]
         print_out(json.dumps(records, indent=2, default=str, ensure_ascii=False))
     elif output is Format.CSV:
-        writer = csv.writer(sys.stdout)
-        writer.writerows(map(in_spreadsheet, row) for row in (names, *rows))
+        csv_writer(sys.stdout).writerows(map(in_spreadsheet, row) for row in (names, *rows))
     else:
         _print_table(names, rows)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+from typing import Any, TextIO
+
 
 def printable(text: str) -> str:
     """A text that cannot speak to a terminal: what a model or a server wrote may hold any code."""
@@ -18,6 +21,11 @@ def in_spreadsheet(value: object) -> object:
     if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r", "\n")):
         return f"'{value}"
     return value
+
+
+def csv_writer(file: TextIO) -> Any:  # noqa: ANN401 # the library does not name its kind
+    """A writer of CSV, whose lines end as those of all our files do."""
+    return csv.writer(file, lineterminator="\n")
 
 
 def first_line(exc: Exception) -> str:

@@ -12,6 +12,7 @@ from benchmarks.explorer import explorer, explorer_floor
 from benchmarks.goals import GOALS, judged
 from benchmarks.processes import PYTHON, served, serving, started_on
 from benchmarks.recorder import multiply
+from benchmarks.soak import soak
 from merge_runner.llm.cache import ResponseCache
 
 
@@ -79,6 +80,27 @@ def test_the_explorer_is_asked_when_it_has_read_the_trials_and_its_floor_serves_
     assert "o3/A1/N_0_0/rep01" in kept["filtered"]
     assert "I am at step 15." in kept["trial"]
     assert figures.keys() - explorer_floor(bench).keys() == {"reading_s"}
+
+
+def test_a_long_case_is_run_only_where_it_is_named():
+    long = [case for case in CASES if case.is_long]
+    assert [case.name for case in long if case.chosen("*", "") or case.chosen("soak*", "")] == []
+    assert [case.chosen(case.name, "") for case in long] == [True] * len(long) != []
+    assert next(case for case in CASES if case.name == "replay").chosen("re*", "")
+
+
+@pytest.mark.slow
+def test_a_soak_is_killed_and_counts_what_its_server_saw(bench, monkeypatch):
+    monkeypatch.setattr("benchmarks.soak.FAULT_RATE", 0.1)
+    figures = soak(2, lives_s=0.5)(bench)
+    assert figures["kills"] > 0
+    assert figures["requests"] > figures["calls_made"] > 2 * 8
+    assert figures["handles"] > 10 < figures["peak_mb"]
+    assert figures["answered_asked_again"] == figures["attempts_made_twice"] == 0
+    paid, billed = figures["spent_usd"], figures["billed_usd"]
+    assert 0 < paid == pytest.approx(figures["quiet_billed_usd"])
+    assert paid <= billed <= paid + figures["set_aside_usd"]
+    assert figures["digest_differs"] == 0
 
 
 def test_a_server_that_does_not_begin_says_why():

@@ -30,6 +30,11 @@ def cells(text):
     return list(csv.reader(io.StringIO(text, newline="")))
 
 
+@pytest.fixture
+def client(db):
+    return TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+
+
 @pytest.mark.parametrize("begins", list("=+-@\t\r\n"))
 def test_a_text_that_a_spreadsheet_would_run_gets_an_apostrophe(begins):
     assert in_spreadsheet(f"{begins}1") == f"'{begins}1"
@@ -53,8 +58,7 @@ async def test_a_table_names_a_driver_so_that_it_does_not_run(merge_runner, db):
     assert [row[:2] for row in rows] == [[f"'{FORMULA}/baseline", f"'{FORMULA}"]]
 
 
-def test_the_explorers_downloads_do_not_run_either(db):
-    client = TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+def test_the_explorers_downloads_do_not_run_either(client):
     head, *rows = cells(client.get("/trials.csv").text)
     assert len(rows) == 11
     for row in rows:
@@ -66,3 +70,18 @@ def test_the_explorers_downloads_do_not_run_either(db):
         ["'=x", "n", "d", "a", "b", "c"],
         ["'=1+1", "-1.5", "-2.0", "'@a", "'-", "true"],
     ]
+
+
+async def test_lines_of_csv_end_alike_wherever_they_come_from(merge_runner, db, client):
+    async def printed(*command):
+        run = await merge_runner(*command, "--db", db, "--format", "csv")
+        return run.out
+
+    texts = [
+        await printed("sql", QUERY),
+        await printed("tables", "attempts"),
+        client.get("/trials.csv").text,
+        client.get("/sql.csv", params={"q": QUERY}).text,
+    ]
+    assert [text.count("\r") for text in texts] == [0, 0, 0, 0]
+    assert all(text.endswith("\n") for text in texts)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import tempfile
 import threading
 from dataclasses import dataclass, field, fields
@@ -18,6 +17,7 @@ from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.plan import stand_in
 from merge_runner.records import SIDES
 from merge_runner.served import ALIASES, others_among
+from merge_runner.texts import csv_writer
 
 PAGE = 100
 # Two are equal where the same trials are listed: unlike a stamp, it stands when tables are kept.
@@ -389,9 +389,7 @@ class Catalogue:
             if form == "csv":
                 with path.open("w", encoding="utf-8", newline="") as file:
                     rows = [chosen.columns, *chosen.fetchall()]
-                    csv.writer(file, lineterminator="\n").writerows(
-                        map(csv_cell, row) for row in rows
-                    )
+                    csv_writer(file).writerows(map(csv_cell, row) for row in rows)
             else:
                 chosen.write_parquet(str(path))
             return path.read_bytes()

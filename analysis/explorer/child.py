@@ -7,7 +7,6 @@ there is one, and after it the CSV where that is asked for.
 from __future__ import annotations
 
 import contextlib
-import csv
 import io
 import json
 import shutil
@@ -25,7 +24,7 @@ import duckdb
 from merge_runner.database import Instance, read_database
 from merge_runner.errors import MergeRunnerError
 from merge_runner.store import answering
-from merge_runner.texts import in_spreadsheet
+from merge_runner.texts import csv_writer, in_spreadsheet, quoted
 
 # Python and DuckDB take addresses for more than they use, beside what the query may use.
 ADDRESSES_MB = 1024
@@ -97,22 +96,15 @@ def _copy(job: Copying) -> dict[str, Any]:
             with contextlib.suppress(FileNotFoundError):
                 shutil.copyfile(f"{database}{log}", f"{copy}{log}")
         shutil.copyfile(database, copy)
+    with duckdb.connect(copy) as whole:  # the copy loses its name, and its log with it
+        whole.execute("CHECKPOINT")
     return {}
 
 
 def _run(query: Query) -> tuple[dict[str, Any], bytes]:
     _confine(query)
-    config: dict[str, str | bool | int | float | list[str]] = {
-        "memory_limit": f"{query.memory_mb}MB",
-        "threads": THREADS,
-        "temp_directory": "",
-        "python_enable_replacements": False,
-    }
     began = time.monotonic()
-    with (
-        duckdb.connect(query.file, read_only=True, config=config) as connection,
-        answering(connection, query.sql) as result,
-    ):
+    with _opened(query) as connection, answering(connection, query.sql) as result:
         columns = [(name, str(kind)) for name, kind, *_ in result.description or ()]
         rows = _fetched(result)
         if query.as_csv:
@@ -124,6 +116,20 @@ def _run(query: Query) -> tuple[dict[str, Any], bytes]:
     names = [[name[:NAME], kind[:NAME]] for name, kind in columns]
     seconds = time.monotonic() - began
     return {"columns": names, "rows": cells, "more": more, "seconds": seconds}, b""
+
+
+@contextlib.contextmanager
+def _opened(query: Query) -> Iterator[duckdb.DuckDBPyConnection]:
+    """The database under a name of ours: its file's is that of an open file."""
+    config: dict[str, str | bool | int | float | list[str]] = {
+        "memory_limit": f"{query.memory_mb}MB",
+        "threads": THREADS,
+        "temp_directory": "",
+        "python_enable_replacements": False,
+    }
+    with duckdb.connect(config=config) as connection:
+        connection.execute(f"ATTACH {quoted(query.file)} AS results (READ_ONLY); USE results")
+        yield connection
 
 
 def _confine(query: Query) -> None:
@@ -171,7 +177,7 @@ def _csv(
     names: list[str], rows: Iterator[tuple[Any, ...]], query: Query
 ) -> tuple[dict[str, Any], bytes]:
     content, lines = io.BytesIO(), io.StringIO()
-    writer = csv.writer(lines)
+    writer = csv_writer(lines)
     writer.writerow(map(in_spreadsheet, names))
     for number, row in enumerate(rows):
         writer.writerow(map(csv_cell, row))

@@ -65,7 +65,10 @@ class Result:
 
 
 class Copy:
-    """A copy of a database, deleted when nobody holds it any more, and when the program ends."""
+    """A copy of a database, which has no name: it goes when nobody holds it any more.
+
+    So nothing is left of it when the program is killed, and no query can say where it lies.
+    """
 
     def __init__(self, db: Path, stamp: tuple[int, ...]) -> None:
         """Make it; raises NoAnswer."""
@@ -73,14 +76,18 @@ class Copy:
         try:
             folder = tempfile.mkdtemp(prefix="merge-runner-view-")
         except OSError as exc:
-            raise NoAnswer(f"there is no room for a copy of the database: {exc}") from exc
-        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        self.file = Path(folder) / "results.duckdb"
-        told = _asked(Copying(str(db.absolute()), str(self.file)), COPYING_S, SAID_BYTES)
-        if told is None:
-            raise NoAnswer("the database could not be copied in a minute: is it being written?")
-        if "error" in told[0]:
-            raise NoAnswer(told[0]["error"])
+            raise NoAnswer(f"there is no room for a copy of the database: {exc.strerror}") from exc
+        try:
+            copying = Copying(str(db.resolve()), f"{folder}/results.duckdb")
+            told = _asked(copying, COPYING_S, SAID_BYTES)
+            if told is None:
+                raise NoAnswer("the database could not be copied in a minute: is it being written?")
+            if "error" in told[0]:
+                raise NoAnswer(_without_folders(told[0]["error"], copying))
+            self.fd = os.open(copying.copy, os.O_RDONLY)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+        weakref.finalize(self, os.close, self.fd)
 
 
 @dataclass
@@ -119,7 +126,7 @@ class Sandbox:
         with self._turn():
             copy = self._current()
             query = Query(
-                file=str(copy.file),
+                file=f"/dev/fd/{copy.fd}",
                 sql=sql,
                 as_csv=as_csv,
                 rows=DOWNLOADED_ROWS if as_csv else caps.rows,
@@ -128,7 +135,7 @@ class Sandbox:
                 memory_mb=caps.memory_mb,
                 seconds=caps.seconds,
             )
-            told = _asked(query, caps.seconds, size + SAID_BYTES)
+            told = _asked(query, caps.seconds, size + SAID_BYTES, copy.fd)
         if told is None:
             raise NoAnswer(f"stopped after {caps.seconds:g} s")
         error = told[0].get("error")
@@ -165,10 +172,12 @@ class Sandbox:
             return self._copy
 
 
-def _asked(job: Query | Copying, seconds: float, size: int) -> tuple[dict[str, Any], bytes] | None:
+def _asked(
+    job: Query | Copying, seconds: float, size: int, *files: int
+) -> tuple[dict[str, Any], bytes] | None:
     """What a process says, up to so many bytes; None where it was killed for taking too long.
 
-    Raises NoAnswer where it ended without a word.
+    It is given the open ``files``. Raises NoAnswer where it ended without a word.
     """
     process = subprocess.Popen(
         [sys.executable, "-s", "-X", "utf8", "-m", "analysis.explorer.child"],
@@ -177,6 +186,7 @@ def _asked(job: Query | Copying, seconds: float, size: int) -> tuple[dict[str, A
         stderr=subprocess.DEVNULL,
         cwd=PROJECT,
         env=_environment(),
+        pass_fds=files,
     )
     assert process.stdin is not None
     assert process.stdout is not None
@@ -209,6 +219,13 @@ def _asked(job: Query | Copying, seconds: float, size: int) -> tuple[dict[str, A
     if late.is_set():
         return None
     raise NoAnswer(_silence(job, code))
+
+
+def _without_folders(text: str, job: Copying) -> str:
+    """What went wrong with a copy, for those whom the machine is no business of."""
+    for path in (job.database, job.copy):
+        text = text.replace(f"{Path(path).parent}{os.sep}", "")
+    return text
 
 
 def _silence(job: Query | Copying, code: int) -> str:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 from collections.abc import Callable, Sequence
 
 from analysis.forms import TableFormat
 from analysis.tables.model import Column, Row, Table, Value
-from merge_runner.texts import in_spreadsheet
+from merge_runner.texts import csv_writer, in_spreadsheet
 
 MISSING = "–"
 VARIANTS = {
@@ -67,7 +66,7 @@ def as_text(table: Table) -> str:
 def as_csv(table: Table) -> str:
     """A table's values at full precision; an interval makes two columns."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer = csv_writer(out)
     names = [name for column in table.columns for name in _names(column)]
     writer.writerow(["row", *names, "note"])
     for row in value_rows(table):

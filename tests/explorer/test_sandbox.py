@@ -6,6 +6,7 @@ import contextlib
 import gc
 import os
 import shutil
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -19,6 +20,7 @@ from analysis.explorer.child import Query
 from analysis.explorer.sandbox import Caps, NoAnswer, Sandbox
 from merge_runner.database import open_database
 from merge_runner.errors import UsageError
+from merge_runner.places import PROJECT
 
 PROC = Path("/proc")
 LOADED_S = 60  # what a process may wait for its turn on a machine that does much else
@@ -133,7 +135,7 @@ def test_a_plan_of_execution_is_whole(run):
 def test_a_download_is_whole_or_refused(run):
     csv = run("SELECT 'a,\"b' AS x, NULL AS y, repeat('é', 3000) AS z FROM range(101)", as_csv=True)
     assert csv.decode().splitlines() == ["x,y,z", *['"a,""b",,' + "é" * 3000] * 101]
-    assert run("SELECT 1 AS x WHERE false", as_csv=True) == b"x\r\n"
+    assert run("SELECT 1 AS x WHERE false", as_csv=True) == b"x\n"
     assert len(run("FROM range(100)", as_csv=True, rows=100).splitlines()) == 101
     assert "up to 100 rows" in run("FROM range(101)", as_csv=True, rows=100)["error"]
     assert "has more" in run("FROM range(1000)", as_csv=True, size=1000)["error"]
@@ -146,6 +148,30 @@ def test_a_query_is_answered_and_a_refusal_is_one_line(queries):
     writing = "WITH x AS (INSERT INTO meta VALUES (9) RETURNING *) FROM x"
     assert "read-only" in refusal(queries, writing)
     assert contents(queries.db.parent) == before
+
+
+def test_no_query_tells_where_anything_lies_on_the_machine(queries):
+    telling = ["FROM duckdb_settings()", "FROM duckdb_databases()", "FROM pragma_database_list",
+               "FROM pg_catalog.pg_database", "FROM pg_settings", "FROM duckdb_temporary_files()",
+               "FROM duckdb_secrets()", "FROM duckdb_logs()", "FROM duckdb_schemas()",
+               "SELECT current_setting('allowed_paths') AS x"]  # fmt: skip
+    parts = [f"SELECT to_json(t)::VARCHAR AS said FROM ({sql}) t" for sql in telling]
+    whole = f"SELECT string_agg(said) AS x FROM ({' UNION ALL '.join(parts)})"
+    said = queries.csv(
+        f"{whole} UNION ALL SELECT a::VARCHAR FROM (SHOW allowed_paths) t(a)"
+    ).decode()
+    assert "allowed_paths" in said
+    for place in (tempfile.gettempdir(), Path.home(), PROJECT, queries.db.parent):
+        assert str(place) not in said
+
+
+def test_no_refusal_tells_where_anything_lies_on_the_machine(tmp_path, monkeypatch):
+    (tmp_path / "text.duckdb").write_text("no database")
+    queries = Sandbox(tmp_path / "text.duckdb")
+    assert refusal(queries, "SELECT 1").startswith("text.duckdb cannot be opened as a database")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    assert "no room" in refusal(queries, "SELECT 1")
+    assert str(tmp_path) not in refusal(queries, "SELECT 1")
 
 
 def test_what_needs_too_much_memory_is_stopped_soon(queries):
@@ -169,7 +195,7 @@ def test_a_sweep_writes_while_a_query_runs(own, monkeypatch):
     said = []
     asking = threading.Thread(target=lambda: said.append(refusal(queries, ENDLESS)))
     asking.start()
-    until(lambda: len(processes) == 2 and reads(processes[1], copy.file))
+    until(lambda: len(processes) == 2 and reads(processes[1], copy))
     with open_database(own, read_only=False, patience_s=0) as connection:
         connection.execute("DELETE FROM sweeps")
     if PROC.exists():
@@ -202,16 +228,17 @@ def until(condition):
         time.sleep(0.02)
 
 
-def reads(process, file):
-    """Whether a process has opened a file."""
+def reads(process, copy):
+    """Whether a process has opened the copy, beside the file that it was given."""
     if not PROC.exists():
         time.sleep(1)
         return True
+    file = (PROC / "self/fd" / str(copy.fd)).readlink()
     opened = []
     for number in (PROC / str(process.pid) / "fd").iterdir():
         with contextlib.suppress(OSError):  # closed meanwhile
             opened.append(number.readlink())
-    return file in opened
+    return opened.count(file) > 1
 
 
 def test_the_environment_of_a_query_holds_nothing_of_ours(monkeypatch):
@@ -237,13 +264,22 @@ def test_a_copy_lasts_while_the_file_stays_and_no_longer(own):
     assert queries._current() is first
     os.utime(own, ns=(0, 0))
     second = queries._current()
-    assert second.file != first.file
-    kept = [first.file.parent, second.file.parent]
-    assert all(folder.exists() for folder in kept)
+    kept = [first.fd, second.fd]
+    assert len({os.fstat(fd).st_ino for fd in kept}) == 2
     del first, second
     queries.close()
     gc.collect()
-    assert not any(folder.exists() for folder in kept)
+    for fd in kept:
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            os.fstat(fd)
+
+
+def test_a_copy_leaves_nothing_when_the_program_is_killed(own, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = contents(tmp_path)
+    queries = Sandbox(own)
+    assert os.fstat(queries._current().fd).st_size > 0
+    assert contents(tmp_path) == before
 
 
 def test_who_finds_others_running_is_told_after_a_while(study):

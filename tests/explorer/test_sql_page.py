@@ -51,7 +51,7 @@ def asked(site, monkeypatch):
         return Result([("x", "INTEGER")], [[("1", 0)]], False, 0.0)
 
     monkeypatch.setattr(site.sandbox, "result", result)
-    monkeypatch.setattr(site.sandbox, "csv", lambda sql: queries.append(sql) or b"x\r\n1\r\n")
+    monkeypatch.setattr(site.sandbox, "csv", lambda sql: queries.append(sql) or b"x\n1\n")
     return queries
 
 
@@ -202,7 +202,7 @@ def test_the_page_holds_no_style_and_no_script_of_its_own(client, asked):
 
 def test_a_download_is_a_file_or_says_why_not(client):
     reply = client.get("/sql.csv", params={"q": "select 1 as x, 'a' as y"})
-    assert (reply.status_code, reply.text) == (200, "x,y\r\n1,a\r\n")
+    assert (reply.status_code, reply.text) == (200, "x,y\n1,a\n")
     assert reply.headers["content-type"] == "text/csv; charset=utf-8"
     assert reply.headers["content-disposition"] == 'attachment; filename="query.csv"'
     reply = client.get("/sql.csv", params={"q": "selekt"})
