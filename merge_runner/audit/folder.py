@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
-import duckdb
-
 from merge_runner.audit.findings import Audit, Finding
-from merge_runner.database import read_database
+from merge_runner.database import read_database, room_for_texts, streamed
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ResponseCache
 
-BATCH = 1_000
 # The answer to every call that a decision used, once, with the first place that used it.
-ANSWERS = """
-SELECT call_key, min_by((trial_id, side, decision), (trial_id, decision, side)),
-    any_value(request::VARCHAR), any_value(reply::VARCHAR)
+USED = """
+CREATE OR REPLACE TEMP TABLE used_answers AS
+SELECT min_by(calls.rowid, (trial_id, decision, side)) AS place
 FROM calls SEMI JOIN decisions USING (trial_id, spec_hash, side, decision, call_key)
 SEMI JOIN (SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = coalesce(?, sweep_id))
     USING (trial_id, spec_hash)
@@ -27,6 +23,10 @@ ANTI JOIN (SELECT trial_id, spec_hash, side, decision, max(attempt) AS attempt F
     AND answers.side = calls.side AND answers.decision = calls.decision
     AND answers.attempt > calls.attempt
 GROUP BY call_key
+"""
+ANSWERS = """
+SELECT call_key, trial_id, side, decision, request::VARCHAR, reply::VARCHAR
+FROM calls SEMI JOIN used_answers ON calls.rowid = place
 """
 
 
@@ -38,8 +38,9 @@ def audit_cache(path: Path, folder: Path, sweep_id: str | None = None) -> Audit:
     findings: list[Finding] = []
     calls = 0
     try:
-        with read_database(path) as connection:
-            for key, (trial_id, side, decision), request, reply in _answers(connection, sweep_id):
+        with read_database(path) as connection, room_for_texts(connection):
+            connection.execute(USED, [sweep_id])
+            for key, trial_id, side, decision, request, reply in streamed(connection, ANSWERS):
                 calls += 1
                 problem = _problem(cache, key, request, reply)
                 if problem:
@@ -47,14 +48,6 @@ def audit_cache(path: Path, folder: Path, sweep_id: str | None = None) -> Audit:
     finally:
         cache.close()
     return Audit(str(folder), {"calls": calls}, tuple(findings))
-
-
-def _answers(
-    connection: duckdb.DuckDBPyConnection, sweep_id: str | None
-) -> Iterator[tuple[str, tuple[str, str, int], str, str | None]]:
-    rows = connection.execute(ANSWERS, [sweep_id])
-    while batch := rows.fetchmany(BATCH):
-        yield from batch
 
 
 def _problem(cache: ResponseCache, key: str, request: str, reply: str | None) -> str | None:
