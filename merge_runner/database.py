@@ -25,8 +25,9 @@ SCHEMA = Path(__file__).with_name("schema.sql")
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
 ROWS_AT_ONCE, COPIED_AT_ONCE = 100, 2_048
-# A file of this size, and with so much more for each call, has texts that are short.
-MERGED_BYTES, MERGED_BYTES_A_CALL = 2**26, 2**11
+# What a file takes for each call where replies are short, compressed and with its share of states;
+# and how much more than that is little enough to be merged, and to be read as if they were short.
+BYTES_OF_A_CALL, MERGED_BYTES, SHORT_BYTES = 3_000, 2**26, 2**23
 LOG = logging.getLogger(__name__)
 Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
@@ -138,28 +139,35 @@ def _attached(
             return connection, name
 
 
-def merge_small_groups(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
+def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
     """Let the next writing merge what many small ones left, unless the rows hold long texts.
 
     To merge takes as much memory as the texts of 122,880 rows, and writes them again each time.
     """
-    row = connection.execute(
-        "SELECT estimated_size FROM duckdb_tables() "
-        "WHERE table_name = 'calls' AND database_name = current_database()"
-    ).fetchone()
-    calls, size = row[0] if row else 0, path.stat().st_size
-    tasks = 0 if size > MERGED_BYTES + calls * MERGED_BYTES_A_CALL else 100
+    tasks = 100 if _bytes_of_texts(connection) <= MERGED_BYTES else 0
     connection.execute(f"SET max_vacuum_tasks = {tasks}")
 
 
 @contextmanager
 def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
     """More memory while long texts are read: each thread unpacks those of 2,048 rows at once."""
+    if _bytes_of_texts(connection) <= SHORT_BYTES:
+        yield
+        return
     connection.execute(f"SET memory_limit = '{TEXTS['memory_limit']}'; SET threads = 1")
     try:
         yield
     finally:
         connection.execute(f"SET memory_limit = '{SETTINGS['memory_limit']}'; RESET threads")
+
+
+def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
+    """The size of the open file beyond what it has with short replies."""
+    row = connection.execute(
+        "SELECT path, estimated_size FROM duckdb_tables() JOIN duckdb_databases() "
+        "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
+    ).fetchone()
+    return Path(row[0]).stat().st_size - row[1] * BYTES_OF_A_CALL if row else 0
 
 
 def streamed(connection: duckdb.DuckDBPyConnection, sql: str) -> Iterator[tuple[Any, ...]]:

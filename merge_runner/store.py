@@ -122,7 +122,7 @@ class Store:
         # Made before anybody is kept waiting, though a trial that is stored already needs none.
         rows = [rows_of(record) for record in records]
         with self._writing(patience_s) as connection:
-            merge_small_groups(connection, self.path)
+            merge_small_groups(connection)
             keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
             stored = _statuses(connection, keys)
             _delete(connection, [key for key, status in stored.items() if status == "failed"])
