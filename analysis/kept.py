@@ -16,7 +16,12 @@ from pathlib import Path
 import duckdb
 
 import merge_runner
-from merge_runner.database import open_database, read_database
+from merge_runner.database import (
+    SCHEMA_VERSION,
+    open_database,
+    read_database,
+    schema_version,
+)
 from merge_runner.errors import StoreError
 from merge_runner.texts import first_line
 
@@ -107,6 +112,8 @@ def keep_finished(db: Path, made_of: str, options: str, contents: dict[str, str]
     """Keep tables or figures, unless the results have left the state that these are ``made_of``."""
     try:
         with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
+            if schema_version(connection, db) < SCHEMA_VERSION:
+                return  # a copy of it was read
             connection.begin()
             connection.execute(KEPT)
             if state(connection) == made_of:

@@ -43,7 +43,8 @@ SELECT provider, model_requested, model_served,
 -- A recorded call that several trials use was made once.
 FROM (
     SELECT DISTINCT ON (call_key, attempt)
-        * REPLACE (max(model_served) OVER (PARTITION BY call_key) AS model_served)
+        * EXCLUDE (request, reply, error)
+        REPLACE (max(model_served) OVER (PARTITION BY call_key) AS model_served)
     FROM calls
 )
 GROUP BY provider, model_requested, model_served ORDER BY ALL

@@ -5,18 +5,19 @@ from __future__ import annotations
 import gc
 import json
 import math
+import shutil
 import sys
 import tempfile
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.places import DEFAULT_CACHE, DEFAULT_DB
-from merge_runner.texts import csv_writer, in_spreadsheet, printable
+from merge_runner.texts import printable
 
 if TYPE_CHECKING:
     from merge_runner.emulator.faults import FaultPlan
@@ -219,16 +220,16 @@ def sql(
     output: Annotated[Format, typer.Option("--format", help="Form of the result.")] = Format.TEXT,
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
-    from merge_runner.store import query as run_query
+    from merge_runner.output import write_csv, write_json, write_table
+    from merge_runner.store import answers
 
-    names, rows = run_query(db, query)
-    if output is Format.JSON:
-        records = [dict(zip(names, row, strict=True)) for row in rows]
-        print_out(json.dumps(records, indent=2, default=str, ensure_ascii=False))
-    elif output is Format.CSV:
-        csv_writer(sys.stdout).writerows(map(in_spreadsheet, row) for row in (names, *rows))
-    else:
-        _print_table(names, rows)
+    writers = {Format.TEXT: write_table, Format.CSV: write_csv, Format.JSON: write_json}
+    # Who reads the output may take their time: until then nobody could write into the database.
+    with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as kept:
+        with answers(db, query) as (names, rows):
+            writers[output](names, rows, kept)
+        kept.seek(0)
+        shutil.copyfileobj(kept, sys.stdout)
 
 
 @app.command()
@@ -334,6 +335,7 @@ def models() -> None:
     """List the registry: provider, id, key, price, known shutdown date."""
     from merge_runner.config import Price, key_status, load_models
     from merge_runner.llm.prices import pricing
+    from merge_runner.output import write_table
     from merge_runner.records import Usage
 
     million = 1_000_000
@@ -359,7 +361,7 @@ def models() -> None:
             )
         )
     headings = ["name", "provider", "id", "key", "USD/M in", "USD/M out", "prices", "shutdown"]
-    _print_table([*headings, "note"], rows)
+    write_table([*headings, "note"], rows, sys.stdout)
 
 
 @app.command()
@@ -495,11 +497,12 @@ def _dry_run(plan: Plan, options: Options) -> Estimate:
     import asyncio
     from dataclasses import replace
 
+    from merge_runner.database import readable
     from merge_runner.estimate import estimate
     from merge_runner.sweep import Sweep
 
     with tempfile.TemporaryDirectory() as folder:
-        db = options.db if options.db.is_file() else Path(folder) / "none.duckdb"
+        db = readable(options.db) if options.db.is_file() else Path(folder) / "none.duckdb"
         recorded = (options.cache / "cache.db").is_file()
         cache = options.cache if recorded else Path(folder) / "responses"
         prepared = Sweep(plan, replace(options, db=db, cache=cache), say=say)
@@ -582,15 +585,6 @@ def _emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list
 def listed(text: str | None) -> list[str] | None:
     """The parts of an option that takes several names, None where it is not given."""
     return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
-
-
-def _print_table(names: list[str], rows: list[tuple[Any, ...]]) -> None:
-    cells = [names, *(["" if value is None else str(value) for value in row] for row in rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(names))]
-    for row in cells:
-        print_out(
-            "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        )
 
 
 def print_out(text: str) -> None:

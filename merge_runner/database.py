@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import duckdb
 
@@ -23,12 +24,19 @@ SCHEMA_VERSION = 4
 SCHEMA = Path(__file__).with_name("schema.sql")
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
+ROWS_AT_ONCE, COPIED_AT_ONCE = 100, 2_048
+# What a file takes for each call where replies are short, compressed and with its share of states;
+# and how much more than that is little enough to be merged, and to be read as if they were short.
+BYTES_OF_A_CALL, MERGED_BYTES, SHORT_BYTES = 3_000, 2**26, 2**23
 LOG = logging.getLogger(__name__)
 Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
     "memory_limit": "200MB",  # of the machine's by default; it is a cache of the file most of all
+    "max_vacuum_tasks": 0,  # see merge_small_groups
     "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
 }
+TEXTS: Settings = {**SETTINGS, "memory_limit": "1GB"}
+"""Where the texts of replies are read: 2,048 of 64 KB take a quarter of it, JSON of them more."""
 REBUILD = (
     "move it away, or name another with --db, and run the same sweep again: it is rebuilt from the "
     "cache without a call"
@@ -59,7 +67,8 @@ class Instance:
     Where it does not ``confine`` those who read, they do so themselves.
     """
 
-    def __init__(self, *, confine: bool = True) -> None:
+    def __init__(self, settings: Settings = SETTINGS, *, confine: bool = True) -> None:
+        self._settings = settings
         self._confine = confine
         self._connection: duckdb.DuckDBPyConnection | None = None
         self._confined: tuple[Path, duckdb.DuckDBPyConnection] | None = None
@@ -68,7 +77,7 @@ class Instance:
     def cursor(self) -> duckdb.DuckDBPyConnection:
         """A connection of its own."""
         if self._connection is None:
-            self._connection = in_memory(SETTINGS)
+            self._connection = in_memory(self._settings)
         return self._connection.cursor()
 
     def confined(self, path: Path) -> duckdb.DuckDBPyConnection:
@@ -79,7 +88,7 @@ class Instance:
         if not self._confine:
             return self.cursor()
         if self._confined is None or self._confined[0] != path:
-            made = in_memory(SETTINGS)
+            made = in_memory(self._settings)
             own = ", ".join(quoted(f"{path}{log}") for log in ("", ".wal"))
             made.execute(f"SET allowed_paths = [{own}]; SET enable_external_access = false")
             self._confined = path, made
@@ -156,6 +165,48 @@ def _attached(
             return connection, name
 
 
+def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
+    """Let the next writing merge what many small ones left, unless the rows hold long texts.
+
+    To merge takes as much memory as the texts of 122,880 rows, and writes them again each time.
+    """
+    tasks = 100 if _bytes_of_texts(connection) <= MERGED_BYTES else 0
+    connection.execute(f"SET max_vacuum_tasks = {tasks}")
+
+
+@contextmanager
+def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
+    """More memory while long texts are read: each thread unpacks those of 2,048 rows at once."""
+    if _bytes_of_texts(connection) <= SHORT_BYTES:
+        yield
+        return
+    connection.execute(f"SET memory_limit = '{TEXTS['memory_limit']}'; SET threads = 1")
+    try:
+        yield
+    finally:
+        connection.execute(f"SET memory_limit = '{SETTINGS['memory_limit']}'; RESET threads")
+
+
+def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
+    """The size of the open file beyond what it has with short replies."""
+    row = connection.execute(
+        "SELECT path, estimated_size FROM duckdb_tables() JOIN duckdb_databases() "
+        "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
+    ).fetchone()
+    return Path(row[0]).stat().st_size - row[1] * BYTES_OF_A_CALL if row else 0
+
+
+def streamed(connection: duckdb.DuckDBPyConnection, sql: str) -> Iterator[tuple[Any, ...]]:
+    """The rows of a query on long texts; nothing else may be asked until it has ended."""
+    return fetched(connection.execute(sql))
+
+
+def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
+    """The rows of a result, a few at a time."""
+    while batch := result.fetchmany(ROWS_AT_ONCE):
+        yield from batch
+
+
 @contextmanager
 def read_database(
     path: Path, instance: Instance = SHARED, patience_s: float = PATIENCE_S
@@ -163,27 +214,55 @@ def read_database(
     """Open an existing database for reading, of this schema or an older one; raises UsageError."""
     if not path.is_file():
         raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
-    with _current(path, instance, patience_s) as connection:
-        if connection is not None:
-            yield connection
-            return
-    migrate(path)
-    with _current(path, instance, patience_s) as connection:
-        assert connection is not None
-        yield connection
-
-
-@contextmanager
-def _current(
-    path: Path, instance: Instance, patience_s: float
-) -> Iterator[duckdb.DuckDBPyConnection | None]:
-    """The database for reading; None where its schema is older."""
     with (
         unreadable_is_usage(),
         open_database(path, read_only=True, patience_s=patience_s, instance=instance) as connection,
     ):
-        older = schema_version(connection, path) < SCHEMA_VERSION
-        yield None if older else connection
+        if schema_version(connection, path) == SCHEMA_VERSION:
+            yield connection
+            return
+        copy = _readable_copy(connection, path)
+    with open_database(
+        copy, read_only=True, patience_s=patience_s, instance=instance
+    ) as connection:
+        yield connection
+
+
+def readable(path: Path) -> Path:
+    """The file in which the rows of a database are read: itself, or a copy where it is older."""
+    with read_database(path) as connection:
+        row = connection.execute(
+            "SELECT path FROM duckdb_databases() WHERE database_name = current_database()"
+        ).fetchone()
+    assert row is not None
+    return Path(row[0])
+
+
+def _readable_copy(connection: duckdb.DuckDBPyConnection, path: Path) -> Path:
+    """A copy of an open database of an older schema in this one, until this process ends."""
+    told = path.stat()
+    state = (path.resolve(), told.st_mtime_ns, told.st_size)
+    if state not in _COPIES:
+        folder = tempfile.TemporaryDirectory(prefix="merge-runner-")
+        copy = Path(folder.name) / path.name
+        LOG.warning(
+            "%s has an older schema and is left as it is: what is read is a copy of it, %s, which "
+            "is deleted at the end; the next sweep into it brings it up to date",
+            path,
+            copy,
+        )
+        try:
+            _copy_rows(connection, copy)
+        except duckdb.Error as exc:
+            raise StoreError(
+                f"{path} has an older schema and cannot be copied to {copy}: {first_line(exc)}"
+            ) from exc
+        _COPIES[state] = folder, copy
+    return _COPIES[state][1]
+
+
+# The folder of a copy goes when the process does.
+_COPIES: dict[tuple[Path, int, int], tuple[tempfile.TemporaryDirectory[str], Path]] = {}
 
 
 @contextmanager
@@ -243,6 +322,7 @@ def migrate(path: Path) -> None:
                 return  # another process was quicker
             _discard(copy)  # what a process left that died here
             try:
+                connection.execute("CHECKPOINT")
                 _copy_rows(connection, copy)
                 kept = _free_name(path, version)
                 shutil.copy2(path, kept)
@@ -285,10 +365,17 @@ def _numbers() -> Iterator[str]:
 
 def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
     """Make a new file with all rows of the open one."""
-    connection.execute("CHECKPOINT")
     with duckdb.connect(str(copy)) as made:
         made.execute(SCHEMA.read_text(encoding="utf-8"))
     connection.execute(f"ATTACH {quoted(copy)} AS copied")
+    try:
+        with room_for_texts(connection):
+            _fill_copy(connection)
+    finally:
+        connection.execute("DETACH copied")
+
+
+def _fill_copy(connection: duckdb.DuckDBPyConnection) -> None:
     old = {
         table
         for (table,) in connection.execute(
@@ -300,15 +387,27 @@ def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
     ).fetchall()
     for (table,) in new:
         if table in old and table != "meta":
-            connection.execute(f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table}")  # noqa: S608 # our tables
+            _copy_table(connection, table)
     # Before version 4 nobody looked at what the replies say of a stand-in.
     connection.execute(
-        "UPDATE copied.calls SET scripted = true WHERE provider = 'emulator' OR reply->>? = 'true'",
-        [f"$.{SCRIPTED_FIELD}"],
+        "UPDATE copied.calls SET scripted = true WHERE CASE WHEN provider = 'emulator' THEN true "
+        "WHEN contains(reply::VARCHAR, ?) THEN reply->>? = 'true' ELSE false END",
+        [SCRIPTED_FIELD, f"$.{SCRIPTED_FIELD}"],
     )
     connection.execute(
         "UPDATE copied.trials SET scripted = true WHERE NOT scripted AND (trial_id, spec_hash) IN "
         "(SELECT (trial_id, spec_hash) FROM copied.calls WHERE scripted)"
     )
     connection.execute("INSERT INTO copied.meta VALUES (?)", [SCHEMA_VERSION])
-    connection.execute("DETACH copied")
+
+
+def _copy_table(connection: duckdb.DuckDBPyConnection, table: str) -> None:
+    """Copy a table, some rows at a time: a transaction's rows are together in memory."""
+    row = connection.execute(f"SELECT coalesce(max(rowid), -1) FROM {table}").fetchone()  # noqa: S608 # our tables
+    assert row is not None
+    size = COPIED_AT_ONCE if table in ("calls", "decisions") else row[0] + 1
+    for first in range(0, row[0] + 1, size):
+        connection.execute(
+            f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # our tables
+            [first, first + size - 1],
+        )

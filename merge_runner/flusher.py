@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import sys
 from collections.abc import Callable
+from itertools import accumulate, chain
 
 from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.records import TrialRecord
@@ -14,17 +16,27 @@ EVERY_S = 1.0
 BATCH = 64
 """Trials in one transaction: few enough that a reader gets its turn soon."""
 MOST_PENDING = 4 * BATCH
+BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
+# What cannot be stored now, as while another program holds the file.
+MOST_STUCK_BYTES = 2**29
 LOCK_PATIENCE_S = 2.0
 # At the end: with a lock, which somebody will release, and with anything else, as a full disk.
 LAST_LOCK_PATIENCE_S, LAST_PATIENCE_S = 60.0, 3.0
 
 
+def size_of(record: TrialRecord) -> int:
+    """The bytes of a trial's replies, which are most of it."""
+    replies = (row.decision.reply for row in record.decisions if row.decision.reply)
+    calls = chain((reply.attempts for reply in replies), (c.attempts for c in record.failed_calls))
+    return sum(sys.getsizeof(attempt.reply) for attempt in chain.from_iterable(calls))
+
+
 class Flusher:
     """Collects ended trials and stores them about once a second.
 
-    What cannot be stored waits in memory while the trials go on; where it is only slow, they wait
-    for it. ``differing`` names the trials that are stored already with other values, and in
-    which columns.
+    What cannot be stored waits in memory while the trials go on, up to a limit; where it is only
+    slow, they wait for it. ``differing`` names the trials that are stored already with other
+    values, and in which columns.
     """
 
     def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
@@ -33,6 +45,7 @@ class Flusher:
         self._sweep_id = sweep_id
         self._say = say
         self._pending: list[TrialRecord] = []
+        self._bytes = 0
         self._problem = ""
         self._locked = self._stuck = False
         self._closing = False
@@ -42,14 +55,20 @@ class Flusher:
     def add(self, record: TrialRecord) -> None:
         """Store this trial with the next batch."""
         self._pending.append(record)
-        if len(self._pending) >= BATCH:
+        self._bytes += size_of(record)
+        if len(self._pending) >= BATCH or self._bytes >= BATCH_BYTES:
             self._awake.set()
 
     async def room(self) -> None:
         """Wait while much is still to be stored, and it can be."""
-        while len(self._pending) > MOST_PENDING and not self._stuck and not self._task.done():
+        while self._is_full() and not self._task.done():
             self._tried.clear()
             await self._tried.wait()
+
+    def _is_full(self) -> bool:
+        if self._stuck:
+            return self._bytes > MOST_STUCK_BYTES
+        return len(self._pending) > MOST_PENDING or self._bytes > MOST_PENDING_BYTES
 
     async def close(self) -> None:
         """Store what is left; raises StoreError if that does not work after a while."""
@@ -80,7 +99,9 @@ class Flusher:
 
     async def _flush(self) -> bool:
         """Write one batch; False if that did not work."""
-        batch, self._pending = self._pending[:BATCH], self._pending[BATCH:]
+        sizes = accumulate(map(size_of, self._pending[:BATCH]))
+        number = max(1, sum(size <= BATCH_BYTES for size in sizes))
+        batch, self._pending = self._pending[:number], self._pending[number:]
         try:
             self.differing |= await asyncio.to_thread(
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
@@ -94,6 +115,7 @@ class Flusher:
             return False
         else:
             self._stuck = False
+            self._bytes -= sum(map(size_of, batch))
             return True
         finally:
             self._tried.set()

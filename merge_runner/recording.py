@@ -13,11 +13,13 @@ import hashlib
 import json
 import os
 import re
+import sqlite3
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import duckdb
@@ -61,6 +63,8 @@ HEADERS = TypeAdapter(dict[str, str])
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """DuckDB hands out this many rows at once, and their texts may have this many bytes."""
+PART_BYTES, GROUP_BYTES = 2**25, 2**27
+"""What is written at once, and what one group of rows of the file holds if it may."""
 READING: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
@@ -101,48 +105,106 @@ def export_recording(
 
     Damaged ones are left out, and told by the error when the others are written.
     """
-    damaged, missing = _lacking(cache, keys)
+    ordered, damaged = _in_order(cache, keys)
+    if file.is_dir():
+        raise UsageError(f"{file} is a folder: name a file")
+    with _written(file), TemporaryDirectory(prefix=f".{file.name}-", dir=file.parent) as folder:
+        _write_parts(Path(folder), file, (cache.get(key) for key in ordered), provenance)
+    if damaged:
+        key, reason = next(iter(damaged.items()))
+        raise RecordingError(
+            f"{len(damaged)} of {len(keys)} replies are damaged and left out of {file}, the first "
+            f"is {key}: {reason}. The other {len(ordered)} are in it; a sweep into another "
+            "database, named with --db, asks for the damaged ones again"
+        )
+    return len(keys)
+
+
+def _write_parts(
+    folder: Path, file: Path, entries: Iterable[Entry | None], provenance: dict[str, str]
+) -> None:
+    """Write the entries part by part into the folder, and all of them as the file."""
+    partial = file.with_name(file.name + ".partial")
+    content, calls, size = hashlib.sha256(), 0, 0
+    with in_memory(READING) as connection:
+        columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
+        connection.execute(f"CREATE TABLE calls ({columns})")
+        rows = (_row(entry) for entry in entries if entry)
+        for part, some in enumerate(_of_bounded_size(rows)):
+            for row in some:
+                content.update(_fingerprint(row[0], row[-1]))
+                size += _size(row)
+            calls += len(some)
+            _append(connection, some)
+            connection.execute(
+                f"COPY calls TO {quoted(f'{folder}/{part:06}.parquet')} (COMPRESSION snappy)"
+            )
+            connection.execute("DELETE FROM calls")
+        metadata = {
+            **provenance,
+            "format": FORMAT,
+            "key_version": str(KEY_VERSION),
+            "calls": str(calls),
+            "content_sha256": content.hexdigest(),
+        }
+        metadata[PROVENANCE_HASH] = _provenance_hash(metadata)
+        pairs = ", ".join(f"{quoted(name)}: {quoted(text)}" for name, text in metadata.items())
+        group = max(BLOCK, min(10240, GROUP_BYTES * calls // max(1, size)))
+        source = f"read_parquet({_pattern(folder)[:-1]}/*.parquet')" if calls else "calls"
+        connection.execute(
+            f"COPY (FROM {source}) TO {quoted(str(partial))} "
+            f"(FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE {group}, KV_METADATA {{{pairs}}})"
+        )
+        os.replace(partial, file)
+
+
+def _in_order(cache: ResponseCache, keys: list[str]) -> tuple[list[str], dict[str, str]]:
+    """The keys in the order of condition, repetition, side, decision, sample set and key.
+
+    Returns the damaged ones apart, with what is wrong with each. Raises RecordingError where one
+    is not in the cache.
+    """
+    places, missing, damaged = [], [], {}
+    for key in keys:
+        try:
+            entry = cache.get(key)
+        except RecordingError as exc:
+            damaged[key] = str(exc)
+            continue
+        if entry is None:
+            missing.append(key)
+        else:
+            places.append((*astuple(entry.request.slot), key))
     if missing:
         raise RecordingError(
             f"{len(missing)} of {len(keys)} replies are not in the cache {cache.folder}, the first "
             f"is {missing[0]}: run the sweep again with this cache"
         )
-    if file.is_dir():
-        raise UsageError(f"{file} is a folder: name a file")
-    partial = file.with_name(file.name + ".partial")
-    whole = [key for key in keys if key not in damaged]
-    rows = sorted((_row(entry) for entry in map(cache.get, whole) if entry), key=_order)
-    content = hashlib.sha256()
+    return [key for *_, key in sorted(places)], damaged
+
+
+def _of_bounded_size(rows: Iterable[tuple[Any, ...]]) -> Iterator[list[tuple[Any, ...]]]:
+    """The rows in lists of some rows, or of one."""
+    batch: list[tuple[Any, ...]] = []
+    size = 0
     for row in rows:
-        content.update(_fingerprint(row[0], row[-1]))
-    metadata = {
-        **provenance,
-        "format": FORMAT,
-        "key_version": str(KEY_VERSION),
-        "calls": str(len(rows)),
-        "content_sha256": content.hexdigest(),
-    }
-    metadata[PROVENANCE_HASH] = _provenance_hash(metadata)
-    with _written(file), in_memory({}) as connection:
-        columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
-        connection.execute(f"CREATE TABLE calls ({columns})")
-        appender = connection.appender("calls")
-        appender.append_rows(rows)
-        appender.flush()
-        pairs = ", ".join(f"{quoted(name)}: {quoted(text)}" for name, text in metadata.items())
-        connection.execute(
-            f"COPY calls TO {quoted(str(partial))} "
-            f"(FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE 10240, KV_METADATA {{{pairs}}})"
-        )
-        os.replace(partial, file)
-    if damaged:
-        key, reason = next(iter(damaged.items()))
-        raise RecordingError(
-            f"{len(damaged)} of {len(keys)} replies are damaged and left out of {file}, the first "
-            f"is {key}: {reason}. The other {len(rows)} are in it; a sweep into another database, "
-            "named with --db, asks for the damaged ones again"
-        )
-    return len(keys)
+        batch.append(row)
+        size += _size(row)
+        if size >= PART_BYTES or len(batch) == 10 * BATCH:
+            yield batch
+            batch, size = [], 0
+    if batch:
+        yield batch
+
+
+def _size(row: tuple[Any, ...]) -> int:
+    return len(row[-2]) + len(row[-1])
+
+
+def _append(connection: duckdb.DuckDBPyConnection, rows: list[tuple[Any, ...]]) -> None:
+    appender = connection.appender("calls")
+    appender.append_rows(rows)
+    appender.flush()
 
 
 def read_recording(file: Path) -> Iterator[Entry]:
@@ -173,6 +235,36 @@ def read_recording(file: Path) -> Iterator[Entry]:
             f"{file} is not as it was exported: what it says of where it comes from has another "
             "hash"
         )
+
+
+class Spilled(Mapping[str, Entry]):
+    """The entries of a recording by key, verified; SQLite keeps what is much in a file that goes.
+
+    Raises RecordingError.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._db = sqlite3.connect("", check_same_thread=False)
+        self._db.execute("CREATE TABLE entries (key TEXT PRIMARY KEY, entry TEXT)")
+        rows = ((entry.request.key, entry.to_json()) for entry in read_recording(file))
+        self._db.executemany("INSERT INTO entries VALUES (?, ?)", rows)
+
+    def __getitem__(self, key: str) -> Entry:
+        row = self._db.execute("SELECT entry FROM entries WHERE key = ?", [key]).fetchone()
+        if row is None:
+            raise KeyError(key)
+        return Entry.from_json(row[0])
+
+    def __contains__(self, key: object) -> bool:
+        found = self._db.execute("SELECT 1 FROM entries WHERE key = ?", [key])
+        return found.fetchone() is not None
+
+    def __iter__(self) -> Iterator[str]:
+        return (key for (key,) in self._db.execute("SELECT key FROM entries"))
+
+    def __len__(self) -> int:
+        count: int = self._db.execute("SELECT count(*) FROM entries").fetchone()[0]
+        return count
 
 
 def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
@@ -223,19 +315,6 @@ def summarise(file: Path) -> Summary:
     )
 
 
-def _lacking(cache: ResponseCache, keys: list[str]) -> tuple[dict[str, str], list[str]]:
-    """The keys of damaged entries, with what is wrong with each, and those of none."""
-    damaged: dict[str, str] = {}
-    missing: list[str] = []
-    for key in keys:
-        try:
-            if cache.get(key) is None:
-                missing.append(key)
-        except RecordingError as exc:
-            damaged[key] = str(exc)
-    return damaged, missing
-
-
 @contextmanager
 def _written(file: Path) -> Iterator[None]:
     try:
@@ -243,11 +322,6 @@ def _written(file: Path) -> Iterator[None]:
         yield
     except (OSError, duckdb.Error) as exc:
         raise RecordingError(f"{file} cannot be written: {exc}") from exc
-
-
-def _order(row: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Rows in the order of condition, repetition, side, decision, sample set and key."""
-    return (*row[6:11], row[0])
 
 
 def _fingerprint(key: str, attempts: str) -> bytes:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,16 @@ from merge_runner.database import (
     PATIENCE_S,
     SCHEMA,
     SCHEMA_VERSION,
+    TEXTS,
     Instance,
+    fetched,
+    merge_small_groups,
     migrate,
     open_database,
     read_database,
+    room_for_texts,
     schema_version,
+    streamed,
     unreadable_is_usage,
 )
 from merge_runner.errors import StoreError, UsageError
@@ -117,6 +123,7 @@ class Store:
         # Made before anybody is kept waiting, though a trial that is stored already needs none.
         rows = [rows_of(record) for record in records]
         with self._writing(patience_s) as connection:
+            merge_small_groups(connection)
             keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
             stored = _statuses(connection, keys)
             _delete(connection, [key for key, status in stored.items() if status == "failed"])
@@ -178,12 +185,19 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 
     It reaches no file and no network, and changes no setting.
     """
+    with answers(path, sql) as (names, rows):
+        return names, list(rows)
+
+
+@contextmanager
+def answers(path: Path, sql: str) -> Iterator[tuple[list[str], Iterator[tuple[Any, ...]]]]:
+    """The column names and the rows of a query; nobody can write until they are read."""
     # The settings hold for a whole instance, and cannot be taken back.
     with (
-        read_database(path, Instance(confine=False)) as connection,
+        read_database(path, Instance(TEXTS, confine=False)) as connection,
         answering(connection, sql) as result,
     ):
-        return [column[0] for column in result.description or ()], result.fetchall()
+        yield [column[0] for column in result.description or ()], fetched(result)
 
 
 @contextmanager
@@ -209,6 +223,11 @@ def answering(
         yield connection.execute(statements[0])
     except duckdb.IOException:
         raise  # no query reaches a file but the database, so that one is damaged
+    except duckdb.OutOfMemoryException as exc:
+        raise UsageError(
+            f"the query needs more than the {TEXTS['memory_limit']} of memory that it may use: ask "
+            "for fewer rows or columns at once; requests and replies are long"
+        ) from exc
     except duckdb.Error as exc:
         if "pytz" in str(exc):
             raise UsageError("cast times with a zone, as in now()::TIMESTAMP") from exc
@@ -231,36 +250,48 @@ def results_digest(path: Path) -> tuple[str, int]:
     where or at what price: no clock times, latencies, costs, cache keys or spec hashes.
     """
     digests: dict[TrialKey, Any] = {}
-    with read_database(path) as connection:
-        for columns, table, order in (
+    with read_database(path) as connection, room_for_texts(connection):
+        # The first and the third of the columns order the rows of a trial.
+        for columns, table in (
             (
                 "pair, source, model_left, model_right, variant, condition, rep, sample_set, "
                 "status, merged_first, end_time_s, error",
                 "trials",
-                "trial_id, spec_hash",
             ),
-            (
-                "step, time_s, side, position_m, velocity_mps, acceleration_mps2",
-                "states",
-                "trial_id, spec_hash, step, side",
-            ),
+            ("step, time_s, side, position_m, velocity_mps, acceleration_mps2", "states"),
             (
                 "decision, time_s, side, valid, failure, tactical, rationale, plan, applied, "
                 "fallback, prompt",
                 "decisions",
-                "trial_id, spec_hash, decision, side",
             ),
         ):
-            rows = connection.execute(
-                f"SELECT trial_id, spec_hash, {columns} FROM {table} ORDER BY {order}"  # noqa: S608 # constants
-            )
-            while batch := rows.fetchmany(10_000):
-                for trial_id, spec_hash, *values in batch:
-                    key = (trial_id, spec_hash)
-                    digest = digests.setdefault(key, hashlib.sha256(trial_id.encode()))
+            for key, rows in _by_trial(connection, columns, table):
+                digest = digests.setdefault(key, hashlib.sha256(key[0].encode()))
+                for values in sorted(rows, key=itemgetter(0, 2)):
                     digest.update(json.dumps(values).encode())
     whole = hashlib.sha256("".join(sorted(d.hexdigest() for d in digests.values())).encode())
     return whole.hexdigest(), len(digests)
+
+
+def _by_trial(
+    connection: duckdb.DuckDBPyConnection, columns: str, table: str
+) -> Iterator[tuple[TrialKey, list[list[Any]]]]:
+    """The rows of each trial, once all are there: they lie together, and are too many to sort."""
+    counts = {
+        (trial_id, spec_hash): count
+        for trial_id, spec_hash, count in connection.execute(
+            f"SELECT trial_id, spec_hash, count(*) FROM {table} GROUP BY ALL"  # noqa: S608 # constants
+        ).fetchall()
+    }
+    begun: dict[TrialKey, list[list[Any]]] = {}
+    for trial_id, spec_hash, *values in streamed(
+        connection,
+        f"SELECT trial_id, spec_hash, {columns} FROM {table}",  # noqa: S608 # constants
+    ):
+        rows = begun.setdefault((trial_id, spec_hash), [])
+        rows.append(values)
+        if len(rows) == counts[trial_id, spec_hash]:
+            yield (trial_id, spec_hash), begun.pop((trial_id, spec_hash))
 
 
 def used_call_keys(path: Path, sweep_id: str | None) -> tuple[str, list[str]]:

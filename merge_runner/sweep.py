@@ -38,7 +38,7 @@ from merge_runner.players import Crew, Players
 from merge_runner.progress import Progress, shown, told
 from merge_runner.progress_file import ProgressFile
 from merge_runner.provenance import git_state, versions
-from merge_runner.recording import read_recording
+from merge_runner.recording import Spilled
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.store import Store, SweepFacts, SweepRow, sweep_facts
 
@@ -433,6 +433,4 @@ async def _drained(crew: Crew, work: asyncio.Task[None]) -> None:
 
 
 def _overlay(recording: Path | None) -> Mapping[str, Entry]:
-    if recording is None:
-        return {}
-    return {entry.request.key: entry for entry in read_recording(recording)}
+    return {} if recording is None else Spilled(recording)

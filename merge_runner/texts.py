@@ -8,6 +8,8 @@ from typing import Any, TextIO
 
 def printable(text: str) -> str:
     """A text that cannot speak to a terminal: what a model or a server wrote may hold any code."""
+    if text.replace("\n", "").replace("\t", "").isprintable():
+        return text  # as most are, and some are long
     return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
 
 

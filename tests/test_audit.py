@@ -389,7 +389,7 @@ VALID = {
     ),
     "a reply was given to two samples": (
         ["UPDATE calls SET reply = (SELECT reply FROM calls WHERE {other}) WHERE {slot}"],
-        {"shared": "the provider's id of its reply is also that of {named}"},
+        {"shared": "its answer, with the provider's id of it, is also that of {named}"},
     ),
     "a call was used for two samples": (
         ["UPDATE calls SET call_key = (SELECT call_key FROM calls WHERE {other}) WHERE {slot}",
@@ -613,6 +613,57 @@ async def test_a_proxy_that_caches_is_found_in_repetitions_and_in_a_fresh_set_of
     assert "L_4_8/rep01/set1, left, decision 0" in texts
 
 
+# Ollama draws an id out of a thousand, some servers give all replies the same one, some give none.
+IDS = {
+    "ids that repeat": (lambda number: f"chatcmpl-{number % 30}", True),
+    "one id": (lambda _: "chatcmpl-0", True),
+    "no id": (lambda _: None, False),
+    "an empty id": (lambda _: "", False),
+}
+
+
+@pytest.mark.parametrize("what", IDS)
+async def test_ids_that_a_server_gives_to_different_answers_are_a_note(
+    merge_runner, tmp_path, what
+):
+    name, repeats = IDS[what]
+    numbers = count()
+
+    async def renamed(request, handler):
+        body = json.loads((await handler(request)).body)
+        return web.json_response(body | {"id": name(next(numbers))})
+
+    async with watched(renamed) as server:
+        run = await merge_runner(
+            "sweep", "baseline", "--conditions", "L_4_8", "--reps", 3,
+            EMULATOR_BASE_URL=f"{server.url}/v1",
+        )  # fmt: skip
+    assert run.code == 0, run.err
+    assert next(numbers) > 40
+    assert ("gave to different answers" in run.out) == repeats
+    exported = tmp_path / "sweep.parquet"
+    assert (await merge_runner("recording", "export", exported)).code == 0
+    for found in (audit("--db", tmp_path / "results/merge.duckdb"), audit("--recording", exported)):
+        assert found.code == 0
+        assert ("gave to different answers" in found.notes) == repeats
+
+
+def test_one_id_of_two_answers_does_not_hide_one_answer_of_two_samples(db):
+    slots = [f"{OF_PAIR} AND side = 'left' AND decision = {n}" for n in range(4)]
+    (one, other) = (f"(SELECT reply FROM calls WHERE {slot})" for slot in slots[:2])
+    damage(
+        db,
+        f"UPDATE calls SET reply = {one} WHERE {slots[2]}",
+        f"UPDATE calls SET reply = json_merge_patch(reply, json_object('id', {other}->>'id')) "
+        f"WHERE {slots[3]}",
+    )
+    found = audit("--db", db)
+    (finding,) = found.findings
+    assert (finding["kind"], finding["decision"]) == ("shared", 0)
+    assert f"is also that of {PAIR}, left, decision 2" in finding["text"]
+    assert "2 replies of scripted-driver at " in found.notes
+
+
 async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tmp_path):
     numbers = count()
     new_ids = caching({}, id=lambda: f"new-{next(numbers)}")
@@ -733,7 +784,7 @@ RECORDINGS = {
     ),
     "a reply was given to two samples": (
         lambda e: [answered(e[0], reply=e[1].attempts[-1].reply), *e[1:]],
-        "shared", "the provider's id of its reply is also that of N_0_0/rep01, left, decision 1",
+        "shared", "with the provider's id of it, is also that of N_0_0/rep01, left, decision 1",
     ),
     "another model answered": (
         lambda e: [answered(e[0], model_served="gpt-0"), *e[1:]],

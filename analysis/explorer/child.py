@@ -21,7 +21,7 @@ from typing import Any
 
 import duckdb
 
-from merge_runner.database import Instance, read_database
+from merge_runner.database import Instance, read_database, readable
 from merge_runner.errors import MergeRunnerError
 from merge_runner.store import answering
 from merge_runner.texts import csv_writer, in_spreadsheet, quoted
@@ -89,7 +89,8 @@ def main() -> None:
 
 def _copy(job: Copying) -> dict[str, Any]:
     """Copy a database while it is open for reading here, so that nobody writes."""
-    database, copy = Path(job.database), Path(job.copy)
+    copy = Path(job.copy)
+    database = readable(Path(job.database))
     with read_database(database, Instance()):
         # The database last: a process that closes a file loses all its locks on it.
         for log in LOGS:

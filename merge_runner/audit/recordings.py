@@ -14,13 +14,18 @@ from pydantic import ValidationError
 from merge_runner.audit.answers import answers_another
 from merge_runner.audit.expected import SweepConfig
 from merge_runner.audit.findings import Audit, Finding
-from merge_runner.audit.replies import CONSTANT_IDS
+from merge_runner.audit.ids import CONSTANT_IDS, identified, repetition_note
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import Entry
 from merge_runner.llm.keys import canonical_json, without_prompt
 from merge_runner.recording import read_recording, summarise
-from merge_runner.records import SIDES, Attempt, ChatRequest, Side
+from merge_runner.records import SIDES, Side, Slot
 from merge_runner.served import others_among
+
+NO_CONFIG = "it does not say of what sweep it is: trials are not compared"
+# An endpoint, a model, and an id that it gave a reply.
+ReplyId = tuple[str, str, str]
+Answer = tuple[Slot, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,17 +50,21 @@ class Track:
 
 @dataclass(slots=True)
 class Contents:
-    """What is gathered of a recording while it is read."""
+    """What is gathered of a recording while it is read, without its texts.
+
+    ``reply_ids`` has the calls of each endpoint, model and id of a reply: by their key, the slot
+    and a hash of the answer.
+    """
 
     decisions: defaultdict[Track, Counter[int]] = field(
         default_factory=lambda: defaultdict(Counter)
     )
-    reply_ids: defaultdict[tuple[str, str, str], list[ChatRequest]] = field(
-        default_factory=lambda: defaultdict(list)
+    reply_ids: defaultdict[ReplyId, dict[str, Answer]] = field(
+        default_factory=lambda: defaultdict(dict)
     )
     served: Counter[tuple[str, str]] = field(default_factory=Counter)
-    misnumbered: list[ChatRequest] = field(default_factory=list)
-    exchanged: list[ChatRequest] = field(default_factory=list)
+    misnumbered: list[Slot] = field(default_factory=list)
+    exchanged: list[Slot] = field(default_factory=list)
 
 
 def audit_recording(file: Path) -> Audit:
@@ -69,14 +78,15 @@ def audit_recording(file: Path) -> Audit:
         return Audit(str(file), {}, (Finding("recording", str(exc)),))
     config = _config(summary.provenance)
     tracks = contents.decisions
+    telling, notes = _repeated(contents)
     findings = [
         *_numbering(tracks, config),
-        *_shared(contents),
+        *_shared(telling),
         *_served(contents, config),
-        *(_at(request, "attempt", "its attempts are out of order, or one follows an answer")
-          for request in contents.misnumbered),
-        *(_at(request, "derived", "its reply is, as the server says in it, another's answer")
-          for request in contents.exchanged),
+        *(_at(slot, "attempt", "its attempts are out of order, or one follows an answer")
+          for slot in contents.misnumbered),
+        *(_at(slot, "derived", "its reply is, as the server says in it, another's answer")
+          for slot in contents.exchanged),
         *_missing(tracks, config, ended=_ended(summary.provenance)),
     ]  # fmt: skip
     return Audit(
@@ -89,10 +99,7 @@ def audit_recording(file: Path) -> Audit:
             **{f"answers {name}": count for name, count in sorted(summary.outcomes.items())},
         },
         findings=tuple(findings),
-        notes=(
-            *summary.notes,
-            *(() if config else ("it does not say of what sweep it is: trials are not compared",)),
-        ),
+        notes=(*summary.notes, *notes, *(() if config else (NO_CONFIG,))),
     )
 
 
@@ -109,28 +116,20 @@ def _gather(entry: Entry, contents: Contents) -> None:
     )
     track = Track(template, slot.condition, slot.repetition, slot.sample_set, slot.side)
     contents.decisions[track][slot.decision] += 1
-    for reply_id in {found for found in map(_reply_id, entry.attempts) if found}:
-        if not (request.provider == "emulator" and reply_id in CONSTANT_IDS):
-            contents.reply_ids[request.endpoint, request.model, reply_id].append(request)
     for attempt in entry.attempts:
+        told = identified(attempt.reply or "") if attempt.http_status == 200 else None
+        if told and not (request.provider == "emulator" and told[0] in CONSTANT_IDS):
+            replies = contents.reply_ids[request.endpoint, request.model, told[0]]
+            replies[request.key] = (slot, told[1])
         if attempt.http_status == 200 and attempt.model_served is not None:
             contents.served[request.model, attempt.model_served] += 1
     asked = hashlib.sha256(request.body.encode()).hexdigest()
     if any(answers_another(_json(a.reply), asked, slot.as_dict()) for a in entry.attempts):
-        contents.exchanged.append(request)
+        contents.exchanged.append(slot)
     numbers = [attempt.number for attempt in entry.attempts]
     early = any(a.outcome in ("ok", "refusal", "truncated") for a in entry.attempts[:-1])
     if early or numbers != list(range(1, len(numbers) + 1)):
-        contents.misnumbered.append(request)
-
-
-def _reply_id(attempt: Attempt) -> str | None:
-    """The provider's id of a reply of status 200; None where it has none."""
-    reply = _json(attempt.reply)
-    if attempt.http_status != 200 or not isinstance(reply, dict):
-        return None
-    found = reply.get("id") or reply.get("responseId")
-    return found if isinstance(found, str) else None
+        contents.misnumbered.append(slot)
 
 
 def _json(text: str | None) -> object:
@@ -169,16 +168,34 @@ def _numbering(tracks: dict[Track, Counter[int]], config: SweepConfig | None) ->
                 yield _in(track, number, "numbering", text)
 
 
-def _shared(contents: Contents) -> Iterator[Finding]:
-    for requests in contents.reply_ids.values():
-        if len(requests) > 1:
-            first, second, *rest = sorted(requests, key=lambda r: tuple(r.slot.as_dict().items()))
-            more = f" and {len(rest)} more" if rest else ""
-            yield _at(
-                first,
-                "shared",
-                f"the provider's id of its reply is also that of {_told(second)}{more}",
-            )
+def _repeated(contents: Contents) -> tuple[list[list[Slot]], list[str]]:
+    """The calls with one answer under one id, and notes of servers whose ids prove nothing.
+
+    The rule is that of a database (see ids.py).
+    """
+    servers: defaultdict[tuple[str, str], list[list[Answer]]] = defaultdict(list)
+    for (endpoint, model, _), answers in contents.reply_ids.items():
+        if len(answers) > 1:
+            servers[endpoint, model].append(list(answers.values()))
+    telling, notes = [], []
+    for (endpoint, model), repeated in servers.items():
+        same = [answers for answers in repeated if len({content for _, content in answers}) == 1]
+        found = same if 2 * len(same) >= len(repeated) else []
+        telling += [[slot for slot, _ in answers] for answers in found]
+        if others := sum(map(len, repeated)) - sum(map(len, found)):
+            notes.append(repetition_note(model, endpoint, others))
+    return telling, notes
+
+
+def _shared(telling: list[list[Slot]]) -> Iterator[Finding]:
+    for slots in telling:
+        first, second, *rest = sorted(slots, key=lambda slot: tuple(slot.as_dict().items()))
+        more = f" and {len(rest)} more" if rest else ""
+        yield _at(
+            first,
+            "shared",
+            f"its answer, with the provider's id of it, is also that of {_told(second)}{more}",
+        )
 
 
 def _served(contents: Contents, config: SweepConfig | None) -> Iterator[Finding]:
@@ -217,12 +234,11 @@ def _in(track: Track, decision: int | None, kind: str, text: str) -> Finding:
     return Finding(kind, text, trial=track.trial, side=track.side, decision=decision)
 
 
-def _at(request: ChatRequest, kind: str, text: str) -> Finding:
-    slot = request.slot
+def _at(slot: Slot, kind: str, text: str) -> Finding:
     track = Track("", slot.condition, slot.repetition, slot.sample_set, slot.side)
     return _in(track, slot.decision, kind, text)
 
 
-def _told(request: ChatRequest) -> str:
-    found = _at(request, "", "")
+def _told(slot: Slot) -> str:
+    found = _at(slot, "", "")
     return f"{found.trial}, {found.side}, decision {found.decision}"

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from functools import partial
 
 import duckdb
 
 from merge_runner.audit.findings import Finding, Sharing
+from merge_runner.database import streamed
 
 SHOWN = 3
-
-BATCH = 1_000
 
 # A place, a hash, and the parts of the text that has it; that of a key is in llm/keys.py.
 KEYS = """
@@ -29,28 +27,10 @@ FROM decisions SEMI JOIN audited USING (trial_id, spec_hash) JOIN drivers USING 
 WHERE body IS NOT NULL
 """
 
-# Earlier emulators gave every reply the same id: those of a stand-in tell nothing. The present
-# ones give each reply its own, and are audited like any provider.
-CONSTANT_IDS = ("chatcmpl-emulated", "resp_emulated", "msg_emulated", "emulated")
-# A reply that is no JSON object has no id; neither has one of a server that sends none or "". An id
-# is one within the endpoint that gave it: two emulators answer the same question with the same.
-REPLY_IDS = f"""
-CREATE OR REPLACE TEMP TABLE reply_ids AS
-SELECT * FROM (
-    SELECT trial_id, spec_hash, side, decision, call_key, provider, model_requested,
-        coalesce(endpoint, '') AS endpoint,
-        list_first(list_filter(try(json_extract_string(reply, ['$.id', '$.responseId'])),
-            lambda found : found <> '')) AS reply_id
-    FROM calls LEFT JOIN drivers USING (spec_hash, side)
-    WHERE http_status = 200 AND reply IS NOT NULL
-)
-WHERE reply_id IS NOT NULL AND NOT (provider = 'emulator' AND reply_id IN {CONSTANT_IDS})
-"""  # noqa: S608 # constants
-
 # Two slots of one spec with one call, and two calls of any spec with one reply: a proxy that
 # caches answers a repetition, or a fresh set of samples, with an old reply.
 _SHARED = """
-WITH suspects AS (SELECT {what} FROM {slots} GROUP BY ALL HAVING {several})
+WITH suspects AS ({suspects})
 SELECT list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places
 FROM {slots} SEMI JOIN suspects USING ({what})
 GROUP BY {what}
@@ -58,11 +38,15 @@ HAVING len(places) > 1
     AND bool_or((trial_id, spec_hash) IN (SELECT (trial_id, spec_hash) FROM audited))
     AND NOT bool_or((trial_id, spec_hash) IN (SELECT (trial_id, spec_hash) FROM done))
 """
-SHARED_CALLS = _SHARED.format(what="spec_hash, call_key", slots="decisions", several="count(*) > 1")
+SHARED_CALLS = _SHARED.format(
+    what="spec_hash, call_key",
+    slots="decisions",
+    suspects="SELECT spec_hash, call_key FROM decisions GROUP BY ALL HAVING count(*) > 1",
+)
 SHARED_REPLIES = _SHARED.format(
     what="endpoint, model_requested, reply_id",
     slots="reply_ids",
-    several="min(call_key) <> max(call_key)",
+    suspects="FROM repeated_ids WHERE same AND telling",
 )
 
 USED = """
@@ -81,14 +65,24 @@ GROUP BY ALL ORDER BY ALL
 """
 MANY_REPEATED = 5
 # Of the answers to a prompt that was asked before, those that are word for word like another.
+ASKED_AGAIN = """
+CREATE OR REPLACE TEMP TABLE asked_again AS
+SELECT min(decisions.rowid) AS place, model_left, model_right, side, prompt_hash
+FROM decisions JOIN audited USING (trial_id, spec_hash)
+WHERE valid AND call_key IS NOT NULL
+GROUP BY call_key, model_left, model_right, side, prompt_hash
+QUALIFY count(*) OVER (PARTITION BY model_left, model_right, side, prompt_hash) > 1
+"""
+ANSWERED = """
+CREATE OR REPLACE TEMP TABLE answered AS
+SELECT place, hash(coalesce(rationale, ''), plan) AS answer
+FROM decisions JOIN asked_again ON decisions.rowid = place
+"""
 ALIKE = """
-WITH answers AS (
-    SELECT DISTINCT call_key, model_left, model_right, side, prompt_hash, rationale, plan
-    FROM decisions JOIN audited USING (trial_id, spec_hash)
-    WHERE valid AND call_key IS NOT NULL
-), repeated AS (
-    SELECT count(*) AS times, count(DISTINCT (coalesce(rationale, ''), plan)) AS different
-    FROM answers GROUP BY model_left, model_right, side, prompt_hash HAVING times > 1
+WITH repeated AS (
+    SELECT count(*) AS times, count(DISTINCT answer) AS different
+    FROM asked_again JOIN answered USING (place)
+    GROUP BY model_left, model_right, side, prompt_hash
 )
 SELECT coalesce(sum(times - 1), 0)::INTEGER, coalesce(sum(times - different), 0)::INTEGER
 FROM repeated
@@ -118,11 +112,9 @@ def _hashed_otherwise(
 
     Python hashes several times as fast as the database.
     """
-    rows = connection.execute(sql)
     return sorted(
         (trial_id, side, decision, None not in parts)
-        for batch in iter(partial(rows.fetchmany, BATCH), [])
-        for trial_id, side, decision, told, *parts in batch
+        for trial_id, side, decision, told, *parts in streamed(connection, sql)
         if None in parts or hashlib.sha256("".join(parts).encode()).hexdigest() != told
     )
 
@@ -131,7 +123,7 @@ def check_sharing(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
     """Find the slots that are no samples of their own; ``done`` holds what was told before."""
     for sql, text in (
         (SHARED_CALLS, "its call is also that of"),
-        (SHARED_REPLIES, "the provider's id of its reply is also that of"),
+        (SHARED_REPLIES, "its answer, with the provider's id of it, is also that of"),
     ):
         for (slots,) in connection.execute(sql).fetchall():
             first, *others = slots
@@ -158,6 +150,8 @@ def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:
     gives each reply a new id does, and so does a model at temperature 0: in both cases the
     repetitions are no samples. 0 also where a few answers alone were to such prompts.
     """
+    connection.execute(ASKED_AGAIN)
+    connection.execute(ANSWERED)
     row = connection.execute(ALIKE).fetchone()
     assert row is not None
     repeated, alike = row

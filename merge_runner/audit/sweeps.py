@@ -15,8 +15,8 @@ from merge_runner.audit.checks import CHECKS
 from merge_runner.audit.derived import Derived, check_derived
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Audit, Finding, Sharing
+from merge_runner.audit.ids import find_ids, meaningless_ids
 from merge_runner.audit.replies import (
-    REPLY_IDS,
     USED,
     answers_alike,
     calls_in_common,
@@ -25,11 +25,12 @@ from merge_runner.audit.replies import (
 )
 from merge_runner.audit.slots import Slots, check_slots
 from merge_runner.audit.traces import GAPS, check_traces, reach_m
-from merge_runner.database import read_database
+from merge_runner.database import read_database, room_for_texts
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.llm.keys import canonical_json
 from merge_runner.records import SIDES
 from merge_runner.served import other_models
+from merge_runner.texts import first_line
 
 TABLES = """
 CREATE OR REPLACE TEMP TABLE rules (spec_hash VARCHAR, executed INTEGER, plan_actions INTEGER,
@@ -133,10 +134,10 @@ def audit_database(path: Path) -> list[Audit]:
 @contextmanager
 def _reading(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
     try:
-        with read_database(path) as connection:
+        with read_database(path) as connection, room_for_texts(connection):
             yield connection
     except duckdb.Error as exc:
-        raise StoreError(f"{path} cannot be audited: {exc}") from exc
+        raise StoreError(f"{path} cannot be audited: {first_line(exc)}") from exc
 
 
 def _audit(
@@ -178,7 +179,12 @@ def _audit(
         | ({"derived anew": derived.trials} if derive else {}),
         findings=tuple(replace(finding, sweep=sweep.sweep_id) for finding in findings),
         sharings=tuple(_taken_over(connection, sweep.sweep_id)),
-        notes=(*slots.notes, *_alike_notes(connection), *derived.notes),
+        notes=(
+            *slots.notes,
+            *meaningless_ids(connection),
+            *_alike_notes(connection),
+            *derived.notes,
+        ),
     )
 
 
@@ -254,7 +260,7 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
         ),
     )
     _fill(connection, "other_models", other_models(connection))
-    connection.execute(REPLY_IDS)
+    find_ids(connection)
     connection.execute(USED)
     connection.execute(GAPS)
     return specs

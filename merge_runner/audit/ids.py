@@ -1,0 +1,89 @@
+"""What the ids that providers give their replies say of whether an answer was given twice."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+
+import duckdb
+
+from merge_runner.database import streamed
+
+# Earlier emulators gave every reply the same id: those of a stand-in tell nothing. The present
+# ones give each reply its own, and are audited like any provider.
+CONSTANT_IDS = ("chatcmpl-emulated", "resp_emulated", "msg_emulated", "emulated")
+# Where the four formats have the answer; what stands beside it, as a time, may change in a copy.
+ANSWERS = ("choices", "output", "candidates", "content")
+REPLIES = "SELECT rowid, reply::VARCHAR FROM calls WHERE http_status = 200"
+# An id is one within the endpoint that gave it: two emulators answer the same question with the
+# same.
+REPLY_IDS = f"""
+CREATE OR REPLACE TEMP TABLE reply_ids AS
+SELECT trial_id, spec_hash, side, decision, call_key, model_requested,
+    coalesce(endpoint, '') AS endpoint, reply_id, content
+FROM identified JOIN calls ON calls.rowid = place LEFT JOIN drivers USING (spec_hash, side)
+WHERE NOT (provider = 'emulator' AND reply_id IN {CONSTANT_IDS})
+"""  # noqa: S608 # constants
+# Some servers draw ids out of a thousand, or have but one. An id that came with different answers
+# proves nothing; neither does any other one of a server most of whose repeated ids are such.
+REPEATED_IDS = """
+CREATE OR REPLACE TEMP TABLE repeated_ids AS
+SELECT *, count(*) FILTER (same) OVER server >= count(*) FILTER (NOT same) OVER server AS telling
+FROM (
+    SELECT endpoint, model_requested, reply_id, min(content) = max(content) AS same
+    FROM reply_ids GROUP BY ALL HAVING min(call_key) <> max(call_key)
+) WINDOW server AS (PARTITION BY endpoint, model_requested)
+"""
+MEANINGLESS = """
+SELECT model_requested, endpoint, count(DISTINCT call_key)
+FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash)
+JOIN repeated_ids USING (endpoint, model_requested, reply_id)
+WHERE NOT (same AND telling) GROUP BY ALL ORDER BY ALL
+"""
+
+
+def identified(reply: str) -> tuple[str, str] | None:
+    """A reply's id and a hash of its answer; None for one without an id, or that is no object."""
+    try:
+        body = json.loads(reply)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(body, dict):
+        return None
+    found = body.get("id") or body.get("responseId")
+    if not isinstance(found, str):
+        return None
+    answer = json.dumps([body.get(name) for name in ANSWERS])
+    return found, hashlib.blake2b(answer.encode(), digest_size=16).hexdigest()
+
+
+def find_ids(connection: duckdb.DuckDBPyConnection) -> None:
+    """Make ``reply_ids``, of all replies that have one, and ``repeated_ids``."""
+    connection.execute(
+        "CREATE OR REPLACE TEMP TABLE identified (place BIGINT, reply_id VARCHAR, content VARCHAR)"
+    )
+    found = [
+        (place, *told)
+        for place, reply in streamed(connection, REPLIES)
+        if (told := identified(reply or ""))
+    ]
+    appender = connection.appender("identified")
+    appender.append_rows(found)
+    appender.flush()
+    connection.execute(REPLY_IDS)
+    connection.execute(REPEATED_IDS)
+
+
+def meaningless_ids(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
+    """Notes of the servers whose ids are no proof."""
+    for model, endpoint, count in connection.execute(MEANINGLESS).fetchall():
+        yield repetition_note(model, endpoint, count)
+
+
+def repetition_note(model: str, endpoint: str, count: int) -> str:
+    """That so many replies of a server have ids that prove nothing."""
+    return (
+        f"{count} replies of {model} at {endpoint or 'its endpoint'} have an id that the server "
+        "gave to different answers: its ids do not tell whether an answer was given twice"
+    )

@@ -1,0 +1,140 @@
+"""Replies as long as reasoning texts are: nothing holds many of them in memory."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from dataclasses import replace
+from itertools import islice
+
+import pytest
+from harness import RECORDING
+from typer.testing import CliRunner
+
+from benchmarks.recorder import longer
+from merge_runner.cli import app
+from merge_runner.database import (
+    BYTES_OF_A_CALL,
+    MERGED_BYTES,
+    SETTINGS,
+    SHORT_BYTES,
+    in_memory,
+    merge_small_groups,
+    room_for_texts,
+)
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.recording import export_recording, read_recording
+
+SIZE, REPS = 20_480, 5
+REPLAY = ("replay", "baseline", "--reps", REPS, "--cache", "cache", "--json")
+
+
+@pytest.fixture(scope="module")
+def long(prepare, tmp_path_factory):
+    """A folder with a cache of a thousand replies of 20 KB, and the database of their replay."""
+    folder = tmp_path_factory.mktemp("long")
+    cache = ResponseCache(folder / "cache")
+    entries = (e for e in read_recording(RECORDING) if e.request.slot.repetition <= REPS)
+    while batch := list(islice(entries, 200)):
+        cache.put_now(_lengthened(entry) for entry in batch)
+    cache.close()
+    run = prepare(folder, *REPLAY)
+    assert run.code == 0, run.err
+    assert run.summary["calls"]["cached"] > 1_000
+    return folder
+
+
+def _lengthened(entry):
+    (*others, last) = entry.attempts
+    reply = longer(last.reply, SIZE, entry.request.key)
+    return replace(entry, attempts=(*others, replace(last, reply=reply)))
+
+
+def command(folder, *arguments):
+    db = ("--db", str(folder / "results/merge.duckdb"))
+    run = CliRunner().invoke(app, [*map(str, arguments), *db])
+    assert run.exit_code == 0, run.output
+    return run.stdout
+
+
+def test_a_thousand_long_replies_are_audited_and_looked_up_in_the_cache(long):
+    told = json.loads(command(long, "audit", "--cache", long / "cache", "--json"))
+    assert told["ok"]
+    assert told["audits"][-1]["counts"]["calls"] > 1_000
+
+
+def test_a_thousand_long_replies_are_queried_in_every_format(long):
+    query = "SELECT call_key, reply, reply->>'$.model' AS model FROM calls ORDER BY call_key"
+    rows = list(csv.DictReader(io.StringIO(command(long, "sql", query, "--format", "csv"))))
+    assert len(rows) > 1_000
+    assert min(len(row["reply"]) for row in rows) > 0.9 * SIZE
+    few = f"{query} LIMIT 20"
+    assert rows[:20] == json.loads(command(long, "sql", few, "--format", "json"))
+    table = command(long, "sql", few).splitlines()
+    assert table[0].split() == ["call_key", "reply", "model"]
+    assert [line.split()[0] for line in table[1:]] == [row["call_key"] for row in rows[:20]]
+
+
+def test_a_query_that_needs_too_much_memory_says_what_to_do(long):
+    query = "SELECT len(string_agg(reply || n::VARCHAR)) FROM calls, range(100) AS numbers(n)"
+    db = ("--db", str(long / "results/merge.duckdb"))
+    run = CliRunner().invoke(app, ["sql", query, *db])
+    assert "ask for fewer rows or columns at once" in str(run.exception)
+
+
+def test_long_replies_are_recorded_and_replayed_in_an_order_of_their_own(long, prepare):
+    file = long / "long.parquet"
+    assert prepare(long, "recording", "export", file, "--cache", "cache").code == 0
+    assert [path.name for path in long.glob("*long.parquet*")] == ["long.parquet"]
+    slots = [(e.request.slot.as_dict(), e.request.key) for e in read_recording(file)]
+    assert slots == sorted(
+        slots, key=lambda told: [told[0][name] for name in (
+            "condition", "repetition", "side", "decision", "sample_set")]
+    )  # fmt: skip
+    again = prepare(long, "replay", "baseline", "--reps", REPS, "--recording", file,
+                    "--db", "again.duckdb", "--cache", "none", "--json")  # fmt: skip
+    assert again.code == 0, again.err
+    digests = [
+        prepare(long, "digest", "--db", db).out for db in ("again.duckdb", "results/merge.duckdb")
+    ]
+    assert digests[0] == digests[1]
+
+
+def test_a_recording_of_any_size_is_exported_in_the_same_order_and_with_the_same_hash(
+    tmp_path, monkeypatch
+):
+    entries = list(islice(read_recording(RECORDING), 300))
+    cache = ResponseCache(tmp_path / "cache")
+    cache.put_now(entries)
+    contents = []
+    for part_bytes in (2**25, 10_000):
+        monkeypatch.setattr("merge_runner.recording.PART_BYTES", part_bytes)
+        file = tmp_path / f"{part_bytes}.parquet"
+        export_recording(file, cache, [e.request.key for e in entries[::-1]], {})
+        contents.append(list(read_recording(file)))
+    assert contents[0] == contents[1] == entries
+
+
+def test_small_groups_of_rows_are_merged_and_texts_read_as_short_unless_they_are_long(tmp_path):
+    def told(size):
+        """The tasks of merging, and the memory for texts, where the file has this size."""
+        os.truncate(file, size)
+        merge_small_groups(connection)
+        with room_for_texts(connection):
+            names = ("max_vacuum_tasks", "memory_limit")
+            settings = [f"current_setting('{name}')" for name in names]
+            return connection.execute(f"SELECT {', '.join(settings)}").fetchone()
+
+    file = tmp_path / "file.duckdb"
+    connection = in_memory(SETTINGS)
+    connection.execute(f"ATTACH '{file}' AS file; USE file")
+    connection.execute("CREATE TABLE calls AS SELECT * FROM range(10_000)")
+    connection.execute("CHECKPOINT")
+    of_calls = 10_000 * BYTES_OF_A_CALL
+    short, long = "190.7 MiB", "953.6 MiB"
+    assert told(of_calls + SHORT_BYTES) == (100, short)
+    assert told(of_calls + SHORT_BYTES + 1) == (100, long)
+    assert told(of_calls + MERGED_BYTES + 1) == (0, long)
+    assert connection.execute("SELECT current_setting('memory_limit')").fetchone() == (short,)
