@@ -64,12 +64,16 @@ class Instance:
     To make one takes longer than most of what is done with it, so there is one for all. After an
     error it may be of no use any more, and a new one is made.
 
-    Where it does not ``confine`` those who read, they do so themselves.
+    Where it does not ``confine`` those who read, they do so themselves; else they reach the file
+    that they read, and those in the folder ``also``.
     """
 
-    def __init__(self, settings: Settings = SETTINGS, *, confine: bool = True) -> None:
+    def __init__(
+        self, settings: Settings = SETTINGS, *, confine: bool = True, also: Path | None = None
+    ) -> None:
         self._settings = settings
         self._confine = confine
+        self._also = [] if also is None else [also]
         self._connection: duckdb.DuckDBPyConnection | None = None
         self._confined: tuple[Path, duckdb.DuckDBPyConnection] | None = None
         self._numbers = itertools.count()
@@ -90,6 +94,8 @@ class Instance:
         if self._confined is None or self._confined[0] != path:
             made = in_memory(self._settings)
             own = ", ".join(quoted(f"{path}{log}") for log in ("", ".wal"))
+            also = ", ".join(map(quoted, self._also))
+            made.execute(f"SET allowed_directories = [{also}]")
             made.execute(f"SET allowed_paths = [{own}]; SET enable_external_access = false")
             self._confined = path, made
         return self._confined[1].cursor()
@@ -221,7 +227,8 @@ def read_database(
         if schema_version(connection, path) == SCHEMA_VERSION:
             yield connection
             return
-        copy = _readable_copy(connection, path)
+    with unreadable_is_usage():
+        copy = _readable_copy(path, patience_s)
     with open_database(
         copy, read_only=True, patience_s=patience_s, instance=instance
     ) as connection:
@@ -238,8 +245,8 @@ def readable(path: Path) -> Path:
     return Path(row[0])
 
 
-def _readable_copy(connection: duckdb.DuckDBPyConnection, path: Path) -> Path:
-    """A copy of an open database of an older schema in this one, until this process ends."""
+def _readable_copy(path: Path, patience_s: float) -> Path:
+    """A copy of a database of an older schema in this one, until this process ends."""
     told = path.stat()
     state = (path.resolve(), told.st_mtime_ns, told.st_size)
     if state not in _COPIES:
@@ -251,12 +258,15 @@ def _readable_copy(connection: duckdb.DuckDBPyConnection, path: Path) -> Path:
             path,
             copy,
         )
-        try:
-            _copy_rows(connection, copy)
-        except duckdb.Error as exc:
-            raise StoreError(
-                f"{path} has an older schema and cannot be copied to {copy}: {first_line(exc)}"
-            ) from exc
+        with open_database(
+            path, read_only=True, patience_s=patience_s, instance=Instance(also=copy.parent)
+        ) as connection:
+            try:
+                _copy_rows(connection, copy)
+            except duckdb.Error as exc:
+                raise StoreError(
+                    f"{path} has an older schema and cannot be copied to {copy}: {first_line(exc)}"
+                ) from exc
         _COPIES[state] = folder, copy
     return _COPIES[state][1]
 

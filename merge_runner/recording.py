@@ -150,7 +150,8 @@ def _write_parts(
         metadata[PROVENANCE_HASH] = _provenance_hash(metadata)
         pairs = ", ".join(f"{quoted(name)}: {quoted(text)}" for name, text in metadata.items())
         group = max(BLOCK, min(10240, GROUP_BYTES * calls // max(1, size)))
-        source = f"read_parquet({_pattern(folder)[:-1]}/*.parquet')" if calls else "calls"
+        parts = f"{_pattern(folder)[:-1]}/*.parquet', hive_partitioning = false"
+        source = f"read_parquet({parts})" if calls else "calls"
         connection.execute(
             f"COPY (FROM {source}) TO {quoted(str(partial))} "
             f"(FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE {group}, KV_METADATA {{{pairs}}})"
