@@ -6,7 +6,6 @@ import asyncio
 
 import pytest
 from llmock.scenarios import Delay, Fail, Match, Reply
-from tenacity.wait import wait_exponential_jitter
 
 from merge_runner.config import Endpoint, ModelEntry
 from merge_runner.errors import CallFailed, EndpointRefused
@@ -39,9 +38,7 @@ BACKOFF_S = 0.05  # a tenth of ours, so that tests end soon
 async def client_of(llmock, tmp_path, monkeypatch):
     """Makes clients of LLMock, one for each format and model."""
     monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path))  # nothing here speaks TLS
-    monkeypatch.setattr(
-        "merge_runner.llm.retry._BACKOFF", wait_exponential_jitter(BACKOFF_S, 60, jitter=BACKOFF_S)
-    )
+    monkeypatch.setattr("merge_runner.llm.retry.FIRST_BACKOFF_S", BACKOFF_S)
     cache = ResponseCache(tmp_path / "responses")
     transports = {
         wire: HttpTransport(Endpoint("openai", wire, llmock.base_url(name), {}), connections=16)
