@@ -18,12 +18,14 @@ from analysis.forms import TableFormat
 from analysis.human.commands import INTERRUPTED, human_app
 from merge_runner.cli import DbOption, app, listed, main, print_out, say
 from merge_runner.errors import UsageError
-from merge_runner.places import DEFAULT_DB
+from merge_runner.places import DEFAULT_DB, refuse_another_kind
 
 if TYPE_CHECKING:
     from analysis.study import Study
 
 __all__ = ["app", "main"]
+
+HTML = b"<!doctype html"
 
 app.add_typer(human_app, name="human")
 
@@ -122,6 +124,7 @@ def report(
     """Write tables, figures, provenance and conclusions as one HTML file, and all as files."""
     from analysis.report import write_report
 
+    refuse_another_kind(out, HTML, "page of HTML")
     for path in write_report(db, listed(models), out, files):
         say(f"wrote {path}")
 
@@ -179,6 +182,8 @@ def _serve(db: Path, port: int, bind: str) -> None:
 def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[str]) -> None:
     from analysis.explorer.export import export_folder, export_page
 
+    if file is not None:
+        refuse_another_kind(file, HTML, "page of HTML")
     try:
         for path in export_folder(db, folder, wanted, _watched) if folder is not None else ():
             say(f"wrote {path}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import json
 import math
@@ -81,6 +82,9 @@ RecordingOption = Annotated[
     typer.Option("--recording", help="Replay from this file too, without importing it."),
 ]
 
+# A full disk, a limit of file sizes, and a device that fails.
+OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
+
 
 def main() -> None:
     """Run the command line and exit with the contract's code."""
@@ -95,6 +99,11 @@ def main() -> None:
             raise
         say(f"error: {exc}")
         sys.exit(exc.exit_code)
+    except OSError as exc:
+        if debug or exc.errno not in OUTPUT_ERRORS:
+            raise
+        say(f"error: the output cannot be written: {exc.strerror}")
+        sys.exit(1)
 
 
 @app.callback()

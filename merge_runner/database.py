@@ -6,11 +6,13 @@ import contextlib
 import itertools
 import logging
 import os
+import re
 import shutil
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,8 @@ SCHEMA_VERSION = 4
 SCHEMA = Path(__file__).with_name("schema.sql")
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
+LOGS = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
+"""How the names of a database's own files go on."""
 ROWS_AT_ONCE, COPIED_AT_ONCE = 100, 2_048
 # What a file takes for each call where replies are short, compressed and with its share of states;
 # and how much more than that is little enough to be merged, and to be read as if they were short.
@@ -93,7 +97,9 @@ class Instance:
             return self.cursor()
         if self._confined is None or self._confined[0] != path:
             made = in_memory(self._settings)
-            own = ", ".join(quoted(f"{path}{log}") for log in ("", ".wal"))
+            own = ", ".join(
+                quoted(f"{each}{log}") for each in (path.absolute(), path.resolve()) for log in LOGS
+            )
             also = ", ".join(map(quoted, self._also))
             made.execute(f"SET allowed_directories = [{also}]")
             made.execute(f"SET allowed_paths = [{own}]; SET enable_external_access = false")
@@ -151,7 +157,9 @@ def _attached(
     told = False
     while True:
         try:
-            connection.execute(f"ATTACH {quoted(path)} AS {name} ({mode}); USE {name}")
+            # A name such as md:x or :memory: is that of a file, too.
+            whole = quoted(path.absolute())
+            connection.execute(f"ATTACH {whole} AS {name} ({mode}); USE {name}")
         except duckdb.Error as exc:
             if not any(words in str(exc) for words in _BUSY):
                 instance.drop()
@@ -298,22 +306,43 @@ def unreadable_is_usage() -> Iterator[None]:
 def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
     """The version of an existing database; raises UsageError for a newer or a foreign one."""
     # A table, and functions of DuckDB's: a view or a macro of such a name could read any file.
-    ours = connection.execute(
-        "SELECT 1 FROM system.main.duckdb_tables() "
-        "WHERE table_name = 'meta' AND database_name = system.main.current_database()"
-    ).fetchone()
-    if ours is None:
+    tables = dict(
+        connection.execute(
+            "SELECT table_name, column_count FROM system.main.duckdb_tables() "
+            "WHERE database_name = system.main.current_database()"
+        ).fetchall()
+    )
+    if "meta" not in tables:
         raise UsageError(f"{path} is no database of merge-runner: name another with --db")
     row = connection.execute("SELECT schema_version FROM meta").fetchone()
     if row is None:
         raise UsageError(f"{path} has no schema version: {REBUILD}")
     version: int = row[0]
+    if version < 1:
+        raise UsageError(f"{path} has schema version {version}, which no program wrote: {REBUILD}")
     if version > SCHEMA_VERSION:
         raise UsageError(
             f"{path} has schema version {version}, written by a newer merge-runner; this one reads "
             f"up to {SCHEMA_VERSION}: update merge-runner, or name another file with --db"
         )
+    for table, columns in _columns().items() if version == SCHEMA_VERSION else ():
+        if tables.get(table) != columns:
+            raise UsageError(
+                f"{path} has {tables.get(table, 'no')} columns in the table {table}, and "
+                f"merge-runner made {columns}: {REBUILD}. Tables of other names may be added"
+            )
     return version
+
+
+@cache
+def _columns() -> dict[str, int]:
+    """How many columns each table of the schema has."""
+    tables = re.findall(
+        r"^CREATE TABLE IF NOT EXISTS (\w+) \(\n(.*?)^\);",
+        SCHEMA.read_text(encoding="utf-8"),
+        re.DOTALL | re.MULTILINE,
+    )
+    return {name: len(re.findall(r"^    [a-z]\w* ", body, re.MULTILINE)) for name, body in tables}
 
 
 def migrate(path: Path) -> None:

@@ -8,6 +8,7 @@ from itertools import chain
 from tempfile import TemporaryFile
 from typing import Any, TextIO
 
+from merge_runner.errors import UsageError
 from merge_runner.texts import csv_writer, in_spreadsheet, printable
 
 Rows = Iterable[tuple[Any, ...]]
@@ -21,6 +22,9 @@ def write_csv(names: list[str], rows: Rows, out: TextIO) -> None:
 
 def write_json(names: list[str], rows: Rows, out: TextIO) -> None:
     """As an array of objects."""
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UsageError(f"two columns are named {twice!r}: name them apart with AS")
     before = "["
     for row in rows:
         record = dict(zip(names, row, strict=True))

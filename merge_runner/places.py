@@ -1,9 +1,23 @@
-"""Where things lie by default."""
+"""Where things lie by default, and what may be written where something lies already."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from merge_runner.errors import UsageError
+
 PROJECT = Path(__file__).resolve().parent.parent
 DEFAULT_DB = Path("results/merge.duckdb")
 DEFAULT_CACHE = Path("cache/responses")
+
+
+def refuse_another_kind(file: Path, begins: bytes, kind: str) -> None:
+    """Raise UsageError where a file is there that does not begin as those that we write."""
+    if not file.is_file():
+        return
+    with file.open("rb") as there:
+        found = there.read(len(begins))
+    if found.lower() != begins.lower():
+        raise UsageError(
+            f"{file} is there, and is no {kind}: name another file, or remove that one"
+        )

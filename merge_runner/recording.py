@@ -30,6 +30,7 @@ from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, Entry, ResponseCache
 from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
 from merge_runner.llm.verify import DAMAGED, check_attempts, check_body
+from merge_runner.places import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
 from merge_runner.texts import first_line, one_line, quoted
 
@@ -108,6 +109,7 @@ def export_recording(
     ordered, damaged = _in_order(cache, keys)
     if file.is_dir():
         raise UsageError(f"{file} is a folder: name a file")
+    refuse_another_kind(file, b"PAR1", "recording")
     with _written(file), TemporaryDirectory(prefix=f".{file.name}-", dir=file.parent) as folder:
         _write_parts(Path(folder), file, (cache.get(key) for key in ordered), provenance)
     if damaged:

@@ -52,7 +52,7 @@ class Account:
 
 def accounts(folder: Path) -> list[Account]:
     """All ledgers of a cache folder; raises UsageError where there is none."""
-    with _opened(folder) as cache:
+    with _opened(folder, read_only=True) as cache:
         return [_account(cache, scope) for scope in scopes(cache)]
 
 
@@ -84,10 +84,10 @@ def release(folder: Path, sweep: str) -> Account:
 
 
 @contextmanager
-def _opened(folder: Path) -> Iterator[ResponseCache]:
+def _opened(folder: Path, *, read_only: bool = False) -> Iterator[ResponseCache]:
     if not (folder / "cache.db").is_file():
         raise UsageError(f"there is no cache in {folder}, so nothing was spent: name it by --cache")
-    cache = ResponseCache(folder)
+    cache = ResponseCache(folder, read_only=read_only)
     try:
         yield cache
     finally:

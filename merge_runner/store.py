@@ -62,6 +62,8 @@ class Store:
     def __init__(self, path: Path) -> None:
         """Open or make the database; raises UsageError for one that is not ours."""
         self.path = path
+        if path.exists() and not path.is_file():
+            raise UsageError(f"{path} is no file: name one with --db")
         self._one_at_a_time = threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

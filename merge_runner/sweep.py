@@ -212,7 +212,7 @@ class Sweep:
             outcome.suspended = len(self._suspended)
             outcome.fail(
                 TrialSuspended.exit_code,
-                f"{len(self._suspended)} trials wait for money: {self._suspended[0]}. Their "
+                f"{len(self._suspended)} trials wait for money: {self._suspended[-1]}. Their "
                 "replies are kept: raise --max-cost and run the same command again",
             )
         if self._progress.done["failed"] and not self._misses:

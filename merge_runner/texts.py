@@ -27,7 +27,18 @@ def in_spreadsheet(value: object) -> object:
 
 def csv_writer(file: TextIO) -> Any:  # noqa: ANN401 # the library does not name its kind
     """A writer of CSV, whose lines end as those of all our files do."""
-    return csv.writer(file, lineterminator="\n")
+    return csv.writer(_Lines(file))
+
+
+class _Lines:
+    """Ends each row with LF alone; told to do so itself, the library would not quote a CR."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, row: str) -> int:
+        """Write a row, which the library hands over as one text."""
+        return self._file.write(row.removesuffix("\r\n") + "\n")
 
 
 def first_line(exc: Exception) -> str:

@@ -12,7 +12,7 @@ from studies import write_study, yielding
 
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
-from merge_runner.texts import in_spreadsheet
+from merge_runner.texts import csv_writer, in_spreadsheet
 
 HOST = "127.0.0.1:8700"
 FORMULA = "=HYPERLINK(x)"
@@ -85,3 +85,16 @@ async def test_lines_of_csv_end_alike_wherever_they_come_from(merge_runner, db, 
     ]
     assert [text.count("\r") for text in texts] == [0, 0, 0, 0]
     assert all(text.endswith("\n") for text in texts)
+
+
+@pytest.mark.parametrize("text", ["a\rb", "a\nb", "a\r\n", "\r\n", 'a"b', "a,b"])
+def test_every_text_comes_back_from_csv_as_it_was(text):
+    written = io.StringIO(newline="")
+    csv_writer(written).writerows([["x", text], ["y", "z"]])
+    assert cells(written.getvalue()) == [["x", text], ["y", "z"]]
+
+
+async def test_two_columns_of_one_name_are_no_json(merge_runner, db):
+    run = await merge_runner("sql", "select 1 as a, 2 as a", "--db", db, "--format", "json")
+    assert (run.code, run.out) == (2, "")
+    assert "two columns are named 'a'" in run.err

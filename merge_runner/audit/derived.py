@@ -178,6 +178,11 @@ def check_derived(
 ) -> Derived:
     """Derive the audited trials anew, and compare every column that replies and specs tell."""
     found = Derived()
+    found.findings += [
+        Finding("config", f"its model {name} has the format {model.format!r}, which there is not")
+        for name, model in config.models.items()
+        if model.format and model.format not in FORMATS
+    ]
     audited = connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall()
     batches = in_batches(connection, audited, PLACES, partial(_tables, connection))
     with ThreadPoolExecutor(max_workers=1) as thread:  # a loop of its own: one may run here

@@ -181,6 +181,7 @@ def _audit(
         sharings=tuple(_taken_over(connection, sweep.sweep_id)),
         notes=(
             *slots.notes,
+            *_checked_elsewhere(connection, sweep.sweep_id),
             *meaningless_ids(connection),
             *_alike_notes(connection),
             *derived.notes,
@@ -276,6 +277,17 @@ def _rule_findings(connection: duckdb.DuckDBPyConnection) -> Iterable[Finding]:
 def _taken_over(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> Iterable[Sharing]:
     for other, count in connection.execute(TAKEN_OVER, [sweep_id, sweep_id]).fetchall():
         yield Sharing("trials", sweep_id, other, count)
+
+
+def _checked_elsewhere(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> Iterable[str]:
+    """That later sweeps have its trials too, under which they are counted and checked."""
+    (count,) = connection.execute(
+        "SELECT count(*) FROM sweep_trials SEMI JOIN done USING (trial_id, spec_hash) "
+        "WHERE sweep_id = ?",
+        [sweep_id],
+    ).fetchall()[0]
+    if count:
+        yield f"{count} of its trials are checked with a later sweep that has them too"
 
 
 def _alike_notes(connection: duckdb.DuckDBPyConnection) -> Iterable[str]:

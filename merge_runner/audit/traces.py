@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from math import hypot
+from math import hypot, nan
 
 import duckdb
 
@@ -79,7 +79,8 @@ def _collision(
 def _gap_m(before_m: Sequence[float], after_m: Sequence[float], length_m: float) -> float:
     """The net gap at the first arrival at the merge point, linear within the step."""
     steps = list(zip(before_m, after_m, strict=True))
-    share = min((MERGE_POINT_M - a) / (b - a) for a, b in steps if b >= MERGE_POINT_M)
+    shares = ((MERGE_POINT_M - a) / (b - a) for a, b in steps if b >= MERGE_POINT_M)
+    share = min(shares, default=nan)  # DuckDB takes what is no number for the largest
     left_m, right_m = (a + share * (b - a) for a, b in steps)
     return abs(left_m - right_m) - length_m
 

@@ -31,7 +31,7 @@ async def read_body(chunks: AsyncIterator[bytes], encoding: str, most_bytes: int
         if size > most_bytes:
             raise refused(f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)")
         pieces.append(piece)
-    text = b"".join(pieces).decode(errors="replace")
+    text = b"".join(pieces).decode("utf-8-sig", errors="replace")
     if why := _why_refused(text):
         raise refused(why)
     return text
@@ -54,6 +54,8 @@ async def _unpacked(chunks: AsyncIterator[bytes], encoding: str) -> AsyncIterato
     unpacking = zlib.decompressobj(wbits=32 + zlib.MAX_WBITS)  # tells gzip from deflate
     cut = False
     async for chunk in chunks:
+        if unpacking.eof and chunk:
+            raise refused(f"it goes on after the end of its {encoding}")
         packed = chunk
         while packed:
             try:
@@ -63,6 +65,8 @@ async def _unpacked(chunks: AsyncIterator[bytes], encoding: str) -> AsyncIterato
             packed = unpacking.unconsumed_tail
             cut = not unpacking.eof
             await asyncio.sleep(0)
+        if unpacking.unused_data:
+            raise refused(f"it goes on after the end of its {encoding}")
     if cut:
         raise TransportFailure("connection_lost", f"the reply is cut within its {encoding}")
 

@@ -177,7 +177,7 @@ class Budget:
             + (
                 f", {aside:.4f} set aside for {spending.open_attempts} attempts whose cost is not "
                 "known: `merge-runner ledger`"
-                if aside
+                if aside > TOLERANCE_USD
                 else ""
             )
             + ")"

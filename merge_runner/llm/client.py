@@ -342,7 +342,7 @@ class LlmClient:
                 call.request, attempt=number, timeout_s=min(self.entry.timeout_s, seconds_left)
             )
             verdict = judge(raw, FORMATS[self.entry.format])
-            record = self._record(number, raw, verdict)
+            record = self._record(number, raw, verdict, call.worst)
             spent = record.cost_usd
             self._settle_tokens(permit, record.usage)
         except TransportFailure as exc:
@@ -466,7 +466,7 @@ class LlmClient:
         """The provider whose own host is asked; None: another server in its format."""
         return self.entry.provider if self.endpoint == self.entry.provider else None
 
-    def _record(self, number: int, raw: RawReply, verdict: Verdict) -> Attempt:
+    def _record(self, number: int, raw: RawReply, verdict: Verdict, worst: Usage) -> Attempt:
         usage = verdict.reading.usage
         return Attempt(
             number=number,
@@ -477,16 +477,23 @@ class LlmClient:
             usage=usage,
             reply=raw.body,
             error=verdict.message,
-            cost_usd=self._cost_usd(raw, usage),
+            cost_usd=self._cost_usd(raw, usage, worst),
             scripted=SCRIPTED_HEADER in raw.headers or says_scripted(raw.body),
         )
 
-    def _cost_usd(self, raw: RawReply, usage: Usage) -> float | None:
-        """What a reply cost: by its usage, also in an error; None where that is not known."""
+    def _cost_usd(self, raw: RawReply, usage: Usage, worst: Usage) -> float | None:
+        """What a reply cost: by its usage, also in an error; None where that is not known.
+
+        More output than there can be is charged, whatever the server says of the input.
+        """
         if self.entry.price == "free":
             return 0.0
         if usage.input_tokens and usage.output_tokens is not None:
             return self.pricing.cost_usd(usage)
+        if (usage.output_tokens or 0) > (worst.output_tokens or 0):
+            return self.pricing.cost_usd(
+                Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
+            )
         stray = raw.status == 200 and is_web_page(raw) and not self.first.known
         return 0.0 if stray or not may_be_charged(raw, self._own_host) else None
 

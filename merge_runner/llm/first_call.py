@@ -11,7 +11,7 @@ import json
 
 from merge_runner.config import PROVIDERS, ModelEntry
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.base import as_dict, as_text
+from merge_runner.llm.formats.base import as_dict, as_text, is_answer
 from merge_runner.llm.verdicts import RawReply, Verdict, is_web_page
 
 NOBODY_S = 5.0
@@ -50,17 +50,18 @@ class FirstCall:
         self.passed = self.known = True
 
 
-def in_format(raw: RawReply, entry: ModelEntry) -> bool:
-    """Whether an accepted reply has anything of an answer in the entry's format."""
-    members = FORMATS[entry.format].members
-    return raw.status != 200 or bool(members & as_dict(json.loads(raw.body)).keys())
+def is_foreign(raw: RawReply, entry: ModelEntry) -> bool:
+    """Whether a reply of status 200 is JSON, and nothing of an answer in the entry's format."""
+    payload = _loaded(raw.body)
+    answers = isinstance(payload, dict) and is_answer(payload, FORMATS[entry.format].members)
+    return raw.status == 200 and isinstance(payload, dict) and not answers
 
 
 def refusal(name: str, entry: ModelEntry, raw: RawReply, verdict: Verdict) -> str | None:
     """Why no other call of a run would fare better, and what to set; None: one might."""
     if is_web_page(raw) and raw.status == 200:
         return f"a web page answers there, and no language model: {set_base_url(name, entry)}"
-    if verdict.action == "accept" and not in_format(raw, entry):
+    if verdict.outcome == "bad_body" and is_foreign(raw, entry):
         return f"what answers there does not speak {entry.format}: {set_base_url(name, entry)}"
     if verdict.action != "fail" or "invalid_prompt" in raw.body:
         return None

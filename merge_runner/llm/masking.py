@@ -8,19 +8,21 @@ from collections.abc import Iterable
 
 MASK = "[key]"
 # Few replies have one, and to look for every spelling takes longer than all other reading.
-_ESCAPE = re.compile(r"[\\%&](?:/|#|(?:u00|x)?[2-7][0-9A-Fa-f])")
+_UNSEEN = r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\u200b-\u200f\u2060-\u2064\ufeff]"
+_ESCAPE = re.compile(rf"\\+(?:/|u00|x)|%(?:25)*[2-7][0-9A-Fa-f]|&(?:amp;)*#|{_UNSEEN}")
 
 
 class Mask:
     """Replaces secrets in texts.
 
     Found are they as they are, with any of their characters escaped as in JSON (also in JSON within
-    JSON), in URLs or in HTML, and within what is base64, say of ``user:key``.
+    JSON), in URLs (also twice) or as numbers in HTML, with characters between that nobody sees (as
+    in UTF-16), and within what is base64, say of ``user:key``.
     """
 
     def __init__(self, secrets: Iterable[str]) -> None:
         self._secrets = list(secrets)
-        patterns = ("".join(map(_spellings, secret)) for secret in self._secrets)
+        patterns = (f"{_UNSEEN}*".join(map(_spellings, secret)) for secret in self._secrets)
         self._escaped = re.compile("|".join(patterns))
         self._coded = {core for secret in self._secrets for core in _base64_cores(secret)}
 
@@ -43,8 +45,8 @@ def _spellings(character: str) -> str:
     hexadecimal = "".join(f"[{d}{d.upper()}]" if d.isalpha() else d for d in f"{code:02x}")
     slashed = r"\\*/" if character == "/" else re.escape(character)
     return (
-        rf"(?:{slashed}|\\+(?:u00|x){hexadecimal}|%{hexadecimal}"
-        rf"|&#0*{code};|&#[xX]0*{hexadecimal};)"
+        rf"(?:{slashed}|\\+(?:u00|x){hexadecimal}|%(?:25)*{hexadecimal}"
+        rf"|(?:&|\\+u0026)(?:amp;)*#(?:0*{code}|[xX]0*{hexadecimal});?)"
     )
 
 

@@ -29,8 +29,8 @@ class Pricing:
         if not self.known or usage.input_tokens is None or usage.output_tokens is None:
             return None
         cached = usage.cached_input_tokens or 0
-        if not 0 <= cached <= usage.input_tokens or usage.output_tokens < 0:
-            return None  # the server counts wrongly
+        if cached > usage.input_tokens:
+            cached = 0  # the server counts wrongly: none is taken for cheap
         if isinstance(self.price, Price):
             cached_price = self.price.cached_input
             cost = (

@@ -16,6 +16,7 @@ from merge_runner.llm.formats.base import (
     as_dict,
     as_list,
     error_info,
+    is_answer,
 )
 
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
@@ -142,6 +143,8 @@ def _judge_success(raw: RawReply, payload: object, wire: WireFormat) -> Verdict:
     if not isinstance(payload, dict):
         return Verdict("retry", "bad_body", Reading("error"), "the body is no JSON object")
     reading = wire.read(payload)
+    if reading.outcome == "empty" and not is_answer(payload, wire.members):
+        return Verdict("retry", "bad_body", reading, "the body has nothing of an answer")
     if reading.outcome != "error":
         return Verdict("accept", reading.outcome, reading)
     return replace(_judge_error(_status_within(payload, raw), raw, payload), reading=reading)

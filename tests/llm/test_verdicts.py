@@ -422,7 +422,6 @@ SUCCESSES = [
     ("openai-chat", choice("", "length"), "accept", "truncated"),
     ("openai-chat", choice(None, "content_filter"), "accept", "refusal"),
     ("openai-chat", choice(""), "accept", "empty"),
-    ("openai-chat", {"choices": []}, "accept", "empty"),
     ("openai-chat", " \n\n" + json.dumps(choice()), "accept", "ok"),
     ("gemini", candidate("STOP", {"text": "M"}), "accept", "ok"),
     ("gemini", candidate("STOP"), "accept", "empty"),
@@ -435,6 +434,10 @@ SUCCESSES = [
     ("openai-chat", HTML, "retry", "bad_body"),
     ("openai-chat", "null", "retry", "bad_body"),
     ("openai-chat", "[]", "retry", "bad_body"),
+    ("openai-chat", {"choices": []}, "retry", "bad_body"),
+    ("openai-chat", {"id": "x", "choices": None, "usage": None}, "retry", "bad_body"),
+    *((wire, {"status_page": "maintenance"}, "retry", "bad_body") for wire in FORMATS),
+    ("anthropic", {"content": [], "stop_reason": "end_turn"}, "accept", "empty"),
     # Responses fail with status 200.
     ("openai-responses", failed("server_error"), "retry", "server_error"),
     ("openai-responses", failed("invalid_prompt"), "fail", "bad_request"),

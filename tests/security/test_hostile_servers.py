@@ -151,6 +151,12 @@ def endless(beginning, unit):
 
 
 CHUNKED = head(transfer_encoding="chunked")
+
+
+def in_chunks(body):
+    return b"%x\r\n%s\r\n" % (len(body), body)
+
+
 ENDLESS = {
     "headers": endless(b"HTTP/1.1 200 X\r\n", b"x: y\r\n" * 1000),
     "one header": endless(b"HTTP/1.1 200 X\r\nx: ", b"y" * 65536),
@@ -162,6 +168,10 @@ ENDLESS = {
     "a body": endless(head(), b"y" * 65536),
     "chunks": endless(CHUNKED, b"10000\r\n" + b"y" * 65536 + b"\r\n"),
     "chunks of one byte": endless(CHUNKED, b"1\r\ny\r\n" * 10_000),
+    "more after a gzip": endless(
+        head(transfer_encoding="chunked", content_encoding="gzip") + in_chunks(gzip.compress(CHAT)),
+        b"10000\r\n" + b"y" * 65536 + b"\r\n",
+    ),
     "gzip of nothing": endless(
         head(transfer_encoding="chunked", content_encoding="gzip")
         + b"a\r\n\x1f\x8b\x08\0\0\0\0\0\0\3\r\n",

@@ -25,7 +25,7 @@ class AnthropicMessages:
     """``POST /v1/messages`` with the API version as a header."""
 
     retries_empty = False
-    members = frozenset({"content"})
+    members = frozenset({"content", "stop_reason"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
         """One user message; ``max_tokens`` is required."""

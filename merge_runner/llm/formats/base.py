@@ -64,6 +64,11 @@ class ErrorInfo:
     details: tuple[dict[str, Any], ...]
 
 
+def is_answer(payload: dict[str, Any], members: frozenset[str]) -> bool:
+    """Whether a body of status 200 has anything of an answer: an empty one has its frame."""
+    return any(payload.get(name) not in (None, [], {}) for name in members)
+
+
 def outcome_of(text: str, *, truncated: bool, refused: bool) -> str:
     """The outcome of an answer, from its text and what its finish reason means."""
     if refused:
@@ -94,7 +99,9 @@ def as_text(value: object) -> str | None:
 
 
 def as_count(value: object) -> int | None:
-    """A token count, or None where it is absent or cannot be one."""
+    """A token count, or None where it is absent or cannot be one; some servers write 9.0."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
     return value if type(value) is int and 0 <= value <= MOST_TOKENS else None
 
 

@@ -1,0 +1,87 @@
+"""Databases that lie elsewhere, hold more or less than ours, or cannot take what is written."""
+
+from __future__ import annotations
+
+import os
+
+import duckdb
+import pytest
+from studies import write_study, yielding
+
+from merge_runner.audit import audit_database
+from merge_runner.errors import UsageError
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.recording import export_recording
+
+
+@pytest.fixture
+def db(tmp_path):
+    (tmp_path / "real").mkdir()
+    return write_study(tmp_path / "real" / "m.duckdb", yielding("m", reps=1))
+
+
+async def test_a_link_to_a_database_is_read_as_it_is(merge_runner, db, tmp_path):
+    (tmp_path / "link.duckdb").symlink_to(db)
+    for command in (("digest",), ("tables", "who-first"), ("sql", "from sweeps")):
+        run = await merge_runner(*command, "--db", "link.duckdb")
+        assert run.code == 0, run.err
+
+
+@pytest.mark.parametrize("table", ["trials", "states", "decisions", "calls", "sweeps"])
+@pytest.mark.parametrize("change", ["ADD COLUMN more INTEGER", "RENAME TO other"])
+async def test_a_table_with_other_columns_is_told_in_one_line(merge_runner, db, table, change):
+    with duckdb.connect(str(db)) as connection:
+        for (view,) in connection.execute(
+            "SELECT view_name FROM duckdb_views() WHERE NOT internal"
+        ).fetchall():
+            connection.execute(f"DROP VIEW IF EXISTS {view}")
+        for (index,) in connection.execute("SELECT index_name FROM duckdb_indexes()").fetchall():
+            connection.execute(f"DROP INDEX {index}")
+        connection.execute(f"ALTER TABLE {table} {change}")
+    run = await merge_runner("digest", "--db", db)
+    assert run.code == 2
+    assert f"columns in the table {table}, and merge-runner made" in run.err
+
+
+async def test_a_name_of_another_kind_of_database_is_that_of_a_file(merge_runner, tmp_path):
+    sweep = ("baseline", "--model", "constant", "--reps", 1, "--conditions", "N_0_0")
+    for name in ("md:x", ":memory:"):
+        run = await merge_runner("sweep", *sweep, "--db", name)
+        assert run.code == 0, run.err
+        assert (tmp_path / name).is_file()
+
+
+async def test_a_pipe_is_no_database(merge_runner, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    run = await merge_runner("replay", "baseline", "--db", "pipe")
+    assert run.code == 2
+    assert "pipe is no file" in run.err
+
+
+def test_a_position_that_is_no_number_is_a_finding(db):
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("UPDATE states SET position_m = 'nan' WHERE step > 20")
+    kinds = {finding.kind for audit in audit_database(db) for finding in audit.findings}
+    assert {"gap", "outcome"} & kinds
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("report", "--out"), ("view", "--trials", "*", "--single")],
+    ids=" ".join,
+)
+async def test_nothing_is_written_over_what_is_of_another_kind(merge_runner, db, command):
+    before = db.read_bytes()
+    run = await merge_runner(*command, db, "--db", db)
+    assert run.code == 2
+    assert f"{db} is there, and is no" in run.err
+    assert db.read_bytes() == before
+
+
+def test_a_recording_is_written_over_nothing_but_a_recording(tmp_path):
+    cache = ResponseCache(tmp_path / "c")
+    for _ in range(2):
+        export_recording(tmp_path / "r.parquet", cache, [], {})
+    with pytest.raises(UsageError, match="is there, and is no recording"):
+        export_recording(tmp_path / "c/cache.db", cache, [], {})
+    cache.close()
