@@ -99,6 +99,11 @@ def main() -> None:
             raise
         say(f"error: {exc}")
         sys.exit(exc.exit_code)
+    except RuntimeError as exc:
+        if debug or str(exc) != "Query interrupted":  # as DuckDB says of Ctrl-C
+            raise
+        say("interrupted: run the same command again")
+        sys.exit(130)
     except OSError as exc:
         if debug or exc.errno not in OUTPUT_ERRORS:
             raise

@@ -191,6 +191,7 @@ def check_derived(
             records = thread.submit(asyncio.run, _all_played(trials)).result()
             for trial, record in zip(trials, records, strict=True):
                 found.findings += _findings(trial, record, tables)
+                trial.drivers.clear()  # which know it: else its replies stay until a collection
             found.trials += len(trials)
     return found
 

@@ -341,7 +341,7 @@ async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make, reply, ou
         ([gemini(), gemini("M")], ["empty", "ok"]),
         ([gemini(), gemini(), gemini("M")], ["empty", "empty", "ok"]),
         ([gemini(), gemini(), gemini(), gemini("M")], ["empty"] * 3),
-        ([raw({"usageMetadata": {}}), gemini("M")], ["empty", "ok"]),
+        ([raw({"usageMetadata": {"promptTokenCount": 9}}), gemini("M")], ["empty", "ok"]),
         # Other failures in between do not use up the two.
         ([gemini(), error(500), gemini(), gemini("M")], ["empty", "server_error", "empty", "ok"]),
     ],
@@ -358,10 +358,17 @@ async def test_an_empty_answer_of_gemini_is_asked_at_most_twice_again(
     assert cache.get(reply.request.key).attempts == reply.attempts
 
 
-@pytest.mark.parametrize("wire", ["openai-chat", "openai-responses", "anthropic"])
+@pytest.mark.parametrize(
+    ("wire", "body"),
+    [
+        ("openai-chat", {"choices": [{"message": {"content": ""}, "finish_reason": "stop"}]}),
+        ("openai-responses", {"status": "completed", "output": []}),
+        ("anthropic", {"content": [], "stop_reason": "end_turn"}),
+    ],
+)
 @in_virtual_time
-async def test_an_empty_answer_of_others_is_not_asked_again(make, wire):
-    client = make(raw({}), format=wire)
+async def test_an_empty_answer_of_others_is_not_asked_again(make, wire, body):
+    client = make(raw(body), format=wire)
     assert (await client.ask("prompt", slot())).outcome == "empty"
     assert len(client.transport.sent) == 1
 
