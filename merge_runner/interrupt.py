@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import socket
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -26,3 +28,31 @@ def on_interrupt(first: Callable[[], object], again: Callable[[], object]) -> It
     finally:
         for number in SIGNALS:
             loop.remove_signal_handler(number)
+
+
+@contextmanager
+def at_signals(act: Callable[[], object]) -> Iterator[None]:
+    """Call ``act`` from a thread at each signal, although the main thread is not in Python.
+
+    DuckDB looks at no signal while more than one of its threads work on a query.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's
+        return
+
+    def listen() -> None:
+        while heard.recv(1):
+            act()
+
+    heard, told = socket.socketpair()
+    told.setblocking(False)
+    listener = threading.Thread(target=listen, daemon=True)
+    before = signal.set_wakeup_fd(told.fileno())
+    listener.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        told.close()
+        listener.join()
+        heard.close()

@@ -34,6 +34,7 @@ from merge_runner.database import (
     unreadable_is_usage,
 )
 from merge_runner.errors import StoreError, UsageError
+from merge_runner.interrupt import at_signals
 from merge_runner.records import TrialRecord
 from merge_runner.rows import Row, rows_of, state_rows, trial_row
 from merge_runner.served import other_models, sql_of
@@ -197,6 +198,7 @@ def answers(path: Path, sql: str) -> Iterator[tuple[list[str], Iterator[tuple[An
     # The settings hold for a whole instance, and cannot be taken back.
     with (
         read_database(path, Instance(TEXTS, confine=False)) as connection,
+        at_signals(connection.interrupt),
         answering(connection, sql) as result,
     ):
         yield [column[0] for column in result.description or ()], fetched(result)

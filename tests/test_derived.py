@@ -107,6 +107,13 @@ def test_one_changed_value_of_a_column_is_a_finding(db, made, table, column, kin
     assert bool(with_cache) == (table == "calls" and column != "cached")
 
 
+def test_a_format_that_there_is_not_is_a_finding_and_switches_nothing_off_in_silence(db):
+    change(db, "UPDATE sweeps SET config = replace(config::VARCHAR, 'openai-chat', 'zz')::JSON")
+    (finding,) = findings(db)
+    assert finding.kind == "config"
+    assert "has the format 'zz', which there is not" in finding.text
+
+
 def test_what_is_not_derived_is_listed_in_the_docs_and_by_the_command(made, prepare):
     page = (PROJECT / "docs/audit.md").read_text()
     known = {f"{table}.{column}" for table, column, _ in COLUMNS}

@@ -79,16 +79,21 @@ def test_the_table_and_the_trials_behind_its_cell_agree(db):
 
 
 names = st.text(max_size=3)
-MEMORY = in_memory({})
+
+
+@pytest.fixture(scope="module")
+def memory():
+    with in_memory({}) as connection:
+        yield connection
 
 
 @given(st.lists(st.tuples(names, names)), st.lists(st.tuples(names, names)))
-def test_the_condition_in_sql_is_the_rule(pairs, aliases):
+def test_the_condition_in_sql_is_the_rule(memory, pairs, aliases):
     others = others_among(pairs, aliases)
     declared = {asked: {a for model, a in aliases if model == asked} for asked, _ in pairs}
     assert others == [p for p in pairs if is_other_model(*p, declared[p[0]])]
     for pair in pairs:
-        (other,) = MEMORY.execute(
+        (other,) = memory.execute(
             f"SELECT {sql_of(others)} FROM (SELECT ? AS model_requested, ? AS model_served)", pair
         ).fetchone()
         assert other is (pair in others)

@@ -299,18 +299,23 @@ def usable(folder: Path) -> Iterator[None]:
 def _make(file: Path) -> None:
     """Make the file whole or not at all, so that an empty one was not just made by somebody."""
     with tempfile.TemporaryDirectory(prefix="new-", dir=file.parent) as folder:
-        made = _opened(Path(folder))
-        made.set(_FORMAT, str(FORMAT))
-        made.close()
+        _lay_out(Path(folder))
         try:
             os.link(Path(folder) / FILE, file)
         except FileExistsError:
             pass  # another process was quicker
         except OSError:  # a file system without links
-            os.rename(Path(folder) / FILE, file)
+            _lay_out(file.parent)
     descriptor = os.open(file.parent, os.O_RDONLY)
     os.fsync(descriptor)
     os.close(descriptor)
+
+
+def _lay_out(folder: Path) -> None:
+    """Make what is missing of a file; one that another process has made stays as it is."""
+    made = _opened(folder)
+    made.add(_FORMAT, str(FORMAT))
+    made.close()
 
 
 def _opened(folder: Path) -> _Store:

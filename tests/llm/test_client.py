@@ -373,6 +373,26 @@ async def test_an_empty_answer_of_others_is_not_asked_again(make, wire, body):
     assert len(client.transport.sent) == 1
 
 
+@pytest.mark.parametrize(
+    "usage",
+    [
+        {"prompt_tokens": 0, "completion_tokens": 5_000_000},
+        {"completion_tokens": 5_000_000},
+        {"prompt_tokens": "many", "completion_tokens": 5_000_000.0},
+    ],
+    ids=str,
+)
+@in_virtual_time
+async def test_more_output_than_there_can_be_is_paid_whatever_is_said_of_the_input(make, usage):
+    body = {"choices": [{"message": {"content": "M"}, "finish_reason": "stop"}], "usage": usage}
+    price = Price(input=2, output=8, source="test")
+    client = make(raw(body), price=price, cap=100)
+    await client.ask("prompt", slot())
+    spent = client.budget.ledger.read()
+    assert spent.spent_usd >= 40
+    assert (spent.overrun_usd > 39, spent.reserved_usd) == (True, 0)
+
+
 async def ticks(count=20):
     """Let everybody run who can without time passing."""
     for _ in range(count):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
+import signal
+import subprocess
 
 import duckdb
 import pytest
+from harness import PROGRAM
 from studies import write_study, yielding
 
 from merge_runner.audit import audit_database
@@ -49,6 +53,33 @@ async def test_a_name_of_another_kind_of_database_is_that_of_a_file(merge_runner
         run = await merge_runner("sweep", *sweep, "--db", name)
         assert run.code == 0, run.err
         assert (tmp_path / name).is_file()
+
+
+async def test_a_version_that_no_program_wrote_is_told(merge_runner, db):
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("UPDATE meta SET schema_version = -1")
+    run = await merge_runner("digest", "--db", db)
+    assert run.code == 2
+    assert "has schema version -1, which no program wrote" in run.err
+
+
+async def test_ctrl_c_within_a_query_ends_it_in_one_line(merge_runner, db):
+    endless = "SELECT count(*) FROM range(1000000) AS a, range(1000000) AS b WHERE a > b"
+    process = await merge_runner.fork("sql", endless, "--db", db)
+    await asyncio.sleep(1)
+    process.send_signal(signal.SIGINT)
+    _, err = await process.communicate()
+    assert (process.returncode, "Traceback" in err.decode()) == (130, False), err
+
+
+def test_an_output_that_cannot_be_written_is_one_line(db):
+    with open("/dev/full", "w") as full:
+        run = subprocess.run(
+            [PROGRAM, "sql", "FROM sweeps", "--db", str(db)],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert run.returncode == 1
+    assert run.stderr == "error: the output cannot be written: No space left on device\n"
 
 
 async def test_a_pipe_is_no_database(merge_runner, tmp_path):

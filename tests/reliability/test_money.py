@@ -218,7 +218,6 @@ async def test_two_runs_under_one_cap_never_pass_it_and_both_end(merge_runner):
 
 async def test_a_gateways_error_may_be_charged_whatever_its_form(merge_runner, experiments):
     async def middle(request, handler):
-        await handler(request)
         if server.requests % 2:
             return web.Response(status=502, text="<html>502 Bad Gateway</html>")
         return web.json_response({"error": {"message": "Overloaded."}}, status=503)
@@ -248,10 +247,9 @@ async def test_a_dry_run_makes_no_file(merge_runner, tmp_path):
 
 async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(merge_runner):
     async def middle(request, handler):
-        reply = await handler(request)
         if server.requests in (3, 5):
             return web.Response(status=502, text="<html>502 Bad Gateway</html>")
-        return reply
+        return await handler(request)
 
     async with watched(middle) as server:
         env = account(server)

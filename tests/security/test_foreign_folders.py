@@ -288,6 +288,20 @@ def test_a_file_system_without_links_does_as_well(tmp_path, monkeypatch):
         cache.close()
 
 
+def test_a_file_that_another_process_made_meanwhile_is_not_replaced(tmp_path, monkeypatch):
+    def comes_second(*_):
+        monkeypatch.undo()
+        quicker = ResponseCache(tmp_path)
+        quicker.put_now([FIRST])
+        quicker.close()
+        raise PermissionError  # and there are no links
+
+    monkeypatch.setattr("os.link", comes_second)
+    cache = ResponseCache(tmp_path)
+    assert cache.get(FIRST.request.key) == FIRST
+    cache.close()
+
+
 def test_a_folder_is_imported_without_a_byte_written_to_it(folder, own):
     before = everything_in(folder)
     assert import_folder(folder, own) == (2, 0)

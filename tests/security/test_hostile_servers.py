@@ -180,6 +180,20 @@ ENDLESS = {
 }
 
 
+@pytest.mark.parametrize("chunks", [1, 2])
+async def test_bytes_after_the_end_of_a_gzip_refuse_the_reply(chunks):
+    whole = gzip.compress(CHAT) + b"more"
+    cut = len(whole) - 4 if chunks == 2 else len(whole)
+    body = b"".join(in_chunks(part) for part in (whole[:cut], whole[cut:]) if part)
+    sent = head(transfer_encoding="chunked", content_encoding="gzip") + body + b"0\r\n\r\n"
+    with pytest.raises(TransportFailure, match="goes on after the end of its gzip"):
+        await answered(sent)
+
+
+async def test_a_byte_order_mark_before_json_is_left_out():
+    assert (await answered(ok(b"\xef\xbb\xbf" + CHAT))).body == CHAT.decode()
+
+
 @pytest.mark.parametrize("answer", ENDLESS.values(), ids=ENDLESS)
 async def test_what_never_ends_is_ended_in_little_memory(answer):
     with pytest.raises(TransportFailure) as failure, watched_memory() as watched:
