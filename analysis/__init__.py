@@ -11,9 +11,9 @@ from importlib import import_module
 
 # Names are loaded when they are used: the command line must not wait for pandas.
 _PLACES = {
-    "Study": "analysis.study",
-    "load": "analysis.load",
-    "load_trials": "analysis.load",
+    "Study": "analysis.data.study",
+    "load": "analysis.data.load",
+    "load_trials": "analysis.data.load",
     "table": "analysis.tables",
     "TABLES": "analysis.tables",
 }

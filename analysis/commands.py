@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from analysis.forms import TableFormat
 from analysis.human.commands import INTERRUPTED, human_app
+from analysis.table_format import TableFormat
 from merge_runner.cli import DbOption, app, listed, main, print_out, say
 from merge_runner.errors import UsageError
-from merge_runner.places import DEFAULT_DB, refuse_another_kind
+from merge_runner.paths import DEFAULT_DB, refuse_another_kind
 
 if TYPE_CHECKING:
-    from analysis.study import Study
+    from analysis.data.study import Study
 
 __all__ = ["app", "main"]
 
@@ -104,7 +104,7 @@ def figures(
     models: ModelsOption = None,
 ) -> None:
     """Draw Figure 2, the ablation matrix and the distributions, as PDF and PNG."""
-    from analysis.figures import write_figures
+    from analysis.figures.gallery import write_figures
 
     for path in write_figures(_study(db, models), out):
         say(f"wrote {path}")
@@ -122,7 +122,7 @@ def report(
     models: ModelsOption = None,
 ) -> None:
     """Write tables, figures, provenance and conclusions as one HTML file, and all as files."""
-    from analysis.report import write_report
+    from analysis.report.writer import write_report
 
     refuse_another_kind(out, HTML, "page of HTML")
     for path in write_report(db, listed(models), out, files):
@@ -130,7 +130,7 @@ def report(
 
 
 def _study(db: Path, models: str | None) -> Study:
-    from analysis.study import Study
+    from analysis.data.study import Study
 
     return Study(db, listed(models))
 

@@ -8,13 +8,13 @@ from functools import cache
 
 import duckdb
 
-from analysis.published import citation
-from analysis.study import Group, Study, of_group
+from analysis.data.reference_data import citation
+from analysis.data.study import Group, Study, of_group
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.errors import UsageError
-from merge_runner.places import DEFAULT_DB
-from merge_runner.texts import quoted
+from merge_runner.paths import DEFAULT_DB
+from merge_runner.text_safety import quoted
 
 SHOWN = 10
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from benchmarks.processes import PROGRAM, PYTHON, RUNNER, Run, Server, run
 from benchmarks.recorder import multiply
 from benchmarks.workload import CALLS, TRIALS
-from merge_runner.store import query
+from merge_runner.results.store import query
 
 Figures = dict[str, float]
 # In this condition both vehicles collide early whatever the server answers: 8 calls a trial.

@@ -17,7 +17,7 @@ import httpx
 
 from benchmarks.cases import Bench, Figures, study_of
 from benchmarks.processes import PROGRAM, PYTHON, serving
-from merge_runner.store import query
+from merge_runner.results.store import query
 
 ASKED, TIMEOUT_S, POLL_S = 20, 60.0, 0.05
 LIST, FILTERED = "trials", "trials?condition=N_0_0&sort=gap&page=3"

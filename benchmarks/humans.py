@@ -5,12 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "analysis"))
-
-from recordings import drive, write_zip
-
 from merge_runner.records import SIDES
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.recordings import drive, write_zip
 
 PAIRS, RUNS = 9, 10
 

@@ -14,16 +14,16 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.config import load_models
-from merge_runner.database import SCHEMA
-from merge_runner.drivers.llm_driver import LlmDriver
+from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.shared_limits import BURST_S
-from merge_runner.plan import Choice, make_plan
 from merge_runner.records import SIDES, Attempt, ChatReply, Side, Slot, TrialRecord, TrialSpec
-from merge_runner.rows import rows_of
-from merge_runner.store import Store
+from merge_runner.results.database import SCHEMA
+from merge_runner.results.rows import rows_of
+from merge_runner.results.store import Store
+from merge_runner.run.plan import Choice, make_plan
 from merge_runner.trial import play_trial
 
 WAITERS, LIMIT, WINDOW_S = 2_000, 500, 1.0

@@ -31,7 +31,7 @@ from merge_runner.emulator.faults import FaultPlan, transient_faults
 from merge_runner.emulator.server import HOST, Emulator
 from merge_runner.llm.keys import call_key
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot
-from merge_runner.store import results_digest
+from merge_runner.results.store import results_digest
 
 FAULT_RATE, SEED = 0.2, 15
 LOOK_S = 0.2

@@ -17,8 +17,8 @@ from pathlib import Path
 import duckdb
 import numpy as np
 
+from analysis.data.reference_data import PAIRS
 from analysis.human.record import SPEC, SPEC_HASH
-from analysis.published import PAIRS
 from merge_runner.config import Scenario
 from merge_runner.records import (
     SIDES,
@@ -35,9 +35,9 @@ from merge_runner.records import (
     TrialSpec,
     Usage,
 )
-from merge_runner.simulator.conditions import CONDITIONS, Condition
-from merge_runner.simulator.world import World
-from merge_runner.store import Store, SweepRow
+from merge_runner.results.store import Store, SweepRow
+from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.scenarios.merge.world import World
 
 SEED = 1
 BATCH = 500

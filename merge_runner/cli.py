@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from merge_runner.errors import MergeRunnerError, UsageError
-from merge_runner.places import DEFAULT_CACHE, DEFAULT_DB
-from merge_runner.texts import printable
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+from merge_runner.text_safety import printable
 
 if TYPE_CHECKING:
     from merge_runner.emulator.faults import FaultPlan
-    from merge_runner.estimate import Estimate
-    from merge_runner.plan import Choice, Plan
-    from merge_runner.sweep import Options, Sweep
+    from merge_runner.run.estimate import Estimate
+    from merge_runner.run.plan import Choice, Plan
+    from merge_runner.run.sweep import Options, Sweep
 
 
 app = typer.Typer(
@@ -163,8 +163,8 @@ def sweep(
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
-    from merge_runner.plan import Choice, Limits
-    from merge_runner.sweep import Options
+    from merge_runner.run.plan import Choice, Limits
+    from merge_runner.run.sweep import Options
 
     if max_cost is not None and not math.isfinite(max_cost):
         raise UsageError("--max-cost is a number of USD")
@@ -234,8 +234,8 @@ def sql(
     output: Annotated[Format, typer.Option("--format", help="Form of the result.")] = Format.TEXT,
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
-    from merge_runner.output import write_csv, write_json, write_table
-    from merge_runner.store import answers
+    from merge_runner.results.query_output import write_csv, write_json, write_table
+    from merge_runner.results.store import answers
 
     writers = {Format.TEXT: write_table, Format.CSV: write_csv, Format.JSON: write_json}
     # Who reads the output may take their time: until then nobody could write into the database.
@@ -249,7 +249,7 @@ def sql(
 @app.command()
 def digest(db: DbOption = DEFAULT_DB) -> None:
     """Print one line: a hash of all results, equal for equal results."""
-    from merge_runner.store import results_digest
+    from merge_runner.results.store import results_digest
 
     value, trials = results_digest(db)
     print_out(f"{value}  {trials} trials")
@@ -312,7 +312,7 @@ def ledger(
     as_json: JsonOption = False,
 ) -> None:
     """Show what each sweep has spent, and what is set aside and why; or release that."""
-    from merge_runner import spending
+    from merge_runner.run import spending
 
     if release is None:
         found = spending.accounts(cache)
@@ -349,8 +349,8 @@ def models() -> None:
     """List the registry: provider, id, key, price, known shutdown date."""
     from merge_runner.config import Price, key_status, load_models
     from merge_runner.llm.prices import pricing
-    from merge_runner.output import write_table
     from merge_runner.records import Usage
+    from merge_runner.results.query_output import write_table
 
     million = 1_000_000
     rows = []
@@ -415,10 +415,10 @@ def recording_export(
     ] = None,
 ) -> None:
     """Write what a sweep asked and was answered into one file."""
-    from merge_runner import signing
     from merge_runner.llm.cache import ResponseCache
-    from merge_runner.recording import export_recording
-    from merge_runner.store import sweep_row, used_call_keys
+    from merge_runner.results import signing
+    from merge_runner.results.recording import export_recording
+    from merge_runner.results.store import sweep_row, used_call_keys
 
     if sign is not None:
         signing.tool_for(sign)
@@ -438,7 +438,7 @@ def recording_import(file: ImportedFile, cache: CacheOption = DEFAULT_CACHE) -> 
     """Verify a recording, or the cache folder of somebody else, and add it to the cache."""
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.foreign import import_folder
-    from merge_runner.recording import import_recording
+    from merge_runner.results.recording import import_recording
 
     take = import_folder if file.is_dir() else import_recording
     added, there = take(file, ResponseCache(cache))
@@ -454,8 +454,8 @@ def recording_verify(
     ] = None,
 ) -> None:
     """Check that a file is as it was exported, and by whom."""
-    from merge_runner import signing
-    from merge_runner.recording import summarise
+    from merge_runner.results import signing
+    from merge_runner.results.recording import summarise
 
     found = summarise(file)
     say(f"{file} is whole: {found.calls} calls, as they were exported")
@@ -470,7 +470,7 @@ def recording_info(file: RecordingFile) -> None:
     """Verify a recording and print what it holds, as JSON."""
     from dataclasses import asdict
 
-    from merge_runner.recording import summarise
+    from merge_runner.results.recording import summarise
 
     print_out(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
 
@@ -478,9 +478,9 @@ def recording_info(file: RecordingFile) -> None:
 def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json: bool) -> None:
     import asyncio
 
-    from merge_runner.plan import make_plan
-    from merge_runner.summary import Summary
-    from merge_runner.sweep import INTERRUPTED, Sweep
+    from merge_runner.run.plan import make_plan
+    from merge_runner.run.summary import Summary
+    from merge_runner.run.sweep import INTERRUPTED, Sweep
 
     plan = make_plan(choice)
     if dry_run:
@@ -511,9 +511,9 @@ def _dry_run(plan: Plan, options: Options) -> Estimate:
     import asyncio
     from dataclasses import replace
 
-    from merge_runner.database import readable
-    from merge_runner.estimate import estimate
-    from merge_runner.sweep import Sweep
+    from merge_runner.results.database import readable
+    from merge_runner.run.estimate import estimate
+    from merge_runner.run.sweep import Sweep
 
     with tempfile.TemporaryDirectory() as folder:
         db = readable(options.db) if options.db.is_file() else Path(folder) / "none.duckdb"
@@ -530,7 +530,7 @@ def _confirm(plan: Plan, prepared: Sweep, options: Options, *, yes: bool) -> Est
     import asyncio
 
     from merge_runner.config import resolve_endpoint
-    from merge_runner.estimate import estimate
+    from merge_runner.run.estimate import estimate
 
     for name, entry in plan.entries.items():
         resolve_endpoint(name, entry)

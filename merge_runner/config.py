@@ -26,8 +26,8 @@ from pydantic import (
 )
 
 from merge_runner.errors import UsageError
-from merge_runner.places import PROJECT
-from merge_runner.texts import one_line
+from merge_runner.paths import PROJECT
+from merge_runner.text_safety import one_line
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")

@@ -17,8 +17,8 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.simulator.world import World
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
 
 
 async def play_trial(

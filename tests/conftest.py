@@ -10,11 +10,11 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from harness import PROGRAM, Run, environment
 from hypothesis import settings
-from zygote import Zygote
 
-from merge_runner.store import results_digest
+from merge_runner.results.store import results_digest
+from tests.harness import PROGRAM, Run, environment
+from tests.zygote import Zygote
 
 RUNTIME = tempfile.TemporaryDirectory()
 # Limits of a key that another test used must hold up none.

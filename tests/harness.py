@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from collections import Counter
 from collections.abc import Awaitable, Callable
@@ -15,6 +16,7 @@ from aiohttp import web
 
 from merge_runner.emulator.server import HOST, Emulator
 from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
+from merge_runner.registry import GROUP
 
 PROJECT = Path(__file__).parent.parent
 PROGRAM = Path(sys.executable).with_name("merge-runner")
@@ -37,6 +39,23 @@ class Run:
     @property
     def summary(self) -> dict:
         return json.loads(self.out)
+
+
+def how_to(name: str) -> str:
+    """The code of a page of docs/how-to."""
+    page = (PROJECT / f"docs/how-to/{name}.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    return code
+
+
+def plugin(folder: Path, source: str, module: str = "dummies") -> dict[str, str]:
+    """Variables under which a package with this source is installed, its entry point named."""
+    described = folder / f"{module}-1.0.dist-info"
+    described.mkdir(parents=True)
+    (folder / f"{module}.py").write_text(source)
+    (described / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+    (described / "entry_points.txt").write_text(f"[{GROUP}]\n{module} = {module}\n")
+    return {"PYTHONPATH": os.pathsep.join(map(str, (folder, PROJECT)))}
 
 
 def environment(**changes: str) -> dict[str, str]:

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import pytest
 import typer.main
-from harness import CONFIGURING, PROJECT, environment, watched
-from recordings import drive, write_folder
 
 from analysis.commands import app, main
-from analysis.published import published
-from merge_runner.simulator.conditions import CONDITIONS
+from analysis.data.reference_data import published
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.recordings import drive, write_folder
+from tests.harness import CONFIGURING, PROJECT, environment, watched
 
 PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"

@@ -7,7 +7,8 @@ import re
 import signal
 
 import pytest
-from harness import watched
+
+from tests.harness import watched
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--conditions", "R_-4_8", "--json")
 

@@ -22,15 +22,15 @@ import threading
 from functools import partial
 from pathlib import Path
 
-from harness import PROGRAM, PROJECT, environment
+from tests.harness import PROGRAM, PROJECT, environment
 
 # What commands import where they need it; nothing of it may start a thread.
 WARM = (
     "analysis.commands",
-    "analysis.report",
+    "analysis.report.writer",
     "merge_runner.llm.http",
     "merge_runner.emulator.server",
-    "merge_runner.summary",
+    "merge_runner.run.summary",
     "rich.live",
     "rich.table",
 )
@@ -47,10 +47,10 @@ class Zygote:
         self._folder = tempfile.TemporaryDirectory(prefix="zygote")
         self._address = str(Path(self._folder.name) / "socket")
         self._process = subprocess.Popen(
-            [sys.executable, __file__, self._address, *self._more],
+            [sys.executable, "-m", "tests.zygote", self._address, *self._more],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=environment(PYTHONPATH=f"{PROJECT}:{PROJECT}/tests"),
+            env=environment(PYTHONPATH=str(PROJECT)),
             start_new_session=True,
         )
         assert self._process.stdout.readline() == b"ready\n"

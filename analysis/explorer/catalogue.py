@@ -10,14 +10,14 @@ from typing import Any
 
 import duckdb
 
-from analysis.explorer.child import csv_cell
+from analysis.explorer.query_worker import csv_cell
 from analysis.explorer.reading import PATIENCE_S, reading
-from merge_runner.database import SCHEMA, Instance, spill_folder
+from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
-from merge_runner.plan import stand_in
 from merge_runner.records import SIDES
-from merge_runner.served import ALIASES, others_among
-from merge_runner.texts import csv_writer
+from merge_runner.results.database import SCHEMA, Instance, spill_folder
+from merge_runner.served_model import ALIASES, others_among
+from merge_runner.text_safety import csv_writer
 
 PAGE = 100
 # Two are equal where the same trials are listed: unlike a stamp, it stands when tables are kept.

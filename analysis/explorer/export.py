@@ -21,7 +21,6 @@ from markupsafe import Markup
 
 from analysis.explorer.catalogue import FACETS, SEVERAL, Filter
 from analysis.explorer.details import Row, read_decisions, read_trial
-from analysis.explorer.links import EXPORTED, StaticLinks, bundle_name
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.humans import humans_page
@@ -30,10 +29,11 @@ from analysis.explorer.pages.tables import table_page, tables_page
 from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import list_sweeps
+from analysis.explorer.urls import EXPORTED, StaticLinks, bundle_name
 from analysis.explorer.views import sparkline, speed_scale
 from analysis.tables import TABLES
 from merge_runner.errors import UsageError
-from merge_runner.places import PROJECT
+from merge_runner.paths import PROJECT
 
 STATIC = Path(__file__).with_name("static")
 STYLES = ("vendor/uplot-1.6.32.min.css", "explorer.css")

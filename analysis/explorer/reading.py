@@ -13,9 +13,9 @@ from pathlib import Path
 
 import duckdb
 
-from merge_runner.database import SHARED, Instance, read_database
 from merge_runner.errors import UsageError
-from merge_runner.texts import first_line
+from merge_runner.results.database import SHARED, Instance, read_database
+from merge_runner.text_safety import first_line
 
 ALONE = threading.RLock()
 

@@ -8,7 +8,7 @@ from functools import cache
 
 import duckdb
 
-from merge_runner.database import SCHEMA
+from merge_runner.results.database import SCHEMA
 
 _BEGINS = re.compile(r"CREATE (?:TABLE|VIEW) IF NOT EXISTS (\w+)")
 _COLUMN = re.compile(r" {4}(\w+) [A-Z][^-]*(?:-- (.*))?")

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import jinja2
 
+from analysis.explorer.analysis_process import Computing
 from analysis.explorer.catalogue import Catalogue
-from analysis.explorer.computing import Computing
-from analysis.explorer.links import Links
-from analysis.explorer.sandbox import Sandbox
-from analysis.explorer.texts import visible
+from analysis.explorer.display_text import visible
+from analysis.explorer.query_process import Sandbox
+from analysis.explorer.urls import Links
 from merge_runner.errors import MergeRunnerError
-from merge_runner.places import DEFAULT_DB
+from merge_runner.paths import DEFAULT_DB
 
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {

@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from analysis.explorer.catalogue import Catalogue
 from merge_runner.audit.expected import ModelFacts
 from merge_runner.config import pair_name
-from merge_runner.plan import stand_in
-from merge_runner.progress_file import Standing, read_standing
+from merge_runner.drivers.registry import stand_in
+from merge_runner.results.progress_file import Standing, read_standing
 
 Row = dict[str, Any]
 OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"

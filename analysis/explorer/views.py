@@ -7,13 +7,13 @@ from math import ceil, floor
 from typing import Any
 
 from analysis.explorer.details import Decision, Row, Trial
-from analysis.explorer.texts import visible
+from analysis.explorer.display_text import visible
 from merge_runner.config import Scenario
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES
-from merge_runner.simulator import track
-from merge_runner.simulator.collision import collided
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.scenarios.merge import geometry as track
+from merge_runner.scenarios.merge.collision import collided
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 BISECTIONS = 14
 # What a picture shows of the plane around the track, in m.

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path, PureWindowsPath
 
 from merge_runner.errors import MergeRunnerError, UsageError
-from merge_runner.texts import one_line
+from merge_runner.text_safety import one_line
 
 MAX_FILE_BYTES = 64 * 2**20
 MAX_TOTAL_BYTES = 4 * 2**30

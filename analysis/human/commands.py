@@ -11,7 +11,7 @@ import typer
 
 from merge_runner.cli import DbOption, print_out, say
 from merge_runner.errors import UsageError
-from merge_runner.places import DEFAULT_DB
+from merge_runner.paths import DEFAULT_DB
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,10 +38,10 @@ def human_import(
     from rich.console import Console
     from rich.progress import track
 
+    from analysis.data.imported_humans import human_trials, imported
     from analysis.human.archive import open_files
     from analysis.human.load import import_trials, sort_files
-    from analysis.imported import human_trials, imported
-    from merge_runner.store import Store
+    from merge_runner.results.store import Store
 
     try:
         with open_files(path) as files:
@@ -73,8 +73,15 @@ def human_import(
 @human_app.command("status")
 def human_status(db: DbOption = DEFAULT_DB) -> None:
     """Count the human trials per pair and condition, beside the published counts."""
-    from analysis.imported import COUNTS, OUTCOMES, by_condition, by_pair, human_trials, imported
-    from analysis.published import HUMAN_DOI
+    from analysis.data.imported_humans import (
+        COUNTS,
+        OUTCOMES,
+        by_condition,
+        by_pair,
+        human_trials,
+        imported,
+    )
+    from analysis.data.reference_data import HUMAN_DOI
 
     trials = human_trials(db) if db.exists() else None
     if trials is None or trials.empty:

@@ -12,7 +12,7 @@ from analysis.human.archive import File, Unreadable, refuse_bombs
 from analysis.human.record import SPEC, SPEC_HASH, trial_record
 from analysis.human.trace import Trace, parse_csv, parse_mat
 from merge_runner.records import TrialRecord
-from merge_runner.store import Store
+from merge_runner.results.store import Store
 
 BATCH = 100
 NAME = re.compile(

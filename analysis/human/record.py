@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+from analysis.data.reference_data import HUMAN_DOI, PAIRS
 from analysis.human.archive import Unreadable
 from analysis.human.trace import Trace
-from analysis.published import HUMAN_DOI, PAIRS
-from merge_runner.llm.keys import canonical_json
-from merge_runner.plan import spec_hash
+from merge_runner.llm.keys import canonical_json, spec_hash
 from merge_runner.records import SIDES, Side, StateRow, Status, TrialRecord, TrialSpec
-from merge_runner.simulator.conditions import CONDITIONS, Condition
-from merge_runner.simulator.track import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
+from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
 
 STATUSES: dict[str, Status] = {
     "Finished": "finished",

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analysis.kept import finished, keep_finished
+from analysis.data.derived_cache import finished, keep_finished
 from analysis.tables.formats import value_rows
 from analysis.tables.model import Table, from_text, options_text, to_text
 from merge_runner.errors import UsageError
@@ -15,7 +15,7 @@ from merge_runner.errors import UsageError
 if TYPE_CHECKING:
     import pandas as pd
 
-    from analysis.study import Study
+    from analysis.data.study import Study
 
 # Name to module. They are loaded when a table is made: one that is kept must not wait for pandas.
 TABLES = {
@@ -60,7 +60,7 @@ def finished_tables(
     found = {name: from_text(text) for name, text in kept.items()}
     missing = [name for name in dict.fromkeys(wanted) if name not in found]
     if missing:
-        from analysis.study import Study
+        from analysis.data.study import Study
 
         made = dict(zip(missing, make_tables(study or Study(db, models), missing), strict=True))
         keep_finished(db, state, options, {name: to_text(made[name]) for name in missing})

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from analysis.indicators import INDICATORS
-from analysis.measures import (
+from analysis.data.reference_data import citation
+from analysis.data.study import Group, Study
+from analysis.stats.group_scores import score
+from analysis.stats.indicators import INDICATORS
+from analysis.stats.measures import (
     BOXES,
     COLLISIONS,
     MEASURES,
@@ -14,8 +17,6 @@ from analysis.measures import (
     published_human,
     undecided,
 )
-from analysis.published import citation
-from analysis.study import Group, Study
 from analysis.tables.indicators import (
     BOXES_ALONE,
     RULES,
@@ -28,7 +29,6 @@ from analysis.tables.indicators import (
 )
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
-from analysis.verdicts import score
 
 # Columns that rest on who merged first.
 OF_OUTCOMES = tuple(

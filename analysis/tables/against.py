@@ -9,12 +9,12 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.indicators import INDICATORS
-from analysis.published import citation, published
-from analysis.study import HUMAN, Group
+from analysis.data.reference_data import citation, published
+from analysis.data.study import HUMAN, Group
+from analysis.stats.indicators import INDICATORS
 from analysis.tables.model import Column, Row, Table, Value
+from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import UsageError
-from merge_runner.plan import EMULATOR
 
 PAPER = "paper"
 # Whom the paper has rows of, and what may follow the name of a driver that is one of them.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from analysis.provenance import ANSWERS, Tally, tally
-from analysis.study import Group, Study
+from analysis.data.provenance import ANSWERS, Tally, tally
+from analysis.data.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
-from merge_runner.served import sql_of
-from merge_runner.texts import quoted
+from merge_runner.served_model import sql_of
+from merge_runner.text_safety import quoted
 
 NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
 FALLBACK = (

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from analysis.published import citation, published
-from analysis.study import Group, Study
+from analysis.data.reference_data import citation, published
+from analysis.data.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 QUARTILES = {"crt_q1_s": 0.25, "crt_median_s": 0.5, "crt_q3_s": 0.75}
 CRITICALITY = {

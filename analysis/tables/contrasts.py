@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from analysis.contrasts import Contrast, contrast_means, contrast_rates, corrected
-from analysis.measures import (
+from analysis.data.study import BASELINE, Group, Study
+from analysis.stats.contrasts import Contrast, contrast_means, contrast_rates, corrected
+from analysis.stats.measures import (
     BOXES,
     JOINT,
     MEASURES,
@@ -18,7 +19,6 @@ from analysis.measures import (
     published_human,
     undecided,
 )
-from analysis.study import BASELINE, Group, Study
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import sample_notes
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from analysis.joint import GAP, NARROW, WHO_FIRST, Difference, pairs_known
-from analysis.joint import differences as tested
-from analysis.mixed import MIN_PAIRS
-from analysis.study import Group, Study
+from analysis.data.study import Group, Study
+from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Difference, pairs_known
+from analysis.stats.joint import differences as tested
+from analysis.stats.mixed import MIN_PAIRS
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import sample_notes
 from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER

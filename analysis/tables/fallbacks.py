@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from analysis.indicators import INDICATORS, TESTED, Verdict, paper_verdicts, robust_verdicts
-from analysis.intervals import Estimate
-from analysis.measures import (
+from analysis.data.study import Group, Study, of_group
+from analysis.stats.group_scores import Fits, fits
+from analysis.stats.indicators import INDICATORS, TESTED, Verdict, paper_verdicts, robust_verdicts
+from analysis.stats.intervals import Estimate
+from analysis.stats.measures import (
     BOXES,
     COLLISIONS,
     GAP,
@@ -16,12 +18,10 @@ from analysis.measures import (
     estimate,
     undecided,
 )
-from analysis.study import Group, Study, of_group
 from analysis.tables.attempts import FALLBACK
 from analysis.tables.indicators import RULES
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
-from analysis.verdicts import Fits, fits
 
 COMPARED = (COLLISIONS, BOXES, LEFT_FIRST, GAP, RMSE, JOINT)
 # What an indicator's regression is fitted to.

@@ -6,9 +6,9 @@ import io
 import json
 from collections.abc import Callable, Sequence
 
-from analysis.forms import TableFormat
+from analysis.table_format import TableFormat
 from analysis.tables.model import Column, Row, Table, Value
-from merge_runner.texts import csv_writer, in_spreadsheet
+from merge_runner.text_safety import csv_writer, in_spreadsheet
 
 MISSING = "–"
 VARIANTS = {

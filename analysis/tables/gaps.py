@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from analysis.intervals import mean
-from analysis.regressions import Regression, gap_ols
-from analysis.study import Group, Study
+from analysis.data.study import Group, Study
+from analysis.stats.intervals import mean
+from analysis.stats.regressions import Regression, gap_ols
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
 

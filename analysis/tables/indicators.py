@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from analysis.indicators import INDICATORS, Verdict
-from analysis.likeness import gains
-from analysis.measures import (
+from analysis.data.reference_data import citation
+from analysis.data.study import Group, Study
+from analysis.stats.group_scores import PAPER_RULE, ROBUST_RULE, Score, score, total, unjudged
+from analysis.stats.indicators import INDICATORS, Verdict
+from analysis.stats.likeness import gains
+from analysis.stats.measures import (
     BOXES,
     COLLISIONS,
     MEASURES,
@@ -16,12 +19,9 @@ from analysis.measures import (
     published_human,
     undecided,
 )
-from analysis.published import citation
-from analysis.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
 from analysis.tables.profiles import gain_values
-from analysis.verdicts import PAPER_RULE, ROBUST_RULE, Score, score, total, unjudged
 
 BOXES_ALONE = f"{COLLISIONS.heading}: published human collisions are boxes that overlap"
 SOURCE = "paper_ablation_quantitative"

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import cache
 
-from analysis import ceiling
-from analysis.intermittency import STEADY_MPS
-from analysis.likeness import MARGIN_SD
-from analysis.published import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
-from analysis.study import Group, Study
+from analysis.data.intermittency import STEADY_MPS
+from analysis.data.reference_data import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
+from analysis.data.study import Group, Study
+from analysis.stats import ceiling
+from analysis.stats.likeness import MARGIN_SD
 
 
 def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) -> list[str]:

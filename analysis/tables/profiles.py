@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from analysis.intervals import Estimate
-from analysis.likeness import NO_ACTION, difference, gains, mean_gain
-from analysis.study import Group, Study, of_group
+from analysis.data.study import Group, Study, of_group
+from analysis.stats.intervals import Estimate
+from analysis.stats.likeness import NO_ACTION, difference, gains, mean_gain
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import intermittency_notes, sample_notes
 

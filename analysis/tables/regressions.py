@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from functools import cache
 
-from analysis.indicators import GAP_MARGIN_M, LARGEST_VELOCITY_MPS, equivalence_p
-from analysis.measures import outcomes_note
-from analysis.mixed import gap_mixed, who_first_mixed
-from analysis.published import citation, published
-from analysis.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
-from analysis.study import Group, Study
+from analysis.data.reference_data import citation, published
+from analysis.data.study import Group, Study
+from analysis.stats.group_scores import fits
+from analysis.stats.indicators import GAP_MARGIN_M, LARGEST_VELOCITY_MPS, equivalence_p
+from analysis.stats.measures import outcomes_note
+from analysis.stats.mixed import gap_mixed, who_first_mixed
+from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
-from analysis.verdicts import fits
 
 TERM_NAMES = {
     "intercept": "Intercept",

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator
 
 import pandas as pd
 
-from analysis.intervals import proportion
-from analysis.load import SIZES, load_each
-from analysis.robustness import BOXES, READINGS, UNDECIDED, outcomes
-from analysis.study import Group, Study, of_group
+from analysis.data.collision_rules import BOXES, READINGS, UNDECIDED, outcomes
+from analysis.data.load import SIZES, load_each
+from analysis.data.study import Group, Study, of_group
+from analysis.stats.intervals import proportion
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
 

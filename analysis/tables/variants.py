@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from analysis.intervals import POWER
-from analysis.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
-from analysis.study import Group, Study
-from analysis.tables.contrasts import shared_notes
-from analysis.tables.model import Column, Kind, Row, Table, Value
-from analysis.tables.notes import sample_notes
-from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER, problems, published_gap
-from analysis.variants import (
+from analysis.data.study import Group, Study
+from analysis.stats.group_scores import fits
+from analysis.stats.intervals import POWER
+from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
+from analysis.stats.variants import (
     Corrected,
     Differences,
     corrected_differences,
@@ -22,7 +19,10 @@ from analysis.variants import (
     variants,
     who_first_differences,
 )
-from analysis.verdicts import fits
+from analysis.tables.contrasts import shared_notes
+from analysis.tables.model import Column, Kind, Row, Table, Value
+from analysis.tables.notes import sample_notes
+from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER, problems, published_gap
 
 FAMILY_NOTE = (
     "difference: variant minus its driver's baseline; Holm, BH: corrected over the variants of a "

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from analysis.intervals import mean, proportion
-from analysis.measures import JOINT, RMSE, published_human
-from analysis.study import Group, Study, of_group
+from analysis.data.study import Group, Study, of_group
+from analysis.stats.intervals import mean, proportion
+from analysis.stats.measures import JOINT, RMSE, published_human
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import sample_notes
 

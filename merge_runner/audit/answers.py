@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.llm.formats.base import Reading, WireFormat
-from merge_runner.llm.verdicts import RawReply, judge
+from merge_runner.llm.http_outcome import RawReply, judge
 from merge_runner.records import ANSWERED_FIELD, says_scripted
-from merge_runner.rows import Row
+from merge_runner.results.rows import Row
 
 ANSWERS = ("ok", "refusal", "truncated", "empty")
 # A row of ``calls`` as it is read here; ``READ`` of it is what its reply tells.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from merge_runner.simulator.track import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
+from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
 
 IN_CONTROL_M = TUNNEL_EXIT_M - 1e-9
 

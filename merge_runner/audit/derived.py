@@ -19,25 +19,14 @@ import duckdb
 from merge_runner.audit.answers import COLUMNS, Answer, answers_another, read_answer
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Finding
-from merge_runner.compared import (
-    LONG,
-    PLACES,
-    Difference,
-    Spans,
-    Stored,
-    TrialKey,
-    in_batches,
-    rows_of_trials,
-    stored_rows,
-)
 from merge_runner.config import Scenario
 from merge_runner.drivers.base import Driver
-from merge_runner.drivers.llm_driver import LlmDriver
-from merge_runner.drivers.programs import PROGRAMS
+from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import WireFormat
-from merge_runner.plan import SPEC_VERSION
+from merge_runner.llm.keys import SPEC_VERSION
 from merge_runner.prompts.blocks import VARIANTS, block_digests
 from merge_runner.records import (
     SIDES,
@@ -50,8 +39,19 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
-from merge_runner.rows import decision_rows, state_rows, trial_row
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.results.comparison import (
+    LONG,
+    PLACES,
+    Difference,
+    Spans,
+    Stored,
+    TrialKey,
+    in_batches,
+    rows_of_trials,
+    stored_rows,
+)
+from merge_runner.results.rows import decision_rows, state_rows, trial_row
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
 TOLERANCE = 1e-9

@@ -9,12 +9,12 @@ from typing import Any
 import duckdb
 
 from merge_runner.audit.findings import Audit, Finding
-from merge_runner.compared import Spans, TrialKey, in_batches, rows_of_trials
-from merge_runner.database import read_database, room_for_texts
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import ChatRequest, Slot
-from merge_runner.rows import call_row
+from merge_runner.results.comparison import Spans, TrialKey, in_batches, rows_of_trials
+from merge_runner.results.database import read_database, room_for_texts
+from merge_runner.results.rows import call_row
 
 TRIALS = """
 SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = coalesce(?, sweep_id)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import duckdb
 
-from merge_runner.database import streamed
+from merge_runner.results.database import streamed
 
 # Earlier emulators gave every reply the same id: those of a stand-in tell nothing. The present
 # ones give each reply its own, and are audited like any provider.

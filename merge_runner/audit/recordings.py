@@ -18,9 +18,9 @@ from merge_runner.audit.ids import CONSTANT_IDS, identified, repetition_note
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import Entry
 from merge_runner.llm.keys import canonical_json, without_prompt
-from merge_runner.recording import read_recording, summarise
 from merge_runner.records import SIDES, Side, Slot
-from merge_runner.served import others_among
+from merge_runner.results.recording import read_recording, summarise
+from merge_runner.served_model import others_among
 
 NO_CONFIG = "it does not say of what sweep it is: trials are not compared"
 # An endpoint, a model, and an id that it gave a reply.

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import duckdb
 
 from merge_runner.audit.findings import Finding, Sharing
-from merge_runner.database import streamed
+from merge_runner.results.database import streamed
 
 SHOWN = 3
 

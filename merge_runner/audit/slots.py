@@ -10,7 +10,7 @@ import duckdb
 
 from merge_runner.audit.expected import Cell, Spec, SweepConfig
 from merge_runner.audit.findings import Finding
-from merge_runner.plan import spec_hash
+from merge_runner.llm.keys import spec_hash
 
 TRIALS = """
 SELECT trial_id, spec_hash, links, status, error, variant, condition, rep, sample_set, model_left,

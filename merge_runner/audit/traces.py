@@ -10,8 +10,8 @@ import duckdb
 from merge_runner.audit.expected import Spec
 from merge_runner.audit.findings import Finding
 from merge_runner.config import Scenario
-from merge_runner.simulator.collision import collided
-from merge_runner.simulator.track import FORWARD, LATERAL, MERGE_POINT_M
+from merge_runner.scenarios.merge.collision import collided
+from merge_runner.scenarios.merge.geometry import FORWARD, LATERAL, MERGE_POINT_M
 
 TOLERANCE_M = 1e-6
 GAPS = "CREATE OR REPLACE TEMP TABLE gaps AS SELECT trial_id, spec_hash, gap_m FROM trial_metrics"

@@ -16,10 +16,10 @@ from datetime import UTC, datetime, timedelta
 from aiohttp import web
 
 from merge_runner.config import Format
+from merge_runner.emulator.driver import answer
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.emulator.scenarios import SCENARIOS
 from merge_runner.emulator.scenarios.base import Scene
-from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
 from merge_runner.errors import UsageError
 from merge_runner.records import (
@@ -30,7 +30,7 @@ from merge_runner.records import (
     SLOT_HEADER,
     Slot,
 )
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 HOST = "127.0.0.1"
 # The names by which a browser or a client may ask for it.

@@ -19,8 +19,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
-from merge_runner.llm.batches import BatchWriter, Operation
-from merge_runner.llm.disk import (
+from merge_runner.llm.cache_db import (
     FAILURES,
     FORMAT,
     TextDisk,
@@ -31,6 +30,7 @@ from merge_runner.llm.disk import (
 )
 from merge_runner.llm.keys import manner, without_prompt
 from merge_runner.llm.verify import DAMAGED, check_body, check_call
+from merge_runner.llm.write_batcher import BatchWriter, Operation
 from merge_runner.records import Attempt, ChatRequest, is_scripted
 
 ENTRY_VERSION = 1

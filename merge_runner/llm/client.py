@@ -27,6 +27,7 @@ from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.first_call import NOBODY_S, FirstCall, refusal, set_base_url, set_key
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import Reading
+from merge_runner.llm.http_outcome import RawReply, Verdict, is_web_page, judge, may_be_charged
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
 from merge_runner.llm.meter import Meter, Wait
@@ -38,9 +39,8 @@ from merge_runner.llm.retry import (
     backoff_s,
     call_with_retries,
 )
-from merge_runner.llm.sharing import Claiming, Purse, Turn, Turns
+from merge_runner.llm.shared_services import Claiming, Purse, Turn, Turns
 from merge_runner.llm.transport import Transport, TransportFailure
-from merge_runner.llm.verdicts import RawReply, Verdict, is_web_page, judge, may_be_charged
 from merge_runner.records import (
     SCRIPTED_HEADER,
     Attempt,
@@ -50,7 +50,7 @@ from merge_runner.records import (
     Usage,
     says_scripted,
 )
-from merge_runner.served import is_other_model
+from merge_runner.served_model import is_other_model
 
 EMPTY_RETRIES = 2
 CLAIM_POLL_S = 0.1

@@ -12,7 +12,7 @@ import json
 from merge_runner.config import PROVIDERS, ModelEntry
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import as_dict, as_text, is_answer
-from merge_runner.llm.verdicts import RawReply, Verdict, is_web_page
+from merge_runner.llm.http_outcome import RawReply, Verdict, is_web_page
 
 NOBODY_S = 5.0
 SEVERAL = 3

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ResponseCache, entries_of
-from merge_runner.llm.disk import open_read_only, usable
+from merge_runner.llm.cache_db import open_read_only, usable
 
 BATCH = 1_000
 

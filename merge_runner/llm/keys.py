@@ -1,8 +1,8 @@
-"""The content hash under which a reply is kept.
+"""The hashes under which a reply and the definition of a trial are known.
 
-The key covers the key version, the endpoint's identity, the path, the headers that change the
-meaning of a request, its exact body and the slot. All stand in one canonical JSON object, so no
-two of them can run into each other.
+The key of a reply covers the key version, the endpoint's identity, the path, the headers that
+change the meaning of a request, its exact body and the slot. All stand in one canonical JSON
+object, so no two of them can run into each other.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pydantic import JsonValue
 from merge_runner.records import ChatRequest, Slot
 
 KEY_VERSION = 1
+SPEC_VERSION = 2  # since then one valid array in a reply is enough
 _CANONICAL = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
 )
@@ -25,6 +26,11 @@ _CANONICAL = json.JSONEncoder(
 def canonical_json(value: object) -> str:
     """The one spelling of a JSON value: sorted keys, no spaces; NaN raises ValueError."""
     return _CANONICAL.encode(value)
+
+
+def spec_hash(text: str) -> str:
+    """The short hash of the canonical JSON that defines a trial."""
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def make_request(

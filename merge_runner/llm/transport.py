@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from merge_runner.errors import MergeRunnerError, ReplayMiss
-from merge_runner.llm.verdicts import Action, RawReply
+from merge_runner.llm.http_outcome import Action, RawReply
 from merge_runner.records import ChatRequest
 
 

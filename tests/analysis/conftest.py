@@ -7,13 +7,13 @@ import sys
 from dataclasses import replace
 
 import pytest
-from harness import CONFIGURING
-from studies import ANSWERS, Said, write_study, yielding
 
-from analysis.ceiling import ceiling
 from analysis.commands import main
-from analysis.study import Study
+from analysis.data.study import Study
+from analysis.stats.ceiling import ceiling
 from analysis.tables import make_tables
+from tests.analysis.studies import ANSWERS, Said, write_study, yielding
+from tests.harness import CONFIGURING
 
 CONFIG = {"models": {"o3": {"id": "o3", "aliases": ["o3-alias"]}}}
 # What went wrong at one decision of the first trials of A1; who drove it did not change.
@@ -57,8 +57,8 @@ def in_process(tmp_path, monkeypatch):
 @pytest.fixture
 def few_draws(monkeypatch):
     """For tests that look at no chance: never with the studies that others read."""
-    monkeypatch.setattr("analysis.ceiling.DATA_SETS", 20)
-    monkeypatch.setattr("analysis.contrasts.PERMUTATIONS", 99)
+    monkeypatch.setattr("analysis.stats.ceiling.DATA_SETS", 20)
+    monkeypatch.setattr("analysis.stats.contrasts.PERMUTATIONS", 99)
     yield
     ceiling.cache_clear()  # the published humans are the same for all studies
 

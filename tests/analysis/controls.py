@@ -1,6 +1,6 @@
 """Speeds whose control is known, and how far measures of I5 tell them apart.
 
-``python tests/analysis/controls.py`` prints the tables of docs/analysis.md.
+``python -m tests.analysis.controls`` prints the tables of docs/analysis.md.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 from scipy import stats
 
-from analysis.intermittency import SAMPLE_S, at_5_hz, gains, without_resistance
+from analysis.data.intermittency import SAMPLE_S, at_5_hz, gains, without_resistance
 
 SECONDS = 10
 PROFILES = 200

@@ -13,21 +13,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-if __name__ == "__main__":  # else pytest has set them
-    tests = Path(__file__).resolve().parents[1]
-    sys.path[:0] = [str(tests.parent), str(tests), str(tests / "analysis")]
-
-from recordings import drive, write_folder
-from studies import Said, write_study, yielding
-
 from analysis.explorer.export import export_folder
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
-from analysis.report import write_report
+from analysis.report.writer import write_report
 from merge_runner.config import Scenario
-from merge_runner.database import open_database
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.store import Store
+from merge_runner.results.database import open_database
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.recordings import drive, write_folder
+from tests.analysis.studies import Said, write_study, yielding
 
 OWN = {"endpoint": "openai", "body": {"model": "o3", "messages": [], "reasoning_effort": "medium"}}
 IMPORTED = 129

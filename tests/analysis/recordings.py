@@ -13,9 +13,9 @@ from scipy.io import savemat
 
 from analysis.human.archive import File
 from merge_runner.records import SIDES
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.simulator.track import place
-from merge_runner.simulator.vehicle import advance
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import place
+from merge_runner.scenarios.merge.vehicle import advance
 
 STEP_S = 0.05
 HEADER = (

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 import duckdb
 
-from analysis.study import Study
+from analysis.data.study import Study
 from merge_runner.config import Scenario
 from merge_runner.records import (
     SIDES,
@@ -27,9 +27,9 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.simulator.world import World
-from merge_runner.store import Store, SweepRow
+from merge_runner.results.store import Store, SweepRow
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
 
 SCENARIO = Scenario()
 ANSWERS = ("ok", "refusal", "truncated", "empty")

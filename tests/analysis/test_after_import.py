@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import pytest
-from recordings import drive, write_folder
-from studies import write_study, yielding
 
-from analysis.ceiling import published_humans
-from analysis.conclusions import not_shown
+from analysis.data.intermittency import measure_profiles
+from analysis.data.load import SPEEDS
+from analysis.data.provenance import provenance
+from analysis.data.study import Study
 from analysis.explain import explain
-from analysis.explorer.numbers import human_panels
-from analysis.figures import figure_2
+from analysis.explorer.analysis_worker import human_panels
+from analysis.figures.gallery import figure_2
+from analysis.figures.variant_figure import figure_2_variants
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
-from analysis.indicators import Verdict
-from analysis.intermittency import measure_profiles
-from analysis.intervals import mean
-from analysis.likeness import MARGIN_SD, gains
-from analysis.load import SPEEDS
-from analysis.provenance import provenance
-from analysis.study import Study
+from analysis.report.conclusions import not_shown
+from analysis.stats.ceiling import published_humans
+from analysis.stats.group_scores import population, score
+from analysis.stats.indicators import Verdict
+from analysis.stats.intervals import mean
+from analysis.stats.likeness import MARGIN_SD, gains
 from analysis.tables import make_tables
-from analysis.variant_figure import figure_2_variants
-from analysis.verdicts import population, score
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.store import Store
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.recordings import drive, write_folder
+from tests.analysis.studies import write_study, yielding
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 

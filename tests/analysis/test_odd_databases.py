@@ -6,11 +6,11 @@ import html
 import re
 
 import pytest
-from odd_databases import KINDS, made
 
-from analysis.page import report_html
-from analysis.study import Study
+from analysis.data.study import Study
+from analysis.report.page import report_html
 from analysis.tables import make_tables
+from tests.analysis.odd_databases import KINDS, made
 
 # What the report of a kind says, and what it must not say.
 SAID = {

@@ -6,11 +6,11 @@ import sys
 from importlib.machinery import SourceFileLoader
 
 import pytest
-from harness import PROJECT
 
-from merge_runner.drivers.programs import PROGRAMS, source_digest
+from merge_runner.drivers.registry import PROGRAMS, source_digest
 from merge_runner.errors import UsageError
-from merge_runner.plan import Choice, make_plan
+from merge_runner.run.plan import Choice, make_plan
+from tests.harness import PROJECT
 
 PACKAGE = {
     "__init__.py": "",
@@ -90,7 +90,7 @@ def test_programs_have_a_source_of_their_own_and_share_what_both_rest_on(monkeyp
 def test_the_trials_of_an_edited_program_are_other_trials(monkeypatch, model):
     plan = make_plan(Choice("baseline", model))
     before = {spec.spec_hash for spec in plan.trial_specs({"emulator": "emulator"})}
-    monkeypatch.setattr("merge_runner.drivers.programs.source_digest", lambda _: "edited")
+    monkeypatch.setattr("merge_runner.drivers.registry.source_digest", lambda _: "edited")
     assert not before & {spec.spec_hash for spec in plan.trial_specs({"emulator": "emulator"})}
 
 

@@ -5,8 +5,8 @@ import pytest
 from merge_runner.config import Scenario
 from merge_runner.emulator.server import serve
 from merge_runner.prompts.render import render_prompt
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.simulator.world import World
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
 
 
 @pytest.fixture

@@ -5,11 +5,11 @@ import re
 from collections import Counter
 
 import pytest
-from harness import PROJECT
 
 from merge_runner.emulator.faults import FAULTS, TRANSIENT, FaultPlan, load_faults, transient_faults
 from merge_runner.emulator.scenarios import SCENARIOS
 from merge_runner.errors import UsageError
+from tests.harness import PROJECT
 
 DRAWS = 5000
 

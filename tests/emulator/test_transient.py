@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from harness import watched
 
 from merge_runner.emulator.faults import TRANSIENT, FaultPlan
-from merge_runner.store import results_digest
+from merge_runner.results.store import results_digest
+from tests.harness import watched
 
 pytestmark = pytest.mark.slow
 

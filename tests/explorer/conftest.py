@@ -7,12 +7,12 @@ import shutil
 
 import duckdb
 import pytest
-from harness import RECORDING
-from hostile import hostile_trial
-from serving import served
-from studies import Drive, Said, played
 
-from merge_runner.store import Store
+from merge_runner.results.store import Store
+from tests.analysis.studies import Drive, Said, played
+from tests.explorer.hostile import hostile_trial
+from tests.explorer.serving import served
+from tests.harness import RECORDING
 
 HERE = ("http://127.0.0.1:", "file:", "data:", "blob:")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

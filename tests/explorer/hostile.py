@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
-from studies import Drive, Said, played
+from tests.analysis.studies import Drive, Said, played
 
 # What a model may write; none of it may run, hide, or turn the page around.
 HOSTILE = (

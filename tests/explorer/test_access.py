@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from axe import serious
+
+from tests.explorer.axe import serious
 
 PAGES = (
     "/sweeps",

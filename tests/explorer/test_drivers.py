@@ -9,7 +9,6 @@ from urllib.parse import parse_qs, urlsplit
 
 import duckdb
 import pytest
-from harness import FAST
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
@@ -20,6 +19,7 @@ from analysis.explorer.pages.trial import trial_page
 from analysis.explorer.pages.trials import filter_of, trials_page
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import list_sweeps
+from tests.harness import FAST
 
 SMALL = ("--reps", 1, "--conditions", "L_4_0,N_0_0", "--yes", *FAST)
 

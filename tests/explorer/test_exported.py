@@ -11,11 +11,11 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from axe import serious
 from playwright.sync_api import expect
 
 from analysis.explorer.export import export_folder, export_page
 from merge_runner.errors import UsageError
+from tests.explorer.axe import serious
 
 
 @pytest.fixture(scope="session")

@@ -6,10 +6,11 @@ import subprocess
 import time
 
 import pytest
-from axe import serious
-from harness import PROGRAM, environment
 from playwright.sync_api import expect
-from serving import served
+
+from tests.explorer.axe import serious
+from tests.explorer.serving import served
+from tests.harness import PROGRAM, environment
 
 
 def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, emulator_url):

@@ -6,23 +6,23 @@ import re
 from html import unescape
 
 import pytest
-from recordings import drive, write_folder
 from starlette.testclient import TestClient
-from studies import Drive, write_study, yielding
-from test_tables_pages import InProcess
 
+from analysis.data.study import Study
+from analysis.explorer.analysis_process import Computing
+from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
-from analysis.explorer.computing import Computing
-from analysis.explorer.numbers import Numbers
 from analysis.explorer.pages.humans import KINDS, chart
 from analysis.explorer.site import Site
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
-from analysis.study import Study
 from analysis.tables.notes import sample_notes
 from merge_runner.config import Scenario
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.store import Store
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.recordings import drive, write_folder
+from tests.analysis.studies import Drive, write_study, yielding
+from tests.explorer.test_tables_pages import InProcess
 
 HOST = "127.0.0.1:8700"
 # A sweep that was killed: two trials of one condition that have nothing in common.

@@ -7,10 +7,7 @@ import re
 import duckdb
 import pytest
 from playwright.sync_api import expect
-from recordings import drive, write_folder
-from serving import served
 from starlette.testclient import TestClient
-from studies import Drive, write_study
 
 from analysis.explorer.app import explorer
 from analysis.explorer.details import read_trial
@@ -19,8 +16,11 @@ from analysis.explorer.views import collision_bounds
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
 from merge_runner.config import Scenario
-from merge_runner.simulator.collision import collided
-from merge_runner.store import Store
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.collision import collided
+from tests.analysis.recordings import drive, write_folder
+from tests.analysis.studies import Drive, write_study
+from tests.explorer.serving import served
 
 HOST = "127.0.0.1:8700"
 # Both keep their speed and meet at the merge point.

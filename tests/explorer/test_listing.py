@@ -8,13 +8,13 @@ from html.parser import HTMLParser
 import duckdb
 import pytest
 from starlette.testclient import TestClient
-from studies import Drive, write_study, yielding
 
 from analysis.explorer.app import explorer
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.export import export_folder
 from analysis.explorer.site import Site
 from analysis.explorer.views import sparkline, speed_scale
+from tests.analysis.studies import Drive, write_study, yielding
 
 HOST = "127.0.0.1:8700"
 HIDDEN = "o3\u202egpj\u200b"

@@ -12,8 +12,8 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
+from analysis.explorer.analysis_process import Child, Computing, Result
 from analysis.explorer.app import explorer
-from analysis.explorer.computing import Child, Computing, Result
 from analysis.explorer.site import Site
 
 HOST = "127.0.0.1:8700"

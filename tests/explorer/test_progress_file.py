@@ -9,11 +9,11 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from merge_runner.plan import Choice, make_plan
-from merge_runner.players import Players
-from merge_runner.progress import Progress
-from merge_runner.progress_file import ProgressFile, clear_dead, read_standing
-from merge_runner.sweep import Options, Sweep
+from merge_runner.results.progress_file import ProgressFile, clear_dead, read_standing
+from merge_runner.run.local_runner import Players
+from merge_runner.run.plan import Choice, make_plan
+from merge_runner.run.progress import Progress
+from merge_runner.run.sweep import Options, Sweep
 
 NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
 SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm", 100)

@@ -9,11 +9,11 @@ import threading
 import duckdb
 import pytest
 from starlette.testclient import TestClient
-from studies import write_study, yielding
 
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
-from merge_runner.database import SCHEMA_VERSION
+from merge_runner.results.database import SCHEMA_VERSION
+from tests.analysis.studies import write_study, yielding
 
 HOST = "127.0.0.1:8700"
 TRIAL = "/trials/o3/baseline/N_0_0/rep01"

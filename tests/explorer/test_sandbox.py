@@ -13,14 +13,15 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from studies import write_study, yielding
 
-from analysis.explorer import child, sandbox
-from analysis.explorer.child import Query
-from analysis.explorer.sandbox import Caps, NoAnswer, Sandbox
-from merge_runner.database import open_database
+from analysis.explorer import query_process as sandbox
+from analysis.explorer import query_worker as child
+from analysis.explorer.query_process import Caps, NoAnswer, Sandbox
+from analysis.explorer.query_worker import Query
 from merge_runner.errors import UsageError
-from merge_runner.places import PROJECT
+from merge_runner.paths import PROJECT
+from merge_runner.results.database import open_database
+from tests.analysis.studies import write_study, yielding
 
 PROC = Path("/proc")
 LOADED_S = 60  # what a process may wait for its turn on a machine that does much else
@@ -217,7 +218,7 @@ def recorded(monkeypatch, name):
         made.append(original(*arguments, **options))
         return made[-1]
 
-    monkeypatch.setattr(f"analysis.explorer.sandbox.{name}", make)
+    monkeypatch.setattr(f"analysis.explorer.query_process.{name}", make)
     return made
 
 

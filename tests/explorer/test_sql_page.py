@@ -11,16 +11,16 @@ from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
-from harness import PROJECT
 from starlette.testclient import TestClient
-from studies import write_study, yielding
 
 from analysis.explorer.app import explorer
 from analysis.explorer.examples import EXAMPLES
-from analysis.explorer.sandbox import Caps, NoAnswer, Result
+from analysis.explorer.query_process import Caps, NoAnswer, Result
 from analysis.explorer.schema import tables
 from analysis.explorer.site import Site
-from merge_runner.store import query
+from merge_runner.results.store import query
+from tests.analysis.studies import write_study, yielding
+from tests.harness import PROJECT
 
 HOST = "127.0.0.1:8700"
 FIRST = next(iter(EXAMPLES.values()))

@@ -13,7 +13,6 @@ from urllib.parse import parse_qs, urlsplit
 import duckdb
 import pytest
 from starlette.testclient import TestClient
-from studies import Said, write_study, yielding
 
 from analysis.explorer.app import explorer
 from analysis.explorer.pages import sweep as page
@@ -21,10 +20,11 @@ from analysis.explorer.pages.trials import filter_of
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import Config, Entry, config_of, verdict_of
 from merge_runner.audit.expected import ModelFacts
-from merge_runner.progress import Progress
-from merge_runner.progress_file import ProgressFile
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.store import Store, sweep_facts
+from merge_runner.results.progress_file import ProgressFile
+from merge_runner.results.store import Store, sweep_facts
+from merge_runner.run.progress import Progress
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.studies import Said, write_study, yielding
 
 URL = "/sweeps/sweep-1"
 CONFIG = {

@@ -12,21 +12,29 @@ from urllib.parse import parse_qs, urlsplit
 import duckdb
 import pytest
 from starlette.testclient import TestClient
-from studies import Said, write_study, yielding
 
+from analysis.data.study import Study
 from analysis.explain import explain
+from analysis.explorer.analysis_process import (
+    Child,
+    Computing,
+    Ended,
+    Failed,
+    Failure,
+    Result,
+    Waiting,
+)
+from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
-from analysis.explorer.computing import Child, Computing, Ended, Failed, Failure, Result, Waiting
-from analysis.explorer.numbers import Numbers
 from analysis.explorer.pages.ablations import ablations
 from analysis.explorer.pages.humans import KINDS, scale
 from analysis.explorer.pages.tables import ABOUT
 from analysis.explorer.site import Site
-from analysis.measures import MEASURES
-from analysis.study import Study
+from analysis.stats.measures import MEASURES
 from analysis.tables import TABLES, make_tables
 from merge_runner.errors import MergeRunnerError
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.studies import Said, write_study, yielding
 
 HERE = "127.0.0.1:8700"
 HOSTILE = '<img src=x onerror="alert(1)">'

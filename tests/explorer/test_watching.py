@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 
 import pytest
-from hostile import HOSTILE
 from playwright.sync_api import expect
+
+from tests.explorer.hostile import HOSTILE
 
 TRIAL = "/trials/emulator/baseline/N_0_0/rep01"
 COLLIDED = "/trials/emulator/baseline/N_0_0/rep03"

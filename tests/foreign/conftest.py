@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from harness import FAST
+
+from tests.harness import FAST
 
 PROVIDERS = {
     "openai-chat": "openai",

@@ -11,9 +11,9 @@ import urllib.request
 from collections import Counter
 
 import pytest
-from harness import environment, watched
 
 from merge_runner.emulator.faults import FaultPlan
+from tests.harness import environment, watched
 
 LITELLM = shutil.which("litellm")
 BROKEN = ("rate_limit", "server_error", "overloaded", "reset", "truncated_body")

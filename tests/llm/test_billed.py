@@ -17,14 +17,6 @@ from pathlib import Path
 
 import pytest
 from aiohttp import web
-from test_scenarios import (  # noqa: F401 # fixtures
-    GEMINI,
-    MODELS,
-    OPENAI,
-    _idle_connections_grow_old_in_virtual_time,
-    _no_settings_of_the_user,
-)
-from virtual_time import in_virtual_time
 
 from merge_runner.config import Endpoint, ModelEntry, Price
 from merge_runner.emulator.faults import FaultPlan
@@ -41,6 +33,14 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import pricing
 from merge_runner.records import Slot, Usage
+from tests.llm.test_scenarios import (  # noqa: F401 # fixtures
+    GEMINI,
+    MODELS,
+    OPENAI,
+    _idle_connections_grow_old_in_virtual_time,
+    _no_settings_of_the_user,
+)
+from tests.virtual_time import in_virtual_time
 
 PRICE = Price(input=2, output=8, source="test")
 OUTPUT_CAP, LONG = 16_000, 15_000

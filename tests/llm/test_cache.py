@@ -460,7 +460,7 @@ def test_what_is_damaged_again_lies_beside_what_was_before(cache, folder):
 
 
 def test_a_row_of_many_megabytes_is_not_read_and_blocks_nothing(folder, monkeypatch):
-    monkeypatch.setattr("merge_runner.llm.disk.LONGEST", 2**20)
+    monkeypatch.setattr("merge_runner.llm.cache_db.LONGEST", 2**20)
     cache = ResponseCache(folder)
     key = entry(1).request.key
     cache.put_now([entry(1), entry(2)])

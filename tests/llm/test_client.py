@@ -5,7 +5,6 @@ from collections import Counter
 
 import diskcache
 import pytest
-from virtual_time import in_virtual_time, now_s
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import (
@@ -19,12 +18,13 @@ from merge_runner.errors import (
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.http_outcome import RawReply
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.transport import SealedTransport, TransportFailure
-from merge_runner.llm.verdicts import RawReply
 from merge_runner.records import Slot
+from tests.virtual_time import in_virtual_time, now_s
 
 
 class Server:

@@ -5,7 +5,12 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from test_client import (  # noqa: F401 # fixtures
+
+from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.first_call import FirstCall
+from merge_runner.llm.transport import TransportFailure
+from tests.llm.test_client import (  # noqa: F401 # fixtures
     PRICE,
     Server,
     answer,
@@ -15,12 +20,7 @@ from test_client import (  # noqa: F401 # fixtures
     slot,
     ticks,
 )
-from virtual_time import in_virtual_time, now_s
-
-from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
-from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.first_call import FirstCall
-from merge_runner.llm.transport import TransportFailure
+from tests.virtual_time import in_virtual_time, now_s
 
 WEB_PAGE = raw("\n<!DOCTYPE html><html>Welcome</html>")
 REFUSED = TransportFailure("no_connection", "refused", sent=False)

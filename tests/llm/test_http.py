@@ -12,8 +12,8 @@ import pytest
 from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry, Scenario, resolve_endpoint
+from merge_runner.emulator.driver import answer
 from merge_runner.emulator.faults import FaultPlan, transient_faults
-from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.server import serve
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
@@ -26,8 +26,8 @@ from merge_runner.llm.transport import TransportFailure
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Slot
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.simulator.world import World
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
 
 SLOT = Slot("N_0_0", 1, "left", 0, 0)
 KEY = "sk-dummy-0123456789"

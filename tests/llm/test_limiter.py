@@ -7,10 +7,10 @@ import pytest
 from asyncio_throttle import throttler
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from virtual_time import in_virtual_time, now_s
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.limiter import Limiter, Pause
+from tests.virtual_time import in_virtual_time, now_s
 
 MINUTE = 60.0
 

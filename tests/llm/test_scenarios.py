@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import aiohttp
 import pytest
-from virtual_time import in_virtual_time, now_s
 
 from merge_runner.config import Endpoint, ModelEntry
+from merge_runner.emulator.driver import answer
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.emulator.scenarios import SCENARIOS
-from merge_runner.emulator.scripted import answer
 from merge_runner.emulator.server import serve
 from merge_runner.errors import CallFailed, EndpointRefused, QuotaExhausted
 from merge_runner.llm.cache import ResponseCache
@@ -26,6 +25,7 @@ from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.retry import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
 from merge_runner.records import Slot
+from tests.virtual_time import in_virtual_time, now_s
 
 CHAT, RESPONSES, GEMINI, ANTHROPIC = "openai-chat", "openai-responses", "gemini", "anthropic"
 OPENAI = (CHAT, RESPONSES)

@@ -9,12 +9,12 @@ import sys
 import time
 
 import pytest
-from test_limiter import MINUTE, Queue, fullest_window, on_a_clock
-from virtual_time import now_s
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.shared_limits import SharedLimits, limits_file
+from tests.llm.test_limiter import MINUTE, Queue, fullest_window, on_a_clock
+from tests.virtual_time import now_s
 
 KEY = {"authorization": "Bearer sk-a-secret-key"}
 

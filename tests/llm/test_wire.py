@@ -10,12 +10,12 @@ import threading
 import time
 
 import pytest
-from raw_server import a_request, head, ok, raw_server
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.transport import TransportFailure
+from tests.llm.raw_server import a_request, head, ok, raw_server
 
 
 @contextlib.asynccontextmanager

@@ -16,8 +16,8 @@ from merge_runner.config import Scenario
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, block_digests
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import SIDES, Observation
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.simulator.world import World
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "prompts"
 UPDATE = os.environ.get("UPDATE_GOLDEN_PROMPTS") == "1"

@@ -10,11 +10,11 @@ import signal
 import sqlite3
 
 import pytest
-from harness import watched
 
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.records import SLOT_HEADER
-from merge_runner.store import results_digest
+from merge_runner.results.store import results_digest
+from tests.harness import watched
 
 SWEEP = ("sweep", "baseline", "--reps", 2, "--in-flight", 8, "--json")
 KILLS = 20

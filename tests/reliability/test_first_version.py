@@ -9,11 +9,11 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from harness import PROJECT
 
-from merge_runner.database import SCHEMA_VERSION
-from merge_runner.llm.disk import FORMAT
-from merge_runner.store import Store
+from merge_runner.llm.cache_db import FORMAT
+from merge_runner.results.database import SCHEMA_VERSION
+from merge_runner.results.store import Store
+from tests.harness import PROJECT
 
 ARCHIVE = PROJECT / "tests/data/first-version.tar.gz"
 # As the first version printed it.

@@ -9,13 +9,13 @@ import subprocess
 
 import duckdb
 import pytest
-from harness import PROGRAM
-from studies import write_study, yielding
 
 from merge_runner.audit import audit_database
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.recording import export_recording
+from merge_runner.results.recording import export_recording
+from tests.analysis.studies import write_study, yielding
+from tests.harness import PROGRAM
 
 
 @pytest.fixture

@@ -10,12 +10,12 @@ from dataclasses import replace
 from itertools import islice
 
 import pytest
-from harness import RECORDING
 from typer.testing import CliRunner
 
 from benchmarks.recorder import longer
 from merge_runner.cli import app
-from merge_runner.database import (
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.results.database import (
     BYTES_OF_A_CALL,
     MERGED_BYTES,
     SETTINGS,
@@ -24,8 +24,8 @@ from merge_runner.database import (
     merge_small_groups,
     room_for_texts,
 )
-from merge_runner.llm.cache import ResponseCache
-from merge_runner.recording import export_recording, read_recording
+from merge_runner.results.recording import export_recording, read_recording
+from tests.harness import RECORDING
 
 SIZE, REPS = 20_480, 5
 REPLAY = ("replay", "baseline", "--reps", REPS, "--cache", "cache", "--json")
@@ -110,7 +110,7 @@ def test_a_recording_of_any_size_is_exported_in_the_same_order_and_with_the_same
     cache.put_now(entries)
     contents = []
     for part_bytes in (2**25, 10_000):
-        monkeypatch.setattr("merge_runner.recording.PART_BYTES", part_bytes)
+        monkeypatch.setattr("merge_runner.results.recording.PART_BYTES", part_bytes)
         file = tmp_path / f"{part_bytes}.parquet"
         export_recording(file, cache, [e.request.key for e in entries[::-1]], {})
         contents.append(list(read_recording(file)))

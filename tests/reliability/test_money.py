@@ -9,7 +9,8 @@ import shutil
 
 import pytest
 from aiohttp import web
-from harness import FAST, PROJECT, as_a_model, watched
+
+from tests.harness import FAST, PROJECT, as_a_model, watched
 
 pytestmark = pytest.mark.slow
 

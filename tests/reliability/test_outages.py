@@ -9,10 +9,10 @@ from unittest.mock import ANY
 
 import pytest
 from aiohttp import web
-from harness import FAST, watched
-from llm.test_limiter import fullest_window
 
 from merge_runner.records import SLOT_HEADER
+from tests.harness import FAST, watched
+from tests.llm.test_limiter import fullest_window
 
 pytestmark = pytest.mark.slow
 

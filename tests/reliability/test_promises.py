@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 
-from harness import PROJECT
+from tests.harness import PROJECT
 
 
 def test_every_promise_has_its_test():

@@ -9,10 +9,10 @@ import sqlite3
 import sys
 
 import pytest
-from harness import watched
 
-from merge_runner.plan import Choice, make_plan
-from merge_runner.store import results_digest
+from merge_runner.results.store import results_digest
+from merge_runner.run.plan import Choice, make_plan
+from tests.harness import watched
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
 LOCK = """

@@ -8,11 +8,10 @@ import os
 import signal
 import sys
 
-from harness import watched
-
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.llm.claims import Claims
-from merge_runner.store import results_digest
+from merge_runner.results.store import results_digest
+from tests.harness import watched
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
 TAKE = """

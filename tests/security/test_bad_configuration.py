@@ -10,7 +10,7 @@ from analysis.commands import main
 from merge_runner.config import PROVIDERS, ModelEntry, Scenario, SweepFile
 from merge_runner.emulator.faults import FAULTS, FaultPlan
 from merge_runner.prompts.blocks import VARIANTS
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 MODEL = {
     "provider": '"local"',

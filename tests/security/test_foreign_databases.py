@@ -5,9 +5,9 @@ from __future__ import annotations
 import duckdb
 import pytest
 
-from merge_runner.database import read_database
 from merge_runner.errors import UsageError
-from merge_runner.store import Store, query, results_digest
+from merge_runner.results.database import read_database
+from merge_runner.results.store import Store, query, results_digest
 
 SECRET = "what nobody else may read"
 PART = ("baseline", "--reps", 1, "--conditions", "N_0_0")

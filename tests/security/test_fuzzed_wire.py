@@ -8,14 +8,14 @@ import math
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from raw_server import CHAT, a_request, raw_server
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.delays import MOST_S, server_delay_s
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
+from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
 from merge_runner.llm.transport import TransportFailure
-from merge_runner.llm.verdicts import RawReply, judge, may_be_charged
+from tests.llm.raw_server import CHAT, a_request, raw_server
 
 DELAYS = (
     *("retry-after", "retry-after-ms", "x-should-retry", "x-ratelimit-remaining-requests"),

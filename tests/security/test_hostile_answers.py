@@ -7,11 +7,11 @@ import json
 from types import SimpleNamespace
 
 from aiohttp import web
-from harness import watched
 from rich.console import Console
 
 from merge_runner.llm.meter import Meter, Wait
-from merge_runner.progress import Progress, _table
+from merge_runner.run.progress import Progress, _table
+from tests.harness import watched
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202e"
 ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0")

@@ -12,13 +12,13 @@ import zlib
 from contextlib import suppress
 
 import pytest
-from harness import Run, environment
-from recordings import drive, write_folder, write_zip
 
 from analysis.human.archive import Unreadable, open_files
 from analysis.human.mat import MAX_BYTES, read_mat
 from merge_runner.errors import UsageError
-from merge_runner.store import query
+from merge_runner.results.store import query
+from tests.analysis.recordings import drive, write_folder, write_zip
+from tests.harness import Run, environment
 
 GOOD = {"a/experiment_4_iter_1.csv": drive("L_4_0").csv()}
 TRIAL = "experiment_9_iter_9"

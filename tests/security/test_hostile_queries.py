@@ -10,7 +10,7 @@ import duckdb
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.store import Store, query
+from merge_runner.results.store import Store, query
 
 DB = Path("results/merge.duckdb")
 
@@ -188,7 +188,7 @@ def test_what_is_more_than_one_query_of_the_database_is_refused_and_changes_noth
 
 def test_each_setting_alone_holds_where_a_statement_slips_through(here, monkeypatch):
     """As if the check of statements let everything pass."""
-    monkeypatch.setattr("merge_runner.store._reads", lambda statement: True)
+    monkeypatch.setattr("merge_runner.results.store._reads", lambda statement: True)
     before = contents(here)
     harmless = {
         *("USE memory", "SET VARIABLE x = 1", "CHECKPOINT", "VACUUM", "BEGIN TRANSACTION"),

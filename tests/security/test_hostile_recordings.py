@@ -17,8 +17,8 @@ import pytest
 from merge_runner.errors import MergeRunnerError, RecordingError
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.keys import call_key, make_request
-from merge_runner.recording import COLUMNS, export_recording, import_recording, summarise
 from merge_runner.records import Attempt, Slot
+from merge_runner.results.recording import COLUMNS, export_recording, import_recording, summarise
 
 CALLS = 3
 ANSWER = json.dumps({"choices": [{"message": {"content": "M\n[0.1]"}}]})
@@ -188,7 +188,7 @@ def test_a_reply_that_a_replay_or_a_table_cannot_take_is_refused(file, cache, ch
 
 
 def test_nothing_is_kept_of_a_file_whose_last_row_is_wrong(file, cache, monkeypatch):
-    monkeypatch.setattr("merge_runner.recording.BATCH", 1)
+    monkeypatch.setattr("merge_runner.results.recording.BATCH", 1)
     assert "is damaged" in refusal(
         rewritten(file, "UPDATE calls SET attempts = '' WHERE decision = 2"), cache
     )
@@ -302,7 +302,7 @@ PEAK_MB = """
 import sys
 from pathlib import Path
 from merge_runner.errors import RecordingError
-from merge_runner.recording import summarise
+from merge_runner.results.recording import summarise
 
 def peak():
     status = Path("/proc/self/status").read_text()

@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_runner.config import Scenario
-from merge_runner.emulator.scripted import answer
+from merge_runner.emulator.driver import answer
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Slot
-from merge_runner.simulator.conditions import CONDITIONS
-from merge_runner.simulator.world import World
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
 
 N = 20
 REPLIES = 100_000

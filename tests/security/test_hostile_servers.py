@@ -15,13 +15,13 @@ import zlib
 from base64 import b64encode
 
 import pytest
-from harness import FAST
-from raw_server import CHAT, a_request, head, ok, raw_server
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.bodies import MOST_LEVELS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.transport import TransportFailure
+from tests.harness import FAST
+from tests.llm.raw_server import CHAT, a_request, head, ok, raw_server
 
 KEY = "sk-dummy-Zx81/Qp55"
 ONE = ("baseline", "--reps", 1, "--conditions", "N_0_0", "--yes", *FAST)

@@ -9,9 +9,9 @@ from pathlib import Path
 import duckdb
 import pytest
 from aiohttp import web
-from harness import FAST, watched
 
-from analysis.report import write_report
+from analysis.report.writer import write_report
+from tests.harness import FAST, watched
 
 KEYS = {
     "OPENAI_API_KEY": "sk-dummy-Zx81Qp55-openai",
@@ -141,8 +141,8 @@ async def test_no_key_and_no_account_id_is_in_anything_that_a_sweep_leaves(
         runs.append(await merge_runner("recording", "info", "o3.parquet", **env))
     assert [run.code for run in runs] == [0] * len(runs), runs
     # What chance draws is of no interest here.
-    monkeypatch.setattr("analysis.ceiling.DATA_SETS", 20)
-    monkeypatch.setattr("analysis.contrasts.PERMUTATIONS", 99)
+    monkeypatch.setattr("analysis.stats.ceiling.DATA_SETS", 20)
+    monkeypatch.setattr("analysis.stats.contrasts.PERMUTATIONS", 99)
     results = tmp_path / "results"
     report = write_report(
         results / "merge.duckdb", None, results / "report.html", tmp_path / "files"

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
-from analysis.explorer.asked import seconds
-from analysis.explorer.computing import Request, Result, Waiting, about_s
-from analysis.explorer.links import query_of
+from analysis.explorer.analysis_process import Request, Result, Waiting, about_s
+from analysis.explorer.query_params import seconds
 from analysis.explorer.site import NotThere, Site
+from analysis.explorer.urls import query_of
 
 # What is kept in the database comes within the first; the second is for a page that shows a clock.
 AT_ONCE_S = 0.3

@@ -14,7 +14,7 @@ from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import Site
 from analysis.tables.formats import notes_of, shown_value
 from analysis.tables.model import Table, from_text
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 HUMAN = "human"
 # Okabe and Ito's colours that show on white, each with a shape; humans are black circles.

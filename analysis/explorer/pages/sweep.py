@@ -11,14 +11,14 @@ from datetime import UTC, datetime
 
 from markupsafe import escape
 
+from analysis.explorer.display_text import visible
 from analysis.explorer.site import NothingNew, NotThere, Site
 from analysis.explorer.sweeps import Cell, Sweep, duration, find_sweep, list_sweeps
-from analysis.explorer.texts import visible
 from analysis.explorer.views import condition_text, prompt_text
 from merge_runner.errors import MergeRunnerError
-from merge_runner.progress_file import read_standing
 from merge_runner.prompts.blocks import VARIANTS
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.results.progress_file import read_standing
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 LOOK_EVERY_S = 1.0
 READ_EVERY_S = 3.0

@@ -10,11 +10,11 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from analysis.explorer import views
-from analysis.explorer.asked import whole
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.details import Decision, Row, Trial, read_decisions, read_trial
+from analysis.explorer.display_text import shortened
+from analysis.explorer.query_params import whole
 from analysis.explorer.site import NotThere, Site
-from analysis.explorer.texts import shortened
 from merge_runner.records import SIDES
 
 # So many trials of a kind are offered to compare with.

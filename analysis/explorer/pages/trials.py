@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from analysis.explorer.asked import whole
 from analysis.explorer.catalogue import FACETS, PAGE, SORTS, Filter
 from analysis.explorer.pages.computed import computed
+from analysis.explorer.query_params import whole
 from analysis.explorer.site import NothingNew, NotThere, Site
 from analysis.explorer.views import sparkline, speed_scale
 from analysis.tables import TABLES

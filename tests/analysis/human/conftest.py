@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from harness import Run, environment
+
+from tests.harness import Run, environment
 
 
 @pytest.fixture

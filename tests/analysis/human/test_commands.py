@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from recordings import drive, write_folder, write_zip
 
-from merge_runner.store import query
+from merge_runner.results.store import query
+from tests.analysis.recordings import drive, write_folder, write_zip
 
 GOOD = {
     "data/experiment_4/experiment_4_iter_1.csv": drive("L_4_0").csv(),

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from recordings import Recording, drive, file
 
 from analysis.human import load
 from analysis.human.load import import_trials, sort_files
 from analysis.human.record import SPEC, SPEC_HASH, trial_record
 from analysis.human.trace import parse_csv
 from merge_runner.errors import UsageError
-from merge_runner.rows import state_rows, trial_row
-from merge_runner.store import Store, query, results_digest
+from merge_runner.results.rows import state_rows, trial_row
+from merge_runner.results.store import Store, query, results_digest
+from tests.analysis.recordings import Recording, drive, file
 
 LEFT, RIGHT = drive("L_4_0"), drive("R_-4_0", yields="left")
 

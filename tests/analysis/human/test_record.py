@@ -5,12 +5,12 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
-from recordings import drive
 
 from analysis.human.archive import Unreadable
 from analysis.human.record import SPEC_HASH, trial_record
 from analysis.human.trace import parse_csv
-from merge_runner.simulator.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.recordings import drive
 
 
 def record(recording, experiment=6, iteration=1):

@@ -8,11 +8,11 @@ import zlib
 from contextlib import suppress
 
 import pytest
-from recordings import Recording, drive
 
 from analysis.human.archive import Unreadable
 from analysis.human.mat import VERSION_5
 from analysis.human.trace import NEEDED, parse_csv, parse_mat
+from tests.analysis.recordings import Recording, drive
 
 FORMS = {
     "csv": (parse_csv, Recording.csv),

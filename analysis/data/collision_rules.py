@@ -1,0 +1,263 @@
+"""What the trials would have come to under the other readings of "collision".
+
+Up to a trial's end the rule changes nothing but the end, so the stored traces are judged again.
+Where a trial of drivers ended in a collision that another rule does not see, its stored plans are
+driven again, and the last ones go on as far as they reach; what is open then stays ``undecided``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby, pairwise
+from math import ceil, hypot, isclose
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import pandas as pd
+
+from analysis.data.load import SPECS, load_each
+from merge_runner.config import CollisionRule, Scenario
+from merge_runner.scenarios.merge.collision import collided, rectangles_overlap
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import FORWARD, LATERAL, MERGE_POINT_M
+from merge_runner.scenarios.merge.vehicle import advance
+from merge_runner.scenarios.merge.world import World
+
+# The readings of the paper's rule, looked for at every step of the simulation.
+RULES: tuple[CollisionRule, ...] = get_args(CollisionRule)
+# The rule of the human experiment: boxes that overlap, looked for so often.
+LOOKS_HZ = 20
+BOXES = f"rectangle at {LOOKS_HZ} Hz"
+READINGS = (*RULES, BOXES)
+UNDECIDED = "undecided"
+# Samples at or next to which a rule can see a collision: with centres closer in the plane than the
+# diagonal of a box and the way that they can come nearer within a step.
+NEAR = """
+SELECT trial_id, spec_hash,
+    list((step, time_s, left_m, left_mps, right_m, right_mps) ORDER BY step) AS near
+FROM (
+    SELECT *, left_m - {merge} AS left_past_m, right_m - {merge} AS right_past_m,
+        {lateral} * (least(left_past_m, 0) + least(right_past_m, 0)) AS across_m,
+        if(left_past_m < 0, {forward} * left_past_m, left_past_m)
+            - if(right_past_m < 0, {forward} * right_past_m, right_past_m) AS along_m,
+        {step_s} * (abs(left_mps - right_mps) + {lateral} * (left_mps + right_mps)) AS nearer_m
+    FROM vehicle_pairs
+) WHERE across_m ** 2 + along_m ** 2 < ({reach_m} + nearer_m) ** 2 GROUP BY ALL
+"""
+# Trials in which both drivers decided something; the others ended before that.
+DECIDED = """
+SELECT trial_id, spec_hash FROM decisions GROUP BY ALL HAVING count(DISTINCT side) = 2
+"""
+PLANS = (
+    "SELECT trial_id, spec_hash, side, list(applied ORDER BY decision) AS applied, "
+    "arg_max(coalesce(plan, []), decision) AS last_plan FROM decisions "
+    "SEMI JOIN (FROM trials WHERE status = 'collided') USING (trial_id, spec_hash) "
+    "GROUP BY ALL ORDER BY ALL"
+)
+Outcome = tuple[str, str | None]
+
+
+class Sample(NamedTuple):
+    """Both vehicles at one time: travelled distances in m, speeds in m/s."""
+
+    step: int
+    time_s: float
+    left_m: float
+    left_mps: float
+    right_m: float
+    right_mps: float
+
+
+def judged(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
+    """The trials with whether they collided, by two rules; NA where that stays undecided.
+
+    ``collided``: by the rule of their scenario, looked for at its steps; of humans by the paper's.
+    ``collided_boxes``: by the rule of the human experiment.
+    """
+    found = outcomes(db, trials, ["euclid2d", BOXES])
+    recorded = trials["status"].eq("collided").astype("boolean")
+    return trials.assign(
+        collided=recorded.mask(trials["status"] == "failed").mask(
+            trials["source"] == "human", _collided(trials, found, "euclid2d")
+        ),
+        collided_boxes=_collided(trials, found, BOXES),
+    )
+
+
+def _collided(trials: pd.DataFrame, found: pd.DataFrame, reading: str) -> pd.Series:
+    known = found[(found["rule"] == reading) & (found["status"] != UNDECIDED)]
+    known = known.set_index(["trial_id", "spec_hash"])["status"]
+    keys = pd.MultiIndex.from_frame(trials[["trial_id", "spec_hash"]])
+    values = known.eq("collided").astype("boolean").reindex(keys)
+    return values.set_axis(trials.index)
+
+
+def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS) -> pd.DataFrame:
+    """One row a trial that ended and a reading: trial_id, spec_hash, rule, status, merged_first.
+
+    ``status`` is finished, collided, timeout or undecided.
+    """
+    ended = trials[trials["status"] != "failed"]
+    specs = load_each({"specs": SPECS}, db)["specs"]
+    scenarios = _scenarios(ended["spec_hash"].unique(), specs)
+    found = load_each({"plans": PLANS, "near": _near(scenarios.values()), "decided": DECIDED}, db)
+    near = {
+        (row.trial_id, row.spec_hash): [Sample(*sample) for sample in row.near]
+        for row in found["near"].itertuples()
+    }
+    decided = set(found["decided"].itertuples(index=False, name=None))
+    plans: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in found["plans"].itertuples():
+        plans.setdefault((row.trial_id, row.spec_hash), {})[row.side] = row
+    rows = []
+    columns = ["trial_id", "spec_hash", "source", "condition", "status", "merged_first"]
+    for trial in ended[columns].itertuples(index=False):
+        key = (trial.trial_id, trial.spec_hash)
+        known = trial.source == "human" or key in decided
+        for reading in readings:
+            scenario = scenarios[trial.spec_hash, reading]
+            outcome: Outcome
+            if reading == BOXES and trial.source == "human":
+                outcome = trial.status, trial.merged_first  # it is the rule of the experiment
+            elif not known:
+                outcome = UNDECIDED, None
+            elif seen(scenario, near.get(key, ()), between=reading == BOXES):
+                outcome = "collided", None
+            elif trial.status != "collided":
+                outcome = trial.status, trial.merged_first
+            elif trial.source == "human":
+                outcome = UNDECIDED, None
+            else:
+                sides = [plans[key][side] for side in ("left", "right")]
+                outcome = redrive(
+                    scenario,
+                    trial.condition,
+                    [side.applied for side in sides],
+                    [side.last_plan for side in sides],
+                    between=reading == BOXES,
+                )
+            rows.append((*key, reading, *outcome))
+    return pd.DataFrame(rows, columns=["trial_id", "spec_hash", "rule", "status", "merged_first"])
+
+
+def _near(scenarios: Iterable[Scenario]) -> str:
+    """The query of the samples at or next to which vehicles can collide."""
+    every = [Scenario(), *scenarios]
+    step_s = max(one.step_s for one in every)
+    # What accelerations against each other, and a resistance, add to the way within a step.
+    added_m = 2 * (max(one.max_acceleration_mps2 for one in every) + 2) * step_s**2
+    reach_m = max(hypot(one.vehicle_length_m, one.vehicle_width_m) for one in every)
+    return NEAR.format(
+        merge=MERGE_POINT_M,
+        lateral=LATERAL,
+        forward=FORWARD,
+        step_s=step_s,
+        reach_m=reach_m + added_m + 0.01,
+    )
+
+
+def seen(scenario: Scenario, samples: Sequence[Sample], *, between: bool) -> bool:
+    """Whether a collision is seen at the scenario's steps, and ``between`` them at 20 Hz."""
+    if any(
+        collided(scenario, sample.left_m, sample.right_m)
+        for sample in samples
+        if _is_multiple(sample.time_s, scenario.step_s)
+    ):
+        return True
+    return between and any(
+        rectangles_overlap(left_m, right_m, scenario.vehicle_length_m, scenario.vehicle_width_m)
+        for before, now in pairwise(samples)
+        if now.step == before.step + 1
+        for left_m, right_m in _looks_between(before, now)
+    )
+
+
+def _looks_between(before: Sample, now: Sample) -> Iterator[tuple[float, float]]:
+    """Both positions at the looks within a step, where accelerations are constant."""
+    step_s = now.time_s - before.time_s
+    looks = ceil(step_s * LOOKS_HZ - 1e-6)
+    left = _acceleration(before.left_m, before.left_mps, now.left_m, now.left_mps, step_s)
+    right = _acceleration(before.right_m, before.right_mps, now.right_m, now.right_mps, step_s)
+    for look in range(1, looks):
+        passed_s = step_s * look / looks
+        yield (
+            advance(before.left_m, before.left_mps, left, passed_s)[0],
+            advance(before.right_m, before.right_mps, right, passed_s)[0],
+        )
+
+
+def _acceleration(
+    before_m: float, before_mps: float, now_m: float, now_mps: float, step_s: float
+) -> float:
+    """The constant acceleration within a step, in m/s^2, also where it stopped the vehicle."""
+    if now_mps > 0 or now_m <= before_m:
+        return (now_mps - before_mps) / step_s
+    return before_mps**2 / (-2 * (now_m - before_m))
+
+
+def _is_multiple(time_s: float, step_s: float) -> bool:
+    return isclose(time_s / step_s, round(time_s / step_s), abs_tol=1e-6)
+
+
+def _scenarios(spec_hashes: Iterable[str], specs: pd.DataFrame) -> dict[tuple[str, str], Scenario]:
+    """The scenario of each spec under each reading; that of humans is the default one."""
+    texts = dict(zip(specs["spec_hash"], specs["spec"], strict=True))
+    found = {
+        spec_hash: json.loads(texts.get(spec_hash, "{}")).get("scenario", {})
+        for spec_hash in spec_hashes
+    }
+    return {
+        (spec_hash, reading): Scenario.model_validate(
+            scenario | {"collision_rule": "rectangle" if reading == BOXES else reading}
+        )
+        for spec_hash, scenario in found.items()
+        for reading in READINGS
+    }
+
+
+def redrive(
+    scenario: Scenario,
+    condition: str,
+    applied: Sequence[Sequence[Sequence[float]]],
+    last_plans: Sequence[Sequence[float]],
+    *,
+    between: bool = False,
+) -> Outcome:
+    """Drive a trial's plans again: (status, merged_first).
+
+    ``between``: collisions are looked for at 20 Hz between the steps too.
+    ``applied`` holds, for left and right, the normalised actions of each decision; a vehicle that
+    decided later than the other cruised before. ``last_plans`` are whole plans, empty if unknown.
+    """
+    world = World(scenario, CONDITIONS[condition])
+    actions = [[action for actions in side for action in actions] for side in applied]
+    steps = max(map(len, actions))
+    queues: list[list[float | None]] = []
+    for side, last, own in zip(applied, last_plans, actions, strict=True):
+        rest = last[len(side[-1]) :] if side else []
+        queues.append([*[None] * (steps - len(own)), *own, *rest])
+    for left, right in zip(*queues, strict=False):
+        if world.status is not None:
+            break
+        world.advance({"left": left, "right": right})
+    if between and seen(scenario, _samples(world), between=True):
+        return "collided", None
+    return world.status or UNDECIDED, world.merged_first() if world.status else None
+
+
+def _samples(world: World) -> list[Sample]:
+    found = []
+    for _, rows in groupby(world.states(), key=lambda row: row.step):
+        left, right = rows
+        found.append(
+            Sample(
+                left.step,
+                left.time_s,
+                left.position_m,
+                left.velocity_mps,
+                right.position_m,
+                right.velocity_mps,
+            )
+        )
+    return found

@@ -1,0 +1,133 @@
+"""What is computed from the results and kept beside them in the database, until they change.
+
+Kept are whole tables and figures. Where the file cannot be written, as on a read-only disk or while
+another program holds it, nothing is kept, and the next run computes anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Sequence
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+import duckdb
+
+import analysis
+import merge_runner
+from merge_runner.errors import StoreError
+from merge_runner.results.database import (
+    SCHEMA_VERSION,
+    open_database,
+    read_database,
+    schema_version,
+)
+from merge_runner.text_safety import first_line
+
+KEPT = """
+-- A table as JSON, or a figure as SVG in Base64, of the results in one state.
+CREATE TABLE IF NOT EXISTS finished (
+    state VARCHAR NOT NULL,
+    options VARCHAR NOT NULL,
+    name VARCHAR NOT NULL,
+    content VARCHAR NOT NULL
+);
+"""
+# What tables are made of: all but prompts, texts, requests and replies.
+ROWS = {
+    "trials": "trials",
+    "states": "states",
+    "decisions": "(FROM decisions SELECT * EXCLUDE (prompt, rationale))",
+    "calls": "(FROM calls SELECT * EXCLUDE (request, reply, error))",
+    "specs": "specs",
+    "sweeps": "sweeps",
+    "sweep_trials": "sweep_trials",
+    "views": "(FROM duckdb_views() SELECT sql WHERE database_name = current_database())",
+}
+LIBRARIES = (
+    "duckdb",
+    "firthmodels",
+    "jinja2",
+    "matplotlib",
+    "numpy",
+    "pandas",
+    "scipy",
+    "statsmodels",
+)
+PACKAGES = (Path(analysis.__file__).parent, Path(merge_runner.__file__).parent)
+PATIENCE_S = 0.5
+LOG = logging.getLogger(__name__)
+
+
+@cache
+def program() -> str:
+    """A hash of everything that computes: our code, the published values, the libraries."""
+    digest = hashlib.sha256()
+    for name in LIBRARIES:
+        digest.update(f"{name} {version(name)}\n".encode())
+    for package in PACKAGES:
+        for path in sorted(package.rglob("*")):
+            if path.suffix in {".py", ".sql", ".csv", ".html"}:
+                digest.update(f"{path.relative_to(package)}\n".encode())
+                digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def state(connection: duckdb.DuckDBPyConnection) -> str:
+    """A hash of all that the tables of the open database depend on: its rows and the program."""
+    sums = connection.execute(
+        " UNION ALL ".join(
+            f"SELECT '{name}', count(*), sum(hash(hash(one))::HUGEINT) FROM {rows} AS one"  # noqa: S608 # constants
+            for name, rows in ROWS.items()
+        )
+    ).fetchall()
+    return hashlib.sha256(f"{program()} {sorted(sums)}".encode()).hexdigest()
+
+
+def has(connection: duckdb.DuckDBPyConnection, table: str) -> bool:
+    """Whether anything was ever kept in this table."""
+    found = connection.execute(
+        "SELECT 1 FROM duckdb_tables() WHERE table_name = ? AND database_name = current_database()",
+        [table],
+    )
+    return found.fetchone() is not None
+
+
+def finished(db: Path, options: str, names: Sequence[str]) -> tuple[str, dict[str, str]]:
+    """The present state of the results, and those that are kept of it, by name."""
+    with read_database(db) as connection:
+        now = state(connection)
+        if not has(connection, "finished"):
+            return now, {}
+        rows = connection.execute(
+            "SELECT name, content FROM finished WHERE state = ? AND options = ? "
+            "AND list_contains(?, name)",
+            [now, options, list(names)],
+        ).fetchall()
+    return now, dict(rows)
+
+
+def keep_finished(db: Path, made_of: str, options: str, contents: dict[str, str]) -> None:
+    """Keep tables or figures, unless the results have left the state that these are ``made_of``."""
+    try:
+        with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
+            if schema_version(connection, db) < SCHEMA_VERSION:
+                return  # a copy of it was read
+            connection.begin()
+            connection.execute(KEPT)
+            if state(connection) == made_of:
+                connection.execute("DELETE FROM finished WHERE state <> ?", [made_of])
+                connection.executemany(
+                    "INSERT INTO finished VALUES (?, ?, ?, ?)",
+                    [[made_of, options, name, content] for name, content in contents.items()],
+                )
+            connection.commit()
+    except (StoreError, duckdb.Error) as exc:
+        _say_once(first_line(exc))
+
+
+@cache
+def _say_once(reason: str) -> None:
+    LOG.warning("what was computed is not kept for the next time: %s", reason)

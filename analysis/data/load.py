@@ -1,0 +1,152 @@
+"""Results as data frames; all SQL that reads for the analysis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from merge_runner.paths import DEFAULT_DB
+from merge_runner.results.database import read_database
+from merge_runner.results.store import query
+from merge_runner.served_model import ALIASES, PAIRS, Pair, others_among
+
+TRIALS = (
+    "SELECT trials.*, driver, coalesce(left_scripted, false) AS left_scripted, "
+    "coalesce(right_scripted, false) AS right_scripted, "
+    "trial_metrics.* EXCLUDE (trial_id, spec_hash) "
+    "FROM trials JOIN trial_drivers USING (trial_id, spec_hash) "
+    "JOIN trial_metrics USING (trial_id, spec_hash) "
+    "LEFT JOIN (SELECT trial_id, spec_hash, bool_or(side = 'left') AS left_scripted, "
+    "bool_or(side = 'right') AS right_scripted FROM calls WHERE scripted GROUP BY ALL) "
+    "USING (trial_id, spec_hash) ORDER BY trial_id, spec_hash"
+)
+# Of each driven trial that ended a hash of its states: equal ones went the same way.
+TRACES = """
+SELECT trial_id, spec_hash, sum(hash(step, side, position_m, velocity_mps))::VARCHAR AS trace
+FROM states SEMI JOIN (FROM trials WHERE source <> 'human' AND status <> 'failed')
+USING (trial_id, spec_hash) GROUP BY ALL
+"""
+# One row a finished trial: the left vehicle's speeds.
+LEFT_SPEEDS = (
+    "SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s, "
+    "list(velocity_mps ORDER BY step) AS velocity_mps FROM states SEMI JOIN ("
+    "FROM trials WHERE status = 'finished') "
+    "USING (trial_id, spec_hash) WHERE time_s >= 0 AND side = 'left' GROUP BY ALL ORDER BY ALL"
+)
+# One row a vehicle: its speeds under control, and whether the simulator slowed it by itself.
+SPEEDS = """
+SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
+    list(velocity_mps ORDER BY step) AS velocity_mps,
+    any_value(resisted) AS resisted
+FROM states JOIN (
+    SELECT spec_hash, coalesce(spec->>'$.source', spec->>'$.scenario.resistance') = 'human'
+        AS resisted FROM specs
+) USING (spec_hash) WHERE time_s >= 0 GROUP BY ALL ORDER BY ALL
+"""
+# A plan's revision: |the new plan's first actions - the old plan's for the same instants|. Both
+# plans cover the horizon; the older one is `executed` actions ahead of the new one.
+PLANS = """
+WITH plans AS (
+    SELECT trial_id, spec_hash, side, decision, plan, len(applied) AS executed,
+        lag(plan) OVER driver AS before
+    FROM decisions WINDOW driver AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
+), compared AS (
+    SELECT trial_id, spec_hash,
+        len(list_distinct(plan)) <= 2 AS coarse,
+        CASE WHEN before IS NOT NULL AND len(before) > executed THEN list_avg(list_transform(
+            range(1, len(before) - executed + 1),
+            lambda i: abs(plan[i] - before[i + executed]))) END AS revision
+    FROM plans WHERE plan IS NOT NULL
+)
+SELECT trial_id, spec_hash, count(*) AS plans, count(*) FILTER (coarse) AS coarse_plans,
+    count(revision) AS revised_plans, sum(revision) AS total_revision,
+    count(*) FILTER (revision > 0.1) AS large_revisions
+FROM compared GROUP BY ALL ORDER BY ALL
+"""
+# How many calls of a variant's spec share their reply with a baseline's spec.
+SHARED = """
+WITH used AS (
+    SELECT DISTINCT spec_hash, variant, call_key
+    FROM decisions JOIN trials USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
+), totals AS (SELECT spec_hash, count(*) AS calls FROM used GROUP BY ALL)
+SELECT one.spec_hash, base.spec_hash AS baseline, calls, count(*) AS shared
+FROM used AS one JOIN used AS base USING (call_key) JOIN totals ON totals.spec_hash = one.spec_hash
+WHERE one.variant <> 'baseline' AND base.variant = 'baseline' GROUP BY ALL ORDER BY ALL
+"""
+
+# One row a trial and kind of attempt; a retried attempt has no share in the answer's failure.
+ATTEMPTS = """
+SELECT trial_id, spec_hash, fate, outcome, if(fate = 'retried', NULL, failure) AS failure,
+    model_requested, model_served, count(*) AS attempts
+FROM attempts GROUP BY ALL ORDER BY ALL
+"""
+# One row a trial and kind of decision.
+DECISIONS = """
+SELECT trial_id, spec_hash, fallback, count(*) AS decisions
+FROM decisions GROUP BY ALL ORDER BY ALL
+"""
+
+SPECS = "SELECT spec_hash, spec FROM specs"
+# The size of a spec's vehicles in words.
+SIZES = "SELECT spec_hash, format('{:g} m x {:g} m', length_m, width_m) AS size FROM geometry"
+
+
+def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
+    """The rows of one read-only query; raises UsageError."""
+    names, rows = query(Path(db), sql)
+    return pd.DataFrame(rows, columns=names)
+
+
+def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
+    """One row a trial: condition, outcome and metrics in SI units (see merge_runner/schema.sql)."""
+    return load(TRIALS, db)
+
+
+def load_each(queries: Mapping[str, str], db: Path | str = DEFAULT_DB) -> dict[str, pd.DataFrame]:
+    """The rows of our own queries, by name; opening a database takes longer than most of them."""
+    with read_database(Path(db)) as connection:
+        found = {}
+        for name, sql in queries.items():
+            result = connection.execute(sql)
+            columns = [column[0] for column in result.description or ()]
+            found[name] = pd.DataFrame(result.fetchall(), columns=columns)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Calls:
+    """What became of the calls.
+
+    ``attempts``: one row a trial and kind of attempt, with the number of these; ``decisions``: one
+    row a trial, its fallbacks apart; ``others``: pairs of a model's id and another model that
+    answered in its place.
+    """
+
+    attempts: pd.DataFrame
+    decisions: pd.DataFrame
+    others: frozenset[Pair]
+
+
+def rows(frame: pd.DataFrame) -> list[Any]:
+    """The rows of a frame as tuples."""
+    return list(frame.itertuples(index=False, name=None))
+
+
+def load_calls(db: Path | str = DEFAULT_DB) -> Calls:
+    """Read what became of the calls; the columns have their types also where there is none."""
+    found = load_each(
+        {"attempts": ATTEMPTS, "decisions": DECISIONS, "pairs": PAIRS, "aliases": ALIASES}, db
+    )
+    keys = ("trial_id", "spec_hash")
+    texts = (*keys, "fate", "outcome", "failure", "model_requested", "model_served")
+    return Calls(
+        found["attempts"].astype(dict.fromkeys(texts, "string") | {"attempts": int}),
+        found["decisions"].astype(
+            dict.fromkeys(keys, "string") | {"fallback": bool, "decisions": int}
+        ),
+        frozenset(others_among(rows(found["pairs"]), rows(found["aliases"]))),
+    )

@@ -1,0 +1,264 @@
+"""Where the results come from: sweeps, specs, what the calls came to, and what they cost."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from analysis.data.load import load_each, rows
+from analysis.data.study import Group, Study, of_group
+from merge_runner.audit.replies import answers_alike
+from merge_runner.config import Scenario
+from merge_runner.records import SIDES
+from merge_runner.results.database import read_database
+from merge_runner.served_model import ALIASES, others_among
+
+SWEEPS = """
+SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
+    count(trial_id) AS trials
+FROM sweeps LEFT JOIN sweep_trials USING (sweep_id)
+GROUP BY ALL ORDER BY started_at, sweep_id
+"""
+# Of each call the last attempt is the answer; those before it are retries.
+CALLS = """
+SELECT provider, model_requested, model_served,
+    count(DISTINCT call_key) AS calls,
+    count(*) FILTER (attempt > 1) AS retries,
+    count(*) FILTER (outcome = 'refusal') AS refusals,
+    count(*) FILTER (outcome = 'truncated') AS truncated,
+    count(*) FILTER (outcome = 'empty') AS empty,
+    sum(input_tokens) AS input_tokens,
+    sum(output_tokens) AS output_tokens,
+    sum(cost_usd) AS cost_usd,
+    count(*) FILTER (cost_usd IS NULL AND http_status = 200) AS unpriced,
+    min(started_at)::DATE AS first_day,
+    max(started_at)::DATE AS last_day
+-- A recorded call that several trials use was made once.
+FROM (
+    SELECT DISTINCT ON (call_key, attempt)
+        * EXCLUDE (request, reply, error)
+        REPLACE (max(model_served) OVER (PARTITION BY call_key) AS model_served)
+    FROM calls
+)
+GROUP BY provider, model_requested, model_served ORDER BY ALL
+"""
+SPECS = """
+SELECT DISTINCT driver, variant, spec_hash, spec
+FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE source <> 'human' ORDER BY ALL
+"""
+# Answers by each model that answered.
+SERVED = """
+SELECT model_requested, model_served,
+    count(DISTINCT (trial_id, spec_hash, side, decision)) AS answers,
+    list_sort(list(DISTINCT sweep_id) FILTER (sweep_id IS NOT NULL)) AS sweeps
+FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
+WHERE fate IN ('driven', 'fallback') AND model_served IS NOT NULL
+GROUP BY ALL ORDER BY ALL
+"""
+SWEEP_COSTS = """
+SELECT sweep_id, name, sweep_costs.* EXCLUDE (sweep_id)
+FROM sweeps JOIN sweep_costs USING (sweep_id) ORDER BY started_at, sweep_id
+"""
+MODEL_COSTS = """
+SELECT driver, count(*) AS trials,
+    sum(calls) AS calls, sum(attempts) AS attempts,
+    sum(input_tokens) AS input_tokens, sum(cached_input_tokens) AS cached_input_tokens,
+    sum(output_tokens) AS output_tokens, sum(reasoning_tokens) AS reasoning_tokens,
+    sum(cost_usd) AS cost_usd, sum(paid_usd) AS paid_usd,
+    sum(attempts_of_unknown_cost) AS attempts_of_unknown_cost
+FROM trials JOIN trial_costs USING (trial_id, spec_hash)
+JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
+"""
+# Trials that are looked through for answers that repeat each other, of a driver at a time.
+OF_DRIVER = """
+CREATE OR REPLACE TEMP TABLE audited AS
+SELECT trial_id, spec_hash, model_left, model_right
+FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE driver = ? AND NOT scripted
+"""
+DRIVERS = """
+SELECT DISTINCT driver FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE source = 'llm' AND NOT scripted ORDER BY ALL
+"""
+# What of a request's body is no parameter.
+NO_PARAMETERS = frozenset({"messages", "input", "contents", "model"})
+# Failures with an own column of the tables; the others are malformed answers.
+ANSWERS = ("refusal", "truncated", "empty")
+
+
+@dataclass(frozen=True, slots=True)
+class Mismatch:
+    """Answers by ``served`` to calls that asked for ``requested``, in these sweeps."""
+
+    requested: str
+    served: str
+    answers: int
+    sweeps: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """What the report says about the origin of its numbers.
+
+    ``sweeps``, ``calls``, ``sweep_costs`` and ``model_costs`` are rows of the queries here;
+    ``switches`` holds, by driver, variant and spec_hash, the settings of the driving task that
+    differ from the defaults, and ``tasks`` the same by spec_hash, empty where none does;
+    ``mismatches`` says where another model answered than was asked for. ``alike`` has the drivers
+    all of whose answers to a prompt that was asked before are word for word as before, with their
+    number. ``sent`` holds what was sent to the models beside the prompt, by spec_hash and side.
+    """
+
+    sweeps: pd.DataFrame
+    calls: pd.DataFrame
+    sweep_costs: pd.DataFrame
+    model_costs: pd.DataFrame
+    switches: dict[str, str]
+    tasks: dict[str, str]
+    mismatches: list[Mismatch]
+    alike: dict[str, int]
+    sent: dict[str, dict[str, dict[str, object]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What became of the calls of one group of trials.
+
+    A call is asked at one decision, in one or more attempts. ``retried`` attempts were followed by
+    another, ``lost`` calls ended without an answer. ``failures`` counts the answers without a valid
+    plan by reason, ``fallbacks`` the ``decisions`` that were driven from an older plan, or none.
+    ``unknown`` attempts were under way when the run was killed; ``others`` are answers of another
+    model than was asked for.
+    """
+
+    trials: int
+    failed: int
+    calls: int
+    attempts: int
+    retried: int
+    lost: int
+    failures: Counter[str]
+    decisions: int
+    fallbacks: int
+    unknown: int
+    others: int
+
+    @property
+    def answers(self) -> int:
+        """Calls with an answer of any kind."""
+        return self.calls - self.lost
+
+    @property
+    def invalid(self) -> int:
+        """Answers without a valid plan."""
+        return self.failures.total()
+
+
+def provenance(db: Path) -> Provenance:
+    """Read the origin of a database's results."""
+    found = load_each(
+        {
+            "sweeps": SWEEPS,
+            "calls": CALLS,
+            "sweep_costs": SWEEP_COSTS,
+            "model_costs": MODEL_COSTS,
+            "specs": SPECS,
+            "served": SERVED,
+            "aliases": ALIASES,
+        },
+        db,
+    )
+    return Provenance(
+        sweeps=found["sweeps"],
+        calls=found["calls"],
+        sweep_costs=found["sweep_costs"],
+        model_costs=found["model_costs"],
+        switches={
+            f"{row.driver}/{row.variant} ({row.spec_hash})": _switched(row.spec) or "defaults"
+            for row in found["specs"].itertuples()
+        },
+        tasks={row.spec_hash: _switched(row.spec) for row in found["specs"].itertuples()},
+        mismatches=_mismatches(found["served"], found["aliases"]),
+        alike=_alike(db),
+        sent={row.spec_hash: _sent(json.loads(row.spec)) for row in found["specs"].itertuples()},
+    )
+
+
+@cache
+def tally(study: Study, group: Group) -> Tally:
+    """Count a group's calls, attempts and decisions."""
+    attempts = of_group(study.calls.attempts, group, group.trials)
+    decisions = of_group(study.calls.decisions, group, group.trials)
+    by_fate = Counter(attempts.groupby("fate")["attempts"].sum().to_dict())
+    answered = attempts[attempts["fate"].isin(("driven", "fallback"))]
+    return Tally(
+        trials=len(group.trials),
+        failed=len(group.trials) - len(group.ended),
+        calls=by_fate.total() - by_fate["retried"],
+        attempts=by_fate.total(),
+        retried=by_fate["retried"],
+        lost=by_fate["lost"],
+        failures=Counter(answered.groupby("failure")["attempts"].sum().to_dict()),
+        decisions=int(decisions["decisions"].sum()),
+        fallbacks=int(decisions.loc[decisions["fallback"], "decisions"].sum()),
+        unknown=int(attempts.loc[attempts["outcome"] == "unknown", "attempts"].sum()),
+        others=int(answered.loc[_other_model(study, answered), "attempts"].sum()),
+    )
+
+
+def _other_model(study: Study, answered: pd.DataFrame) -> list[bool]:
+    pairs = zip(answered["model_requested"], answered["model_served"], strict=True)
+    return [pair in study.calls.others for pair in pairs]
+
+
+def _switched(spec: str) -> str:
+    """The settings of a spec's driving task that differ from the defaults."""
+    defaults, scenario = Scenario().model_dump(), json.loads(spec).get("scenario", {})
+    return ", ".join(f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v)
+
+
+def _alike(db: Path) -> dict[str, int]:
+    with read_database(db) as connection:
+        found = {}
+        for (driver,) in connection.execute(DRIVERS).fetchall():
+            connection.execute(OF_DRIVER, [driver])
+            found[driver] = answers_alike(connection)
+    return {driver: repeated for driver, repeated in found.items() if repeated}
+
+
+def _sent(spec: Mapping[str, Any]) -> dict[str, dict[str, object]]:
+    """The parameters of the model on each side of a spec, by the last part of their names.
+
+    A program on a side has none, and is left out.
+    """
+    bodies = {side: spec[side]["body"] for side in SIDES if "body" in spec.get(side, {})}
+    return {
+        side: dict(_leaves({k: v for k, v in body.items() if k not in NO_PARAMETERS}))
+        for side, body in bodies.items()
+    }
+
+
+def _leaves(values: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value)
+        else:
+            yield name, value
+
+
+def _mismatches(served: pd.DataFrame, aliases: pd.DataFrame) -> list[Mismatch]:
+    found = {
+        (row.model_requested, row.model_served): Mismatch(
+            row.model_requested, row.model_served, row.answers, tuple(row.sweeps or ())
+        )
+        for row in served.itertuples()
+    }
+    return [found[pair] for pair in others_among(found, rows(aliases))]

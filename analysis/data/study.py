@@ -1,0 +1,334 @@
+"""What a study holds: one group of trials per driver and prompt variant, and the humans."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from pathlib import Path
+
+import pandas as pd
+
+from analysis.data.collision_rules import judged
+from analysis.data.imported_humans import Imported, imported, of_published_pairs
+from analysis.data.intermittency import measure_profiles
+from analysis.data.load import (
+    LEFT_SPEEDS,
+    PLANS,
+    SHARED,
+    SPECS,
+    SPEEDS,
+    TRACES,
+    TRIALS,
+    Calls,
+    load_calls,
+    load_each,
+)
+from analysis.data.reference_data import human_outcomes
+from merge_runner.drivers.registry import stand_in
+from merge_runner.errors import UsageError
+from merge_runner.paths import DEFAULT_DB
+from merge_runner.records import SIDES
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.text_safety import quoted
+
+HUMAN = "human"
+# What tells groups apart, and is no measure.
+COLUMNS_OF_GROUPS = ["driver", "task", "trace", "left_scripted", "right_scripted"]
+BASELINE = "baseline"
+# So many human trials in every condition make a reference; fewer are shown, but not compared with.
+ENOUGH_PER_CONDITION = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Trials of equal drivers, prompts and parameters.
+
+    ``trials`` are rows of ``load_trials``; for humans before an import only the outcomes that are
+    published, and ``measured`` is False. ``setting`` is the prompt variant, empty for humans.
+    ``label`` is how tables name the driver, ``model`` the name that was asked for, and ``posing``
+    what is said of a scripted stand-in. Of a driver without chance, whose repetitions are the same
+    trial again, only the first are ``trials``, and ``repeated`` counts the others; ``equal`` counts
+    such trials of a driver that samples. ``narrowed`` is what tells the trials in SQL from others
+    of their spec and variant, empty where there are none. ``published_outcomes`` stand in the place
+    of the trials' outcomes where these are a part of the published ones.
+    """
+
+    driver: str
+    setting: str
+    spec_hash: str | None
+    trials: pd.DataFrame
+    label: str
+    model: str
+    measured: bool = True
+    posing: str = ""
+    repeated: int = 0
+    equal: int = 0
+    narrowed: str = ""
+    published_outcomes: pd.DataFrame | None = None
+
+    @property
+    def id(self) -> str:
+        """``o3/A2``, or ``human``."""
+        return f"{self.driver}/{self.setting}" if self.setting else self.driver
+
+    @property
+    def scripted(self) -> bool:
+        """Whether a scripted stand-in answered."""
+        return bool(self.posing)
+
+    @property
+    def outcomes(self) -> pd.DataFrame:
+        """The trials that count for collisions and for who merged first."""
+        return self.trials if self.published_outcomes is None else self.published_outcomes
+
+    def part(self, wanted: Callable[[pd.DataFrame], pd.Series]) -> Group:
+        """The group with only those trials, and outcomes, of which ``wanted`` holds."""
+        outcomes = self.published_outcomes
+        return replace(
+            self,
+            trials=self.trials[wanted(self.trials)],
+            published_outcomes=None if outcomes is None else outcomes[wanted(outcomes)],
+        )
+
+    @cached_property
+    def ended(self) -> pd.DataFrame:
+        """The trials that did not fail."""
+        return self.trials[self.trials["status"] != "failed"]
+
+    @cached_property
+    def finished(self) -> pd.DataFrame:
+        """The trials that a vehicle finished without a collision."""
+        return self.trials[self.trials["status"] == "finished"]
+
+    @property
+    def ended_outcomes(self) -> pd.DataFrame:
+        """The outcomes of trials that did not fail."""
+        return self.outcomes[self.outcomes["status"] != "failed"]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """How many outcomes there are in each condition, in the order of CONDITIONS."""
+        counts = self.ended_outcomes["condition"].value_counts()
+        return tuple(int(counts.get(name, 0)) for name in CONDITIONS)
+
+    @cached_property
+    def left_out(self) -> str:
+        """Which trials are not among the finished ones, in words."""
+        counts = self.trials["status"].value_counts()
+        parts = [
+            f"{counts[status]} {status}"
+            for status in ("collided", "timeout", "failed")
+            if counts.get(status, 0)
+        ]
+        return ", ".join(parts) or "none"
+
+
+class Study:
+    """The groups of a database, humans first, and what is computed from their traces once."""
+
+    def __init__(self, db: Path | str = DEFAULT_DB, models: Sequence[str] | None = None) -> None:
+        """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
+        self.db = Path(db)
+        self.chosen = models
+        found = load_each({"trials": TRIALS, "specs": SPECS, "traces": TRACES}, self.db)
+        trials = found["trials"].merge(found["traces"], on=["trial_id", "spec_hash"], how="left")
+        trials = judged(self.db, trials)
+        recorded = trials["source"] == HUMAN
+        self.imported = imported(trials[recorded]) if recorded.any() else None
+        self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
+        every = _model_groups(trials[~recorded], _tasks(found["specs"]))
+        valid = [HUMAN, *dict.fromkeys(group.driver for group in every)]
+        wanted = valid if models is None else list(models)
+        unknown = [name for name in wanted if name not in valid]
+        if unknown or not wanted:
+            named = f"no driver {unknown[0]!r}" if unknown else "nothing that --models names"
+            raise UsageError(f"{db} holds {named}; valid: {', '.join(valid)}")
+        self.empty = not every
+        self.models = [group for group in every if group.driver in wanted]
+        self.groups = [self.human, *self.models] if HUMAN in wanted else self.models
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether there are human traces enough of every condition to compare others with."""
+        counts = self.human.ended["condition"].value_counts().reindex(CONDITIONS, fill_value=0)
+        return self.human.measured and bool(counts.min() >= ENOUGH_PER_CONDITION)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the human traces are all there, so that whole trials can be drawn from them."""
+        return self.imported is not None and self.imported.complete
+
+    @property
+    def baselines(self) -> list[Group]:
+        """The humans and every driver with the baseline prompt."""
+        return [group for group in self.groups if group.setting in {"", BASELINE}]
+
+    @cached_property
+    def profiles(self) -> pd.DataFrame:
+        """One row a vehicle: whether it acted, and how far its acceleration is held."""
+        return measure_profiles(self._read(SPEEDS))
+
+    @cached_property
+    def left_speeds(self) -> pd.DataFrame:
+        """One row a finished trial: the left vehicle's speeds under control."""
+        return self._read(LEFT_SPEEDS)
+
+    @cached_property
+    def deviations(self) -> pd.DataFrame:
+        """One row a trial and window: RMSE of the speeds from the initial ones, and joint."""
+        return self._read("SELECT * FROM speed_deviations ORDER BY ALL")
+
+    @cached_property
+    def plans(self) -> pd.DataFrame:
+        """One row a trial with valid plans: how coarse they are, how much they were revised."""
+        return self._read(PLANS)
+
+    @cached_property
+    def calls(self) -> Calls:
+        """What became of the calls, by trial."""
+        return load_calls(self.db)
+
+    @cached_property
+    def shared(self) -> pd.DataFrame:
+        """One row a variant: how many of its calls share their reply with the baseline."""
+        return self._read(SHARED)
+
+    def _read(self, sql: str) -> pd.DataFrame:
+        return load_each({"rows": sql}, self.db)["rows"]
+
+
+def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.DataFrame:
+    """The rows of a per-trial frame that belong to these trials of a group."""
+    keys = trials[["trial_id", "spec_hash"]]
+    # To join all rows takes longer than to leave out those of other groups first.
+    near = frame["spec_hash"].isin(keys["spec_hash"].unique())
+    return frame[near].merge(keys, on=["trial_id", "spec_hash"])
+
+
+def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
+    if known is None:
+        return _published_group()
+    pairs = ", ".join(quoted(pair) for pair in sorted(trials["pair"].unique()))
+    return Group(
+        HUMAN,
+        "",
+        str(trials["spec_hash"].iloc[0]),
+        trials,
+        label=known.label,
+        model=HUMAN,
+        narrowed=f"pair IN ({pairs})" if known.left_out else "",
+        published_outcomes=None if known.complete else human_outcomes(),
+    )
+
+
+@cache
+def _published_group() -> Group:
+    """One object for all studies: what is computed from it is computed once."""
+    return Group(HUMAN, "", None, human_outcomes(), label=HUMAN, model=HUMAN, measured=False)
+
+
+def _tasks(specs: pd.DataFrame) -> dict[str, str]:
+    """Spec hash to a hash of what it covers beside the prompt: equal for variants of one study."""
+    tasks = {}
+    for row in specs.itertuples():
+        spec = json.loads(row.spec)
+        spec.pop("prompt_blocks", None)
+        text = json.dumps(spec, sort_keys=True)
+        tasks[row.spec_hash] = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return tasks
+
+
+def _model_groups(trials: pd.DataFrame, tasks: dict[str, str]) -> list[Group]:
+    """Groups by driver and variant, scripted stand-ins last.
+
+    Where a driver was run under several settings of the task, all but the most frequent carry a
+    mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
+    a stand-in answered some of its trials.
+    """
+    if trials.empty:
+        return []
+    task = trials["spec_hash"].map(lambda spec_hash: tasks.get(spec_hash, spec_hash[:8]))
+    keyed = trials.assign(task=task)
+    keyed["driver"] += _marks(keyed, ["driver"], "task")
+    keyed["driver"] += _marks(keyed, ["driver", "variant"], "spec_hash")
+    both = keyed.groupby("driver")["scripted"].transform("nunique") > 1
+    keyed.loc[both & keyed["scripted"], "driver"] += " [scripted]"
+    groups = [
+        _model_group(driver, variant, spec_hash, rows, both[rows.index].any())
+        for (driver, variant, spec_hash), rows in keyed.groupby(["driver", "variant", "spec_hash"])
+    ]
+    return sorted(
+        groups,
+        key=lambda group: (
+            group.scripted,
+            group.driver,
+            group.setting != BASELINE,
+            group.setting,
+        ),
+    )
+
+
+def _model_group(
+    driver: str, variant: str, spec_hash: str, rows: pd.DataFrame, told_apart: bool
+) -> Group:
+    model = str(rows["trial_id"].iloc[0]).split("/", maxsplit=1)[0]
+    scripted = bool(rows["scripted"].any())
+    sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
+    posing = stand_in(model, sides or SIDES) if scripted else ""
+    distinct = _distinct(rows)
+    narrowed = [f"scripted = {str(scripted).lower()}"] if told_apart else []
+    if len(distinct) < len(rows):
+        names = ", ".join(quoted(trial_id) for trial_id in distinct["trial_id"])
+        narrowed.append(f"trials.trial_id IN ({names})")
+    return Group(
+        driver,
+        variant,
+        spec_hash,
+        distinct.drop(columns=COLUMNS_OF_GROUPS),
+        label=f"{driver} ({posing})" if scripted else driver,
+        model=model,
+        posing=posing,
+        repeated=len(rows) - len(distinct),
+        equal=len(_again(distinct)),
+        narrowed=" AND ".join(narrowed),
+    )
+
+
+def _distinct(rows: pd.DataFrame) -> pd.DataFrame:
+    """The trials without the repetitions of a driver that has no chance in it.
+
+    That is a program, and a model that in every condition went the same way each time. Of a driver
+    that samples, two equal trials are two samples.
+    """
+    again = _again(rows)
+    ways = rows.groupby("condition")["trace"].agg(["count", "nunique"])
+    repeated = ways[ways["count"] > 1]
+    # In a single condition it may be chance.
+    no_chance = len(repeated) > 1 and bool((repeated["nunique"] == 1).all())
+    programs = bool((rows["source"] == "driver").all())
+    return rows.drop(index=again) if no_chance or programs else rows
+
+
+def _again(rows: pd.DataFrame) -> pd.Index:
+    """The trials that went the same way as an earlier repetition."""
+    ended = rows[rows["trace"].notna()].sort_values("rep", kind="stable")
+    return ended.index[ended.duplicated(["condition", "trace"])]
+
+
+def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:
+    """`` [mark]`` for all but the most frequent value of ``what`` within equal names."""
+    counts = keyed.groupby([*within, what]).size().reset_index(name="n")
+    ordered = counts.sort_values(
+        [*within, "n", what], ascending=[True] * len(within) + [False, True]
+    )
+    usual = ordered.drop_duplicates(within).set_index(within)[what]
+    keys = pd.MultiIndex.from_frame(keyed[within]) if len(within) > 1 else keyed[within[0]]
+    expected = usual.reindex(keys).to_numpy()
+    marks = [
+        "" if found == usually else f" [{found[:8]}]"
+        for found, usually in zip(keyed[what], expected, strict=True)
+    ]
+    return pd.Series(marks, index=keyed.index)

@@ -1,0 +1,249 @@
+"""What the pages show of the analysis, computed in a process of its own.
+
+pandas and the fits hold a Python process for seconds, and no page may wait for another's numbers.
+Requests and answers are lines of JSON on standard input and output.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analysis.data.derived_cache import finished, keep_finished
+from analysis.tables import make_tables
+from analysis.tables.formats import shown_value
+from analysis.tables.model import Table, from_text, options_text, to_text
+from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner.results.database import read_database
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+
+if TYPE_CHECKING:
+    from analysis.data.study import Group, Study
+
+
+class Numbers:
+    """Answers from one database; its trials are read when something needs them, and only once."""
+
+    def __init__(self, db: Path) -> None:
+        self.db = db
+
+    def answer(self, request: Sequence[str]) -> dict[str, Any]:
+        """What is asked for, with ``counted``: how many trials it was made of.
+
+        Where no table has the cell, the answer says so as ``absent``.
+
+        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``, whatever
+        stands after it. Raises MergeRunnerError.
+        """
+        match list(request):
+            case ["tables", *names]:
+                return self._tables(names)
+            case ["cell", table, row, column]:
+                return self._cell(table, row, column)
+            case ["cells", *names]:
+                return self._counted() | self._cells(names)
+            case ["humans", *_]:
+                return self._counted() | human_panels(self.study) | self._tables(["contrasts"])
+        raise UsageError(f"nothing answers {request!r}")
+
+    @property
+    def study(self) -> Study:
+        """The study, once it is read."""
+        return self._read[0]
+
+    @cached_property
+    def _read(self) -> tuple[Study, str]:
+        """The study, and the state of the results before it was read."""
+        from analysis.data.study import Study
+
+        state, _ = finished(self.db, "", [])
+        return Study(self.db), state
+
+    def _counted(self) -> dict[str, Any]:
+        if "_read" in self.__dict__:
+            groups = [group for group in self.study.groups if group.measured]
+            return {"counted": sum(len(group.trials) for group in groups)}
+        with read_database(self.db) as connection:
+            (row,) = connection.execute("SELECT count(*) FROM trials").fetchall()
+        return {"counted": row[0]}
+
+    def _tables(self, names: Sequence[str]) -> dict[str, Any]:
+        found = self._finished(names)
+        return self._counted() | {"tables": [to_text(found[name]) for name in names]}
+
+    def _finished(self, names: Sequence[str]) -> dict[str, Table]:
+        """Tables by name, kept ones where the database has them."""
+        options = options_text(self.db, None)
+        _, kept = finished(self.db, options, names)
+        found = {name: from_text(text) for name, text in kept.items()}
+        if missing := [name for name in names if name not in found]:
+            study, state = self._read
+            made = dict(zip(missing, make_tables(study, missing), strict=True))
+            # They are of the state in which the study was read; where it is past, nothing is kept.
+            keep_finished(self.db, state, options, {name: to_text(made[name]) for name in missing})
+            found |= made
+        return found
+
+    def _cell(self, name: str, row_id: str, column_name: str) -> dict[str, Any]:
+        from analysis.explain import sources_of, sql_command
+
+        table = self._finished([name])[name]
+        rows = {row.id: row for row in table.rows}
+        columns = {column.name: column for column in table.columns}
+        if row_id not in rows:
+            return {"absent": f"the table {name} has no row {row_id!r}"}
+        if column_name not in columns:
+            return {"absent": f"the table {name} has no column {column_name!r}"}
+        row, column = rows[row_id], columns[column_name]
+        specs = {group.id: group.spec_hash for group in self.study.groups}
+        return self._counted() | {
+            "value": shown_value(column, row.values.get(column.name)),
+            "heading": table.heading,
+            "meaning": column.meaning or column.heading,
+            "note": row.note,
+            "command": sql_command(self.study),
+            "sources": [
+                {
+                    "group": source.group,
+                    "text": source.text,
+                    "query": source.query,
+                    "spec": specs.get(source.group),
+                    "names": source.trials,
+                }
+                for source in sources_of(self.study, table, row, column)
+            ],
+        }
+
+    def _cells(self, names: Sequence[str]) -> dict[str, Any]:
+        """The trials behind every number of some tables.
+
+        ``sets`` are lists of (trial, spec), ``cells`` has the number of one by TABLE/ROW:COLUMN.
+        """
+        from analysis.explain import sources_of
+
+        specs = {group.id: group.spec_hash for group in self.study.groups}
+        sets: dict[tuple[tuple[str, str | None], ...], int] = {}
+        cells = {}
+        for name, table in self._finished(names).items():
+            for row in table.rows:
+                for column in table.columns:
+                    if column.kind == "text" or row.values.get(column.name) is None:
+                        continue
+                    behind = tuple(
+                        (trial, specs[source.group])
+                        for source in sources_of(self.study, table, row, column)
+                        for trial in source.trials
+                    )
+                    if behind:
+                        cells[f"{name}/{row.id}:{column.name}"] = sets.setdefault(behind, len(sets))
+        return {"cells": cells, "sets": list(sets)}
+
+
+def human_panels(study: Study) -> dict[str, Any]:
+    """The humans and the baseline of every driver, measured in each condition.
+
+    Rates in percent, gaps in m, RMSE in m/s. Before an import the humans have outcomes alone;
+    ``published`` holds what the paper prints of the rest: the gap by its regression in m, and the
+    RMSE over all conditions in m/s.
+    """
+    from analysis.data.load import SPECS, load
+    from analysis.data.reference_data import citation
+    from analysis.stats.measures import RMSE, outcomes_note, published_human
+    from analysis.tables.notes import sample_notes
+
+    measured = study.human.measured
+    specs = {row.spec_hash: json.loads(row.spec) for row in load(SPECS, study.db).itertuples()}
+    published = None
+    if study.human in study.groups and not measured:
+        published = {
+            "gap_m": _published_gaps(),
+            "rmse_mps": published_human(RMSE),
+            "outcomes_from": citation("human_outcomes"),
+            "gaps_from": citation("paper_gap"),
+            "rmse_from": citation("paper_ablation_quantitative"),
+        }
+    return {
+        "measured": measured,
+        "published": published,
+        "notes": sample_notes(study, study.baselines),
+        "caveat": outcomes_note(study.human) if study.human in study.groups else "",
+        "groups": [
+            {
+                "id": group.id,
+                "driver": group.label,
+                "scenario": specs.get(group.spec_hash, {}).get("scenario"),
+                "conditions": {name: _in_condition(group, name) for name in CONDITIONS},
+            }
+            for group in study.baselines
+        ],
+    }
+
+
+def _in_condition(group: Group, condition: str) -> dict[str, Any]:
+    """The trials of a group in one condition: counts, and estimates with 95 % intervals."""
+    from analysis.stats.measures import (
+        BOXES,
+        COLLISIONS,
+        GAP,
+        LEFT_FIRST,
+        RMSE,
+        counts,
+        estimate,
+        known,
+    )
+
+    part = group.part(lambda trials: trials["condition"] == condition)
+    found: dict[str, Any] = {"all": len(part.outcomes), "ended": len(part.ended_outcomes)}
+    for measure in (LEFT_FIRST, GAP, RMSE, BOXES, COLLISIONS):
+        if known(group, measure):
+            found[measure.name] = asdict(estimate(part, measure))
+            if measure.rate:
+                found[measure.name]["k"] = counts(part, measure)[0]
+    return found
+
+
+def _published_gaps() -> dict[str, float]:
+    """The human gap in m that the published regression gives in each condition."""
+    import numpy as np
+
+    from analysis.data.reference_data import published
+    from analysis.stats.regressions import gap_design
+
+    terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
+    headway = np.array([condition.projected_headway_m for condition in CONDITIONS.values()])
+    velocity = np.array([condition.relative_velocity_mps for condition in CONDITIONS.values()])
+    return dict(zip(CONDITIONS, map(float, gap_design(headway, velocity) @ terms), strict=True))
+
+
+def main(db: Path) -> None:
+    """Answer until standard input ends, also amid a computation: nobody waits for it any more."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what a library prints is no answer
+    asked: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def listen() -> None:
+        for line in sys.stdin:
+            asked.put(line)
+        os._exit(0)
+
+    threading.Thread(target=listen, daemon=True).start()
+    numbers = Numbers(db)
+    while True:
+        request = json.loads(asked.get())
+        try:
+            answer = numbers.answer(request)
+        except MergeRunnerError as exc:
+            answer = {"failure": str(exc)}
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,243 @@
+"""The process in which a query runs, or a copy is made: the explorer may kill it at any moment.
+
+It is told its job as JSON on stdin. What it says on stdout is a line of JSON, with ``error`` where
+there is one, and after it the CSV where that is asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import duckdb
+
+from merge_runner.errors import MergeRunnerError
+from merge_runner.results.database import Instance, read_database, readable
+from merge_runner.results.store import answering
+from merge_runner.text_safety import csv_writer, in_spreadsheet, quoted
+
+# Python and DuckDB take addresses for more than they use, beside what the query may use.
+ADDRESSES_MB = 1024
+THREADS = 2
+BATCH = 64  # rows fetched at once: each may be large
+COLUMNS = 1000
+NAME = 200
+PLAN_TEXT = 200_000  # characters: a part of a plan of execution says little
+CELL_COSTS = 30  # bytes of a cell of the page, beside its text
+LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
+# What Python is told in their place.
+INFINITE = {"9999-12-31 23:59:59.999999": "infinity", "0001-01-01 00:00:00": "-infinity"}
+MEMORY = "needed more memory"  # the explorer says how much there was
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """What is to be run, and how much may come of it."""
+
+    file: str
+    sql: str
+    as_csv: bool
+    rows: int
+    text: int
+    """Characters of a cell; of CSV, all."""
+    size: int
+    """Bytes."""
+    memory_mb: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Copying:
+    """A database, and the new file that gets all that is in it."""
+
+    database: str
+    copy: str
+
+
+def job_text(job: Query | Copying) -> str:
+    """A job as it is told."""
+    return json.dumps({type(job).__name__: asdict(job)})
+
+
+def main() -> None:
+    """Do the job of stdin."""
+    told: dict[str, Any] = json.load(sys.stdin)
+    body = b""
+    try:
+        if "Copying" in told:
+            said = _copy(Copying(**told["Copying"]))
+        else:
+            said, body = _run(Query(**told["Query"]))
+    except (MemoryError, duckdb.OutOfMemoryException):
+        said = {"error": MEMORY}
+    except (MergeRunnerError, duckdb.Error, OSError) as exc:
+        memory = isinstance(exc.__cause__, duckdb.OutOfMemoryException)
+        said = {"error": MEMORY if memory else _one_line(exc)}
+    sys.stdout.buffer.write(json.dumps(said, ensure_ascii=False).encode() + b"\n" + body)
+    sys.stdout.buffer.flush()
+
+
+def _copy(job: Copying) -> dict[str, Any]:
+    """Copy a database while it is open for reading here, so that nobody writes."""
+    copy = Path(job.copy)
+    database = readable(Path(job.database))
+    with read_database(database, Instance()):
+        # The database last: a process that closes a file loses all its locks on it.
+        for log in LOGS:
+            with contextlib.suppress(FileNotFoundError):
+                shutil.copyfile(f"{database}{log}", f"{copy}{log}")
+        shutil.copyfile(database, copy)
+    with duckdb.connect(copy) as whole:  # the copy loses its name, and its log with it
+        whole.execute("CHECKPOINT")
+    return {}
+
+
+def _run(query: Query) -> tuple[dict[str, Any], bytes]:
+    _confine(query)
+    began = time.monotonic()
+    with _opened(query) as connection, answering(connection, query.sql) as result:
+        columns = [(name, str(kind)) for name, kind, *_ in result.description or ()]
+        rows = _fetched(result)
+        if query.as_csv:
+            return _csv([name for name, _ in columns], rows, query)
+        if len(columns) > COLUMNS:
+            return {"error": f"the result has more than {COLUMNS} columns: name those to show"}, b""
+        is_plan = bool(columns) and columns[0][0] == "explain_key"
+        cells, more = _cells(rows, replace(query, text=PLAN_TEXT) if is_plan else query)
+    names = [[name[:NAME], kind[:NAME]] for name, kind in columns]
+    seconds = time.monotonic() - began
+    return {"columns": names, "rows": cells, "more": more, "seconds": seconds}, b""
+
+
+@contextlib.contextmanager
+def _opened(query: Query) -> Iterator[duckdb.DuckDBPyConnection]:
+    """The database under a name of ours: its file's is that of an open file."""
+    config: dict[str, str | bool | int | float | list[str]] = {
+        "memory_limit": f"{query.memory_mb}MB",
+        "threads": THREADS,
+        "temp_directory": "",
+        "python_enable_replacements": False,
+    }
+    with duckdb.connect(config=config) as connection:
+        connection.execute(f"ATTACH {quoted(query.file)} AS results (READ_ONLY); USE results")
+        yield connection
+
+
+def _confine(query: Query) -> None:
+    """What the process may use, where the system can be asked to see to it."""
+    try:
+        import resource
+    except ImportError:
+        return
+    for kind, most in (
+        (resource.RLIMIT_AS, (query.memory_mb + ADDRESSES_MB) << 20),
+        # Should the explorer die before it could kill this.
+        (resource.RLIMIT_CPU, int(query.seconds * THREADS) + 5),
+        (resource.RLIMIT_FSIZE, 0),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(kind, (most, most))
+
+
+def _fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
+    while batch := result.fetchmany(BATCH):
+        yield from batch
+
+
+def _cells(
+    rows: Iterator[tuple[Any, ...]], query: Query
+) -> tuple[list[list[tuple[str, int] | None]], bool]:
+    """The first rows, and whether there are more. A cell: its text, and how much is left out."""
+    cells: list[list[tuple[str, int] | None]] = []
+    size = 0
+    for row in rows:
+        texts = [text_of(value) for value in row]
+        line = [
+            None if text is None else (text[: query.text], max(0, len(text) - query.text))
+            for text in texts
+        ]
+        size += sum(CELL_COSTS + (len(cell[0].encode()) if cell else 0) for cell in line)
+        if len(cells) == query.rows or size > query.size:
+            return cells, True
+        cells.append(line)
+    return cells, False
+
+
+def _csv(
+    names: list[str], rows: Iterator[tuple[Any, ...]], query: Query
+) -> tuple[dict[str, Any], bytes]:
+    content, lines = io.BytesIO(), io.StringIO()
+    writer = csv_writer(lines)
+    writer.writerow(map(in_spreadsheet, names))
+    for number, row in enumerate(rows):
+        writer.writerow(map(csv_cell, row))
+        content.write(lines.getvalue().encode())
+        lines.seek(0)
+        lines.truncate()
+        if number == query.rows or content.tell() > query.size:
+            # A file that ends early would be taken for the whole.
+            return {
+                "error": f"a download holds up to {query.rows:,} rows and "
+                f"{query.size / 1e6:.0f} MB, and this result has more: narrow the query, or use "
+                "`merge-runner sql --format csv`"
+            }, b""
+    content.write(lines.getvalue().encode())  # the names, where there is no row
+    return {}, content.getvalue()
+
+
+def csv_cell(value: object) -> object:
+    """A value of any type for a cell of CSV."""
+    text = text_of(value)
+    return text if isinstance(value, int | float | Decimal) else in_spreadsheet(text)
+
+
+def text_of(value: object) -> str | None:
+    """A value of any type as a text; None for NULL."""
+    match value:
+        case None | str():
+            return value
+        case bool():
+            return "true" if value else "false"
+        case bytes():
+            return f"0x{value.hex()}"
+        case datetime():
+            text = value.isoformat(" ")
+            return INFINITE.get(text, text)
+        case list() | tuple() | dict():
+            return json.dumps(_plain(value), ensure_ascii=False)
+        case _:
+            return str(value)
+
+
+def _plain(value: object) -> object:
+    """A nested value as JSON can say it."""
+    match value:
+        case list() | tuple():
+            return [_plain(item) for item in value]
+        case dict():
+            return {str(text_of(key)): _plain(item) for key, item in value.items()}
+        case bool() | int() | float():
+            return value
+        case _:
+            return text_of(value)
+
+
+def _one_line(exc: BaseException) -> str:
+    """What an error says, without the query and the stack that DuckDB adds below."""
+    text, _, _ = str(exc).partition("\n\n")
+    return " ".join(text.partition("\nLINE ")[0].split())[:1000]
+
+
+if __name__ == "__main__":
+    main()

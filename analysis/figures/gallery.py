@@ -1,0 +1,300 @@
+"""The figures: Figure 2 of arXiv 2604.09609, the ablation matrix, and distributions."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from analysis.data.study import Group, Study
+from analysis.figures.drawing import (
+    COLUMN_IN,
+    LINE_IN,
+    MISSING,
+    PAGE_IN,
+    draw_points,
+    line_count,
+    named,
+    remarks,
+    say,
+    velocity_text,
+    wrapped,
+)
+from analysis.figures.panels import (
+    VELOCITIES_MPS,
+    Point,
+    deviations,
+    gaps,
+    left_first,
+    left_traces,
+    published_gap_line,
+)
+from analysis.figures.variant_figure import figure_2_variants
+from analysis.stats.group_scores import score
+from analysis.stats.indicators import INDICATORS
+from analysis.stats.measures import GAP, RMSE, known, published_human
+from merge_runner.errors import UsageError
+
+# Okabe and Ito's palette, safe for the colour-blind; each driver has a marker as well.
+HUMAN_STYLE = ("#000000", "o")
+STYLES = (
+    ("#0072B2", "s"),
+    ("#D55E00", "^"),
+    ("#009E73", "D"),
+    ("#CC79A7", "v"),
+    ("#56B4E9", "P"),
+    ("#E69F00", "X"),
+)
+LEGEND_COLUMNS = 4
+PASSED, FAILED, UNKNOWN = "#56B4E9", "#E69F00", "#DDDDDD"
+# The same input gives the same file.
+SETTINGS: Any = {
+    "font.size": 7,
+    "axes.titlesize": 7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "merge-runner",
+    "savefig.dpi": 300,
+}
+
+
+def figure_2(study: Study) -> Figure:
+    """Velocities of the left vehicle (A, B), who was first (C), gap (D), speed deviation (E)."""
+    groups = study.baselines
+    figure = Figure(figsize=(PAGE_IN, 8.2), layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=(2, 3))
+    traces, curves = parts
+    _traces(traces.subplots(2, max(len(groups), 1), sharex=True, sharey=True, squeeze=False), study)
+    axes = curves.subplots(3, 3, sharex=True, sharey="row")
+    _curves(axes[0], groups, left_first, "C", "P(left merges first)")
+    _curves(axes[1], groups, gaps, "D", "gap at merge (m)")
+    _curves(axes[2], groups, deviations, "E", "RMSE of speed (m/s)")
+    axes[0, 0].set_ylim(-0.05, 1.05)
+    for column, velocity in enumerate(VELOCITIES_MPS):
+        axes[0, column].set_title(f"Δv = {velocity_text(velocity)}")
+        axes[2, column].set_xlabel("projected headway (m)")
+        if study.human in groups and not study.human.measured:
+            axes[1, column].plot(*published_gap_line(velocity), color="black", ls="--", lw=0.8)
+            axes[2, column].margins(y=0.3)
+            say(axes[2, column], MISSING, 0.99)
+    _legend(curves, study, groups)
+    return figure
+
+
+def ablation_matrix(study: Study) -> Figure:
+    """Which indicators hold for which driver and variant; text and colour say the same."""
+    groups = study.groups
+    names = [wrapped(named(group), COLUMN_IN / 2) for group in groups]
+    row_in = max(0.22, LINE_IN * line_count(names) + 0.04)
+    figure = Figure(figsize=(COLUMN_IN, 0.6 + row_in * len(groups)), layout="constrained")
+    axes = figure.subplots()
+    for row, group in enumerate(groups):
+        found = score(study, group)
+        for column, name in enumerate(INDICATORS):
+            passed, robust = found.paper[name].passed, found.robust[name].passed
+            colour = UNKNOWN if passed is None else PASSED if passed else FAILED
+            axes.add_patch(
+                mpl.patches.Rectangle((column, row), 1, 1, facecolor=colour, edgecolor="white")
+            )
+            text = _mark(passed)
+            if robust is not None and robust != passed:
+                text += f" / {_mark(robust)}"
+            axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=6)
+    axes.set(xlim=(0, len(INDICATORS)), ylim=(len(groups), 0))
+    axes.set_xticks(np.arange(len(INDICATORS)) + 0.5, list(INDICATORS))
+    axes.set_yticks(np.arange(len(groups)) + 0.5, names)
+    axes.tick_params(length=0, labeltop=True, labelbottom=False)
+    axes.spines[:].set_visible(False)
+    return figure
+
+
+def distributions(study: Study) -> Figure:
+    """Gaps and speed deviations of finished trials: median, quartiles, and every trial."""
+    groups = study.groups
+    names = [wrapped(named(group), PAGE_IN / 4) for group in groups]
+    row_in = max(0.28, LINE_IN * line_count(names) + 0.04)
+    figure = Figure(figsize=(PAGE_IN, 0.8 + row_in * len(groups)), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, measure in zip(axes, (GAP, RMSE), strict=True):
+        for row, group in enumerate(groups):
+            colour, _ = _style(study, group)
+            if not known(group, measure):
+                axis.plot(published_human(measure), row, "D", color=colour, ms=4)
+                axis.annotate(
+                    "published mean", (published_human(measure), row), (6, -2),
+                    textcoords="offset points", fontsize=6,
+                )  # fmt: skip
+                continue
+            values = group.finished[measure.column].dropna().to_numpy(float)
+            if not len(values):
+                axis.annotate("no finished trial", (0.02, row), xycoords=("axes fraction", "data"))
+                continue
+            # Spread by rank, not by chance: the same trials give the same picture.
+            spread = row + 0.36 * (np.arange(len(values)) % 7 / 6 - 0.5)
+            axis.plot(values, spread, ".", color=colour, ms=1.5, alpha=0.4, rasterized=True)
+            axis.boxplot(
+                values, positions=[row], orientation="horizontal", widths=0.6, showfliers=False,
+                medianprops={"color": colour, "lw": 1.4}, manage_ticks=False,
+            )  # fmt: skip
+        axis.set_xlabel(measure.heading)
+    axes[0].set_yticks(range(len(groups)), names)
+    axes[0].set_ylim(len(groups) - 0.5, -0.5)
+    return figure
+
+
+METADATA: dict[str, dict[str, None]] = {
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+    "png": {"Software": None},
+    "svg": {"Date": None, "Creator": None},
+}
+FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
+    "figure2": (
+        figure_2,
+        "Baseline behaviour, collisions left out. (A, B) Speed of the left vehicle from the start "
+        "of control, where it merges first and second. (C) How often the left vehicle merges first "
+        "by projected headway and relative velocity, with Wilson intervals. (D) Mean gap at the "
+        "merge point and (E) mean RMSE of the speed from the initial speed, two values a trial, "
+        "with intervals of Student's t.",
+    ),
+    "figure2-variants": (
+        figure_2_variants,
+        "The same for every prompt variant, a row a driver and variant, collisions left out. (A, "
+        "B) Speed of the left vehicle from the start of control, where it merges first and second. "
+        "(C) How often the left vehicle merges first by projected headway, with Wilson intervals. "
+        "(D) Mean gap at the merge point and (E) mean RMSE of the speed from the initial speed, "
+        "two values a trial, with intervals of Student's t. Colours and markers tell the relative "
+        "velocities apart; few very wide intervals of D and E are cut at the frame.",
+    ),
+    "ablation-matrix": (
+        ablation_matrix,
+        "Indicators of human behaviour by the paper's rule; where the robust tests disagree, their "
+        "verdict stands after a stroke.",
+    ),
+    "distributions": (
+        distributions,
+        "Gap at the merge point and RMSE of the speed of all finished trials: medians, quartiles, "
+        "whiskers to 1.5 times the quartiles' distance, and every trial.",
+    ),
+}
+
+
+def write_figures(study: Study, folder: Path) -> Iterator[Path]:
+    """Write every figure as PDF and PNG; yields the paths. Raises UsageError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise UsageError(f"{folder} cannot be made: {exc}") from exc
+    for name in FIGURES:
+        for form in ("pdf", "png"):
+            path = folder / f"{name}.{form}"
+            path.write_bytes(rendered(study, name, form))
+            yield path
+
+
+def rendered(study: Study, name: str, form: Literal["pdf", "png", "svg"]) -> bytes:
+    """One figure as a file, without a date, so that equal results give equal bytes."""
+    out = io.BytesIO()
+    with mpl.rc_context(SETTINGS):
+        _figure(study, name).savefig(out, format=form, metadata=METADATA[form])
+    return out.getvalue()
+
+
+@cache
+def _figure(study: Study, name: str) -> Figure:
+    """A figure, laid out once for all its forms."""
+    figure = FIGURES[name][0](study)
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)  # or every form would be laid out anew
+    return figure
+
+
+def _traces(axes: NDArray[np.object_], study: Study) -> None:
+    for column, group in enumerate(study.baselines):
+        for row, (first, panel) in enumerate((("left", "A"), ("right", "B"))):
+            axis: Axes = axes[row, column]
+            found = left_traces(study, group, first)
+            colour, _ = _style(study, group)
+            alpha = min(0.4, max(0.06, 25 / max(len(found), 1)))  # many lines must not be one blot
+            lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
+            lines.set(capstyle="projecting", joinstyle="round")
+            axis.add_collection(lines)
+            axis.autoscale_view()
+            if not group.measured:
+                say(axis, MISSING)
+            elif not found:
+                say(axis, f"{first} never merged first")
+            if row == 0:
+                axis.set_title(wrapped(group.label, 0.85 * PAGE_IN / len(study.baselines)))
+            if found:
+                axis.text(0.98, 0.04, f"n = {len(found)}", transform=axis.transAxes, ha="right")
+            if column == 0:
+                place = "first" if first == "left" else "second"
+                axis.set_ylabel(f"left merges {place}\nv left (m/s)")
+                _panel(axis, panel)
+            if row == 1:
+                axis.set_xlabel("time (s)")
+
+
+def _curves(
+    axes: NDArray[np.object_],
+    groups: list[Group],
+    points: Callable[[Group, float], list[Point]],
+    panel: str,
+    label: str,
+) -> None:
+    axes[0].set_ylabel(label)
+    _panel(axes[0], panel)
+    for axis, velocity in zip(axes, VELOCITIES_MPS, strict=True):
+        for index, group in enumerate(groups):
+            found = points(group, velocity)
+            # Side by side, so that intervals do not hide each other.
+            shift = 0.16 * (index - (len(groups) - 1) / 2)
+            draw_points(axis, found, shift, *_group_style(groups, group))
+        axis.set_xticks([-4, -2, 0, 2, 4])
+
+
+def _legend(figure: SubFigure, study: Study, groups: list[Group]) -> None:
+    handles = []
+    for group in groups:
+        colour, marker = _group_style(groups, group)
+        label = wrapped(group.label, PAGE_IN / LEGEND_COLUMNS - 0.4)
+        handles.append(
+            Line2D([], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white", label=label)
+        )
+    handles += remarks(study, "black")
+    figure.legend(handles=handles, loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False)
+
+
+def _style(study: Study, group: Group) -> tuple[str, str]:
+    return _group_style(study.baselines, group)
+
+
+def _group_style(groups: list[Group], group: Group) -> tuple[str, str]:
+    """Colour and marker of a driver, the same for all its variants."""
+    if not group.setting:
+        return HUMAN_STYLE
+    drivers = list(dict.fromkeys(g.driver for g in groups if g.setting))
+    index = drivers.index(group.driver) if group.driver in drivers else len(drivers)
+    return STYLES[index % len(STYLES)]
+
+
+def _mark(passed: bool | None) -> str:
+    return "–" if passed is None else "✓" if passed else "✗"
+
+
+def _panel(axis: Axes, letter: str) -> None:
+    axis.text(-0.02, 1.06, letter, transform=axis.transAxes, fontweight="bold", ha="right")

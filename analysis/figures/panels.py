@@ -1,0 +1,86 @@
+"""What the figures show, as numbers: traces, and estimates per condition with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from analysis.data.reference_data import published
+from analysis.data.study import Group, Study, of_group
+from analysis.stats.intervals import Estimate, mean, proportion
+from analysis.stats.regressions import gap_design
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+
+Array = NDArray[np.float64]
+VELOCITIES_MPS = (-0.8, 0.0, 0.8)
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One condition of a group: projected headway in m, and the estimate there."""
+
+    headway_m: float
+    estimate: Estimate
+
+
+def left_first(group: Group, velocity_mps: float) -> list[Point]:
+    """Panel C: how often the left vehicle merges first, of finished trials."""
+    return [
+        Point(headway, proportion(int((known == "left").sum()), len(known)))
+        for headway, trials in _conditions(group.outcomes, velocity_mps)
+        if len(known := trials["merged_first"].dropna())
+    ]
+
+
+def gaps(group: Group, velocity_mps: float) -> list[Point]:
+    """Panel D: mean gap in m; nothing where no traces are known."""
+    if not group.measured:
+        return []
+    return [
+        Point(headway, mean(trials["gap_m"].to_numpy(float)))
+        for headway, trials in _conditions(group.trials, velocity_mps)
+        if trials["gap_m"].notna().any()
+    ]
+
+
+def deviations(group: Group, velocity_mps: float) -> list[Point]:
+    """Panel E: mean RMSE of the speed in m/s, two values a trial."""
+    if not group.measured:
+        return []
+    return [
+        Point(headway, mean(both))
+        for headway, trials in _conditions(group.trials, velocity_mps)
+        if len(both := trials[["rmse_left_mps", "rmse_right_mps"]].to_numpy(float).ravel())
+    ]
+
+
+def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
+    """The human regression of the gap as the paper prints it: headways and gaps in m."""
+    headway = np.linspace(-4, 4, 81)
+    terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
+    return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
+
+
+def left_traces(study: Study, group: Group, first: str) -> list[Array]:
+    """Panels A and B: times in s and left speeds in m/s, (n, 2), where ``first`` merged first."""
+    if not group.measured:
+        return []
+    chosen = group.finished[group.finished["merged_first"] == first]
+    rows = of_group(study.left_speeds, group, chosen)
+    return [
+        np.column_stack(trace) for trace in zip(rows["time_s"], rows["velocity_mps"], strict=True)
+    ]
+
+
+def _conditions(every: pd.DataFrame, velocity_mps: float) -> Iterator[tuple[float, pd.DataFrame]]:
+    """The finished trials of each condition with this relative velocity, by headway."""
+    finished = every[every["status"] == "finished"]
+    chosen = [c for c in CONDITIONS.values() if c.relative_velocity_mps == velocity_mps]
+    for condition in sorted(chosen, key=lambda c: c.projected_headway_m):
+        trials = finished[finished["condition"] == condition.name]
+        if len(trials):
+            yield condition.projected_headway_m, trials

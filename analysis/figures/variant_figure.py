@@ -1,0 +1,195 @@
+"""Figure 2 of arXiv 2604.09609 for every prompt variant: a row a group, a column a panel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from analysis.data.study import Group, Study
+from analysis.figures.drawing import (
+    LINE_IN,
+    MISSING,
+    PAGE_IN,
+    draw_points,
+    line_count,
+    remarks,
+    say,
+    velocity_text,
+    wrapped,
+)
+from analysis.figures.panels import (
+    VELOCITIES_MPS,
+    Point,
+    deviations,
+    gaps,
+    left_first,
+    left_traces,
+    published_gap_line,
+)
+from analysis.stats.intervals import Estimate
+from analysis.tables.formats import VARIANTS
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+
+# Laid out by hand: many rows of equal panels need no solver. In inches.
+LABEL_IN, ROW_IN = 1.15, 0.62
+LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = LABEL_IN + 0.35, 0.08, 0.4, 0.62
+BETWEEN_ROWS_IN, BETWEEN_COLUMNS_IN = 0.16, 0.3
+# Of Okabe and Ito's palette, with a marker each, in the order of VELOCITIES_MPS.
+STYLES = (("#0072B2", "v"), ("#009E73", "o"), ("#D55E00", "^"))
+HEADINGS = (
+    "left first:\nv left (m/s)",
+    "left second:\nv left (m/s)",
+    "P(left\nmerges first)",
+    "gap at\nmerge (m)",
+    "RMSE of\nspeed (m/s)",
+)
+XLABELS = ("time (s)", "time (s)", *["headway (m)"] * 3)
+SHOWN = 0.95
+PANELS = (left_first, gaps, deviations)
+
+
+def figure_2_variants(study: Study) -> Figure:
+    """Left speeds (A, B), who was first (C), gap (D) and speed deviation (E) of every group."""
+    groups = study.groups
+    names = [_name(group) for group in groups]
+    figure, axes = _panels(len(groups), max(ROW_IN, LINE_IN * line_count(names) + 0.06))
+    for row, group, name in zip(axes, groups, names, strict=True):
+        row[0].annotate(
+            name, (0, 0.5), (-72 * (LEFT_IN - 0.05), 0), "axes fraction",
+            textcoords="offset points", va="center",
+        )  # fmt: skip
+        for axis, first in zip(row[:2], ("left", "right"), strict=True):
+            _traces(axis, study, group, first)
+        for axis, points in zip(row[2:], PANELS, strict=True):
+            _points(axis, group, points)
+        if not group.measured:
+            _published(row[3])
+    _scales(axes, groups)
+    _headings(axes)
+    _legend(figure, study)
+    return figure
+
+
+def _panels(rows: int, row_in: float) -> tuple[Figure, NDArray[np.object_]]:
+    """A figure of page width with ``rows`` rows of panels of equal size."""
+    height_in = TOP_IN + BOTTOM_IN + rows * row_in - BETWEEN_ROWS_IN
+    panel_in = (PAGE_IN - LEFT_IN - RIGHT_IN + BETWEEN_COLUMNS_IN) / len(HEADINGS)
+    figure = Figure(figsize=(PAGE_IN, height_in))
+    axes = figure.subplots(
+        rows,
+        len(HEADINGS),
+        sharex="col",
+        sharey="col",
+        squeeze=False,
+        gridspec_kw={
+            "left": LEFT_IN / PAGE_IN,
+            "right": 1 - RIGHT_IN / PAGE_IN,
+            "top": 1 - TOP_IN / height_in,
+            "bottom": BOTTOM_IN / height_in,
+            "hspace": BETWEEN_ROWS_IN / (row_in - BETWEEN_ROWS_IN),
+            "wspace": BETWEEN_COLUMNS_IN / (panel_in - BETWEEN_COLUMNS_IN),
+        },
+    )
+    return figure, axes
+
+
+def _name(group: Group) -> str:
+    driver = wrapped(group.label, LABEL_IN)
+    if not group.setting:
+        return driver
+    return f"{driver}\n{wrapped(VARIANTS.get(group.setting, group.setting), LABEL_IN)}"
+
+
+def _traces(axis: Axes, study: Study, group: Group, first: str) -> None:
+    """The left speeds of those trials in which this side merged first."""
+    parts = [left_traces(study, _part(group, velocity), first) for velocity in VELOCITIES_MPS]
+    count = sum(map(len, parts))
+    alpha = min(0.4, max(0.06, 25 / max(count, 1)))  # many lines must not be one blot
+    for found, (colour, _) in zip(parts, STYLES, strict=True):
+        lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
+        lines.set(capstyle="projecting", joinstyle="round")
+        axis.add_collection(lines)
+    axis.autoscale_view()
+    if count:
+        # Who goes first drives faster: below there is room, and above for who goes second.
+        y, va = (0.04, "bottom") if first == "left" else (0.96, "top")
+        axis.text(0.98, y, f"n = {count}", transform=axis.transAxes, ha="right", va=va, fontsize=6)
+    else:
+        say(axis, "no such trial" if group.measured else MISSING)
+
+
+def _part(group: Group, velocity_mps: float) -> Group:
+    names = [c.name for c in CONDITIONS.values() if c.relative_velocity_mps == velocity_mps]
+    return group.part(lambda trials: trials["condition"].isin(names))
+
+
+def _points(axis: Axes, group: Group, points: Callable[[Group, float], list[Point]]) -> None:
+    """Estimates of the three relative velocities, side by side."""
+    found = [points(group, velocity) for velocity in VELOCITIES_MPS]
+    for index, (part, style) in enumerate(zip(found, STYLES, strict=True)):
+        draw_points(axis, part, 0.3 * (index - 1), *style)
+    if group.measured and not any(found):
+        say(axis, "no such trial")
+    elif points is deviations and not group.measured:
+        say(axis, MISSING)
+
+
+def _published(axis: Axes) -> None:
+    """The humans' gaps as the paper's regression has them."""
+    for velocity, (colour, _) in zip(VELOCITIES_MPS, STYLES, strict=True):
+        axis.plot(*published_gap_line(velocity), color=colour, ls="--", lw=0.8)
+
+
+def _scales(axes: NDArray[np.object_], groups: list[Group]) -> None:
+    """One scale a quantity; a few very wide intervals must not press all others flat."""
+    speeds = [limit for axis in axes[0, :2] for limit in axis.get_ylim()]
+    for axis in axes[0, :2]:
+        axis.set_ylim(min(speeds), max(speeds))
+    axes[0, 2].set_ylim(-0.08, 1.08)
+    axes[0, 2].set_yticks([0, 0.5, 1])
+    published = not all(group.measured for group in groups)
+    lines = [float(y) for v in VELOCITIES_MPS for y in published_gap_line(v)[1] if published]
+    for axis, points in zip(axes[0, 3:], PANELS[1:], strict=True):
+        found = [p.estimate for g in groups for v in VELOCITIES_MPS for p in points(g, v)]
+        if found:
+            axis.set_ylim(*_limits(found, lines if points is gaps else []))
+    for axis in axes[0, 2:]:
+        axis.set_xlim(-5, 5)
+        axis.set_xticks([-4, 0, 4])
+
+
+def _limits(found: list[Estimate], lines: list[float]) -> tuple[float, float]:
+    """Limits that hold all values and lines, and of 20 bounds of intervals 19."""
+    values = [*lines, *(one.value for one in found if one.value is not None)]
+    lows = [one.low for one in found if one.low is not None] or values
+    highs = [one.high for one in found if one.high is not None] or values
+    low = min(*values, float(np.quantile(lows, 1 - SHOWN)))
+    high = max(*values, float(np.quantile(highs, SHOWN)))
+    margin = 0.08 * (high - low) or 1.0
+    return low - margin, high + margin
+
+
+def _headings(axes: NDArray[np.object_]) -> None:
+    for axis, heading, letter in zip(axes[0], HEADINGS, "ABCDE", strict=True):
+        axis.set_title(heading)
+        axis.text(-0.02, 1.1, letter, transform=axis.transAxes, fontweight="bold", ha="right")
+    for axis, label in zip(axes[-1], XLABELS, strict=True):
+        axis.set_xlabel(label)
+
+
+def _legend(figure: Figure, study: Study) -> None:
+    handles = [
+        Line2D(
+            [], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white",
+            label=f"Δv = {velocity_text(velocity)}",
+        )
+        for velocity, (colour, marker) in zip(VELOCITIES_MPS, STYLES, strict=True)
+    ]  # fmt: skip
+    handles += remarks(study, "#555555")
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False)

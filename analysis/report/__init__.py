@@ -1,0 +1,1 @@
+"""The report: what the results show, in words, and the page that shows it."""

@@ -1,0 +1,215 @@
+"""In plain words: what the prompt variants of each driver change, and what could not be shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import comb, prod
+from typing import Any
+
+from scipy import stats
+
+from analysis.data.study import BASELINE, Group, Study
+from analysis.stats.indicators import ALPHA
+from analysis.stats.intervals import POWER
+from analysis.stats.measures import MEASURES, Measure, counts
+from analysis.stats.variants import variants
+from analysis.tables import finished_tables
+from analysis.tables.model import Row
+
+NAMES = {
+    "collided_percent": ("collisions by the scenario's rule", "points"),
+    "collided_boxes_percent": ("collisions of boxes", "points"),
+    "gap_m": ("the gap", "m"),
+    "rmse_mps": ("the RMSE of the speed", "m/s"),
+    "joint_percent": ("joint contributions", "points"),
+    "projected_headway": ("the effect of headway on who merges first", "logits per m"),
+    "relative_velocity": ("the effect of relative velocity on who merges first", "logits per m/s"),
+    "abs_projected_headway": ("the effect of |headway| on the gap", "m per m"),
+    "abs_relative_velocity": ("the effect of |relative velocity| on the gap", "m per m/s"),
+    "headway_x_velocity": (
+        "the effect of headway times relative velocity on the gap",
+        "m per m²/s",
+    ),
+}
+SOURCES = ("contrasts", "who-first-variants", "gap-variants")
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a variant changes in one measure or slope, named by ``what``.
+
+    ``difference``, ``ci`` and ``detectable`` are in its unit; ``possible``: whether a test of so
+    few trials can reach 5 % at all.
+    """
+
+    setting: str
+    what: str
+    difference: float
+    ci: tuple[float, float] | None
+    p_holm: float
+    detectable: float | None
+    possible: bool
+
+    @property
+    def text(self) -> str:
+        """``the gap by -2.40 m (95 % CI -3.23 to -1.57)``."""
+        name, unit = NAMES[self.what]
+        interval = f" (95 % CI {self.ci[0]:+.2f} to {self.ci[1]:+.2f})" if self.ci else ""
+        return f"{name} by {self.difference:+.2f} {unit}{interval}"
+
+
+def ablation_sentences(study: Study) -> list[str]:
+    """What is shown of the variants of each driver; nothing of stand-ins."""
+    found = dict(variants(study))
+    shown = [group for group in found if not group.scripted]
+    if not shown:
+        return []
+    tables = finished_tables(study.db, study.chosen, SOURCES, study)
+    rows = {row.id: row for table in tables for row in table.rows}
+    return [
+        text
+        for label in dict.fromkeys(group.label for group in shown)
+        for mine in [[group for group in shown if group.label == label]]
+        for text in _of_driver(label, mine, found[mine[0]], rows)
+    ]
+
+
+def _of_driver(
+    label: str, groups: list[Group], baseline: Group | None, rows: dict[str, Row]
+) -> Iterator[str]:
+    names = ", ".join(group.setting for group in groups)
+    if all((group.trials["source"] == "driver").all() for group in groups):
+        yield f"{label} is a program and reads no prompt: {names} can change nothing."
+        return
+    if baseline is None:
+        yield f"{label}: it has no baseline of its own, so what {names} changes cannot be said."
+        return
+    changes = [change for group in groups for change in _changes(group, baseline, rows)]
+    for group in groups:
+        yield from _differs(label, group, baseline, changes)
+    possible = [one for one in changes if one.possible and one.p_holm >= ALPHA]
+    yield from _not_shown(label, possible)
+    yield from _too_few(label, [one for one in changes if not one.possible])
+    yield from _not_compared(label, groups, changes)
+
+
+def _changes(group: Group, baseline: Group, rows: dict[str, Row]) -> Iterator[Change]:
+    for measure in MEASURES:
+        row = rows.get(f"{group.id}/{BASELINE}/{measure.name}")
+        if row is not None:
+            possible = smallest_p(group, baseline, measure) < ALPHA
+            yield _change(group, measure.name, row, "ci", possible=possible)
+    for slope in (name for name in NAMES if name not in {one.name for one in MEASURES}):
+        row = rows[f"{group.id}/{slope}"]
+        if "difference" in row.values:
+            yield _change(group, slope, row, "difference_ci", possible=True)
+
+
+def _change(group: Group, what: str, row: Row, interval: str, *, possible: bool) -> Change:
+    values: dict[str, Any] = dict(row.values)
+    return Change(
+        group.setting,
+        what,
+        values["difference"],
+        values[interval],
+        values["p_holm"],
+        values.get("detectable"),
+        possible,
+    )
+
+
+def smallest_p(group: Group, baseline: Group, measure: Measure) -> float:
+    """The smallest p that a test of so many trials gives, whatever comes out.
+
+    Fisher's of two rates of 0 and 1; that of the permutation test, where of all ways to shuffle
+    within the conditions one is the most extreme, or two that mirror each other.
+    """
+    if measure.rate:
+        n, m = (counts(one, measure)[1] for one in (group, baseline))
+        return float(stats.fisher_exact([[n, 0], [0, m]]).pvalue)
+    first, second = (
+        one.finished.dropna(subset=[measure.column])["condition"].value_counts()
+        for one in (group, baseline)
+    )
+    shared = [
+        (int(first[name]), int(second[name])) for name in first.index.intersection(second.index)
+    ]
+    extreme = 2 if all(n == m for n, m in shared) else 1
+    return extreme / prod(comb(n + m, n) for n, m in shared)
+
+
+def _differs(label: str, group: Group, baseline: Group, changes: list[Change]) -> Iterator[str]:
+    found = [one.text for one in changes if one.setting == group.setting and one.p_holm < ALPHA]
+    if found:
+        yield (
+            f"{label}, {group.setting} ({len(group.ended)} trials) differs from the baseline "
+            f"({len(baseline.ended)}), also after Holm's correction, in {listed(found)}."
+        )
+
+
+def _not_shown(label: str, changes: list[Change]) -> Iterator[str]:
+    if not changes:
+        return
+    sizes = [
+        f"{_span(found)} {unit} in {name}"
+        for what, (name, unit) in NAMES.items()
+        for found in [
+            [c.detectable for c in changes if c.what == what and c.detectable is not None]
+        ]
+        if found
+    ]
+    yield f"{label}: no difference from the baseline is shown, after Holm's correction, in " + (
+        f"{_which(changes)}."
+        if not sizes
+        else f"{_which(changes)}. That does not show that there is none: the smallest difference "
+        f"that one such test, not yet corrected, finds with a chance of {100 * POWER:.0f} % is "
+        f"about {listed(sizes)}."
+    )
+
+
+def _too_few(label: str, changes: list[Change]) -> Iterator[str]:
+    if changes:
+        yield (
+            f"{label}: nothing could have been shown in {_which(changes)}: with so few trials no "
+            "outcome reaches p < .05."
+        )
+
+
+def _not_compared(label: str, groups: list[Group], changes: list[Change]) -> Iterator[str]:
+    there = {(one.setting, one.what) for one in changes}
+    lacking = [
+        (group.setting, what)
+        for what in NAMES
+        for group in groups
+        if (group.setting, what) not in there
+    ]
+    if lacking:
+        yield (
+            f"{label}: not compared with the baseline, for want of finished trials or of a fit: "
+            f"{_grouped(lacking)}. The notes of the tables {', '.join(SOURCES)} say why."
+        )
+
+
+def _which(changes: list[Change]) -> str:
+    return _grouped([(one.setting, one.what) for one in changes])
+
+
+def _grouped(found: list[tuple[str, str]]) -> str:
+    """Measures and slopes with their variants; those of the same variants together."""
+    alike: dict[str, list[str]] = {}
+    for what, (name, _) in NAMES.items():
+        settings = ", ".join(setting for setting, other in found if other == what)
+        if settings:
+            alike.setdefault(settings, []).append(name)
+    return "; ".join(f"{listed(names)} ({settings})" for settings, names in alike.items())
+
+
+def _span(values: list[float]) -> str:
+    low, high = (f"{value:.2f}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def listed(items: list[str]) -> str:
+    """``a, b and c``."""
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

@@ -1,0 +1,282 @@
+"""In plain words: what the results of a study show, and what they cannot show.
+
+Each sentence is made of the numbers that it talks about. Scripted stand-ins are in none.
+"""
+
+from __future__ import annotations
+
+from analysis.data.provenance import Provenance
+from analysis.data.reference_data import HUMAN_TRIALS, PAIRS
+from analysis.data.study import Group, Study
+from analysis.report.ablated import ablation_sentences
+from analysis.report.alarms import mismatch
+from analysis.report.unlike import unlike
+from analysis.stats.contrasts import contrast_rates
+from analysis.stats.group_scores import Score, score, unjudged
+from analysis.stats.indicators import ALPHA, INDICATORS, Verdict
+from analysis.stats.measures import BOXES, GAP, counts, estimate, known, published_human
+from analysis.stats.mixed import MIN_PAIRS
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+
+NAMES = {
+    "I1": "going first becomes likelier with a projected headway advantage",
+    "I2": "going first becomes less likely with a relative velocity advantage",
+    "I3": "the gap grows with the projected headway",
+    "I4": "the gap does not depend on the relative velocity",
+    "I5": "accelerations are held and jump as the humans' do",
+}
+# So many of the human data sets of a study's size that have a mark make its lack strong evidence,
+# and at most so many weak evidence.
+STRONG, WEAK = 0.95, 0.8
+
+
+def shown(study: Study) -> list[str]:
+    """What the baseline of each driver shows, and then its prompt variants."""
+    texts = [text for group in _concluded(study) for text in _shown(study, group)]
+    return texts + ablation_sentences(study)
+
+
+def not_shown(study: Study, origin: Provenance) -> list[str]:
+    """What cannot be concluded, and why."""
+    texts = [text for group in _concluded(study) for text in _limits(study, group)]
+    texts += [
+        f"{group.id}: {group.posing}: its rows say nothing about a language model."
+        for group in study.baselines
+        if group.scripted
+    ]
+    texts += [f"Another model answered: {mismatch(one)}" for one in origin.mismatches]
+    if not _concluded(study):
+        texts.append("There is no baseline trial of a driver to judge: nothing can be concluded.")
+    texts += _human_limits(study)
+    texts += [text for group in study.baselines for text in _asked(group, origin)]
+    return texts
+
+
+def nothing(study: Study) -> str:
+    """Why there is nothing to conclude, where ``shown`` is empty."""
+    if study.chosen is not None:
+        return "Nothing: no driver that was played with the baseline prompt is chosen."
+    if study.empty:
+        return "Nothing yet: there is no trial of a driver. `make sweep` plays some."
+    if any(group.setting and group.scripted for group in study.baselines):
+        return "Nothing: with the baseline prompt only scripted stand-ins drove."
+    return "Nothing yet: no driver was played with the baseline prompt."
+
+
+def _concluded(study: Study) -> list[Group]:
+    """The baselines that conclusions are about."""
+    return [group for group in study.baselines if group.setting and not group.scripted]
+
+
+def _shown(study: Study, group: Group) -> list[str]:
+    if not len(group.ended):
+        return [f"{group.driver}: no trial ended ({group.left_out})."]
+    if not len(group.finished):
+        return [
+            f"{group.driver}: no trial finished ({group.left_out}).",
+            _collisions(study, group),
+        ]
+    return [
+        *_marks(study, group),
+        _collisions(study, group),
+        _gap(study, group),
+        *unlike(study, group),
+    ]
+
+
+def _marks(study: Study, group: Group) -> list[str]:
+    """Which indicators hold, which do not, and what the lack of one says."""
+    found = score(study, group)
+    both = {name: (found.paper[name].passed, found.robust[name].passed) for name in INDICATORS}
+    agreed = [NAMES[name] for name, verdicts in both.items() if verdicts == (True, True)]
+    failed = [name for name, verdicts in both.items() if False in verdicts and True not in verdicts]
+    mixed = [
+        f"{NAMES[name]} (paper's rule: {_word(found.paper[name])}, "
+        f"robust: {_word(found.robust[name])})"
+        for name, verdicts in both.items()
+        if True in verdicts and verdicts != (True, True)
+    ]
+    texts = [f"{group.driver} shows, by both rules: {_listed(agreed)}."] if agreed else []
+    texts += [
+        f"{group.driver} does not show that {NAMES[name]}: {_weight(found, name)}."
+        for name in failed
+    ]
+    if mixed:
+        texts.append(f"{group.driver}, by one rule alone: {_listed(mixed)}.")
+    return texts
+
+
+def _weight(found: Score, name: str) -> str:
+    """What the lack of a mark says, from how often humans have it in studies of this size.
+
+    Who has it by neither rule lacks also the one that humans pass more often.
+    """
+    robust, paper = found.ceiling.robust.get(name), found.ceiling.paper.get(name)
+    if robust is None or paper is None:
+        return "how often humans would in a study of this size is not known"
+    judging = [
+        share
+        for share, verdicts in ((robust, found.robust), (paper, found.paper))
+        if verdicts[name].passed is not None
+    ]
+    strength = _strength(max(judging))
+    return (
+        f"{100 * robust:.0f} % of human data sets of this size do by the robust tests, "
+        f"{100 * paper:.0f} % by the paper's, so that this is {strength} evidence against the "
+        "driver"
+    )
+
+
+def _strength(share: float) -> str:
+    return "strong" if share >= STRONG else "weak" if share < WEAK else "some"
+
+
+def _collisions(study: Study, group: Group) -> str:
+    humans = _alike(study.human, group)
+    found, human = estimate(group, BOXES), estimate(humans, BOXES)
+    if found.value is None:
+        return f"{group.driver}: of no trial is it decided whether boxes would have overlapped."
+    contrast = contrast_rates(counts(group, BOXES), counts(humans, BOXES))
+    assert contrast.low is not None
+    assert contrast.high is not None
+    verdict = (
+        "a difference that chance alone seldom makes"
+        if contrast.p < ALPHA
+        else f"no difference is shown, and one from {100 * contrast.low:+.1f} to "
+        f"{100 * contrast.high:+.1f} percentage points is compatible with these trials"
+    )
+    return (
+        f"{group.driver} collided, by boxes that overlap, in {found.value:.1f} % of "
+        f"{_trials(found.n)} (95 % CI {found.low:.1f} to {found.high:.1f}), humans in "
+        f"{human.value:.1f} % of {human.n} in the same {_conditions(group)} ({human.low:.1f} to "
+        f"{human.high:.1f}); Fisher's exact p "
+        f"{_p(contrast.p)}: {verdict}."
+    )
+
+
+def _gap(study: Study, group: Group) -> str:
+    found = estimate(group, GAP)
+    if found.value is None:
+        return f"{group.driver} has no gap at the merge point."
+    interval = "" if found.low is None else f" (95 % CI {found.low:.2f} to {found.high:.2f})"
+    return (
+        f"{group.driver} leaves {found.value:.2f} m on average of {_trials(found.n)}{interval}; "
+        f"humans {_human_gap(study, group)}."
+    )
+
+
+def _human_gap(study: Study, group: Group) -> str:
+    if not known(study.human, GAP):
+        return f"{published_human(GAP):.2f} m as published, over all {len(CONDITIONS)} conditions"
+    human = estimate(_alike(study.human, group), GAP)
+    if human.value is None:
+        return "have none in the imported trials of these conditions"
+    return f"{human.value:.2f} m in {human.n} imported trials of the same {_conditions(group)}"
+
+
+def _alike(human: Group, group: Group) -> Group:
+    """The humans in the conditions that a driver was played in."""
+    return human.part(lambda trials: trials["condition"].isin(group.ended["condition"]))
+
+
+def _conditions(group: Group) -> str:
+    number = group.ended["condition"].nunique()
+    return f"{number} condition{'s' * (number != 1)}"
+
+
+def _limits(study: Study, group: Group) -> list[str]:
+    found, texts = score(study, group), []
+    if len(group.finished):
+        texts.append(
+            f"{group.driver}: of human data sets with as many trials in each condition "
+            f"({sum(group.sizes)} in all), {100 * found.ceiling.paper['I1-I4']:.0f} % pass I1 to "
+            f"I4 together by the paper's tests, {100 * found.ceiling.robust['I1-I4']:.0f} % by the "
+            "robust ones; one that a test cannot judge does not pass."
+        )
+    if found.paper["I4"].passed and found.robust["I4"].passed is False:
+        texts.append(
+            f"{group.driver}: that the gap does not depend on relative velocity is not shown; the "
+            "effect is not significant, but one of 1 m is not excluded either."
+        )
+    return texts + [
+        f"{group.driver}: {', '.join(names)} cannot be judged {' or '.join(rules)}: {why}."
+        for why, (names, rules) in unjudged(found, *INDICATORS).items()
+    ]
+
+
+def _human_limits(study: Study) -> list[str]:
+    """What the humans' side rests on."""
+    texts = []
+    if study.imported is None:
+        texts.append(
+            "The human recordings are not imported: human gaps, speed deviations and profiles are "
+            "those that were published, the speed profiles have nothing to be compared with, and "
+            "the human ceiling rests on a normal approximation of the gaps."
+        )
+    elif not study.complete:
+        texts.append(
+            f"{study.imported.trials} human trials are imported, of {study.imported.pairs} "
+            f"pair{'s' * (study.imported.pairs != 1)}: gaps, speeds and profiles are theirs, "
+            f"collisions and who merged first are those of the {HUMAN_TRIALS} published ones."
+        )
+        if study.imported.pairs < MIN_PAIRS:
+            texts.append(
+                f"With fewer than {MIN_PAIRS} human pairs a difference from the humans in the gap "
+                "is tested against the published regression."
+            )
+    if study.imported is not None and study.imported.contradicting:
+        texts.append(
+            "The imported human trials contradict the published counts ("
+            f"{'; '.join(study.imported.contradicting)}): they are another data set."
+        )
+    pairs = study.imported.pairs if study.complete and study.imported else len(PAIRS)
+    texts.append(
+        f"Trials of humans come from {pairs} pairs who differ: tests that pool them, as the "
+        "paper's, understate the human uncertainty."
+    )
+    return texts
+
+
+def _asked(group: Group, origin: Provenance) -> list[str]:
+    """What the results of a baseline are bound to: the wording, and what was sent with it."""
+    if not group.setting or group.scripted:
+        return []
+    changed = origin.tasks.get(group.spec_hash or "")
+    task = [f"{group.driver}: its task is not the default one: {changed}."] if changed else []
+    if (group.trials["source"] == "driver").all():
+        return [*task, f"{group.driver} is a program: it reads no prompt, and samples nothing."]
+    sent = origin.sent.get(group.spec_hash or "") or {"": {}}
+    alike = len({str(parameters) for parameters in sent.values()}) == 1
+    told = [
+        _parameters(parameters) if alike else f"{side}: {_parameters(parameters)}"
+        for side, parameters in sent.items()
+    ]
+    return [
+        *task,
+        f"{group.driver}: results hold for the wording of the prompt, which is a reconstruction "
+        f"(the original is not public), and for what was sent with it: "
+        f"{'; '.join(dict.fromkeys(told))}.",
+    ]
+
+
+def _parameters(sent: dict[str, object]) -> str:
+    if not sent:
+        return "no parameter is on record"
+    listed = ", ".join(f"{name} = {value}" for name, value in sent.items())
+    return listed if "temperature" in sent else f"{listed}, and no temperature"
+
+
+def _trials(n: int) -> str:
+    return f"{n} trial" if n == 1 else f"{n} trials"
+
+
+def _p(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"= {p:.3f}"
+
+
+def _word(verdict: Verdict) -> str:
+    return "not judged" if verdict.passed is None else "yes" if verdict.passed else "no"
+
+
+def _listed(items: list[str]) -> str:
+    return items[0] if len(items) == 1 else f"{'; '.join(items[:-1])}; and {items[-1]}"

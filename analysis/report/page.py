@@ -1,0 +1,91 @@
+"""The HTML of the report: conclusions, figures, tables, provenance, the trials behind it all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+import jinja2
+import pandas as pd
+
+from analysis.data.provenance import provenance
+from analysis.data.reference_data import published
+from analysis.data.study import Study
+from analysis.explain import Source, sources_of, sql_command
+from analysis.figures.gallery import FIGURES
+from analysis.report.alarms import alarms, posing
+from analysis.report.conclusions import not_shown, nothing, shown
+from analysis.tables.against import PAPER, against, in_paper
+from analysis.tables.formats import table_view
+from analysis.tables.model import Column, Row, Table
+from merge_runner.results.provenance import program
+
+TEMPLATES = Path(__file__).with_name("templates")
+LISTED = 300
+LIBRARIES = ("statsmodels", "firthmodels", "scipy", "numpy", "pandas", "matplotlib")
+
+
+@dataclass
+class Links:
+    """The sources of all cells; equal ones are listed once, under one number."""
+
+    study: Study
+    found: dict[tuple[Source, ...], int] = field(default_factory=dict)
+
+    def to(self, table: Table, row: Row, column: Column) -> int:
+        """The number of a cell's sources."""
+        sources = sources_of(self.study, table, row, column)
+        return self.found.setdefault(sources, len(self.found) + 1)
+
+
+def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
+    """The report as one HTML text; ``figures`` are SVG in Base64, by name."""
+    links = Links(study)
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    origin = provenance(study.db)
+    return environment.get_template("report.html").render(
+        study=study,
+        alarms=alarms(study, origin),
+        shown=shown(study),
+        not_shown=not_shown(study, origin),
+        nothing=nothing(study),
+        posing=posing(study),
+        figures=[
+            {"name": name, "caption": FIGURES[name][1], "data": data}
+            for name, data in figures.items()
+        ],
+        tables=[table_view(table, links.to) for table in tables],
+        beside=[table_view(against(table, PAPER), links.to) for table in tables if in_paper(table)],
+        sources=[(number, sources) for sources, number in links.found.items()],
+        listed=LISTED,
+        command=sql_command(study),
+        libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
+        origin=origin,
+        records=_records,
+        readings=_records(published("readings")),
+        sources_cited=_records(published("sources")),
+        program=program(),
+    )
+
+
+def _records(frame: pd.DataFrame) -> list[dict[str, object]]:
+    """Rows for a template: what is missing is an empty text, whole numbers are whole."""
+    return [
+        {str(name): _plain(value) for name, value in row.items()}
+        for row in frame.to_dict(orient="records")
+    ]
+
+
+def _plain(value: object) -> object:
+    if value is None or value is pd.NaT or (isinstance(value, float) and pd.isna(value)):
+        return ""
+    if isinstance(value, float):
+        return int(value) if value.is_integer() else round(value, 6)
+    return value

@@ -1,0 +1,69 @@
+"""One HTML file with everything: figures, tables, conclusions, provenance. It needs no network."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from analysis.data.derived_cache import finished, keep_finished
+from analysis.data.study import Study
+from analysis.figures.gallery import FIGURES, rendered, write_figures
+from analysis.report.page import report_html
+from analysis.table_format import TableFormat
+from analysis.tables import finished_tables
+from analysis.tables.formats import render
+from analysis.tables.model import Table, options_text
+from merge_runner.errors import UsageError
+
+SUFFIXES = {
+    TableFormat.TEXT: "txt",
+    TableFormat.CSV: "csv",
+    TableFormat.JSON: "json",
+    TableFormat.MD: "md",
+    TableFormat.LATEX: "tex",
+}
+
+
+def write_report(
+    db: Path, models: Sequence[str] | None, out: Path, files: Path | None
+) -> Iterator[Path]:
+    """Write the report, and all tables and figures into ``files``; yields the paths.
+
+    ``models`` keeps these drivers alone. Raises UsageError.
+    """
+    study = Study(db, models)
+    tables = finished_tables(db, models, study=study)
+    if files is not None:
+        yield from write_figures(study, files)
+        yield from write_tables(tables, files)
+    text = report_html(study, tables, finished_figures(study, options_text(db, models)))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text, encoding="utf-8")
+    except OSError as exc:
+        raise UsageError(f"{out} cannot be written: {exc}") from exc
+    yield out
+
+
+def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
+    """Write each table in every form; yields the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for table in tables:
+        for form, suffix in SUFFIXES.items():
+            path = folder / f"{table.name}.{suffix}"
+            path.write_text(render([table], form) + "\n", encoding="utf-8")
+            yield path
+
+
+def finished_figures(study: Study, options: str) -> dict[str, str]:
+    """Every figure by name as SVG in Base64, as it is kept in the database or drawn now."""
+    state, found = finished(study.db, options, list(FIGURES))
+    drawn = {
+        name: base64.b64encode(rendered(study, name, "svg")).decode()
+        for name in FIGURES
+        if name not in found
+    }
+    if drawn:
+        keep_finished(study.db, state, options, drawn)
+    return found | drawn

@@ -1,0 +1,163 @@
+"""Differences between two groups of trials: exact and permutation tests, and corrections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import optimize, special, stats
+
+from analysis.stats.intervals import LEVEL, POWER, detectable
+
+SEED = 260409609
+PERMUTATIONS = 9999
+DRAWN_AT_ONCE = 2**15  # they stay in the processor
+
+
+@dataclass(frozen=True, slots=True)
+class Contrast:
+    """A difference (first minus second) with its 95 % interval and a two-sided p-value.
+
+    ``detectable`` is the smallest difference, in either direction, that is found at p < .05 with a
+    power of 0.8; None where none is.
+    """
+
+    difference: float
+    low: float | None
+    high: float | None
+    p: float
+    detectable: float | None
+
+
+def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Contrast:
+    """Two rates, (successes, n) each: Fisher's exact test, Newcombe's score interval (1998)."""
+    from statsmodels.stats.proportion import confint_proportions_2indep
+
+    (a, n), (b, m) = first, second
+    low, high = confint_proportions_2indep(a, n, b, m, method="newcomb", alpha=1 - LEVEL)
+    p = stats.fisher_exact([[a, n - a], [b, m - b]]).pvalue
+    found = detectable_rate(n, m, b / m)
+    return Contrast(a / n - b / m, float(low), float(high), float(p), found)
+
+
+def detectable_rate(n: int, m: int, rate: float) -> float | None:
+    """The smallest difference from a true ``rate`` that Fisher's test of n and m trials finds.
+
+    In the direction in which less is enough; None where not even rates of 0 and 1 are told apart
+    from it with the power.
+    """
+    found = rejected(n, m) @ stats.binom.pmf(np.arange(m + 1), m, rate)
+
+    def power(other: float) -> float:
+        return float(stats.binom.pmf(np.arange(n + 1), n, other) @ found)
+
+    ends = [end for end in (0.0, 1.0) if power(end) >= POWER]
+    return min(
+        (abs(optimize.brentq(lambda x: power(x) - POWER, rate, end) - rate) for end in ends),
+        default=None,
+    )
+
+
+@cache
+def rejected(n: int, m: int) -> NDArray[np.bool_]:
+    """Of all outcomes, successes of n by successes of m, those with a Fisher's p below .05."""
+    counts = np.arange(n + 1), np.arange(m + 1)
+    # Log of k! (n - k)!: what is left of binomial coefficients when they are normalised.
+    first, second = (special.gammaln(k + 1) + special.gammaln(k[::-1] + 1) for k in counts)
+    found = np.empty((n + 1, m + 1), dtype=bool)
+    for total in range(n + m + 1):
+        a = np.arange(max(0, total - m), min(n, total) + 1)
+        log = -first[a] - second[total - a]
+        p = np.exp(log - log.max())
+        p /= p.sum()
+        order = np.argsort(p)
+        # As likely but for rounding is as likely.
+        last = np.searchsorted(p[order], p * (1 + 1e-7), side="right") - 1
+        found[a, total - a] = np.cumsum(p[order])[last] < 1 - LEVEL
+    return found
+
+
+def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Contrast | None:
+    """Two means, compared within conditions: permutation test, least-squares interval.
+
+    The difference is that of a linear model with a level for each condition, so that another mix of
+    conditions, as when one group collides more in some, makes none. The test shuffles the groups
+    within each condition, seeded. None where the groups share no condition.
+    """
+    both = pd.concat([first.assign(_first=1.0), second.assign(_first=0.0)]).dropna(subset=[measure])
+    both = both.sort_values("condition", kind="stable")
+    by_condition = both.groupby("condition")
+    value = (both[measure].astype(float) - by_condition[measure].transform("mean")).to_numpy(float)
+    group = (both["_first"] - by_condition["_first"].transform("mean")).to_numpy(float)
+    weight = float((group**2).sum())
+    if weight < 1e-12:
+        return None
+    difference = float((group * value).sum()) / weight
+    freedom = len(both) - by_condition.ngroups - 1
+    low = high = found = None
+    if freedom > 0:
+        variance = float(((value - difference * group) ** 2).sum()) / freedom
+        se = float(np.sqrt(variance / weight))
+        half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * se
+        low, high, found = difference - half, difference + half, detectable(se, freedom)
+    chosen = both["_first"].to_numpy(float) == 1
+    sizes = by_condition.size().to_numpy()
+    p = _permutation_p(value, chosen, sizes, weight, difference)
+    return Contrast(difference, low, high, p, found)
+
+
+def _permutation_p(
+    value: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
+    sizes: NDArray[np.int_],
+    weight: float,
+    observed: float,
+) -> float:
+    """Share of shuffles within conditions, the observed one included, with as large a difference.
+
+    ``value`` is centred within each condition; conditions lie one after another, in ``sizes``.
+    """
+    rng = np.random.default_rng(SEED)
+    ends = np.cumsum(sizes)
+    parts = [
+        shuffled_sums(rng, value[start:end], int(chosen[start:end].sum()))
+        for start, end in zip(ends - sizes, ends, strict=True)
+    ]
+    extreme = int((np.abs(np.sum(parts, axis=0) / weight) >= abs(observed) - 1e-12).sum())
+    return (extreme + 1) / (PERMUTATIONS + 1)
+
+
+def shuffled_sums(
+    rng: np.random.Generator, value: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Sums of ``count`` of the values, those that come first in each of PERMUTATIONS shuffles.
+
+    Shuffled is by random draws: the ``count`` smallest come first, in whatever order.
+    """
+    sums = np.zeros(PERMUTATIONS)
+    rows = max(1, DRAWN_AT_ONCE // len(value))
+    drawn = np.empty((rows, len(value)))
+    for start in range(0, PERMUTATIONS, rows):
+        draws = drawn[: PERMUTATIONS - start]
+        rng.random(out=draws)
+        if count:
+            last = np.partition(draws, count - 1, axis=1)[:, count - 1]
+            sums[start : start + rows] = (draws <= last[:, None]) @ value
+    return sums
+
+
+def corrected(p: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A family's p-values by Holm (1979) and by Benjamini and Hochberg (1995).
+
+    Not by statsmodels, which collects garbage at every call: that takes longer than the tests.
+    """
+    found = np.asarray(p, dtype=float)
+    order = np.argsort(found, kind="stable")
+    # The smallest is multiplied by the number of tests, the next by one less, and none falls.
+    steps = np.maximum.accumulate(found[order] * np.arange(len(found), 0, -1))
+    holm = np.empty_like(found)
+    holm[order] = np.minimum(steps, 1)
+    return holm, np.asarray(stats.false_discovery_control(found))

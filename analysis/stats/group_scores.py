@@ -1,0 +1,113 @@
+"""What a group of trials scores: its regressions, its indicators, and the human ceiling.
+
+Computed once per group and study; every table and figure reads it here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+from analysis.data.reference_data import published
+from analysis.data.study import Group, Study
+from analysis.stats.ceiling import Ceiling, Population, ceiling, imported_humans, published_humans
+from analysis.stats.indicators import Verdict, paper_verdicts, robust_verdicts
+from analysis.stats.likeness import likeness
+from analysis.stats.regressions import Regression, gap_ols, who_first_firth, who_first_logit
+
+PUBLISHED = "as published, no human traces are imported"
+BY_EYE = "by eye, the paper"
+NO_RULE = "the paper judged by eye"
+PAPER_RULE, ROBUST_RULE = "by the paper's test", "by the robust tests"
+REFERENCE = "the humans are the reference"
+
+
+@dataclass(frozen=True, slots=True)
+class Fits:
+    """The regressions of one group."""
+
+    logit: Regression
+    firth: Regression
+    ols: Regression
+    hc3: Regression
+
+
+@cache
+def fits(group: Group) -> Fits:
+    """Fit a group's trials; without gaps the linear fits say so."""
+    logit, firth = who_first_logit(group.outcomes), who_first_firth(group.outcomes)
+    if not group.measured:
+        missing = Regression(0, {}, PUBLISHED)
+        return Fits(logit, firth, missing, missing)
+    return Fits(logit, firth, gap_ols(group.trials), gap_ols(group.trials, robust=True))
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """A group's verdicts by both rules, with I5 in both, and what to draw its ceiling from.
+
+    ``sizes`` are its trials per condition.
+    """
+
+    paper: dict[str, Verdict]
+    robust: dict[str, Verdict]
+    humans: Population
+    sizes: tuple[int, ...]
+
+    @property
+    def ceiling(self) -> Ceiling:
+        """The human ceiling for the group's size."""
+        return ceiling(self.humans, self.sizes)
+
+
+@dataclass(frozen=True, slots=True)
+class Total:
+    """How many indicators hold, of those that can be judged; ``open`` names the others."""
+
+    passed: int
+    judged: int
+    open: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.passed} of {self.judged}"
+
+
+def total(verdicts: dict[str, Verdict]) -> Total:
+    """The score of a group by one rule."""
+    known = {name: v.passed for name, v in verdicts.items() if v.passed is not None}
+    return Total(sum(known.values()), len(known), tuple(n for n in verdicts if n not in known))
+
+
+def unjudged(found: Score, *names: str) -> dict[str, tuple[list[str], list[str]]]:
+    """Why some of these indicators have no verdict: which, and by which rules."""
+    reasons: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
+    for name in names:
+        for rule, verdicts in ((PAPER_RULE, found.paper), (ROBUST_RULE, found.robust)):
+            if verdicts[name].passed is None and (why := verdicts[name].why):
+                indicators, rules = reasons.setdefault(why, ({}, {}))
+                indicators[name] = rules[rule] = None
+    return {why: (list(which), list(rules)) for why, (which, rules) in reasons.items()}
+
+
+@cache
+def score(study: Study, group: Group) -> Score:
+    """Judge a group's indicators."""
+    fit = fits(group)
+    paper, robust = paper_verdicts(fit.logit, fit.ols), robust_verdicts(fit.firth, fit.hc3)
+    if not group.measured:
+        row = published("paper_ablation_qualitative").query("driver == 'human'").iloc[0]
+        for name in ("I3", "I4"):
+            paper[name] = Verdict(bool(row[name.lower()]), None, PUBLISHED)
+        paper["I5"] = Verdict(bool(row["i5"]), None, BY_EYE)
+        robust["I5"] = Verdict(None, None, BY_EYE)
+    elif group is study.human:
+        paper["I5"] = robust["I5"] = Verdict(None, None, REFERENCE)
+    else:
+        paper["I5"], robust["I5"] = Verdict(None, None, NO_RULE), likeness(study, group)
+    return Score(paper, robust, population(study), group.sizes)
+
+
+@cache
+def population(study: Study) -> Population:
+    """The humans from whom the ceilings are drawn."""
+    return imported_humans(study.human.ended) if study.complete else published_humans()

@@ -1,0 +1,109 @@
+"""The programs that drive, and the hash of their source: an edited one is another driver."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec, resolve_name
+
+from merge_runner.config import Scenario
+from merge_runner.drivers import projected_order
+from merge_runner.drivers.base import Driver
+from merge_runner.drivers.constant import ConstantDriver
+from merge_runner.drivers.projected_order import ProjectedOrderDriver
+from merge_runner.errors import UsageError
+from merge_runner.records import SIDES, Side
+from merge_runner.registry import Registry
+
+EMULATOR = "emulator"  # the model that a scripted stand-in of ours answers for
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A driver's class, how one is made for a trial, and the parameters of its rule."""
+
+    driver: type
+    make: Callable[[Scenario, Side], Driver]
+    parameters: Mapping[str, float]
+
+    @property
+    def source(self) -> str:
+        """See ``source_digest``."""
+        return source_digest(self.driver)
+
+
+PROGRAMS = Registry[Program]("driver")
+PROGRAMS.register(
+    "constant", Program(ConstantDriver, lambda scenario, _: ConstantDriver(scenario), {})
+)
+PROGRAMS.register(
+    "projected-order",
+    Program(ProjectedOrderDriver, ProjectedOrderDriver, projected_order.PARAMETERS),
+)
+
+
+def stand_in(model: str, sides: Collection[Side] = SIDES) -> str:
+    """What is said of trials of ``model`` in which a scripted stand-in answered on these sides."""
+    left, _, right = model.partition("+")
+    names: dict[Side, str] = {"left": left, "right": right or left}
+    models = {side: name for side, name in names.items() if name not in {EMULATOR, *PROGRAMS}}
+    posing = "+".join(dict.fromkeys(name for side, name in models.items() if side in sides))
+    real = [side for side in models if side not in sides]
+    where = f" on the {'left' if real == ['right'] else 'right'}" if real else ""
+    return f"scripted stand-in{where}, {f'not {posing}' if posing else 'no language model'}"
+
+
+@cache
+def source_digest(driver: type) -> str:
+    """SHA-256 of the source of a driver's module, and of all that it imports from its package.
+
+    Of our own programs the package is this one: the world and the records, which they share with
+    language models, are covered by the version of the spec. A change of the layout alone is a
+    change, too. Raises UsageError where there is no source to read.
+    """
+    top = driver.__module__.partition(".")[0]
+    package = __package__ if __package__.startswith(f"{top}.") else top
+    sources: dict[str, str] = {}
+    waiting = [driver.__module__]
+    while waiting:
+        name = waiting.pop()
+        if name not in sources and f"{name}.".startswith(f"{package}."):
+            source = _source(name)
+            if source is not None:
+                sources[name] = source
+                waiting += _imported(name, source)
+    if driver.__module__ not in sources:
+        raise UsageError(f"the driver {driver.__qualname__} is no module of its own")
+    return hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()
+
+
+def _source(name: str) -> str | None:
+    """The source of a module; None where the name is that of something within one."""
+    try:
+        found = find_spec(name)
+    except (ModuleNotFoundError, ValueError):
+        return None
+    if found is None:
+        return None
+    read = getattr(found.loader, "get_source", None)
+    source: str | None = read(name) if read else None
+    if source is None:
+        raise UsageError(f"the driver rests on {name}, whose source is not there: install that too")
+    return source
+
+
+def _imported(name: str, source: str) -> Iterator[str]:
+    """What a module may import, also within functions."""
+    found = find_spec(name)
+    assert found is not None
+    package = name if found.submodule_search_locations is not None else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            whole = resolve_name("." * node.level + (node.module or ""), package)
+            yield whole
+            yield from (f"{whole}.{alias.name}" for alias in node.names)

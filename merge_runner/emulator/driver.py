@@ -1,0 +1,230 @@
+"""A scripted human-like driver that reads the prompt and answers in free text, as a model would.
+
+Who goes first is drawn from the human logistic odds, logit P(left first) = -0.30 + 1.11 h - 3.30 dv
+(arXiv 2604.09609, Table III), once for a trial and shared by both sides. Both hold piecewise
+constant accelerations that open a gap. In every third repetition, in one condition, the driver
+that should yield misjudges: it keeps level with the other, and they collide.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from merge_runner.emulator.chance import draw, draw_between, draw_index
+from merge_runner.records import Slot
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import MERGE_POINT_M
+
+VEHICLE_LENGTH_M = 4.5
+MAX_ACCELERATION_MPS2 = 2.5
+SHORTEST_S = 1.0
+HARDEST_BRAKING_MPS2, HARDEST_PUSH_MPS2 = -2.2, 1.4
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What the prompt says, in SI units."""
+
+    own_speed: float
+    other_speed: float
+    relative_distance: float
+    distance_to_merge: float | None
+    asks_tactical: bool
+    plan_actions: int
+    vehicle_length: float
+    other_acceleration: float
+    """From the last two seen speeds of the other; 0 where the prompt has no history."""
+    previous: float | None
+    """The next action of the previous plan, normalised."""
+
+    @property
+    def other_distance_to_merge(self) -> float:
+        """The other vehicle's distance to the merge point, negative once it has passed."""
+        return (self.distance_to_merge or 0.0) - self.relative_distance
+
+
+@dataclass(frozen=True, slots=True)
+class Temper:
+    """What is drawn for a trial: who goes first, the gap aimed at, and who does how much.
+
+    ``misjudges`` says that this driver goes first although the other does.
+    """
+
+    goes_first: bool
+    misjudges: bool
+    target_gap_m: float
+    leader_share: float
+
+
+def answer(prompt: str, slot: Slot | None) -> str:
+    """The reply's text for a prompt; without a slot it depends on the prompt alone."""
+    seen = read_prompt(prompt)
+    if seen is None:
+        return "I am a scripted stand-in for a language model and can only answer driving prompts."
+    temper = temper_for(seen, slot, prompt)
+    if seen.distance_to_merge is None:
+        action, why = _on_straight(seen)
+    elif temper.goes_first:
+        action, why = _go_first(seen, temper, slot)
+    else:
+        action, why = _yield(seen, temper, slot)
+    normalised = round(min(1.0, max(-1.0, action / MAX_ACCELERATION_MPS2)), 2) + 0.0
+    plan = ", ".join([f"{normalised:.2f}"] * seen.plan_actions)
+    token = ("M\n\n" if temper.goes_first else "Y\n\n") if seen.asks_tactical else ""
+    return f"{token}{why}\n\n```python\n[{plan}]\n```"
+
+
+def read_prompt(prompt: str) -> Seen | None:
+    """Find the situation in a prompt; None where it is about something else."""
+    own = _number(r"Your speed: (\S+) m/s", prompt)
+    other = _number(r"Speed of the other car: (\S+) m/s", prompt)
+    relative = _number(r"Relative distance .*?: (\S+) m$", prompt)
+    actions = _number(r"exactly (\d+) numbers", prompt)
+    if own is None or other is None or relative is None or actions is None:
+        return None
+    return Seen(
+        own_speed=own,
+        other_speed=other,
+        relative_distance=relative,
+        distance_to_merge=_number(r"distance to the merge point: (\S+) m$", prompt),
+        asks_tactical="merge first (M) or yield" in prompt,
+        plan_actions=int(actions),
+        vehicle_length=_number(r"Length of each car: (\S+) m", prompt) or VEHICLE_LENGTH_M,
+        other_acceleration=_other_acceleration(prompt, other),
+        previous=_number(r"not been executed yet\): \[([^,\]]+)", prompt),
+    )
+
+
+def temper_for(seen: Seen, slot: Slot | None, prompt: str) -> Temper:
+    """The trial's draws; without a slot the projected order decides who goes first."""
+    if slot is None:
+        return Temper(_projected_lead_m(seen) > 0, False, 3.85, 0.5)
+    trial = (slot.condition, slot.repetition, slot.sample_set)
+    left_first = draw("who first", *trial) < _chance_left_first(slot.condition)
+    goes_first = (slot.side == "left") == left_first
+    misjudges = not goes_first and _somebody_misjudges(slot)
+    return Temper(
+        goes_first=goes_first or misjudges,
+        misjudges=misjudges,
+        target_gap_m=draw_between(1.8, 6.5, "gap", *trial),
+        leader_share=draw_between(0.1, 0.7, "share", *trial),
+    )
+
+
+def _chance_left_first(condition: str) -> float:
+    kinematics = CONDITIONS[condition]
+    odds = -0.30 + 1.11 * kinematics.projected_headway_m - 3.30 * kinematics.relative_velocity_mps
+    return 1 / (1 + math.exp(-odds))
+
+
+def _somebody_misjudges(slot: Slot) -> bool:
+    """Whether it happens in this trial: in one condition of every third repetition."""
+    turn = draw_index(3, "misjudge turn", slot.sample_set)
+    chosen = draw_index(len(CONDITIONS), "misjudged condition", slot.repetition, slot.sample_set)
+    return slot.repetition % 3 == turn and list(CONDITIONS)[chosen] == slot.condition
+
+
+def _go_first(seen: Seen, temper: Temper, slot: Slot | None) -> tuple[float, str]:
+    if seen.other_distance_to_merge <= 0:
+        return 0.0, "The other car is through already, so I keep my speed and stay behind it."
+    leading = _projected_lead_m(seen)
+    if temper.misjudges:
+        catch_up = _even_acceleration(-leading, seen.distance_to_merge, seen.own_speed)
+        action = min(MAX_ACCELERATION_MPS2, max(0.0, seen.other_acceleration + catch_up))
+        return action, _phrase(
+            slot,
+            "I take the gap: with enough speed I reach the merge point before the other car, "
+            "which should let me in. I keep an eye on it.",
+        )
+    lacking = _lacking_m(leading, seen, temper)
+    push = _even_acceleration(temper.leader_share * lacking, seen.distance_to_merge, seen.own_speed)
+    action = min(HARDEST_PUSH_MPS2, max(0.0, push))
+    return _settled(action, seen, slot), _phrase(
+        slot,
+        f"At present speeds I would be {leading:.1f} m ahead at the merge point. I go first and "
+        "make the gap clear by my speed, and hold this acceleration.",
+    )
+
+
+def _yield(seen: Seen, temper: Temper, slot: Slot | None) -> tuple[float, str]:
+    other_distance = seen.other_distance_to_merge
+    if other_distance <= 0:
+        return _on_straight(seen)
+    behind = -_projected_lead_m(seen)
+    lacking = _lacking_m(behind, seen, temper)
+    share = 1 - temper.leader_share
+    brake = -_even_acceleration(share * lacking, other_distance, seen.other_speed)
+    action = min(0.0, max(HARDEST_BRAKING_MPS2, brake))
+    return _settled(action, seen, slot), _phrase(
+        slot,
+        f"The other car will be about {behind:.1f} m ahead at the merge point if nobody acts. I "
+        "let it go first and slow down evenly to leave a safe gap.",
+    )
+
+
+def _on_straight(seen: Seen) -> tuple[float, str]:
+    gap = seen.relative_distance - seen.vehicle_length
+    closing = seen.own_speed - seen.other_speed
+    if seen.relative_distance <= 0:
+        return 0.0, "The other car is behind me. I keep my speed and leave the merge area."
+    if closing > 0.1 and gap < 4 + 2 * closing:
+        needed = -(closing**2) / (2 * max(gap - 1.0, 0.5)) - 0.2
+        return max(HARDEST_BRAKING_MPS2, needed), (
+            f"The other car is {gap:.1f} m ahead and slower. I brake until I match its speed."
+        )
+    return 0.0, "The other car is ahead at a sufficient distance. I keep my speed and follow it."
+
+
+def _settled(action: float, seen: Seen, slot: Slot | None) -> float:
+    """Hold the level of the previous plan unless the need has moved away from it."""
+    held = None if seen.previous is None else seen.previous * MAX_ACCELERATION_MPS2
+    if held is not None and abs(action - held) < 0.25:
+        return held
+    wobble = 0.0 if slot is None else draw_between(-0.05, 0.05, "wobble", *slot.as_dict().values())
+    return action + wobble
+
+
+def _lacking_m(lead: float, seen: Seen, temper: Temper) -> float:
+    """How far the leader's projected lead falls short; a leader from behind acts at once."""
+    return temper.target_gap_m + seen.vehicle_length - lead + max(0.0, 1.0 - lead)
+
+
+def _projected_lead_m(seen: Seen) -> float:
+    """How far ahead of the other the ego would be when the first of both reaches the merge."""
+    own = (seen.distance_to_merge or 0.0) / max(seen.own_speed, 0.1)
+    other = max(seen.other_distance_to_merge, 0.0) / max(seen.other_speed, 0.1)
+    seconds = min(own, other)
+    return (seen.own_speed - seen.other_speed) * seconds - seen.relative_distance
+
+
+def _even_acceleration(metres: float, distance: float | None, speed: float) -> float:
+    """The even acceleration that gains a distance until the leader reaches the merge point."""
+    seconds = max(SHORTEST_S, (distance or MERGE_POINT_M) / max(speed, 0.1))
+    return 2 * metres / seconds**2
+
+
+def _phrase(slot: Slot | None, reason: str) -> str:
+    if slot is None:
+        return reason
+    openings = (
+        "Neither of us has the right of way.",
+        "We approach the merge point at nearly the same time.",
+        "I compare when each of us arrives at the merge point.",
+    )
+    return f"{openings[draw_index(len(openings), 'words', *slot.as_dict().values())]} {reason}"
+
+
+def _other_acceleration(prompt: str, speed_now: float) -> float:
+    before = _number(r"Observed speeds of the other car .*[\[ ]([^, \]]+)\]$", prompt)
+    step = _number(r"one value every (\S+) s", prompt)
+    return (speed_now - before) / step if before is not None and step else 0.0
+
+
+def _number(pattern: str, prompt: str) -> float | None:
+    match = re.search(pattern, prompt, re.MULTILINE)
+    try:
+        return float(match.group(1)) if match else None
+    except ValueError:
+        return None

@@ -1,0 +1,210 @@
+"""A trial's stored rows against the rows that it should have, column by column."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import duckdb
+
+from merge_runner.results.rows import Row
+
+TrialKey = tuple[str, str]
+"""(trial_id, spec_hash)"""
+
+Span = tuple[int, int]
+"""The first and the last row number."""
+Spans = dict[str, Span]
+Read = TypeVar("Read")
+BATCH = 16
+"""Trials at once: their replies are in memory together."""
+
+_OF_THESE = (
+    "SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)"
+)
+# What tells the rows of a trial apart.
+PLACES: dict[str, tuple[str, ...]] = {
+    "trials": (),
+    "states": ("step", "side"),
+    "decisions": ("decision", "side"),
+    "calls": ("decision", "side", "attempt"),
+}
+# Texts of any length are compared by their hash, so that none of them is read.
+LONG: dict[str, tuple[str, ...]] = {
+    "decisions": ("rationale", "prompt"),
+    "calls": ("request", "reply"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A column that is stored otherwise in ``rows`` rows of a trial, and the first of them.
+
+    Without a column rows are missing, or are there that should not be.
+    """
+
+    table: str
+    column: str | None
+    place: dict[str, Any]
+    rows: int
+    stored: object = None
+    wanted: object = None
+
+    @property
+    def name(self) -> str:
+        """The column's name with its table's."""
+        return f"{self.table}.{self.column}" if self.column else f"rows of {self.table}"
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """Rows of one table by trial, with the names of their columns; ``hashed`` are texts' hashes."""
+
+    table: str
+    names: tuple[str, ...]
+    hashed: tuple[str, ...] = ()
+    rows: dict[TrialKey, list[Row]] = field(default_factory=dict)
+
+    def named(self, key: TrialKey) -> Iterator[dict[str, Any]]:
+        """The rows of a trial, each by the names of its columns."""
+        return (dict(zip(self.names, row, strict=True)) for row in self.rows.get(key, ()))
+
+    def differences(
+        self,
+        key: TrialKey,
+        wanted: Iterable[Row],
+        *,
+        ignored: Collection[str] = (),
+        tolerance: float = 0.0,
+    ) -> Iterator[Difference]:
+        """What a trial's stored rows have otherwise than the wanted ones."""
+        stored, made = self.rows.get(key, []), [self._as_stored(row) for row in wanted]
+        at = [self.names.index(name) for name in PLACES[self.table]]
+        old = {tuple(row[i] for i in at): row for row in stored}
+        new = {tuple(row[i] for i in at): row for row in made}
+        if odd := len(stored) - len(old) + len(old.keys() ^ new.keys()):
+            first = min(old.keys() ^ new.keys() or old.keys())
+            yield Difference(
+                self.table, None, dict(zip(PLACES[self.table], first, strict=True)), odd
+            )
+        common = [place for place in new if place in old and old[place] != new[place]]
+        for index, name in enumerate(self.names):
+            if name in ignored:
+                continue
+            places = [p for p in common if not _same(old[p][index], new[p][index], tolerance)]
+            if places:
+                first = places[0]
+                yield Difference(
+                    self.table,
+                    name,
+                    dict(zip(PLACES[self.table], first, strict=True)),
+                    len(places),
+                    old[first][index],
+                    new[first][index],
+                )
+
+    def _as_stored(self, row: Row) -> Row:
+        values = list(row)
+        for name in self.hashed:
+            index = self.names.index(name)
+            if values[index] is not None:
+                values[index] = hashlib.sha256(values[index].encode()).hexdigest()
+        return tuple(values)
+
+
+def stored_rows(
+    connection: duckdb.DuckDBPyConnection,
+    table: str,
+    keys: Sequence[TrialKey],
+    span: Span | None = None,
+) -> Stored:
+    """The rows of these trials, with the hashes of long texts in place of them."""
+    hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in LONG.get(table, ()))
+    columns = f"* REPLACE ({hashes})" if hashes else "*"
+    result = rows_of_trials(connection, columns, table, keys, span)
+    names = tuple(column[0] for column in result.description or ())
+    trial_id, spec_hash = names.index("trial_id"), names.index("spec_hash")
+    stored = Stored(table, names, LONG.get(table, ()))
+    for row in result.fetchall():
+        stored.rows.setdefault((row[trial_id], row[spec_hash]), []).append(row)
+    return stored
+
+
+def rows_of_trials(
+    connection: duckdb.DuckDBPyConnection,
+    columns: str,
+    table: str,
+    keys: Sequence[TrialKey],
+    span: Span | None = None,
+) -> duckdb.DuckDBPyConnection:
+    """A query for the rows of these trials, to be fetched.
+
+    A trial's rows lie together: where is asked first, or told, so that no others are read.
+    """
+    names = [[key[0] for key in keys], [key[1] for key in keys]]
+    first, last = (
+        span
+        or connection.execute(
+            f"SELECT min(rowid), max(rowid) FROM {table} {_OF_THESE}",  # noqa: S608 # constants
+            names,
+        ).fetchall()[0]
+    )
+    return connection.execute(
+        f"SELECT {columns} FROM {table} {_OF_THESE} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # constants
+        [*names, first, last],
+    )
+
+
+def in_batches(
+    connection: duckdb.DuckDBPyConnection,
+    keys: Iterable[TrialKey],
+    tables: Collection[str],
+    read: Callable[[list[TrialKey], Spans], Read],
+) -> Iterator[Read]:
+    """What ``read`` makes of some trials at a time, with where the rows of each table lie.
+
+    So few at a time that they fit into the database's memory.
+    """
+    where = {table: _spans(connection, table) for table in tables}
+    nowhere = (0, -1)
+    ordered = sorted(keys, key=lambda key: [spans.get(key, nowhere) for spans in where.values()])
+    first, size = 0, BATCH
+    while batch := ordered[first : first + size]:
+        found = {
+            table: [spans[key] for key in batch if key in spans] or [nowhere]
+            for table, spans in where.items()
+        }
+        try:
+            made = read(
+                batch,
+                {
+                    t: (min(a for a, _ in spans), max(b for _, b in spans))
+                    for t, spans in found.items()
+                },
+            )
+        except duckdb.OutOfMemoryException:
+            if size == 1:
+                raise
+            size //= 2
+        else:
+            first += size
+            yield made
+
+
+def _spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, Span]:
+    rows = connection.execute(
+        f"SELECT trial_id, spec_hash, min(rowid), max(rowid) FROM {table} GROUP BY ALL"  # noqa: S608 # constants
+    ).fetchall()
+    return {(trial_id, spec_hash): (first, last) for trial_id, spec_hash, first, last in rows}
+
+
+def _same(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table
+    if one == other:
+        return True
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(
+            _same(a, b, tolerance) for a, b in zip(one, other, strict=True)
+        )
+    return isinstance(one, float) and isinstance(other, float) and abs(one - other) <= tolerance

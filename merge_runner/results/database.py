@@ -1,0 +1,452 @@
+"""Opens the results database, with patience for others, and brings an older one up to date."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import os
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import duckdb
+
+from merge_runner.errors import StoreError, StoreLocked, UsageError
+from merge_runner.records import SCRIPTED_FIELD
+from merge_runner.text_safety import first_line, quoted
+
+SCHEMA_VERSION = 4
+SCHEMA = Path(__file__).with_name("schema.sql")
+LOCK_RETRY_S = 0.05
+PATIENCE_S = 60.0
+LOGS = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
+"""How the names of a database's own files go on."""
+ROWS_AT_ONCE, COPIED_AT_ONCE = 100, 2_048
+# What a file takes for each call where replies are short, compressed and with its share of states;
+# and how much more than that is little enough to be merged, and to be read as if they were short.
+BYTES_OF_A_CALL, MERGED_BYTES, SHORT_BYTES = 3_000, 2**26, 2**23
+LOG = logging.getLogger(__name__)
+Settings = dict[str, str | bool | int | float | list[str]]
+SETTINGS: Settings = {
+    "memory_limit": "200MB",  # of the machine's by default; it is a cache of the file most of all
+    "max_vacuum_tasks": 0,  # see merge_small_groups
+    "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
+}
+TEXTS: Settings = {**SETTINGS, "memory_limit": "1GB"}
+"""Where the texts of replies are read: 2,048 of 64 KB take a quarter of it, JSON of them more."""
+REBUILD = (
+    "move it away, or name another with --db, and run the same sweep again: it is rebuilt from the "
+    "cache without a call"
+)
+
+
+def spill_folder() -> Path:
+    """Where DuckDB may write besides its database, also where it is confined to that."""
+    folder = Path(str(SETTINGS["temp_directory"]))
+    folder.mkdir(mode=0o700, exist_ok=True)
+    return folder
+
+
+def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
+    """A database of its own, in memory."""
+    connection = duckdb.connect(config=settings)
+    # DuckDB takes `python -c` for a person at a prompt: a slow query would draw on our output.
+    connection.execute("SET enable_progress_bar = false")
+    return connection
+
+
+class Instance:
+    """A DuckDB instance, to which files are attached and detached: that takes and frees their lock.
+
+    To make one takes longer than most of what is done with it, so there is one for all. After an
+    error it may be of no use any more, and a new one is made.
+
+    Where it does not ``confine`` those who read, they do so themselves; else they reach the file
+    that they read, and those in the folder ``also``.
+    """
+
+    def __init__(
+        self, settings: Settings = SETTINGS, *, confine: bool = True, also: Path | None = None
+    ) -> None:
+        self._settings = settings
+        self._confine = confine
+        self._also = [] if also is None else [also]
+        self._connection: duckdb.DuckDBPyConnection | None = None
+        self._confined: tuple[Path, duckdb.DuckDBPyConnection] | None = None
+        self._numbers = itertools.count()
+
+    def cursor(self) -> duckdb.DuckDBPyConnection:
+        """A connection of its own."""
+        if self._connection is None:
+            self._connection = in_memory(self._settings)
+        return self._connection.cursor()
+
+    def confined(self, path: Path) -> duckdb.DuckDBPyConnection:
+        """A connection that reaches no other file than a database, whoever made that one.
+
+        A view or a macro in it, also one by the name of DuckDB's own functions, may read any file.
+        """
+        if not self._confine:
+            return self.cursor()
+        if self._confined is None or self._confined[0] != path:
+            made = in_memory(self._settings)
+            own = ", ".join(
+                quoted(f"{each}{log}") for each in (path.absolute(), path.resolve()) for log in LOGS
+            )
+            also = ", ".join(map(quoted, self._also))
+            made.execute(f"SET allowed_directories = [{also}]")
+            made.execute(f"SET allowed_paths = [{own}]; SET enable_external_access = false")
+            self._confined = path, made
+        return self._confined[1].cursor()
+
+    def name(self) -> str:
+        """A name for a file that no other one has."""
+        return f"results_{next(self._numbers)}"
+
+    def drop(self) -> None:
+        """Make a new instance next time."""
+        self._connection = self._confined = None
+
+
+SHARED = Instance()
+# Another process holds the file; another connection of this one does.
+_BUSY = ("Could not set lock", "Unique file handle conflict", "already attached")
+
+
+@contextmanager
+def open_database(
+    path: Path, *, read_only: bool, patience_s: float, instance: Instance = SHARED
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open the database, waiting for others to close it; raises StoreError."""
+    connection, name = _attached(path, read_only, patience_s, instance)
+    in_order = False
+    try:
+        yield connection
+        in_order = True
+    finally:
+        if in_order:
+            _detach(connection, name, instance)
+        else:
+            instance.drop()
+        connection.close()
+
+
+def _detach(connection: duckdb.DuckDBPyConnection, name: str, instance: Instance) -> None:
+    try:
+        connection.execute(f"USE memory; DETACH {name}")
+    except duckdb.Error as exc:
+        # What was committed lies in the log beside the file; there is no room to move it over.
+        LOG.warning("the database was not closed in order: %s", first_line(exc))
+        instance.drop()
+
+
+def _attached(
+    path: Path, read_only: bool, patience_s: float, instance: Instance
+) -> tuple[duckdb.DuckDBPyConnection, str]:
+    connection = instance.confined(path) if read_only else instance.cursor()
+    name = instance.name()
+    mode = "READ_ONLY" if read_only else "READ_WRITE"
+    began = time.monotonic()
+    told = False
+    while True:
+        try:
+            # A name such as md:x or :memory: is that of a file, too.
+            whole = quoted(path.absolute())
+            connection.execute(f"ATTACH {whole} AS {name} ({mode}); USE {name}")
+        except duckdb.Error as exc:
+            if not any(words in str(exc) for words in _BUSY):
+                instance.drop()
+                raise StoreError(
+                    f"{path} cannot be opened as a database: {first_line(exc)}"
+                ) from exc
+            waited_s = time.monotonic() - began
+            if waited_s >= patience_s:
+                raise StoreLocked(f"{path} is locked by another program") from exc
+            if waited_s > 1 and not told:
+                told = True
+                LOG.warning(
+                    "waiting up to %.0f s for another program to close %s", patience_s, path
+                )
+            time.sleep(LOCK_RETRY_S)
+        else:
+            return connection, name
+
+
+def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
+    """Let the next writing merge what many small ones left, unless the rows hold long texts.
+
+    To merge takes as much memory as the texts of 122,880 rows, and writes them again each time.
+    """
+    tasks = 100 if _bytes_of_texts(connection) <= MERGED_BYTES else 0
+    connection.execute(f"SET max_vacuum_tasks = {tasks}")
+
+
+@contextmanager
+def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
+    """More memory while long texts are read: each thread unpacks those of 2,048 rows at once."""
+    if _bytes_of_texts(connection) <= SHORT_BYTES:
+        yield
+        return
+    connection.execute(f"SET memory_limit = '{TEXTS['memory_limit']}'; SET threads = 1")
+    try:
+        yield
+    finally:
+        connection.execute(f"SET memory_limit = '{SETTINGS['memory_limit']}'; RESET threads")
+
+
+def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
+    """The size of the open file beyond what it has with short replies."""
+    row = connection.execute(
+        "SELECT path, estimated_size FROM duckdb_tables() JOIN duckdb_databases() "
+        "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
+    ).fetchone()
+    return Path(row[0]).stat().st_size - row[1] * BYTES_OF_A_CALL if row else 0
+
+
+def streamed(connection: duckdb.DuckDBPyConnection, sql: str) -> Iterator[tuple[Any, ...]]:
+    """The rows of a query on long texts; nothing else may be asked until it has ended."""
+    return fetched(connection.execute(sql))
+
+
+def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
+    """The rows of a result, a few at a time."""
+    while batch := result.fetchmany(ROWS_AT_ONCE):
+        yield from batch
+
+
+@contextmanager
+def read_database(
+    path: Path, instance: Instance = SHARED, patience_s: float = PATIENCE_S
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open an existing database for reading, of this schema or an older one; raises UsageError."""
+    if not path.is_file():
+        raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
+    with (
+        unreadable_is_usage(),
+        open_database(path, read_only=True, patience_s=patience_s, instance=instance) as connection,
+    ):
+        if schema_version(connection, path) == SCHEMA_VERSION:
+            yield connection
+            return
+    with unreadable_is_usage():
+        copy = _readable_copy(path, patience_s)
+    with open_database(
+        copy, read_only=True, patience_s=patience_s, instance=instance
+    ) as connection:
+        yield connection
+
+
+def readable(path: Path) -> Path:
+    """The file in which the rows of a database are read: itself, or a copy where it is older."""
+    with read_database(path) as connection:
+        row = connection.execute(
+            "SELECT path FROM duckdb_databases() WHERE database_name = current_database()"
+        ).fetchone()
+    assert row is not None
+    return Path(row[0])
+
+
+def _readable_copy(path: Path, patience_s: float) -> Path:
+    """A copy of a database of an older schema in this one, until this process ends."""
+    told = path.stat()
+    state = (path.resolve(), told.st_mtime_ns, told.st_size)
+    if state not in _COPIES:
+        folder = tempfile.TemporaryDirectory(prefix="merge-runner-")
+        copy = Path(folder.name) / path.name
+        LOG.warning(
+            "%s has an older schema and is left as it is: what is read is a copy of it, %s, which "
+            "is deleted at the end; the next sweep into it brings it up to date",
+            path,
+            copy,
+        )
+        with open_database(
+            path, read_only=True, patience_s=patience_s, instance=Instance(also=copy.parent)
+        ) as connection:
+            try:
+                _copy_rows(connection, copy)
+            except duckdb.Error as exc:
+                raise StoreError(
+                    f"{path} has an older schema and cannot be copied to {copy}: {first_line(exc)}"
+                ) from exc
+        _COPIES[state] = folder, copy
+    return _COPIES[state][1]
+
+
+# The folder of a copy goes when the process does.
+_COPIES: dict[tuple[Path, int, int], tuple[tempfile.TemporaryDirectory[str], Path]] = {}
+
+
+@contextmanager
+def unreadable_is_usage() -> Iterator[None]:
+    """A file that is no database, or a damaged one, is the user's to replace."""
+    try:
+        yield
+    except StoreLocked:
+        raise
+    except StoreError as exc:
+        if "No space left" in str(exc):
+            raise StoreError(f"{exc}; make room, and run the same command again") from exc
+        raise UsageError(f"{exc}; {REBUILD}") from exc
+    except duckdb.IOException as exc:
+        raise UsageError(f"the database cannot be read: {first_line(exc)}; {REBUILD}") from exc
+    except duckdb.PermissionException as exc:
+        raise UsageError(
+            f"the database reads files besides itself, which none of merge-runner does, and is not "
+            f"read on: {first_line(exc)}"
+        ) from exc
+
+
+def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
+    """The version of an existing database; raises UsageError for a newer or a foreign one."""
+    # A table, and functions of DuckDB's: a view or a macro of such a name could read any file.
+    tables = dict(
+        connection.execute(
+            "SELECT table_name, column_count FROM system.main.duckdb_tables() "
+            "WHERE database_name = system.main.current_database()"
+        ).fetchall()
+    )
+    if "meta" not in tables:
+        raise UsageError(f"{path} is no database of merge-runner: name another with --db")
+    row = connection.execute("SELECT schema_version FROM meta").fetchone()
+    if row is None:
+        raise UsageError(f"{path} has no schema version: {REBUILD}")
+    version: int = row[0]
+    if version < 1:
+        raise UsageError(f"{path} has schema version {version}, which no program wrote: {REBUILD}")
+    if version > SCHEMA_VERSION:
+        raise UsageError(
+            f"{path} has schema version {version}, written by a newer merge-runner; this one reads "
+            f"up to {SCHEMA_VERSION}: update merge-runner, or name another file with --db"
+        )
+    for table, columns in _columns().items() if version == SCHEMA_VERSION else ():
+        if tables.get(table) != columns:
+            raise UsageError(
+                f"{path} has {tables.get(table, 'no')} columns in the table {table}, and "
+                f"merge-runner made {columns}: {REBUILD}. Tables of other names may be added"
+            )
+    return version
+
+
+@cache
+def _columns() -> dict[str, int]:
+    """How many columns each table of the schema has."""
+    tables = re.findall(
+        r"^CREATE TABLE IF NOT EXISTS (\w+) \(\n(.*?)^\);",
+        SCHEMA.read_text(encoding="utf-8"),
+        re.DOTALL | re.MULTILINE,
+    )
+    return {name: len(re.findall(r"^    [a-z]\w* ", body, re.MULTILINE)) for name, body in tables}
+
+
+def migrate(path: Path) -> None:
+    """Copy a database of an older schema into a new file of this one, which takes its name.
+
+    What an older schema lacked is NULL or has its default. The old file stays beside the new one,
+    as ``NAME.v1.duckdb``. Raises UsageError where that is not possible.
+    """
+    path = path.resolve()
+    copy = path.with_name(f"{path.name}.migrating")
+    try:
+        # Opened for writing, so that nobody else writes into what is being copied.
+        with open_database(path, read_only=False, patience_s=PATIENCE_S) as connection:
+            version = schema_version(connection, path)
+            if version == SCHEMA_VERSION:
+                return  # another process was quicker
+            _discard(copy)  # what a process left that died here
+            try:
+                connection.execute("CHECKPOINT")
+                _copy_rows(connection, copy)
+                kept = _free_name(path, version)
+                shutil.copy2(path, kept)
+                os.replace(copy, path)
+            finally:
+                _discard(copy)
+    except StoreLocked:
+        raise
+    except (OSError, duckdb.Error, StoreError) as exc:
+        raise UsageError(
+            f"{path} has an older schema and cannot be brought to version {SCHEMA_VERSION} where "
+            f"it lies: {first_line(exc)}. Copy it to a folder that can be written and name the "
+            "copy with --db"
+        ) from exc
+    LOG.warning(
+        "%s was brought from schema %d to %d; the old file is kept as %s",
+        path,
+        version,
+        SCHEMA_VERSION,
+        kept,
+    )
+
+
+def _discard(copy: Path) -> None:
+    for name in (copy, copy.with_name(f"{copy.name}.wal")):
+        with contextlib.suppress(OSError):
+            name.unlink()
+
+
+def _free_name(path: Path, version: int) -> Path:
+    """Where the old file is kept: never in the place of another one."""
+    names = (f"{path.stem}.v{version}{number}{path.suffix}" for number in _numbers())
+    return next(kept for kept in map(path.with_name, names) if not kept.exists())
+
+
+def _numbers() -> Iterator[str]:
+    yield ""
+    yield from (f"-{number}" for number in itertools.count(2))
+
+
+def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
+    """Make a new file with all rows of the open one."""
+    with duckdb.connect(str(copy)) as made:
+        made.execute(SCHEMA.read_text(encoding="utf-8"))
+    connection.execute(f"ATTACH {quoted(copy)} AS copied")
+    try:
+        with room_for_texts(connection):
+            _fill_copy(connection)
+    finally:
+        connection.execute("DETACH copied")
+
+
+def _fill_copy(connection: duckdb.DuckDBPyConnection) -> None:
+    old = {
+        table
+        for (table,) in connection.execute(
+            "SELECT table_name FROM duckdb_tables() WHERE database_name = current_database()"
+        ).fetchall()
+    }
+    new = connection.execute(
+        "SELECT table_name FROM duckdb_tables() WHERE database_name = 'copied'"
+    ).fetchall()
+    for (table,) in new:
+        if table in old and table != "meta":
+            _copy_table(connection, table)
+    # Before version 4 nobody looked at what the replies say of a stand-in.
+    connection.execute(
+        "UPDATE copied.calls SET scripted = true WHERE CASE WHEN provider = 'emulator' THEN true "
+        "WHEN contains(reply::VARCHAR, ?) THEN reply->>? = 'true' ELSE false END",
+        [SCRIPTED_FIELD, f"$.{SCRIPTED_FIELD}"],
+    )
+    connection.execute(
+        "UPDATE copied.trials SET scripted = true WHERE NOT scripted AND (trial_id, spec_hash) IN "
+        "(SELECT (trial_id, spec_hash) FROM copied.calls WHERE scripted)"
+    )
+    connection.execute("INSERT INTO copied.meta VALUES (?)", [SCHEMA_VERSION])
+
+
+def _copy_table(connection: duckdb.DuckDBPyConnection, table: str) -> None:
+    """Copy a table, some rows at a time: a transaction's rows are together in memory."""
+    row = connection.execute(f"SELECT coalesce(max(rowid), -1) FROM {table}").fetchone()  # noqa: S608 # our tables
+    assert row is not None
+    size = COPIED_AT_ONCE if table in ("calls", "decisions") else row[0] + 1
+    for first in range(0, row[0] + 1, size):
+        connection.execute(
+            f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # our tables
+            [first, first + size - 1],
+        )

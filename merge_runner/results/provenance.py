@@ -1,0 +1,57 @@
+"""Where results come from: the program's commit or version, and those of what it runs on."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from importlib.metadata import version
+
+from merge_runner.paths import PROJECT
+
+PACKAGES = ("merge-runner", "diskcache", "duckdb", "httpx", "httpx-aiohttp", "pydantic", "tenacity")
+
+
+def versions() -> dict[str, str]:
+    """Python's and the packages' versions."""
+    return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+
+
+def git_state() -> tuple[str, bool | None]:
+    """The commit of the program's own checkout and whether it is changed.
+
+    Without a checkout: the installed version and None.
+    """
+    commit = _commit()
+    if commit is None:
+        return f"merge-runner {version('merge-runner')}", None
+    return commit, bool(_git("status", "--porcelain"))
+
+
+def program() -> str:
+    """What made a text, for its readers."""
+    made_by, changed = git_state()
+    if changed is None:
+        return f"{made_by}, installed"
+    also = ", with changes that are not committed" if changed else ""
+    return f"merge-runner at commit {made_by}{also}"
+
+
+def _commit() -> str | None:
+    """The commit of a repository at the folder that holds the package, which has it as its own."""
+    package = _git("ls-files", "--error-unmatch", "merge_runner/__init__.py")
+    return _git("rev-parse", "HEAD") if package else None
+
+
+def _git(*arguments: str) -> str | None:
+    """What git says of the repository at PROJECT itself, and of no other around it."""
+    own = ["-C", str(PROJECT), f"--git-dir={PROJECT / '.git'}", f"--work-tree={PROJECT}"]
+    try:
+        done = subprocess.run(  # noqa: S603 # constant arguments
+            ["git", *own, *arguments],  # noqa: S607 # the user's own git
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    except FileNotFoundError:
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

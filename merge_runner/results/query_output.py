@@ -1,0 +1,52 @@
+"""The rows of a query as a table, CSV or JSON, however many and however long they are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain
+from tempfile import TemporaryFile
+from typing import Any, TextIO
+
+from merge_runner.errors import UsageError
+from merge_runner.text_safety import csv_writer, in_spreadsheet, printable
+
+Rows = Iterable[tuple[Any, ...]]
+Writer = Callable[[list[str], Rows, TextIO], None]
+
+
+def write_csv(names: list[str], rows: Rows, out: TextIO) -> None:
+    """As CSV that a spreadsheet does not run."""
+    csv_writer(out).writerows(map(in_spreadsheet, row) for row in chain((names,), rows))
+
+
+def write_json(names: list[str], rows: Rows, out: TextIO) -> None:
+    """As an array of objects."""
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UsageError(f"two columns are named {twice!r}: name them apart with AS")
+    before = "["
+    for row in rows:
+        record = dict(zip(names, row, strict=True))
+        text = json.dumps(record, indent=2, default=str, ensure_ascii=False)
+        out.write(f"{before}\n  " + printable(text.replace("\n", "\n  ")))
+        before = ","
+    out.write("[]\n" if before == "[" else "\n]\n")
+
+
+def write_table(names: list[str], rows: Rows, out: TextIO) -> None:
+    """In columns as wide as their widest cell."""
+    widths = [0] * len(names)
+    with TemporaryFile("w+", encoding="utf-8", errors="surrogatepass") as kept:
+        for row in chain((names,), rows):
+            cells = ["" if value is None else str(value) for value in row]
+            widths = [max(width, len(cell)) for width, cell in zip(widths, cells, strict=True)]
+            kept.write(json.dumps(cells) + "\n")
+        kept.seek(0)
+        for line in kept:
+            out.write(_line(json.loads(line), widths))
+
+
+def _line(cells: Sequence[str], widths: list[int]) -> str:
+    padded = (cell.ljust(width) for cell, width in zip(cells, widths, strict=True))
+    return printable("  ".join(padded).rstrip()) + "\n"

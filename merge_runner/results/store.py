@@ -1,0 +1,465 @@
+"""Results in DuckDB. The file is open only while a batch is written, so that others can read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import chain
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import duckdb
+
+from merge_runner.results.comparison import PLACES, TrialKey, stored_rows
+from merge_runner.results.database import (
+    PATIENCE_S,
+    SCHEMA,
+    SCHEMA_VERSION,
+    TEXTS,
+    Instance,
+    fetched,
+    merge_small_groups,
+    migrate,
+    open_database,
+    read_database,
+    room_for_texts,
+    schema_version,
+    streamed,
+    unreadable_is_usage,
+)
+from merge_runner.errors import StoreError, UsageError
+from merge_runner.signals import at_signals
+from merge_runner.records import TrialRecord
+from merge_runner.results.rows import Row, rows_of, state_rows, trial_row
+from merge_runner.served_model import other_models, sql_of
+from merge_runner.text_safety import first_line
+
+# What a run has of its own: whether it made an attempt itself, and when the attempt was made.
+OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
+
+
+@dataclass(frozen=True, slots=True)
+class SweepRow:
+    """One row of the sweeps table; ``config`` and ``versions`` are JSON texts."""
+
+    sweep_id: str
+    name: str
+    started_at: datetime
+    config: str
+    git_commit: str | None
+    git_dirty: bool | None
+    versions: str
+
+
+class Store:
+    """Writes sweeps and whole trials; every method is one short transaction."""
+
+    def __init__(self, path: Path) -> None:
+        """Open or make the database; raises UsageError for one that is not ours."""
+        self.path = path
+        if path.exists() and not path.is_file():
+            raise UsageError(f"{path} is no file: name one with --db")
+        self._one_at_a_time = threading.Lock()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as exc:
+            raise UsageError(f"{path.parent} cannot be made: {exc}") from exc
+        with unreadable_is_usage(), self._writing() as connection:
+            tables = connection.execute("SHOW TABLES").fetchall()
+            older = bool(tables) and schema_version(connection, path) < SCHEMA_VERSION
+            if not tables:
+                connection.execute(SCHEMA.read_text(encoding="utf-8"))
+                connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
+        if older:
+            migrate(path)
+
+    def begin_sweep(
+        self, sweep: SweepRow, specs: dict[str, str], stored: Iterable[TrialKey]
+    ) -> None:
+        """Add a sweep, what its spec hashes stand for, and its trials that are stored already."""
+        with self._writing() as connection:
+            connection.execute(
+                "INSERT INTO sweeps VALUES (?, ?, ?, NULL, NULL, ?, ?, ?, ?)",
+                [
+                    sweep.sweep_id,
+                    sweep.name,
+                    sweep.started_at,
+                    sweep.config,
+                    sweep.git_commit,
+                    sweep.git_dirty,
+                    sweep.versions,
+                ],
+            )
+            _add_specs(connection, specs)
+            _append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
+
+    def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
+        """Note when and how a sweep ended."""
+        with self._writing() as connection:
+            connection.execute(
+                "UPDATE sweeps SET ended_at = ?, exit_code = ? WHERE sweep_id = ?",
+                [ended_at, exit_code, sweep_id],
+            )
+
+    def ended_trials(self, keys: Iterable[TrialKey]) -> set[TrialKey]:
+        """Which of these trials are stored and did not fail."""
+        with self._writing() as connection:
+            return {
+                key
+                for key, status in _statuses(connection, list(keys)).items()
+                if status != "failed"
+            }
+
+    def write(
+        self, sweep_id: str, records: Sequence[TrialRecord], *, patience_s: float
+    ) -> dict[str, list[str]]:
+        """Store whole trials of a sweep; one that has ended already is compared and linked.
+
+        Returns the ids of those that are stored otherwise, with the columns in which they are.
+        """
+        # Made before anybody is kept waiting, though a trial that is stored already needs none.
+        rows = [rows_of(record) for record in records]
+        with self._writing(patience_s) as connection:
+            merge_small_groups(connection)
+            keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
+            stored = _statuses(connection, keys)
+            _delete(connection, [key for key, status in stored.items() if status == "failed"])
+            new = [
+                made
+                for made, key in zip(rows, keys, strict=True)
+                if stored.get(key, "failed") == "failed"
+            ]
+            again = {
+                key: made
+                for record, made, key in zip(records, rows, keys, strict=True)
+                if stored.get(key, "failed") != "failed" and record.status != "failed"
+            }
+            differing = _differing(connection, again)
+            _append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
+            for table in ("trials", "states", "decisions", "calls"):
+                _append(connection, table, chain.from_iterable(made[table] for made in new))
+            return differing
+
+    def add_recorded(
+        self, records: Sequence[TrialRecord], specs: dict[str, str]
+    ) -> tuple[int, int, list[str]]:
+        """Store recorded trials without decisions; one that is stored already stays as it is.
+
+        Returns how many were added, how many were stored already, and the ids of those that are
+        stored with other values.
+        """
+        with self._writing() as connection:
+            _add_specs(connection, specs)
+            keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
+            known = _stored(connection, keys)
+            stored = len(known)
+            differing = []
+            for key, record in zip(keys, records, strict=True):
+                rows = (trial_row(record), list(state_rows(record)))
+                if known.setdefault(key, rows) != rows:
+                    differing.append(record.spec.trial_id)
+            new = list(known.values())[stored:]
+            _append(connection, "trials", (trial for trial, _ in new))
+            _append(connection, "states", chain.from_iterable(states for _, states in new))
+            return len(new), len(records) - len(new) - len(differing), differing
+
+    @contextmanager
+    def _writing(self, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
+        with (
+            self._one_at_a_time,
+            open_database(self.path, read_only=False, patience_s=patience_s) as connection,
+        ):
+            try:
+                connection.begin()
+                yield connection
+                connection.commit()
+            except duckdb.Error as exc:
+                raise StoreError(f"{self.path} cannot be used: {first_line(exc)}") from exc
+
+
+def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Run one read-only query; returns the column names and the rows. Raises UsageError.
+
+    It reaches no file and no network, and changes no setting.
+    """
+    with answers(path, sql) as (names, rows):
+        return names, list(rows)
+
+
+@contextmanager
+def answers(path: Path, sql: str) -> Iterator[tuple[list[str], Iterator[tuple[Any, ...]]]]:
+    """The column names and the rows of a query; nobody can write until they are read."""
+    # The settings hold for a whole instance, and cannot be taken back.
+    with (
+        read_database(path, Instance(TEXTS, confine=False)) as connection,
+        at_signals(connection.interrupt),
+        answering(connection, sql) as result,
+    ):
+        yield [column[0] for column in result.description or ()], fetched(result)
+
+
+@contextmanager
+def answering(
+    connection: duckdb.DuckDBPyConnection, sql: str
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Run one query, which reaches nothing but what is open, to be fetched; raises UsageError.
+
+    The connection's whole instance stays locked up.
+    """
+    # External access alone leaves the database's own files open to COPY ... TO.
+    connection.execute(
+        "SET temp_directory = ''; SET enable_external_access = false; "
+        "SET disabled_filesystems = 'LocalFileSystem'; SET lock_configuration = true"
+    )
+    try:
+        statements = connection.extract_statements(sql)
+        if len(statements) != 1 or not _reads(statements[0]):
+            raise UsageError(
+                "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
+                "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
+            )
+        yield connection.execute(statements[0])
+    except duckdb.IOException:
+        raise  # no query reaches a file but the database, so that one is damaged
+    except duckdb.OutOfMemoryException as exc:
+        raise UsageError(
+            f"the query needs more than the {TEXTS['memory_limit']} of memory that it may use: ask "
+            "for fewer rows or columns at once; requests and replies are long"
+        ) from exc
+    except duckdb.Error as exc:
+        if "pytz" in str(exc):
+            raise UsageError("cast times with a zone, as in now()::TIMESTAMP") from exc
+        raise UsageError(f"the query failed: {exc}") from exc
+
+
+def _reads(statement: duckdb.Statement) -> bool:
+    """Whether a statement is a query; a PIVOT consists of several."""
+    kinds = duckdb.StatementType
+    try:
+        return statement.type in (kinds.SELECT, kinds.EXPLAIN, kinds.MULTI)
+    except ValueError:  # a kind that the client library does not know
+        return False
+
+
+def results_digest(path: Path) -> tuple[str, int]:
+    """A hash of all results, and the number of trials in it.
+
+    It covers what happened (trials, states, decisions), in an order of its own, and not when,
+    where or at what price: no clock times, latencies, costs, cache keys or spec hashes.
+    """
+    digests: dict[TrialKey, Any] = {}
+    with read_database(path) as connection, room_for_texts(connection):
+        # The first and the third of the columns order the rows of a trial.
+        for columns, table in (
+            (
+                "pair, source, model_left, model_right, variant, condition, rep, sample_set, "
+                "status, merged_first, end_time_s, error",
+                "trials",
+            ),
+            ("step, time_s, side, position_m, velocity_mps, acceleration_mps2", "states"),
+            (
+                "decision, time_s, side, valid, failure, tactical, rationale, plan, applied, "
+                "fallback, prompt",
+                "decisions",
+            ),
+        ):
+            for key, rows in _by_trial(connection, columns, table):
+                digest = digests.setdefault(key, hashlib.sha256(key[0].encode()))
+                for values in sorted(rows, key=itemgetter(0, 2)):
+                    digest.update(json.dumps(values).encode())
+    whole = hashlib.sha256("".join(sorted(d.hexdigest() for d in digests.values())).encode())
+    return whole.hexdigest(), len(digests)
+
+
+def _by_trial(
+    connection: duckdb.DuckDBPyConnection, columns: str, table: str
+) -> Iterator[tuple[TrialKey, list[list[Any]]]]:
+    """The rows of each trial, once all are there: they lie together, and are too many to sort."""
+    counts = {
+        (trial_id, spec_hash): count
+        for trial_id, spec_hash, count in connection.execute(
+            f"SELECT trial_id, spec_hash, count(*) FROM {table} GROUP BY ALL"  # noqa: S608 # constants
+        ).fetchall()
+    }
+    begun: dict[TrialKey, list[list[Any]]] = {}
+    for trial_id, spec_hash, *values in streamed(
+        connection,
+        f"SELECT trial_id, spec_hash, {columns} FROM {table}",  # noqa: S608 # constants
+    ):
+        rows = begun.setdefault((trial_id, spec_hash), [])
+        rows.append(values)
+        if len(rows) == counts[trial_id, spec_hash]:
+            yield (trial_id, spec_hash), begun.pop((trial_id, spec_hash))
+
+
+def used_call_keys(path: Path, sweep_id: str | None) -> tuple[str, list[str]]:
+    """The sweep (the newest where None is named) and the keys of the calls that it used."""
+    with read_database(path) as connection:
+        found = connection.execute(
+            "SELECT sweep_id FROM sweeps WHERE sweep_id = coalesce(?, sweep_id) "
+            "ORDER BY started_at DESC LIMIT 1",
+            [sweep_id],
+        ).fetchone()
+        if found is None:
+            known = connection.execute("SELECT sweep_id FROM sweeps ORDER BY ALL").fetchall()
+            names = ", ".join(name for (name,) in known) or "none"
+            raise UsageError(f"{path} holds no sweep {sweep_id or ''}; valid: {names}")
+        keys = connection.execute(
+            "SELECT DISTINCT call_key FROM decisions SEMI JOIN sweep_trials "
+            "ON decisions.trial_id = sweep_trials.trial_id "
+            "AND decisions.spec_hash = sweep_trials.spec_hash AND sweep_id = ? "
+            "WHERE call_key IS NOT NULL ORDER BY call_key",
+            [found[0]],
+        ).fetchall()
+    return found[0], [key for (key,) in keys]
+
+
+def sweep_row(path: Path, sweep_id: str) -> dict[str, Any]:
+    """One row of the sweeps table, column to value."""
+    with read_database(path) as connection:
+        result = connection.execute("SELECT * FROM sweeps WHERE sweep_id = ?", [sweep_id])
+        names = [column[0] for column in result.description or ()]
+        row = result.fetchone()
+    return dict(zip(names, row or (), strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class SweepFacts:
+    """What the database says of one sweep.
+
+    ``outcomes`` holds (variant, condition, status, merged_first, had a fallback, trials),
+    ``ledger`` (driver, variant, fate, outcome, attempts) as the view ``attempts`` names them,
+    ``failed`` (trial_id, error), ``others`` (model requested, model served, answers) where another
+    model answered, ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
+    scripted stand-in did.
+    """
+
+    outcomes: list[tuple[str, str, str, str | None, bool, int]]
+    ledger: list[tuple[str, str, str, str, int]]
+    failed: list[tuple[str, str]]
+    others: list[tuple[str, str, int]]
+    stand_ins: list[tuple[str, str, str, int, int]]
+    decisions: int
+    invalid: int
+    fallbacks: int
+
+
+# Who was asked, in a row of the view ``attempts`` with its spec.
+DRIVER = "driver_name(model, spec->>('$.' || side || '.endpoint'))"
+
+
+def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
+    """Count a sweep's trials, decisions and answers."""
+    of_sweep = (
+        "SEMI JOIN (SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?) "
+        "USING (trial_id, spec_hash)"
+    )
+    with read_database(path) as connection:
+
+        def rows(select: str, rest: str) -> list[tuple[Any, ...]]:
+            return connection.execute(f"{select} {of_sweep} {rest}", [sweep_id]).fetchall()
+
+        decisions = rows(
+            "SELECT count(*), count(*) FILTER (NOT valid), count(*) FILTER (fallback) "
+            "FROM decisions",
+            "",
+        )[0]
+        return SweepFacts(
+            outcomes=rows(
+                "SELECT variant, condition, status, merged_first, coalesce(fallen_back, false), "
+                "count(*) FROM trials LEFT JOIN (SELECT trial_id, spec_hash, "
+                "bool_or(fallback) AS fallen_back FROM decisions GROUP BY ALL) "
+                "USING (trial_id, spec_hash)",
+                "GROUP BY ALL ORDER BY ALL",
+            ),
+            ledger=rows(
+                f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
+                "if(outcome = 'ok', coalesce(failure, outcome), outcome), count(*) "
+                "FROM attempts LEFT JOIN specs USING (spec_hash)",
+                "GROUP BY ALL ORDER BY ALL",
+            ),
+            failed=rows(
+                "SELECT trial_id, error FROM trials", "WHERE status = 'failed' ORDER BY ALL"
+            ),
+            others=rows(
+                "SELECT model_requested, model_served, count(*) FROM calls",
+                f"WHERE http_status = 200 AND {sql_of(other_models(connection))} "
+                "GROUP BY ALL ORDER BY ALL",
+            ),
+            stand_ins=rows(
+                f"SELECT {DRIVER}, model, provider, "  # noqa: S608 # constants
+                "count(*) FILTER (scripted), count(*) "
+                "FROM attempts LEFT JOIN specs USING (spec_hash)",
+                "WHERE fate IN ('driven', 'fallback') GROUP BY ALL HAVING bool_or(scripted) "
+                "ORDER BY ALL",
+            ),
+            decisions=decisions[0],
+            invalid=decisions[1],
+            fallbacks=decisions[2],
+        )
+
+
+def _add_specs(connection: duckdb.DuckDBPyConnection, specs: dict[str, str]) -> None:
+    for item in specs.items():
+        connection.execute("INSERT OR IGNORE INTO specs VALUES (?, ?)", list(item))
+
+
+def _rows_of(
+    connection: duckdb.DuckDBPyConnection, keys: list[TrialKey], select: str, order: str = "ALL"
+) -> list[Row]:
+    return connection.execute(
+        f"{select} SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) "
+        f"USING (trial_id, spec_hash) ORDER BY {order}",
+        [[key[0] for key in keys], [key[1] for key in keys]],
+    ).fetchall()
+
+
+def _statuses(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> dict[TrialKey, str]:
+    rows = _rows_of(connection, keys, "SELECT trial_id, spec_hash, status FROM trials")
+    return {(trial_id, spec_hash): status for trial_id, spec_hash, status in rows}
+
+
+def _stored(
+    connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]
+) -> dict[TrialKey, tuple[Row, list[Row]]]:
+    """The rows of those of these trials that are stored: the trial's, and its states in order."""
+    trials = _rows_of(connection, keys, "FROM trials")
+    found: dict[TrialKey, tuple[Row, list[Row]]] = {(row[0], row[1]): (row, []) for row in trials}
+    for row in _rows_of(connection, keys, "FROM states", "trial_id, spec_hash, step, side"):
+        found[row[0], row[1]][1].append(row)
+    return found
+
+
+def _differing(
+    connection: duckdb.DuckDBPyConnection, played: dict[TrialKey, dict[str, list[Row]]]
+) -> dict[str, list[str]]:
+    """Which trials are stored otherwise than they were played, and in which columns."""
+    found: dict[str, list[str]] = {}
+    for table in PLACES if played else ():
+        stored = stored_rows(connection, table, list(played))
+        for key, made in played.items():
+            for difference in stored.differences(key, made[table], ignored=OF_A_RUN):
+                found.setdefault(key[0], []).append(difference.name)
+    return found
+
+
+def _delete(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:
+    for table in ("calls", "decisions", "states", "trials") if keys else ():
+        connection.executemany(
+            f"DELETE FROM {table} WHERE trial_id = ? AND spec_hash = ?",  # noqa: S608 # constants
+            keys,
+        )
+
+
+def _append(
+    connection: duckdb.DuckDBPyConnection, table: str, rows: Iterable[tuple[Any, ...]]
+) -> None:
+    appender = connection.appender(table)
+    appender.append_rows(list(rows))
+    appender.flush()

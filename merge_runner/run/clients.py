@@ -1,0 +1,210 @@
+"""Makes the clients of a sweep's language models, with their connections or sealed."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Mapping, Sequence
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+
+from merge_runner.config import (
+    ModelEntry,
+    base_urls,
+    check_network,
+    resolve_endpoint,
+    running_emulator_url,
+    with_base_urls,
+)
+from merge_runner.emulator.process import emulator_process
+from merge_runner.errors import UsageError
+from merge_runner.llm.budget import Budget
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.claims import Claims
+from merge_runner.llm.client import LlmClient
+from merge_runner.llm.first_call import FirstCall
+from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.limiter import Limiter, Pause
+from merge_runner.llm.prices import pricing
+from merge_runner.llm.shared_limits import SharedLimits, limits_file
+from merge_runner.llm.shared_services import Desk
+from merge_runner.llm.transport import SealedTransport
+from merge_runner.run.plan import Limits
+
+SPARE_FILES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """On what terms a sweep asks.
+
+    ``ledger`` holds its spending, over all its runs; ``trial_usd`` is the worst case of a whole
+    trial.
+    """
+
+    limits: Limits
+    ledger: Ledger
+    trial_usd: float
+
+
+@dataclass(frozen=True, slots=True)
+class Addressed:
+    """Whom a sweep asks: the identities of its endpoints, and the variables of their base URLs.
+
+    ``known`` are the models whose endpoint has ever answered in its format, ``passed`` those where
+    it has done so in this run. ``strict`` stops at an answer of another model.
+    """
+
+    endpoints: Mapping[str, str]
+    urls: Mapping[str, str]
+    strict: bool = False
+    known: frozenset[str] = frozenset()
+    passed: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class OwnDesk:
+    """The desk of this process; see Desk."""
+
+    limiters: Mapping[str, Limiter]
+    budget: Budget
+    claims: Claims
+
+
+def sealed_clients(
+    entries: Mapping[str, ModelEntry],
+    endpoints: Mapping[str, str],
+    cache: ResponseCache,
+    transport: SealedTransport,
+) -> dict[str, LlmClient]:
+    """Clients that answer from recordings alone: no key, no connection."""
+    return {
+        name: LlmClient(
+            name=name,
+            entry=entry,
+            endpoint=endpoints[name],
+            cache=cache,
+            transport=transport,
+            limiter=Limiter(),
+            pricing=pricing(entry),
+            sealed=True,
+        )
+        for name, entry in entries.items()
+    }
+
+
+def open_desk(
+    entries: Mapping[str, ModelEntry],
+    endpoints: Mapping[str, str],
+    cache: ResponseCache,
+    terms: Terms,
+    stack: AsyncExitStack,
+) -> OwnDesk:
+    """The desk of a run; its claims are given up with ``stack``.
+
+    Raises UsageError where a cap could not hold.
+    """
+    limits = terms.limits
+    for name, entry in entries.items():
+        if limits.max_cost_usd is not None and not pricing(entry).known:
+            raise UsageError(
+                f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
+                "experiments/models.toml"
+            )
+    if any(entry.price != "free" for entry in entries.values()):
+        terms.ledger.read()
+    claims = Claims(cache.folder)
+    stack.callback(claims.close)
+    pauses: dict[str, Pause] = {}
+    return OwnDesk(
+        limiters={
+            name: Limiter(
+                rpm=limits.rpm or entry.rpm,
+                tpm=limits.tpm or entry.tpm,
+                pause=pauses.setdefault(endpoints[name], Pause()),
+                shared=_shared_limits(name, entry, limits, stack),
+            )
+            for name, entry in entries.items()
+        },
+        budget=Budget(terms.ledger, cap_usd=limits.max_cost_usd, trial_usd=terms.trial_usd),
+        claims=claims,
+    )
+
+
+def _shared_limits(
+    name: str, entry: ModelEntry, limits: Limits, stack: AsyncExitStack
+) -> SharedLimits | None:
+    """What all sweeps of this user with one key keep together; our own emulator has no key."""
+    rpm, tpm = limits.rpm or entry.rpm, limits.tpm or entry.tpm
+    own_emulator = entry.provider == "emulator" and running_emulator_url() is None
+    if own_emulator or (rpm is None and tpm is None):
+        return None
+    endpoint = resolve_endpoint(name, entry)
+    file = limits_file(endpoint.base_url, entry.id, endpoint.auth_headers)
+    shared = SharedLimits(file, rpm=rpm, tpm=tpm)
+    stack.callback(shared.close)
+    return shared
+
+
+async def reached(
+    entries: Mapping[str, ModelEntry], emulator_options: Sequence[str], stack: AsyncExitStack
+) -> dict[str, str]:
+    """The variables of base URLs that lead to the entries' endpoints.
+
+    Starts the emulator where it is asked, to be stopped with ``stack``.
+    """
+    urls = base_urls(entries)
+    emulated = any(entry.provider == "emulator" for entry in entries.values())
+    if emulated and running_emulator_url() is None:
+        url = await stack.enter_async_context(emulator_process(emulator_options))
+        urls |= {"EMULATOR_BASE_URL": f"{url}/v1"}
+    return urls
+
+
+def live_clients(
+    entries: Mapping[str, ModelEntry],
+    addressed: Addressed,
+    cache: ResponseCache,
+    desk: Desk,
+    *,
+    connections: int,
+    stack: AsyncExitStack,
+) -> dict[str, LlmClient]:
+    """Clients with connections, closed with ``stack``. Raises UsageError where a key is missing."""
+    from merge_runner.llm.http import HttpTransport
+
+    _allow_open_files(connections + SPARE_FILES)
+    clients = {}
+    for name, entry in entries.items():
+        endpoint = resolve_endpoint(name, entry, with_base_urls(addressed.urls))
+        check_network(endpoint.base_url)
+        transport = HttpTransport(
+            endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 1e6)
+        )
+        stack.push_async_callback(transport.close)
+        clients[name] = LlmClient(
+            name=name,
+            entry=entry,
+            endpoint=addressed.endpoints[name],
+            cache=cache,
+            transport=transport,
+            limiter=desk.limiters[name],
+            pricing=pricing(entry),
+            budget=None if entry.price == "free" else desk.budget,
+            claims=desk.claims,
+            strict=addressed.strict,
+            first=FirstCall(passed=name in addressed.passed, known=name in addressed.known),
+        )
+    return clients
+
+
+def _allow_open_files(wanted: int) -> None:
+    """Raise this process's limit of open files to what the connections need."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft >= wanted or soft == resource.RLIM_INFINITY:
+        return
+    if hard != resource.RLIM_INFINITY and hard < wanted:
+        raise UsageError(
+            f"{wanted} connections exceed this system's limit of {hard} open files: choose a lower "
+            "--in-flight or raise `ulimit -n`"
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

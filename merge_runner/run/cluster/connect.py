@@ -1,0 +1,153 @@
+"""The cluster that ``--dask`` names: workers on this machine, or an existing scheduler."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from merge_runner.errors import UsageError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+CONNECT_TIMEOUT_S = 10
+SCHEMES = ("tcp", "tls")
+WORKER = "merge_runner.run.cluster.worker"
+# What a worker imports, and a process from which all are forked imports once.
+SHARED = ["distributed", WORKER, "merge_runner.llm.http"]
+VALID = (
+    "valid: local:N (N workers on this machine), the address of a scheduler "
+    "(tcp://HOST:PORT, tls://HOST:PORT), or its scheduler file (PATH.json)"
+)
+
+
+@asynccontextmanager
+async def connected(where: str) -> AsyncIterator[Client]:
+    """Connect to the cluster, or start it where it is local; raises UsageError."""
+    workers = _local_workers(where)
+    to = {} if workers else _scheduler(where)
+    try:
+        import distributed
+    except ModuleNotFoundError as exc:
+        raise UsageError(
+            "--dask needs the package distributed: pip install 'merge-runner[dask]'"
+        ) from exc
+
+    _silence()
+    if workers:
+        async with (
+            _local_cluster(workers) as cluster,
+            distributed.Client(cluster, asynchronous=True) as client,
+        ):
+            yield client
+        return
+    try:
+        client = await distributed.Client(**to, asynchronous=True, timeout=CONNECT_TIMEOUT_S)
+    except (OSError, ValueError) as exc:
+        raise UsageError(
+            f"no Dask scheduler answers at {where} within {CONNECT_TIMEOUT_S} s; start one with "
+            f"`dask scheduler`, or leave the address out: {VALID}"
+        ) from exc
+    try:
+        yield client
+    finally:
+        await client.close(timeout=CONNECT_TIMEOUT_S)
+
+
+@asynccontextmanager
+async def _local_cluster(workers: int) -> AsyncIterator[object]:
+    """Worker processes; Ctrl-C is for us alone, who stop them in order."""
+    import dask
+    from distributed import LocalCluster
+
+    _choose_how_workers_start()
+    # None is what was set there: asked for a forkserver by name, Dask would have it import pandas.
+    with dask.config.set({"distributed.worker.multiprocessing-method": None}):
+        cluster = LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+            preload=[WORKER],  # also for one that takes a lost one's place
+            asynchronous=True,
+        )
+        with _for_children():
+            await cluster
+        async with cluster:
+            yield cluster
+
+
+def _choose_how_workers_start() -> None:
+    """Forked from a process that has imported what they need; on Linux, where that is safe."""
+    method = "forkserver" if sys.platform == "linux" else "spawn"
+    multiprocessing.set_start_method(method, force=True)
+    if method == "forkserver":
+        multiprocessing.set_forkserver_preload(SHARED)
+
+
+@contextmanager
+def _for_children() -> Iterator[None]:
+    """Start processes that Ctrl-C does not reach, and that import nothing from this folder."""
+    resource_tracker.ensure_running()  # else it starts within, and lets Ctrl-C through again
+    name = "PYTHONSAFEPATH"
+    kept = os.environ.get(name)
+    os.environ[name] = "1"
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # children inherit it
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        del os.environ[name]
+        if kept is not None:
+            os.environ[name] = kept
+
+
+def _silence() -> None:
+    """Dask logs with tracebacks what we tell in a line: lost workers, a lost scheduler."""
+    for name in logging.root.manager.loggerDict:
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def _local_workers(where: str) -> int:
+    """How many workers are to be started on this machine; none where a scheduler is named."""
+    kind, _, number = where.partition(":")
+    if kind != "local":
+        return 0
+    if not (number.isascii() and number.isdigit() and int(number) > 0):
+        raise _unknown(where)
+    return int(number)
+
+
+def _scheduler(where: str) -> dict[str, str]:
+    """How the Dask client calls what is named: an address, or a scheduler file."""
+    if not where.endswith(".json"):
+        return {"address": _address(where)}
+    if not Path(where).is_file():
+        raise UsageError(f"there is no scheduler file {where}; {VALID}")
+    return {"scheduler_file": where}
+
+
+def _address(where: str) -> str:
+    try:
+        parts = urlsplit(where if "://" in where else f"tcp://{where}")
+        usable = parts.scheme in SCHEMES and parts.hostname and parts.port and not parts.path
+    except ValueError:
+        usable = False
+    if not usable:
+        raise _unknown(where)
+    return parts.geturl()
+
+
+def _unknown(where: str) -> UsageError:
+    return UsageError(f"--dask {where!r} names no cluster; {VALID}")

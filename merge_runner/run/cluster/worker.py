@@ -1,0 +1,156 @@
+"""A Dask task: a batch of trials, played by the same code as in one process."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import socket
+from contextlib import AsyncExitStack
+from functools import partial
+from pathlib import Path
+
+from distributed import Worker, get_worker
+from distributed.comm import connect
+
+from merge_runner.errors import MergeRunnerError, TrialSuspended
+from merge_runner.llm.meter import Meter
+from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.run.clients import live_clients
+from merge_runner.run.cluster.batch import Batch, fingerprint
+from merge_runner.run.cluster.link import Link, LinkLost, taken_apart
+from merge_runner.run.cluster.remote import (
+    RemoteBudget,
+    RemoteClaims,
+    RemoteDesk,
+    RemoteLedger,
+    RemoteTurns,
+    UnlimitedTurns,
+    WorkerCache,
+)
+from merge_runner.run.local_runner import Players
+
+REPORT_EVERY_S = 0.5
+
+
+def dask_setup(_: object) -> None:
+    """Called by Dask where this is a worker's preload: Ctrl-C is for the coordinator alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def play_batch(address: str, token: str) -> None:
+    """Ask the coordinator for a batch and play it; errors of ours go back over the link."""
+    asyncio.run(_Worker().play(address, token))
+
+
+class _Worker:
+    """One batch at a worker, from its first word to its last."""
+
+    def __init__(self) -> None:
+        self._work: asyncio.Task[None] | None = None
+        self._stopping = False
+        self._turns: dict[str, UnlimitedTurns] = {}
+        self._early_pauses: dict[str, float] = {}
+
+    async def play(self, address: str, token: str) -> None:
+        dask = get_worker()
+        _stop_profiler(dask)
+        try:
+            comm = await connect(address, **dask.security.get_connection_args("worker"))
+        except OSError:
+            return  # the coordinator is gone, and with it whoever would read an error
+        link = Link(comm, {"stop": self._stop, "pause": self._pause})
+        serving = asyncio.create_task(link.serve())
+        serving.add_done_callback(lambda _: self._stop())
+        error: MergeRunnerError | None = None
+        try:
+            batch: Batch | None = await link.ask(
+                "join", token, fingerprint(), dask.address, socket.gethostname()
+            )
+            if batch is None:
+                return
+            # Beside Dask's folders of single workers, which go when their worker does.
+            folder = Path(dask.local_directory).parent / batch.folder
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._play(batch, link, folder)
+        except MergeRunnerError as exc:
+            error = exc
+        finally:
+            with contextlib.suppress(LinkLost):
+                await link.ask("end", error and taken_apart(error))
+            await link.close()
+            await serving
+
+    async def _play(self, batch: Batch, link: Link, folder: Path) -> None:
+        async with AsyncExitStack() as stack:
+            cache = WorkerCache(folder, link)
+            stack.callback(cache.close)
+            self._turns = {name: UnlimitedTurns(link, name) for name in batch.pauses_s}
+            for name, seconds in {**batch.pauses_s, **self._early_pauses}.items():
+                self._pause(name, seconds)
+            limited = {name: RemoteTurns(link, name) for name in batch.limited}
+            desk = RemoteDesk(
+                limiters={**limited, **self._turns},
+                budget=RemoteBudget(link, RemoteLedger(link, cache)),
+                claims=RemoteClaims(link, cache),
+            )
+            clients = live_clients(
+                batch.plan.entries,
+                batch.addressed,
+                cache,
+                desk,
+                connections=2 * batch.in_flight,
+                stack=stack,
+            )
+            players = Players(batch.plan, clients, batch.in_flight)
+            self._work = asyncio.create_task(players.play(batch.specs, partial(_tell, link)))
+            if self._stopping:
+                self._work.cancel()
+            reporting = asyncio.create_task(_report(players, link))
+            try:
+                await asyncio.wait([self._work])
+                await players.drain()
+                await cache.sent()
+            finally:
+                reporting.cancel()
+                _tell_meters(players, link)
+            self._work.result()
+
+    def _stop(self) -> None:
+        self._stopping = True
+        if self._work is not None:
+            self._work.cancel()
+
+    def _pause(self, name: str, seconds: float) -> None:
+        if name in self._turns:
+            self._turns[name].hold(seconds)
+        else:
+            self._early_pauses[name] = seconds
+
+
+def _stop_profiler(dask: Worker) -> None:
+    """Stop Dask's look at all threads a hundred times a second.
+
+    Python 3.11 can deadlock there when it collects a threading.local, as those of the cache are.
+    """
+    if (profiler := dask.periodic_callbacks.get("profile")) is not None:
+        dask.loop.add_callback(profiler.stop)
+
+
+def _tell(link: Link, spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+    told = str(record) if isinstance(record, TrialSuspended) else record
+    link.tell("trial", spec.order, told)
+
+
+async def _report(players: Players, link: Link) -> None:
+    while True:
+        _tell_meters(players, link)
+        await asyncio.sleep(REPORT_EVERY_S)
+
+
+def _tell_meters(players: Players, link: Link) -> None:
+    """What was counted since the last time; what waits is told anew."""
+    since = {}
+    for name, client in players.clients.items():
+        since[name], client.meter = client.meter, Meter(waits=client.meter.waits)
+    link.tell("report", since, players.running, players.flying)

@@ -1,0 +1,148 @@
+"""What a sweep will take, before anything is sent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from merge_runner.config import ModelEntry, driver_name
+from merge_runner.llm.cache import Totals
+from merge_runner.llm.prices import pricing
+from merge_runner.prompts.render import render_prompt
+from merge_runner.records import Usage
+from merge_runner.run.plan import Limits, Plan
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
+
+# A reply's JSON around the prompt, and later prompts with longer histories and numbers.
+PROMPT_MARGIN = 1.25
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """What a live run has yet to do.
+
+    ``trials`` have ended nowhere; ``calls`` are about how many each model has yet to answer;
+    ``facts`` is what the cache knows of each model's earlier answers to requests like these, at
+    its endpoint.
+    """
+
+    trials: int
+    calls: Mapping[str, float]
+    facts: Mapping[str, Totals]
+    endpoints: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Who drives, trials, calls, tokens, USD (None: a price is unknown) and minutes of a live run.
+
+    ``measured`` lists the drivers whose tokens and latency are those of their earlier answers.
+    """
+
+    driver: str
+    trials: int
+    calls: int
+    input_tokens: int
+    output_tokens: int
+    cost_usd: float | None
+    minutes: float
+    free: bool
+    measured: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _PerCall:
+    """What one call of a model takes, as measured or as the registry has it."""
+
+    usage: Usage
+    latency_s: float
+    measured: bool
+
+
+def estimate(plan: Plan, missing: Missing, limits: Limits) -> Estimate:
+    """The estimate for what is missing of a plan."""
+    calls = input_tokens = output_tokens = 0
+    cost: float | None = 0.0
+    slowest_s = 0.0
+    measured = []
+    for name, entry in plan.entries.items():
+        made = round(missing.calls[name])
+        each = _per_call(plan, entry, missing.facts[name])
+        price = pricing(entry).cost_usd(each.usage)
+        tokens_in, tokens_out = each.usage.input_tokens or 0, each.usage.output_tokens or 0
+        calls += made
+        input_tokens += made * tokens_in
+        output_tokens += made * tokens_out
+        cost = None if cost is None or price is None else cost + made * price
+        measured += [driver_name(name, missing.endpoints[name])] if each.measured else []
+        at_once = min(limits.connections, 2 * max(missing.trials, 1))
+        slowest_s = max(
+            slowest_s,
+            math.ceil(made / at_once) * each.latency_s,
+            _limited_s(entry, limits, made, each),
+        )
+    return Estimate(
+        driver=plan.driver(missing.endpoints),
+        trials=missing.trials,
+        calls=calls,
+        input_tokens=input_tokens,
+        output_tokens=output_tokens,
+        cost_usd=None if cost is None else round(cost, 2),
+        minutes=round(slowest_s / 60, 1),
+        free=all(entry.price == "free" for entry in plan.entries.values()),
+        measured=tuple(measured),
+    )
+
+
+def worst_trial_usd(plan: Plan) -> float:
+    """What a whole trial may cost: to the timeout, every byte a token, every answer at its cap."""
+    prompt_bytes = len(_typical_prompt(plan).encode()) * PROMPT_MARGIN
+    return sum(
+        math.ceil(plan.scenario.timeout_steps / plan.scenario.executed_actions)
+        * (
+            pricing(entry).cost_usd(
+                Usage(input_tokens=int(prompt_bytes), output_tokens=entry.max_output_tokens)
+            )
+            or 0.0
+        )
+        for entry in (plan.entries[n] for n in plan.sides.values() if n in plan.entries)
+    )
+
+
+def _per_call(plan: Plan, entry: ModelEntry, facts: Totals) -> _PerCall:
+    if facts.measured:
+        usage = Usage(
+            input_tokens=round(facts.input_tokens / facts.measured),
+            output_tokens=round(facts.output_tokens / facts.measured),
+        )
+        return _PerCall(usage, facts.latency_s / facts.measured, True)
+    prompt_tokens = len(_typical_prompt(plan).encode()) // 4
+    usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
+    return _PerCall(usage, entry.typical_latency_s, False)
+
+
+def _limited_s(entry: ModelEntry, limits: Limits, calls: int, each: _PerCall) -> float:
+    """How long the limits stretch the calls, in s.
+
+    Within a minute's window a call counts with its output cap until its reply is in, and with
+    its actual tokens from then on.
+    """
+    rpm, tpm = limits.rpm or entry.rpm, limits.tpm or entry.tpm
+    waiting = min(each.latency_s / 60, 1.0)
+    tokens = (each.usage.input_tokens or 0) + (
+        waiting * entry.max_output_tokens + (1 - waiting) * (each.usage.output_tokens or 0)
+    )
+    return max(60 * calls / rpm if rpm else 0.0, 60 * calls * tokens / tpm if tpm else 0.0)
+
+
+def _typical_prompt(plan: Plan) -> str:
+    """The longest variant's prompt in the midst of an approach."""
+    world = World(plan.scenario, CONDITIONS[plan.conditions[0]])
+    rest = (0.25,) * (plan.scenario.plan_actions - plan.scenario.executed_actions)
+    prompts = (
+        render_prompt(world.observe("left"), rest, variant=variant, scenario=plan.scenario)
+        for variant in plan.repetitions
+    )
+    return max(prompts, key=len)

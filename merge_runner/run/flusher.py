@@ -1,0 +1,121 @@
+"""Writes ended trials to the store in batches, in a thread, while the trials go on."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+from collections.abc import Callable
+from itertools import accumulate, chain
+
+from merge_runner.errors import StoreError, StoreLocked
+from merge_runner.records import TrialRecord
+from merge_runner.results.store import Store
+
+EVERY_S = 1.0
+BATCH = 64
+"""Trials in one transaction: few enough that a reader gets its turn soon."""
+MOST_PENDING = 4 * BATCH
+BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
+# What cannot be stored now, as while another program holds the file.
+MOST_STUCK_BYTES = 2**29
+LOCK_PATIENCE_S = 2.0
+# At the end: with a lock, which somebody will release, and with anything else, as a full disk.
+LAST_LOCK_PATIENCE_S, LAST_PATIENCE_S = 60.0, 3.0
+
+
+def size_of(record: TrialRecord) -> int:
+    """The bytes of a trial's replies, which are most of it."""
+    replies = (row.decision.reply for row in record.decisions if row.decision.reply)
+    calls = chain((reply.attempts for reply in replies), (c.attempts for c in record.failed_calls))
+    return sum(sys.getsizeof(attempt.reply) for attempt in chain.from_iterable(calls))
+
+
+class Flusher:
+    """Collects ended trials and stores them about once a second.
+
+    What cannot be stored waits in memory while the trials go on, up to a limit; where it is only
+    slow, they wait for it. ``differing`` names the trials that are stored already with other
+    values, and in which columns.
+    """
+
+    def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
+        self.differing: dict[str, list[str]] = {}
+        self._store = store
+        self._sweep_id = sweep_id
+        self._say = say
+        self._pending: list[TrialRecord] = []
+        self._bytes = 0
+        self._problem = ""
+        self._locked = self._stuck = False
+        self._closing = False
+        self._awake, self._tried = asyncio.Event(), asyncio.Event()
+        self._task = asyncio.create_task(self._run())
+
+    def add(self, record: TrialRecord) -> None:
+        """Store this trial with the next batch."""
+        self._pending.append(record)
+        self._bytes += size_of(record)
+        if len(self._pending) >= BATCH or self._bytes >= BATCH_BYTES:
+            self._awake.set()
+
+    async def room(self) -> None:
+        """Wait while much is still to be stored, and it can be."""
+        while self._is_full() and not self._task.done():
+            self._tried.clear()
+            await self._tried.wait()
+
+    def _is_full(self) -> bool:
+        if self._stuck:
+            return self._bytes > MOST_STUCK_BYTES
+        return len(self._pending) > MOST_PENDING or self._bytes > MOST_PENDING_BYTES
+
+    async def close(self) -> None:
+        """Store what is left; raises StoreError if that does not work after a while."""
+        self._closing = True
+        self._awake.set()
+        await self._task
+        began = asyncio.get_running_loop().time()
+        while self._pending:
+            if await self._flush():
+                continue
+            patience_s = LAST_LOCK_PATIENCE_S if self._locked else LAST_PATIENCE_S
+            if asyncio.get_running_loop().time() - began >= patience_s:
+                raise StoreError(
+                    f"{len(self._pending)} trials are not stored: {self._problem}. When that is "
+                    "mended, run the same command again: it writes them from the recorded replies "
+                    "without a call."
+                )
+            await asyncio.sleep(min(EVERY_S, patience_s))
+
+    async def _run(self) -> None:
+        while not self._closing:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(EVERY_S):
+                    await self._awake.wait()
+            self._awake.clear()
+            while self._pending and not self._closing and await self._flush():
+                continue
+
+    async def _flush(self) -> bool:
+        """Write one batch; False if that did not work."""
+        sizes = accumulate(map(size_of, self._pending[:BATCH]))
+        number = max(1, sum(size <= BATCH_BYTES for size in sizes))
+        batch, self._pending = self._pending[:number], self._pending[number:]
+        try:
+            self.differing |= await asyncio.to_thread(
+                self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
+            )
+        except StoreError as exc:
+            self._stuck, self._locked = True, isinstance(exc, StoreLocked)
+            self._pending = batch + self._pending
+            if str(exc) != self._problem:
+                self._problem = str(exc)
+                self._say(f"waiting to store {len(self._pending)} trials: {exc}")
+            return False
+        else:
+            self._stuck = False
+            self._bytes -= sum(map(size_of, batch))
+            return True
+        finally:
+            self._tried.set()

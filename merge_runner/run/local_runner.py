@@ -1,0 +1,143 @@
+"""Plays trials with the clients of their models, in this process."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Protocol
+
+from merge_runner.drivers.base import Driver
+from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.errors import TrialSuspended
+from merge_runner.llm.client import LlmClient
+from merge_runner.llm.meter import Meter
+from merge_runner.records import SIDES, Cell, ChatReply, Side, Slot, TrialRecord, TrialSpec
+from merge_runner.run.plan import Plan
+from merge_runner.run.scheduler import Gate, run_bounded
+from merge_runner.trial import play_trial
+
+# Told of each trial that ends; a suspended one has no money to go on.
+Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]
+# Awaited before a trial begins: is there room to keep it until it is stored?
+Room = Callable[[], Awaitable[None]]
+
+
+async def no_wait() -> None:
+    """Room without end."""
+
+
+class Crew(Protocol):
+    """Whoever plays the trials of a sweep: this process, or workers in a cluster."""
+
+    @property
+    def meters(self) -> Mapping[str, Meter]:
+        """What each model's calls came to, over all who play."""
+        ...
+
+    @property
+    def running(self) -> int:
+        """How many trials are being played."""
+        ...
+
+    @property
+    def playing(self) -> Mapping[Cell, int] | None:
+        """How many trials of each cell are being played; None: only the workers know."""
+        ...
+
+    @property
+    def flying(self) -> int:
+        """How many calls are in flight or being saved."""
+        ...
+
+    @property
+    def workers(self) -> int | None:
+        """How many workers play; None: this process does."""
+        ...
+
+    def answers(self, name: str) -> int:
+        """How many calls of this run a model has answered."""
+        ...
+
+    async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
+        """Play trials in order; what ``ended`` raises, and any error but a trial's own, ends it."""
+        ...
+
+    async def drain(self) -> None:
+        """Let calls in flight end and be saved, and give up those that wait for a turn."""
+        ...
+
+
+@dataclass(slots=True)
+class Players:
+    """Plays at most ``in_flight`` trials at once."""
+
+    plan: Plan
+    clients: Mapping[str, LlmClient]
+    in_flight: int
+    gate: Gate = field(default_factory=Gate)
+    playing: Counter[Cell] = field(default_factory=Counter)
+    workers: None = None
+
+    @property
+    def running(self) -> int:
+        """How many trials are being played."""
+        return self.playing.total()
+
+    @property
+    def meters(self) -> Mapping[str, Meter]:
+        """Those of the clients."""
+        return {name: client.meter for name, client in self.clients.items()}
+
+    @property
+    def flying(self) -> int:
+        """How many calls are in flight or being saved."""
+        return sum(client.flying for client in self.clients.values())
+
+    def answers(self, name: str) -> int:
+        """How many live replies a model's trials have used."""
+        return self.clients[name].meter.calls_live
+
+    async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
+        """See Crew."""
+        await run_bounded(
+            (partial(self._trial, spec, room) for spec in specs),
+            in_flight=self.in_flight,
+            on_done=lambda done: ended(*done),
+        )
+
+    async def drain(self) -> None:
+        """See Crew."""
+        await asyncio.gather(*(client.drain() for client in self.clients.values()))
+
+    async def _trial(
+        self, spec: TrialSpec, room: Room
+    ) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
+        await room()
+        drivers = {side: self._driver(spec, side) for side in SIDES}
+        self.playing[spec.cell] += 1
+        try:
+            return spec, await play_trial(spec, self.plan.scenario, drivers)
+        except TrialSuspended as exc:
+            return spec, exc
+        finally:
+            self.playing[spec.cell] -= 1
+            for client in self.clients.values():
+                client.leave(spec.order)
+
+    def _driver(self, spec: TrialSpec, side: Side) -> Driver:
+        name, scenario = self.plan.sides[side], self.plan.scenario
+        if name in PROGRAMS:
+            return PROGRAMS[name].make(scenario, side)
+        client = self.clients[name]
+
+        async def ask(prompt: str, number: int) -> ChatReply:
+            await self.gate.enter()
+            slot = Slot(spec.condition, spec.repetition, side, number, spec.sample_set)
+            return await client.ask(prompt, slot, order=spec.order)
+
+        assert spec.variant is not None, "only human trials have no prompt variant"
+        return LlmDriver(ask, spec.variant, scenario)

@@ -1,0 +1,443 @@
+"""The composition root: wires drivers, clients, store and display, and runs a sweep."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from merge_runner.audit import Audit, audit_sweep
+from merge_runner.config import ModelEntry, endpoint_identity
+from merge_runner.errors import (
+    MergeRunnerError,
+    ProviderDown,
+    ReplayMiss,
+    StoreError,
+    TrialSuspended,
+    UsageError,
+)
+from merge_runner.llm.cache import Entry, ResponseCache, Totals
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.keys import canonical_json, manner, spec_hash
+from merge_runner.llm.ledger import Ledger, Spending
+from merge_runner.llm.transport import SealedTransport
+from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.results.database import unreadable_is_usage
+from merge_runner.results.progress_file import ProgressFile
+from merge_runner.results.provenance import git_state, versions
+from merge_runner.results.recording import Spilled
+from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
+from merge_runner.run.clients import (
+    Addressed,
+    Terms,
+    live_clients,
+    open_desk,
+    reached,
+    sealed_clients,
+)
+from merge_runner.run.estimate import Missing, worst_trial_usd
+from merge_runner.run.flusher import Flusher
+from merge_runner.run.local_runner import Crew, Players
+from merge_runner.run.plan import PROMPTS_PER_DRIVER, Limits, Plan
+from merge_runner.run.progress import Progress, shown, told
+from merge_runner.run.replay_diagnosis import Miss, explain, misses_of
+from merge_runner.signals import on_interrupt
+
+INTERRUPTED = 130
+SHOWN = 5
+FAILURES_IN_A_ROW = 10
+FROM_RECORDINGS = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a sweep runs; nothing here changes a result.
+
+    ``dask`` names the cluster that plays; None: this process does. ``faults_identity`` tells the
+    answers of an emulator that is asked for bad answers from those of the usual one.
+    """
+
+    db: Path
+    cache: Path
+    in_flight: int = 200
+    limits: Limits = field(default_factory=Limits)
+    replay: bool = False
+    recording: Path | None = None
+    emulator_options: Sequence[str] = ()
+    faults_identity: str = ""
+    strict_model: bool = False
+    dask: str | None = None
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a run did.
+
+    ``stored_before`` trials were not played because they are stored; ``suspended`` ones wait for
+    money, with their replies kept. ``spending`` is that of the sweep over all its runs, and
+    ``cache_cost_usd`` what all replies in the cache cost when they were made. ``damaged`` lists
+    the keys of recorded replies that could not be read. ``facts`` are those of the database over
+    all trials of the sweep, and ``audit`` what was checked there, None where they are not stored.
+    ``playing_s`` is how long the trials took, ``worst_stall_s`` by how much the event loop was late
+    at worst.
+    """
+
+    sweep_id: str
+    driver: str
+    trials: int
+    stored_before: int
+    exit_code: int = 0
+    messages: list[str] = field(default_factory=list)
+    calls_live: int = 0
+    calls_cached: int = 0
+    cost_usd: float = 0.0
+    calls_of_unknown_cost: int = 0
+    attempts: dict[str, int] = field(default_factory=dict)
+    suspended: int = 0
+    damaged: list[str] = field(default_factory=list)
+    spending: Spending = field(default_factory=Spending)
+    cache_cost_usd: float = 0.0
+    facts: SweepFacts | None = None
+    audit: Audit | None = None
+    playing_s: float = 0.0
+    worst_stall_s: float = 0.0
+
+    def fail(self, exit_code: int, message: str) -> None:
+        """Note a problem; the first one decides the exit code."""
+        self.exit_code = self.exit_code or exit_code
+        self.messages.append(message)
+
+
+@dataclass(slots=True)
+class Outage:
+    """How many trials a model failed since it gave its last of so many answers."""
+
+    answers: int = 0
+    trials: int = 0
+
+
+class Sweep:
+    """One run of a plan. Making it opens the cache and the database, and nothing else."""
+
+    def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
+        """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
+        self._plan = plan
+        self._options = options
+        self._say = say
+        self._cache = ResponseCache(options.cache, overlay=partial(_overlay, options.recording))
+        self._endpoints = {name: self._endpoint(name, e) for name, e in plan.entries.items()}
+        self._store = Store(options.db)
+        specs = {
+            (spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs(self._endpoints)
+        }
+        # A replay derives everything from the recorded replies alone, so it plays every trial.
+        with unreadable_is_usage():
+            ended = set() if options.replay else self._store.ended_trials(specs)
+        self._stored = [key for key in specs if key in ended]
+        self._todo = [spec for key, spec in specs.items() if key not in ended]
+        self._sealed = SealedTransport()
+        self._misses: list[Miss] = []
+        self._ledger = Ledger(self._cache, plan.ledger)
+        self._outages: dict[str, Outage] = {}
+        self._suspended: list[TrialSuspended] = []
+        driver = plan.driver(self._endpoints)
+        self._progress = Progress(
+            title=f"{plan.name}: {driver}" + (" (scripted stand-in)" if plan.scripted else ""),
+            total=len(self._todo),
+            expected_calls=round(len(self._todo) * plan.llm_sides * PROMPTS_PER_DRIVER),
+            cap_usd=options.limits.max_cost_usd,
+            ledger=self._ledger,
+            stored_before=len(self._stored),
+            name=plan.name,
+            model=driver,
+            planned=Counter(spec.cell for spec in specs.values()),
+            stored=Counter(specs[key].cell for key in self._stored),
+        )
+
+    @property
+    def trials_to_play(self) -> int:
+        """How many trials are not stored yet."""
+        return len(self._todo)
+
+    async def run(self) -> Outcome:
+        """Play what is missing and store it; what goes wrong is in the outcome."""
+        with unreadable_is_usage():
+            sweep_id = self._begin()
+        file = ProgressFile(self._options.db, sweep_id)
+        async with told(self._progress, file):
+            outcome = await self._run(sweep_id)
+            self._progress.doing = "checking"
+            file.write(self._progress.standing(sweep_id))
+            self._end(outcome)
+        return outcome
+
+    async def _run(self, sweep_id: str) -> Outcome:
+        """Play what is missing and store it."""
+        outcome = Outcome(
+            sweep_id,
+            self._plan.driver(self._endpoints),
+            self._plan.trials,
+            len(self._stored),
+        )
+        async with AsyncExitStack() as stack:
+            stack.callback(self._cache.close)
+            crew = await self._crew(stack)
+            self._progress.crew = crew
+            flusher = Flusher(self._store, outcome.sweep_id, self._say)
+            began = time.perf_counter()
+            try:
+                async with shown(self._progress):
+                    await self._play(crew, flusher, outcome)
+            finally:
+                outcome.playing_s = time.perf_counter() - began
+                outcome.worst_stall_s = self._progress.worst_stall_s
+                await self._store_rest(flusher, outcome)
+            self._explain_misses(outcome)
+            try:
+                outcome.cache_cost_usd = self._cache.cost_usd()
+                outcome.spending = self._ledger.read()
+            except MergeRunnerError as exc:
+                if self._options.replay:  # which spends nothing
+                    outcome.messages.append(str(exc))
+                else:
+                    outcome.fail(exc.exit_code, str(exc))
+        for meter in crew.meters.values():
+            outcome.damaged += meter.damaged
+            outcome.calls_live += meter.calls_live
+            outcome.calls_cached += meter.calls_cached
+            outcome.cost_usd += meter.cost_usd
+            outcome.calls_of_unknown_cost += meter.cost_unknown
+            for name, count in meter.outcomes.items():
+                outcome.attempts[name] = outcome.attempts.get(name, 0) + count
+        if self._suspended:
+            outcome.suspended = len(self._suspended)
+            outcome.fail(
+                TrialSuspended.exit_code,
+                f"{len(self._suspended)} trials wait for money: {self._suspended[-1]}. Their "
+                "replies are kept: raise --max-cost and run the same command again",
+            )
+        if self._progress.done["failed"] and not self._misses:
+            outcome.fail(1, f"{self._progress.done['failed']} trials failed")
+        return outcome
+
+    async def rehearse(self) -> Missing:
+        """Play from the recorded replies alone, store nothing, and count what is missing."""
+        clients = sealed_clients(
+            self._plan.entries, self._endpoints, self._cache, SealedTransport()
+        )
+        trials = 0
+        calls = dict.fromkeys(self._plan.entries, 0.0)
+
+        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+            nonlocal trials
+            if isinstance(record, TrialSuspended) or record.status != "failed":
+                return
+            trials += 1
+            for side, name in self._plan.sides.items():
+                if name in calls:
+                    answered = sum(row.side == side for row in record.decisions)
+                    calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
+
+        await Players(self._plan, clients, in_flight=1).play(self._todo, ended)
+        facts = {name: self._measured(name, entry) for name, entry in self._plan.entries.items()}
+        return Missing(trials, calls, facts, self._endpoints)
+
+    def _measured(self, name: str, entry: ModelEntry) -> Totals:
+        """What is known of answers to requests like those of this sweep."""
+        sent = FORMATS[entry.format].request(entry, "")
+        asked = manner(sent.path, canonical_json(sent.body))
+        return self._cache.facts(entry.id).of(self._endpoints[name], asked)
+
+    def close(self) -> None:
+        """Close what was opened, where the sweep is not run."""
+        self._cache.close()
+
+    def _explain_misses(self, outcome: Outcome) -> None:
+        if not self._misses:
+            return
+        left_out: list[str] = []
+        for line in explain(self._misses, self._cache.entries(left_out)):
+            outcome.fail(ReplayMiss.exit_code, line)
+        if left_out:
+            outcome.messages.append(
+                f"{len(left_out)} rows of the cache are left out of this, the first: {left_out[0]}"
+            )
+
+    def _begin(self) -> str:
+        """Add the sweep to the database, with the trials that are stored already."""
+        started_at = datetime.now(UTC).replace(tzinfo=None)
+        sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
+        commit, dirty = git_state()
+        config = self._plan.config(self._endpoints)
+        config["max_cost_usd"] = self._options.limits.max_cost_usd
+        self._store.begin_sweep(
+            SweepRow(
+                sweep_id=sweep_id,
+                name=self._plan.name,
+                started_at=started_at,
+                config=canonical_json(config),
+                git_commit=commit,
+                git_dirty=dirty,
+                versions=canonical_json(versions()),
+            ),
+            {spec_hash(text): text for text in self._plan.specs(self._endpoints).values()},
+            self._stored,
+        )
+        return sweep_id
+
+    async def _crew(self, stack: AsyncExitStack) -> Crew:
+        """Who plays: this process, or the workers of a cluster."""
+        plan, options = self._plan, self._options
+        if options.replay or not self._todo or not plan.entries:
+            clients = sealed_clients(plan.entries, self._endpoints, self._cache, self._sealed)
+            # Recorded replies are there at once: more in flight only take more memory.
+            return Players(plan, clients, min(options.in_flight, FROM_RECORDINGS))
+        terms = Terms(options.limits, self._ledger, worst_trial_usd(plan))
+        desk = open_desk(plan.entries, self._endpoints, self._cache, terms, stack)
+        urls = await reached(plan.entries, options.emulator_options, stack)
+        known = frozenset(
+            name
+            for name, entry in plan.entries.items()
+            if self._endpoints[name] in self._cache.facts(entry.id).totals
+        )
+        addressed = Addressed(self._endpoints, urls, options.strict_model, known)
+        if options.dask is None:
+            clients = live_clients(
+                plan.entries,
+                addressed,
+                self._cache,
+                desk,
+                connections=options.limits.connections,
+                stack=stack,
+            )
+            return Players(plan, clients, options.in_flight)
+        from merge_runner.run.cluster.connect import connected
+
+        client = await stack.enter_async_context(connected(options.dask))
+        from merge_runner.run.cluster.coordinator import Coordinator  # needs what was asked for
+
+        return await stack.enter_async_context(
+            Coordinator(client, plan, addressed, self._cache, desk, options.in_flight)
+        )
+
+    async def _play(self, crew: Crew, flusher: Flusher, outcome: Outcome) -> None:
+        """Run the trials until all have ended, or the sweep is stopped or interrupted."""
+
+        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+            if isinstance(record, TrialSuspended):
+                self._progress.count(spec.cell, "suspended")
+                self._suspended.append(record)
+                return
+            self._progress.count(spec.cell, record.status)
+            self._misses += misses_of(record, self._sealed)
+            flusher.add(record)
+            self._watch_for_outage(record, crew)
+
+        work = asyncio.create_task(crew.play(self._todo, ended, room=flusher.room))
+        drain = asyncio.create_task(_drained(crew, work))
+
+        def interrupted() -> None:
+            self._say(
+                f"Stopping: {crew.flying} calls in flight are saved first; Ctrl-C again drops them."
+            )
+            work.cancel()
+
+        with on_interrupt(interrupted, drain.cancel):
+            await asyncio.wait([drain])
+            await asyncio.wait([work])
+        if work.cancelled():
+            outcome.fail(INTERRUPTED, "Interrupted. Run the same command again to go on.")
+        elif isinstance(error := work.exception(), MergeRunnerError):
+            outcome.fail(error.exit_code, str(error))
+        elif error is not None:
+            raise error
+
+    async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> None:
+        """Store what has ended and is not stored yet."""
+        try:
+            await flusher.close()
+            if flusher.differing:
+                outcome.fail(
+                    StoreError.exit_code,
+                    f"{len(flusher.differing)} trials are stored otherwise in {self._options.db}, "
+                    f"which is left as it is: {_differing(flusher.differing)}. Replay into "
+                    "another --db.",
+                )
+        except StoreError as exc:
+            outcome.fail(exc.exit_code, str(exc))
+
+    def _end(self, outcome: Outcome) -> None:
+        """Note how the sweep ended, read back what the database holds of it, and audit that."""
+        try:
+            outcome.facts = sweep_facts(self._options.db, outcome.sweep_id)
+            outcome.audit = audit_sweep(
+                self._options.db,
+                outcome.sweep_id,
+                finished=outcome.exit_code == 0,
+                derive=False,  # these trials have just been driven
+            )
+            # Another model's answers are told apart from this, and only --strict-model stops there.
+            findings = [f for f in outcome.audit.findings if f.kind != "served"]
+            if findings:
+                outcome.fail(1, f"the audit found {len(findings)} faults: `merge-runner audit`")
+            outcome.messages += map(str, findings[:SHOWN])
+            ended_at = datetime.now(UTC).replace(tzinfo=None)
+            self._store.end_sweep(outcome.sweep_id, ended_at, outcome.exit_code)
+        except (StoreError, UsageError) as exc:
+            outcome.fail(exc.exit_code, str(exc))
+
+    def _watch_for_outage(self, record: TrialRecord, crew: Crew) -> None:
+        """Stop when trials fail for want of one model, which answers no call in between."""
+        if self._options.replay:
+            return
+        for name in {self._plan.sides[failed.side] for failed in record.failed_calls}:
+            outage = self._outages.setdefault(name, Outage())
+            answers = crew.answers(name)
+            if answers > outage.answers:
+                outage.answers, outage.trials = answers, 0
+            outage.trials += 1
+            if outage.trials >= FAILURES_IN_A_ROW:
+                raise ProviderDown(
+                    f"the last {outage.trials} trials with {name} failed and no call was answered "
+                    f"in between ({record.error}): the rest is not tried. When the service answers "
+                    "again, run the same command to go on"
+                )
+
+    def _endpoint(self, name: str, entry: ModelEntry) -> str:
+        """The endpoint's identity: in a replay, the one under which the model is recorded."""
+        configured = endpoint_identity(name, entry)
+        if entry.provider == "emulator":
+            configured += self._options.faults_identity
+        if not self._options.replay:
+            return configured
+        recorded = self._cache.recorded_endpoints(entry.id)
+        if configured in recorded or not recorded:
+            return configured
+        if len(recorded) > 1:
+            raise UsageError(
+                f"replies of {name} are recorded from several endpoints: {', '.join(recorded)}. "
+                "Set the base URL variable of its provider to the one to replay."
+            )
+        return recorded[0]
+
+
+def _differing(trials: Mapping[str, Sequence[str]]) -> str:
+    """The first trials that are stored otherwise, each with the columns."""
+    shown = list(trials.items())[:SHOWN]
+    return "; ".join(f"{trial_id} ({', '.join(columns)})" for trial_id, columns in shown)
+
+
+async def _drained(crew: Crew, work: asyncio.Task[None]) -> None:
+    """When the work has ended, in whatever way, save the calls that are in flight."""
+    await asyncio.wait([work])
+    await crew.drain()
+
+
+def _overlay(recording: Path | None) -> Mapping[str, Entry]:
+    return {} if recording is None else Spilled(recording)

@@ -1,0 +1,48 @@
+"""When two vehicles collide: three readings of the same sentence of the paper."""
+
+from __future__ import annotations
+
+from merge_runner.config import Scenario
+from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, heading, place
+
+Vector = tuple[float, float]
+
+
+def collided(scenario: Scenario, left_m: float, right_m: float) -> bool:
+    """Whether vehicles at these travelled distances collide under the scenario's rule."""
+    length = scenario.vehicle_length_m
+    if scenario.collision_rule == "euclid2d":
+        return squared_distance_m2(left_m, right_m) < length**2
+    if scenario.collision_rule == "shared_lane":
+        return max(left_m, right_m) >= MERGE_POINT_M and abs(left_m - right_m) < length
+    return rectangles_overlap(left_m, right_m, length, scenario.vehicle_width_m)
+
+
+def squared_distance_m2(left_m: float, right_m: float) -> float:
+    """The squared distance between the two centres in the plane."""
+    (x_left, y_left), (x_right, y_right) = place("left", left_m), place("right", right_m)
+    return (x_left - x_right) ** 2 + (y_left - y_right) ** 2
+
+
+def rectangles_overlap(left_m: float, right_m: float, length_m: float, width_m: float) -> bool:
+    """Whether the two oriented vehicle boxes overlap, by the separating axis theorem."""
+    (x_left, y_left), (x_right, y_right) = place("left", left_m), place("right", right_m)
+    apart = (x_right - x_left, y_right - y_left)
+    ahead_left, ahead_right = heading("left", left_m), heading("right", right_m)
+    for ahead in (ahead_left, ahead_right):
+        for axis in (ahead, (ahead[1], -ahead[0])):
+            reach = _half_extent(ahead_left, axis, length_m, width_m) + _half_extent(
+                ahead_right, axis, length_m, width_m
+            )
+            if abs(_dot(apart, axis)) >= reach:
+                return False
+    return True
+
+
+def _half_extent(ahead: Vector, axis: Vector, length_m: float, width_m: float) -> float:
+    across = (ahead[1], -ahead[0])
+    return abs(_dot(ahead, axis)) * length_m / 2 + abs(_dot(across, axis)) * width_m / 2
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1]

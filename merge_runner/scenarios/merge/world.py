@@ -1,0 +1,140 @@
+"""One trial's world: both vehicles, their trace, what each driver sees, and when it ends."""
+
+from __future__ import annotations
+
+from merge_runner.config import Scenario
+from merge_runner.records import SIDES, Observation, Side, StateRow, Status
+from merge_runner.scenarios.merge.collision import collided
+from merge_runner.scenarios.merge.conditions import Condition
+from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
+from merge_runner.scenarios.merge.vehicle import advance, net_acceleration, time_to_reach
+
+OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
+
+
+class World:
+    """Two vehicles on the track, from the start of control to the end of the trial.
+
+    ``status`` is None while the trial runs. Time 0 is the start of control. Sampled states are
+    kept from step 0 on, in SI units.
+    """
+
+    def __init__(self, scenario: Scenario, condition: Condition) -> None:
+        exits = condition.exit_times_s
+        start = max(exits) if scenario.control_start == "both_exits" else min(exits)
+        self._scenario = scenario
+        self.step = 0
+        self.status: Status | None = None
+        self._merge_times: dict[Side, float] = {}
+        self._positions = {
+            side: [position]
+            for side, position in zip(SIDES, condition.positions_m(start), strict=True)
+        }
+        self._velocities = {
+            side: [speed] for side, speed in zip(SIDES, condition.speeds_mps, strict=True)
+        }
+        self._accelerations: dict[Side, list[float]] = {side: [0.0] for side in SIDES}
+        if collided(scenario, self._positions["left"][0], self._positions["right"][0]):
+            self.status = "collided"
+
+    @property
+    def time_s(self) -> float:
+        """The time since the start of control."""
+        return _time(self.step, self._scenario.step_s)
+
+    def in_control(self, side: Side) -> bool:
+        """Whether the vehicle has left its tunnel; until then it cruises by itself."""
+        return self._positions[side][-1] > TUNNEL_EXIT_M - 1e-9
+
+    def advance(self, actions: dict[Side, float | None]) -> None:
+        """Drive one step with normalised actions in [-1, 1]; None lets a vehicle cruise."""
+        scenario = self._scenario
+        for side in SIDES:
+            velocity = self._velocities[side][-1]
+            action = actions[side]
+            acceleration = (
+                0.0
+                if action is None
+                else net_acceleration(
+                    action * scenario.max_acceleration_mps2, velocity, scenario.resistance
+                )
+            )
+            self._move(side, acceleration)
+        self.step += 1
+        self.status = self._end()
+
+    def merged_first(self) -> Side | None:
+        """Who reached the merge point first; None after a collision or if nobody did."""
+        if self.status == "collided" or not self._merge_times:
+            return None
+        return min(self._merge_times, key=self._merge_times.__getitem__)
+
+    def observe(self, side: Side) -> Observation:
+        """What the driver of ``side`` sees now, itself as ego."""
+        other = OTHER[side]
+        position = self._positions[side][-1]
+        farthest_back = (
+            position
+            if self._scenario.straight_after == "own"
+            else min(position, self._positions[other][-1])
+        )
+        straight = farthest_back >= MERGE_POINT_M
+        return Observation(
+            road="straight" if straight else "merge",
+            own_speed_mps=self._velocities[side][-1],
+            other_speed_mps=self._velocities[other][-1],
+            relative_distance_m=self._positions[other][-1] - position,
+            distance_to_merge_m=None if straight else MERGE_POINT_M - position,
+            own_accelerations_mps2=self._history(self._accelerations[side][1:], 0.0),
+            other_speeds_mps=self._history(
+                self._velocities[other][:-1], self._velocities[other][0]
+            ),
+        )
+
+    def states(self) -> tuple[StateRow, ...]:
+        """The trace, one row per vehicle and sample."""
+        return tuple(
+            StateRow(
+                step=step,
+                time_s=_time(step, self._scenario.step_s),
+                side=side,
+                position_m=self._positions[side][step],
+                velocity_mps=self._velocities[side][step],
+                acceleration_mps2=self._accelerations[side][step],
+            )
+            for step in range(self.step + 1)
+            for side in SIDES
+        )
+
+    def _move(self, side: Side, acceleration: float) -> None:
+        dt = self._scenario.step_s
+        position, velocity = self._positions[side][-1], self._velocities[side][-1]
+        new_position, new_velocity = advance(position, velocity, acceleration, dt)
+        if position < MERGE_POINT_M <= new_position:
+            reach = time_to_reach(MERGE_POINT_M - position, velocity, acceleration)
+            self._merge_times[side] = self.time_s + reach
+        self._positions[side].append(new_position)
+        self._velocities[side].append(new_velocity)
+        # Where the vehicle stopped within the step, what it executed is less than the command.
+        stopped = velocity + acceleration * dt < 0
+        self._accelerations[side].append(-velocity / dt if stopped else acceleration)
+
+    def _end(self) -> Status | None:
+        left, right = self._positions["left"][-1], self._positions["right"][-1]
+        if collided(self._scenario, left, right):
+            return "collided"
+        if max(left, right) >= TRACK_END_M:
+            return "finished"
+        return "timeout" if self.step >= self._scenario.timeout_steps else None
+
+    def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
+        wanted = self._scenario.memory_samples
+        recent = samples[-wanted:]
+        if self._scenario.history_start == "cruise":
+            return (before,) * (wanted - len(recent)) + tuple(recent)
+        return tuple(recent)
+
+
+def _time(step: int, step_s: float) -> float:
+    """The time of a step, without the binary dust of a product like 3 * 0.2."""
+    return round(step * step_s, 9)

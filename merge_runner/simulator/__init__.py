@@ -1,1 +1,0 @@
-"""The driving task: pure functions of positions and speeds, without I/O."""

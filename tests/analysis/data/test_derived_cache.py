@@ -1,0 +1,193 @@
+"""What is kept in the database: equal to what is computed anew, and renewed when it must be."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import duckdb
+import pytest
+
+from analysis.data import derived_cache as kept
+from analysis.data.derived_cache import finished, keep_finished
+from analysis.data.study import Study
+from analysis.report.writer import finished_figures
+from analysis.table_format import TableFormat
+from analysis.tables import TABLES, finished_tables, make_tables
+from analysis.tables.formats import render
+from analysis.tables.model import from_text, to_text
+from merge_runner.errors import UsageError
+from merge_runner.results.store import results_digest
+from tests.analysis.studies import write_study, yielding
+
+HOLDER = """
+import sys, duckdb
+connection = duckdb.connect(sys.argv[1], read_only=True)
+print("held", flush=True)
+sys.stdin.read()
+"""
+# Changes of the results that tables show, and one of each table that they are made of.
+CHANGES = {
+    "a speed": "UPDATE states SET velocity_mps = velocity_mps + 1e-9 "
+    "WHERE step = 9 AND side = 'left' AND trial_id LIKE '%N_0_0/rep01'",
+    "an outcome": "UPDATE trials SET status = 'timeout' WHERE trial_id LIKE '%N_0_0/rep01'",
+    "a plan": "UPDATE decisions SET plan = [0.5] WHERE decision = 1",
+    "a fate": "UPDATE calls SET outcome = 'unknown' WHERE attempt = 1 AND decision = 0",
+    "an alias": "UPDATE sweeps SET config = '{\"models\": {}}'",
+    "a trial of a sweep": "DELETE FROM sweep_trials WHERE trial_id LIKE '%N_0_0/rep01'",
+    "a setting": "UPDATE specs SET spec = '{}'",
+    "a trial": "INSERT INTO trials SELECT * REPLACE ('o3/baseline/N_0_0/rep99' AS trial_id, "
+    "99 AS rep) FROM trials WHERE trial_id LIKE '%N_0_0/rep01'",
+    "two trials' outcomes": "UPDATE trials SET merged_first = "
+    "if(merged_first = 'left', 'right', 'left') WHERE condition IN ('L_4_0', 'R_-4_0')",
+}
+UNSEEN = "UPDATE decisions SET prompt = 'other'; UPDATE calls SET reply = '{}'"
+
+
+@pytest.fixture
+def db(tmp_path) -> Path:
+    """o3 once in every condition, and asked."""
+    drives = [replace(drive, said={}) for drive in yielding("o3", reps=1)]
+    return write_study(tmp_path / "t.duckdb", drives)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Notes which tables are made."""
+    names = []
+
+    def make(study, missing):
+        names.extend(missing)
+        return make_tables(study, missing)
+
+    monkeypatch.setattr("analysis.tables.make_tables", make)
+    return names
+
+
+def change(db, sql):
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(sql)
+
+
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("form", TableFormat)
+def test_a_table_reads_the_same_after_it_was_a_text(tables, name, form):
+    again = from_text(to_text(tables[name]))
+    assert render([again], form) == render([tables[name]], form)
+    assert to_text(again) == to_text(tables[name])
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_tables_are_made_once_and_then_read(db, made):
+    first = finished_tables(db, None, ["gap", "attempts"])
+    assert made == ["gap", "attempts"]
+    again = finished_tables(db, None, ["attempts", "robustness", "gap"])
+    assert made == ["gap", "attempts", "robustness"]
+    assert [to_text(t) for t in (again[2], again[0])] == [to_text(t) for t in first]
+    assert finished_tables(db, ["o3"], ["gap"])
+    assert made[3:] == ["gap"]
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_after_any_change_of_the_results_tables_are_made_anew(db, made, what):
+    finished_tables(db, None, ["attempts"])
+    state, _ = finished(db, "", ())
+    change(db, UNSEEN)
+    assert finished(db, "", ())[0] == state
+    change(db, CHANGES[what])
+    assert finished(db, "", ())[0] != state
+    finished_tables(db, None, ["attempts"])
+    assert made == ["attempts", "attempts"]
+
+
+def test_another_program_makes_tables_anew(db, made, monkeypatch):
+    for name in ("one", "one", "other", "other"):
+        monkeypatch.setattr("analysis.data.derived_cache.program", lambda name=name: name)
+        finished_tables(db, None, ["velocity-profiles"])
+    assert made == ["velocity-profiles"] * 2
+
+
+def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, monkeypatch):
+    (tmp_path / "a.py").write_text("x = 1")
+    monkeypatch.setattr("analysis.data.derived_cache.PACKAGES", (tmp_path,))
+    found = {kept.program.__wrapped__()}
+    (tmp_path / "a.py").write_text("x = 2")
+    found.add(kept.program.__wrapped__())
+    (tmp_path / "b.csv").write_text("1")
+    found.add(kept.program.__wrapped__())
+    monkeypatch.setattr("analysis.data.derived_cache.version", lambda _: "0")
+    found.add(kept.program.__wrapped__())
+    assert len(found) == 4
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_what_is_kept_is_no_result(db):
+    before = results_digest(db)
+    finished_tables(db, None, ["velocity-profiles"])
+    state, _ = finished(db, "", ())
+    finished_tables(db, None, ["gap"])
+    assert results_digest(db) == before
+    assert finished(db, "", ())[0] == state
+
+
+def test_tables_of_results_that_changed_meanwhile_are_not_kept(db):
+    state, _ = finished(db, "x", ["gap"])
+    change(db, CHANGES["an outcome"])
+    keep_finished(db, state, "x", {"gap": "old"})
+    now, found = finished(db, "x", ["gap"])
+    assert found == {}
+    keep_finished(db, now, "x", {"gap": "new"})
+    assert finished(db, "x", ["gap"]) == (now, {"gap": "new"})
+
+
+def test_beside_another_program_tables_are_made_and_not_kept(db, made, caplog):
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(db)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as holder:
+        assert holder.stdout.readline() == b"held\n"
+        held = finished_tables(db, None, ["velocity-profiles"])
+        assert "is not kept for the next time" in caplog.text
+        holder.communicate()
+    free = finished_tables(db, None, ["velocity-profiles"])
+    assert finished_tables(db, None, ["velocity-profiles"])
+    assert made == ["velocity-profiles"] * 2
+    assert to_text(held[0]) == to_text(free[0])
+
+
+def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("analysis.report.writer.FIGURES", {"figure2": None, "distributions": None})
+    monkeypatch.setattr(
+        "analysis.report.writer.rendered", lambda *wanted: drawn.append(wanted[1:]) or b"<svg/>"
+    )
+    first = finished_figures(Study(db), "")
+    assert finished_figures(Study(db), "") == first == dict.fromkeys(first, "PHN2Zy8+")
+    assert drawn == [("figure2", "svg"), ("distributions", "svg")]
+    change(db, CHANGES["an outcome"])
+    finished_figures(Study(db), "")
+    assert drawn == [("figure2", "svg"), ("distributions", "svg")] * 2
+
+
+def test_a_warm_table_waits_for_no_heavy_library(db, tmp_path):
+    finished_tables(db, None, ["gap"])
+    check = (
+        "import sys; from analysis.commands import app; "
+        "app(['tables', 'gap', '--db', sys.argv[1]], standalone_mode=False); "
+        "heavy = {'pandas', 'scipy', 'statsmodels', 'matplotlib', 'numpy'} & sys.modules.keys(); "
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", check, str(db)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Table IV" in done.stdout
+
+
+def test_unknown_names_are_refused_also_beside_kept_tables(db):
+    finished_tables(db, None, ["attempts"])
+    with pytest.raises(UsageError, match="no table 'gaps'"):
+        finished_tables(db, None, ["gaps"])
+    with pytest.raises(UsageError, match="no driver 'o4'"):
+        finished_tables(db, ["o4"], ["attempts"])

@@ -1,0 +1,169 @@
+"""Who stands in which group: endpoints, stand-ins, and drivers without chance."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from analysis.data.load import load
+from analysis.data.provenance import provenance
+from analysis.data.study import Study
+from analysis.explain import explain
+from analysis.report.alarms import alarms
+from analysis.tables import make_tables
+from analysis.tables.formats import value_rows
+from merge_runner.drivers.registry import stand_in
+from tests.analysis.studies import changed, write_study, yielding
+
+pytestmark = pytest.mark.usefixtures("few_draws")
+
+
+@pytest.fixture
+def db(tmp_path):
+    """Three repetitions of two drivers."""
+    drives = [*yielding("o3", reps=3), *yielding("other", reps=3)]
+    return write_study(tmp_path / "t.duckdb", drives)
+
+
+def endpoint(url):
+    """A statement that asks o3 there."""
+    driver = {"endpoint": url, "body": {"model": "o3"}}
+    spec = json.dumps({"left": driver, "right": driver})
+    return f"UPDATE specs SET spec = '{spec}' WHERE spec_hash = 'o3-baseline'"
+
+
+@pytest.mark.parametrize(
+    ("url", "name"),
+    [
+        ("openai", "o3"),
+        ("http://localhost:8080/v1", "o3 at localhost:8080"),
+        ("https://gateway.example", "o3 at gateway.example"),
+    ],
+)
+def test_a_driver_is_named_by_its_endpoint_unless_that_is_the_providers_own(db, url, name):
+    study = changed(db, endpoint(url))
+    assert [group.driver for group in study.models] == [name, "other"]
+    assert [group.id for group in Study(db, [name]).models] == [f"{name}/baseline"]
+
+
+def test_stand_ins_stand_last_and_every_row_of_theirs_says_so(db):
+    study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%'")
+    assert [group.label for group in study.models] == ["other", "o3 (scripted stand-in, not o3)"]
+    for table in make_tables(study):
+        for row, plain in zip(table.rows, value_rows(table), strict=True):
+            if row.groups[0].startswith("o3/"):
+                assert plain["driver"].startswith("o3 (scripted stand-in, not o3)"), table.name
+
+
+def test_the_emulator_is_a_stand_in_for_no_model(tmp_path):
+    db = write_study(tmp_path / "t.duckdb", yielding("emulator", reps=1))
+    (group,) = changed(db, "UPDATE trials SET scripted = true").models
+    assert group.label == "emulator (scripted stand-in, no language model)"
+    assert alarms(Study(db), provenance(db)) == [], "nobody takes it for a model"
+
+
+def test_trials_of_a_stand_in_are_never_pooled_with_those_of_the_model(db):
+    study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%/rep01'")
+    sizes = {group.driver: len(group.trials) for group in study.models}
+    assert sizes == {"o3": 22, "other": 33, "o3 [scripted]": 11}
+    (alarm,) = alarms(study, provenance(db))
+    assert alarm.title == "A scripted stand-in answered"
+    assert "o3 [scripted]/baseline: scripted stand-in, not o3" in alarm.text
+    (table,) = make_tables(study, ["ablation-quantitative"])
+    for row, trials in (("o3/baseline", 22), ("o3 [scripted]/baseline", 11)):
+        (source,) = explain(study, table, f"{row}:n").sources
+        assert len(load(source.query, db)) == len(source.trials) == trials
+
+
+def same_each_time(db, who="trial_id LIKE 'o3/%'"):
+    """Statements after which later repetitions are the first again."""
+    return [
+        f"DELETE FROM states WHERE {who} AND trial_id NOT LIKE '%rep01'",
+        "INSERT INTO states SELECT replace(trial_id, 'rep01', rep) AS trial_id, "
+        "states.* EXCLUDE (trial_id) FROM states, (VALUES ('rep02'), ('rep03')) AS reps (rep) "
+        f"WHERE {who} AND trial_id LIKE '%rep01'",
+        *(
+            f"UPDATE trials SET {column} = (SELECT {column} FROM trials AS one "
+            "WHERE one.trial_id = left(trials.trial_id, -2) || '01') WHERE " + who
+            for column in ("status", "merged_first", "end_time_s")
+        ),
+    ]
+
+
+def test_a_driver_without_chance_counts_each_trial_once(db):
+    study = changed(db, *same_each_time(db))
+    o3, other = study.models
+    assert (len(o3.trials), o3.repeated, len(other.trials), other.repeated) == (11, 22, 33, 0)
+    (table,) = make_tables(study, ["ablation-quantitative"])
+    row = next(row for row in table.rows if row.id == "o3/baseline")
+    assert row.values["n"] == 11
+    (source,) = explain(study, table, "o3/baseline:n").sources
+    assert len(load(source.query, db)) == len(source.trials) == 11
+    assert any("22 of 33 trials repeat an earlier one" in note for note in table.notes)
+    (alarm,) = alarms(study, provenance(db))
+    assert alarm.title == "Repetitions are the same trial"
+    assert alarm.text.startswith("22 of 33 trials of o3/baseline repeat an earlier one")
+
+
+def test_two_equal_trials_of_a_driver_that_samples_are_two_samples(db):
+    one = "trial_id LIKE 'o3/baseline/N_0_0/%'"
+    study = changed(db, *same_each_time(db, one))
+    assert study.models[0].repeated == 0
+
+
+def test_equal_trials_of_a_driver_that_samples_are_told_and_count(db):
+    study = changed(db, *same_each_time(db, "trial_id LIKE 'o3/baseline/N_0_0/%'"))
+    (alarm,) = alarms(study, provenance(db))
+    assert alarm.title == "Some trials are equal"
+    assert "2 of 33 trials of o3/baseline are as an earlier one to the last state" in alarm.text
+
+
+@pytest.mark.parametrize(
+    ("model", "sides", "words"),
+    [
+        ("o3", ("left", "right"), "scripted stand-in, not o3"),
+        ("o3", ("left",), "scripted stand-in on the left, not o3"),
+        ("emulator", ("left", "right"), "scripted stand-in, no language model"),
+        ("emulator+constant", ("left",), "scripted stand-in, no language model"),
+        ("emulator+o3", ("left",), "scripted stand-in on the left, no language model"),
+        ("emulator+o3", ("left", "right"), "scripted stand-in, not o3"),
+        ("constant+o3", ("right",), "scripted stand-in, not o3"),
+        ("o3+gemini-2.5-pro", ("right",), "scripted stand-in on the right, not gemini-2.5-pro"),
+        ("o3+gemini-2.5-pro", ("left", "right"), "scripted stand-in, not o3+gemini-2.5-pro"),
+    ],
+)
+def test_a_stand_in_stands_for_the_models_on_whose_sides_it_answered(model, sides, words):
+    assert stand_in(model, sides) == words
+
+
+def test_the_sides_are_those_of_the_scripted_calls(tmp_path):
+    drives = [replace(drive, said={}) for drive in yielding("o3", reps=1)]
+    study = changed(
+        write_study(tmp_path / "t.duckdb", drives),
+        "UPDATE calls SET scripted = true WHERE side = 'left'",
+        "UPDATE trials SET scripted = true",
+    )
+    assert study.models[0].label == "o3 (scripted stand-in on the left, not o3)"
+
+
+def test_a_program_repeats_itself_wherever_it_does(db):
+    one = "trial_id LIKE 'o3/baseline/N_0_0/%'"
+    study = changed(
+        db,
+        *same_each_time(db, one),
+        "UPDATE trials SET source = 'driver' WHERE trial_id LIKE 'o3/%'",
+    )
+    assert study.models[0].repeated == 2
+
+
+def test_answers_that_are_word_for_word_as_before_are_told_in_the_report(tmp_path):
+    db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
+    study = changed(
+        db,
+        "UPDATE decisions SET call_key = trial_id || side || decision, plan = [0.1], "
+        "rationale = 'as ever', prompt_hash = decision::VARCHAR",
+    )
+    titles = [alarm.title for alarm in alarms(study, provenance(db))]
+    assert "Answers are word for word as before" in titles

@@ -1,0 +1,174 @@
+"""What imported human trials are, beside the published counts, and how their rows are named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+
+from analysis.data.imported_humans import by_condition, by_pair, human_trials, imported
+from analysis.data.reference_data import PAIRS, human_outcomes
+from analysis.data.study import Study
+from analysis.stats.measures import BOXES, COLLISIONS, LEFT_FIRST, counts, known
+from analysis.tables import make_tables
+from merge_runner.records import StateRow, TrialRecord, TrialSpec
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+
+pytestmark = pytest.mark.usefixtures("few_draws")
+
+
+def published_trials() -> pd.DataFrame:
+    """The 990 published outcomes as trials of nine pairs."""
+    pairs = [list(PAIRS.values())[i % 9] for i in range(990)]
+    return human_outcomes().assign(pair=pairs)
+
+
+def changed(trials: pd.DataFrame, condition: str, before: tuple, after: tuple, n: int = 1):
+    """Trials of which ``n`` of a condition came to another (status, merged first)."""
+    first = trials["merged_first"].fillna("nobody")
+    chosen = (trials["condition"] == condition) & (trials["status"] == before[0])
+    chosen &= first == (before[1] or "nobody")
+    rows = trials.index[chosen][:n]
+    found = trials.copy()
+    found.loc[rows, ["status", "merged_first"]] = after
+    return found
+
+
+LEFT, RIGHT, CRASH = ("finished", "left"), ("finished", "right"), ("collided", None)
+
+
+def test_the_published_trials_are_complete_and_there_is_nothing_to_say_of_them():
+    found = imported(published_trials())
+    assert (found.trials, found.pairs, found.complete, found.label) == (990, 9, True, "human")
+    assert list(found.findings()) == []
+
+
+def test_a_part_is_named_so_and_keeps_the_published_outcomes():
+    found = imported(published_trials()[::8])
+    assert found.label == "humans (124 of 990 imported)"
+    assert (found.complete, found.contradicting) == (False, ())
+    (said,) = found.findings()
+    assert said.startswith("124 of 990 trials: who merged first and collisions stay the 990 ")
+
+
+def test_one_missing_trial_of_one_condition_leaves_the_whole_incomplete():
+    assert not imported(published_trials()[1:]).complete
+
+
+def test_more_of_an_outcome_than_is_published_is_another_data_set():
+    more = changed(published_trials(), "N_0_0", LEFT, CRASH, 8)
+    found = imported(more[::2])
+    assert found.contradicting == ("N_0_0 collided 6 instead of 5",)
+    assert found.label == "humans (another data set, 495 trials)"
+    assert "another data set than the published one: N_0_0 collided 6" in next(found.findings())
+    assert "of 990 trials" not in " ".join(found.findings())
+
+
+def test_a_whole_condition_with_less_of_an_outcome_is_another_data_set():
+    timeout = changed(published_trials(), "N_0_0", LEFT, ("timeout", None))
+    assert imported(timeout).contradicting == ("N_0_0 left first 36 instead of 37",)
+    part = timeout[timeout["condition"] != "N_0_0"]
+    assert imported(part).contradicting == ()
+
+
+def test_a_swapped_outcome_is_found():
+    swapped = changed(published_trials(), "R_0_8", LEFT, RIGHT)
+    assert imported(swapped).contradicting == (
+        "R_0_8 left first 7 instead of 8",
+        "R_0_8 right first 79 instead of 78",
+    )
+
+
+def test_trials_of_other_pairs_are_counted_for_nothing():
+    trials = published_trials()
+    moved = trials.assign(pair=trials["pair"].mask(trials.index == 0, "experiment_7"))
+    found = imported(moved)
+    assert (found.trials, found.complete, found.left_out) == (989, False, {"experiment_7": 1})
+    assert "experiment_7: 1 trials, not of the nine published pairs: left out" in found.findings()
+    assert by_condition(moved)["trials"].sum() == 989
+    assert by_pair(moved)["trials"]["experiment_7"] == 1
+
+
+def test_trials_of_other_pairs_alone_are_another_data_set_however_many():
+    found = imported(published_trials().assign(pair="experiment_7"))
+    assert found.label == "humans (another data set, 990 trials)"
+    assert not found.complete
+    assert found.left_out == {}
+
+
+@pytest.fixture
+def stored(tmp_path):
+    """Writes human trials, and a trial of a model, into a database."""
+
+    def write(trials: pd.DataFrame):
+        records = []
+        for number, row in enumerate(trials.itertuples()):
+            first = row.merged_first if isinstance(row.merged_first, str) else None
+            spec = TrialSpec(
+                f"human/{number}", "h", "human", "human", "human", None, row.condition, number,
+                0, 0, pair=row.pair,
+            )  # fmt: skip
+            states = tuple(
+                StateRow(0, 0.0, side, at_m, 10.0, 0.0)
+                for side, at_m in (("left", 50), ("right", 60))
+            )
+            records.append(TrialRecord(spec, row.status, first, 5.0, None, states, ()))
+        path = tmp_path / "merge.duckdb"
+        model = replace(spec, trial_id="o3/1", source="llm", variant="baseline", pair=None)
+        Store(path).add_recorded([*records, replace(records[-1], spec=model)], {})
+        return path
+
+    return write
+
+
+def test_the_trials_of_a_database_are_counted(stored):
+    trials = human_trials(stored(published_trials()))
+    assert list(imported(trials).findings()) == []
+    assert list(by_condition(trials).index) == list(CONDITIONS)
+    assert (by_condition(trials)["trials"] == 90).all()
+    assert dict(by_pair(trials)["trials"]) == dict.fromkeys(PAIRS.values(), 110)
+    assert by_condition(trials)["collided"].sum() == 28
+
+
+def test_a_complete_import_takes_the_place_of_the_published_outcomes(stored):
+    human = Study(stored(published_trials())).human
+    assert human.published_outcomes is None
+    assert counts(human, BOXES) == (28, 990)
+    # Nothing came closer than a vehicle length in these traces, and collided ones stay open.
+    assert counts(human, COLLISIONS) == (0, 962)
+
+
+def test_a_partial_import_has_both_numbers_of_trials_in_its_row(stored):
+    study = Study(stored(published_trials()[::8]))
+    human = study.human
+    assert counts(human, BOXES) == (28, 990)
+    assert counts(human, LEFT_FIRST)[1] == 962
+    assert not known(human, COLLISIONS)
+    (table,) = make_tables(study, ["ablation-quantitative"])
+    row = next(row for row in table.rows if row.id == "human")
+    assert row.values["driver"] == "humans (124 of 990 imported)"
+    assert row.values["n"] == 990
+    assert row.values.get("collided_percent") is None
+    finished = len(human.finished)
+    assert f"the 990 published outcomes; the rest: 124 imported trials, {finished}" in row.note
+    assert "published human collisions are boxes that overlap" in row.note
+
+
+def test_another_data_set_is_named_in_every_table_with_humans(stored):
+    more = changed(published_trials(), "N_0_0", LEFT, CRASH, 8)
+    study = Study(stored(more[::2]))
+    for table in make_tables(study, ["who-first", "ablation-quantitative", "robustness"]):
+        drivers = {row.values["driver"] for row in table.rows if row.groups == ("human",)}
+        assert all("another data set, 495 trials" in driver for driver in drivers), table.name
+        assert any("N_0_0 collided 6 instead of 5" in note for note in table.notes), table.name
+
+
+def test_trials_of_other_pairs_are_in_no_row_and_in_no_query(stored):
+    trials = published_trials()
+    moved = trials.assign(pair=trials["pair"].mask(trials.index < 5, "experiment_7"))
+    human = Study(stored(moved)).human
+    assert len(human.trials) == 985
+    assert "pair IN ('pair1'" in human.narrowed
+    assert "experiment_7" not in human.narrowed

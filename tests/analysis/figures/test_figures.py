@@ -1,0 +1,242 @@
+"""The figures: their data, their sizes, and that equal results give equal files."""
+
+from __future__ import annotations
+
+import re
+import struct
+from itertools import combinations
+
+import duckdb
+import matplotlib as mpl
+import pytest
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+
+from analysis.data.load import load
+from analysis.data.study import Study
+from analysis.figures.drawing import PAGE_IN
+from analysis.figures.gallery import FIGURES, SETTINGS, figure_2, rendered, write_figures
+from analysis.figures.panels import VELOCITIES_MPS, deviations, gaps, left_first, left_traces
+from analysis.figures.variant_figure import figure_2_variants
+from analysis.stats.intervals import mean, proportion
+from merge_runner.errors import UsageError
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.studies import Drive, write_study, yielding
+
+
+@pytest.fixture(scope="module")
+def written(small, tmp_path_factory):
+    """A folder with all figures."""
+    folder = tmp_path_factory.mktemp("figures")
+    list(write_figures(small, folder))
+    return folder
+
+
+def test_equal_results_give_equal_files(small, written):
+    again = Study(small.db)
+    for name, form in (("figure2", "pdf"), ("distributions", "png")):
+        assert rendered(again, name, form) == (written / f"{name}.{form}").read_bytes()
+    assert rendered(again, "figure2", "svg") == rendered(small, "figure2", "svg")
+
+
+def test_figures_are_written_as_vector_pdf_and_as_png_of_page_width(written):
+    assert {p.name for p in written.iterdir()} == {
+        f"{n}.{e}" for n in FIGURES for e in ("pdf", "png")
+    }
+    pdf = (written / "figure2.pdf").read_bytes()
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", pdf)
+    assert float(box[1]) == pytest.approx(72 * PAGE_IN, abs=0.5)
+    assert b"/Type /Font" in pdf, "text stays text"
+    width, _ = struct.unpack(">II", (written / "figure2.png").read_bytes()[16:24])
+    assert width == round(300 * PAGE_IN)
+
+
+def test_a_folder_that_cannot_be_made_is_said(small, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="cannot be made"):
+        list(write_figures(small, tmp_path / "file"))
+
+
+def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(study):
+    group = study.models[0]
+    points = {
+        (velocity, point.headway_m): point.estimate
+        for velocity in VELOCITIES_MPS
+        for point in left_first(group, velocity)
+    }
+    assert set(points) == {
+        (c.relative_velocity_mps, c.projected_headway_m) for c in CONDITIONS.values()
+    }
+    for condition in CONDITIONS.values():
+        trials = group.finished[group.finished["condition"] == condition.name]
+        found = points[condition.relative_velocity_mps, condition.projected_headway_m]
+        assert found == proportion(int((trials["merged_first"] == "left").sum()), len(trials))
+        (gap,) = [
+            point.estimate
+            for point in gaps(group, condition.relative_velocity_mps)
+            if point.headway_m == condition.projected_headway_m
+        ]
+        assert gap == mean(trials["gap_m"])
+        (both,) = [
+            point.estimate
+            for point in deviations(group, condition.relative_velocity_mps)
+            if point.headway_m == condition.projected_headway_m
+        ]
+        assert both.n == 2 * len(trials), "each trial gives two values"
+        assert both.value == pytest.approx(trials["rmse_mps"].mean())
+
+
+def test_traces_are_those_of_the_left_vehicle_that_merges_first_or_second(study):
+    group = study.models[0]
+    for first in ("left", "right"):
+        rows = load(
+            "SELECT list(velocity_mps ORDER BY step) v FROM states JOIN trials "
+            "USING (trial_id, spec_hash) WHERE side = 'left' AND status = 'finished' AND "
+            f"spec_hash = 'o3-baseline' AND merged_first = '{first}' GROUP BY trial_id",
+            study.db,
+        )
+        found = left_traces(study, group, first)
+        assert sorted(tuple(trace[:, 1]) for trace in found) == sorted(tuple(v) for v in rows["v"])
+        assert all(trace[0, 0] == 0 for trace in found)
+
+
+def test_before_an_import_the_figure_says_what_is_missing_and_draws_the_published_line(study):
+    figure = figure_2(study)
+    texts = [t.get_text() for sub in figure.subfigs for axis in sub.axes for t in axis.texts]
+    assert sum("recordings" in text for text in texts) == 2 + 3  # A and B; E for each velocity
+    lines = [
+        line
+        for axis in figure.subfigs[1].axes[3:6]
+        for line in axis.lines
+        if line.get_linestyle() == "--"
+    ]
+    assert len(lines) == 3
+    heights = dict(zip(*lines[1].get_data(), strict=True))
+    assert heights[0] == pytest.approx(3.54)
+    assert heights[4] == pytest.approx(3.54 + 4 * 0.17)
+
+
+LONG = "gemini-2.5-pro-preview-05-06+constant"
+
+
+@pytest.fixture(scope="module")
+def long_names(tmp_path_factory):
+    """A model with a long name, at an endpoint of its own, in whose name stand-ins answered too."""
+    drives = [
+        *yielding(LONG, reps=2)[:4],
+        *yielding(LONG, "A2", reps=2)[:4],
+        *yielding("o3", "A7", 1),
+        *yielding("o3", reps=1),
+        *yielding("other", "A1", reps=1),
+    ]
+    path = write_study(tmp_path_factory.mktemp("long") / "t.duckdb", drives)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE trials SET scripted = trial_id NOT LIKE 'o3/%'")
+    return Study(path)
+
+
+def written_words(figure):
+    """The texts of a figure that hold words, with the boxes that they fill."""
+    figure.draw_without_rendering()
+    return {
+        text: text.get_window_extent()
+        for text in figure.findobj(Text)
+        if text.get_visible() and re.search("[a-z]{2}", text.get_text())
+    }
+
+
+@pytest.mark.usefixtures("few_draws")
+@pytest.mark.parametrize("name", FIGURES)
+def test_no_name_is_cut_and_none_lies_over_another(name, long_names):
+    with mpl.rc_context(SETTINGS):
+        figure = FIGURES[name][0](long_names)
+        words = written_words(figure)
+    for text, box in words.items():
+        assert Bbox.union([figure.bbox, box]).bounds == pytest.approx(figure.bbox.bounds, abs=1), (
+            text
+        )
+    for (one, box), (other, another) in combinations(words.items(), 2):
+        assert not box.padded(-1).overlaps(another.padded(-1)), (one, other)
+
+
+@pytest.mark.usefixtures("few_draws")
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_figure_says_who_is_a_stand_in_and_names_its_variant(name, long_names):
+    figure = FIGURES[name][0](long_names)
+    texts = [text.get_text().replace("\n", " ") for text in figure.findobj(Text)]
+    shown = {text.replace("+ ", "+").replace("- ", "-") for text in texts}
+    marked = [text for text in shown if "scripted stand-in, not" in text]
+    assert any(LONG in text for text in marked)
+    assert not any("o3" in text and "not o3" in text for text in shown)
+    if name != "figure2":
+        assert any("A2" in text for text in marked)
+        assert any("A1" in text for text in marked)
+        assert any("A7" in text and "o3" in text for text in shown)
+
+
+def rows_of(figure):
+    """The panels of the figure of variants, by row."""
+    return [figure.axes[i : i + 5] for i in range(0, len(figure.axes), 5)]
+
+
+def test_each_group_has_a_row_of_its_own_with_its_trials(study):
+    figure = figure_2_variants(study)
+    rows = rows_of(figure)
+    assert len(rows) == len(study.groups) == 5
+    for group, row in zip(study.groups[1:], rows[1:], strict=True):
+        firsts = group.finished["merged_first"].value_counts()
+        for axis, side in zip(row[:2], ("left", "right"), strict=True):
+            assert sum(len(c.get_segments()) for c in axis.collections[:3]) == firsts[side]
+        for axis, points in zip(row[2:], (left_first, gaps, deviations), strict=True):
+            for index, velocity in enumerate(VELOCITIES_MPS):
+                found = points(group, velocity)
+                line = axis.containers[index].lines[0]
+                assert list(line.get_ydata()) == [p.estimate.value for p in found]
+                assert line.get_xdata() == pytest.approx(
+                    [p.headway_m + 0.3 * (index - 1) for p in found]
+                )
+
+
+def test_variants_are_shown_by_the_same_scales_and_before_an_import_humans_as_published(study):
+    rows = rows_of(figure_2_variants(study))
+    for row in rows:
+        assert row[0].get_ylim() == row[1].get_ylim()
+        assert [axis.get_ylim() for axis in row] == [axis.get_ylim() for axis in rows[0]]
+    human = rows[0]
+    assert [any("not imported" in t.get_text() for t in axis.texts) for axis in human] == [
+        True, True, False, False, True,
+    ]  # fmt: skip
+    assert sum(line.get_linestyle() == "--" for line in human[3].lines) == 3
+    assert sum(len(c.lines[0].get_xdata()) for c in human[2].containers) == len(CONDITIONS)
+
+
+def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
+    """Two trials of a condition that differ by 10 m have an interval of 130 m."""
+    drives = [*yielding("o3", reps=10), *yielding("o3", "A1", reps=4)]
+    drives += [
+        Drive("o3", "A2", "L_4_0", rep, (strength,) * 3, (-strength,) * 3)
+        for rep, strength in enumerate((0.3, 0.7), 1)
+    ]
+    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    low, high = rows_of(figure_2_variants(study))[0][3].get_ylim()
+    found = [p.estimate for g in study.groups for v in VELOCITIES_MPS for p in gaps(g, v)]
+    assert max(one.high - one.low for one in found) > 2 * (high - low)
+    assert all(low < one.value < high for one in found)
+    assert sum(low < one.low and one.high < high for one in found) >= 0.8 * len(found)
+
+
+@pytest.mark.usefixtures("few_draws")
+@pytest.mark.parametrize(
+    "drives",
+    [
+        [],
+        [Drive("o3", "baseline", "N_0_0", 1, (0.0,), (0.0,))],
+        yielding("o3", "A1", reps=1)[:1],
+        [Drive("o3", "A1", name, 1, (0.0,), (0.0,)) for name in CONDITIONS],
+    ],
+)
+def test_figures_of_next_to_nothing_are_drawn_all_the_same(drives, tmp_path, recwarn):
+    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    for draw, _ in FIGURES.values():
+        draw(study).draw_without_rendering()
+    assert [str(w.message) for w in recwarn.list] == []

@@ -1,0 +1,145 @@
+"""Collisions of models by the paper's rule and by that of the humans, side by side."""
+
+from __future__ import annotations
+
+import duckdb
+import numpy as np
+import pytest
+
+from analysis.data.collision_rules import redrive
+from analysis.data.load import load_trials
+from analysis.data.study import Study
+from analysis.explain import explain
+from analysis.stats.measures import BOXES, COLLISIONS, MEASURES, counts
+from analysis.tables import make_tables
+from merge_runner.config import Scenario
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.studies import Drive, write_study, yielding
+
+pytestmark = pytest.mark.usefixtures("few_draws")
+
+# So strong vehicles reach the end of the track within one plan.
+STRONG = Scenario(max_acceleration_mps2=5.0)
+SIDE_BY_SIDE = (0.0, 0.0, 0.0)
+UP, DOWN = (1.0,) * 4, (-1.0,) * 4
+HAND_MADE = [
+    # The centres come within 4.5 m on the two branches, then one vehicle stops.
+    Drive("o3", "baseline", "N_0_0", 1, (*SIDE_BY_SIDE, *UP), (*SIDE_BY_SIDE, *DOWN)),
+    # 4.6 m ahead on the merge: boxes touch at its angle for less than a step.
+    Drive("o3", "baseline", "L_4_0", 2, (0.0, 0.0, 0.0, 0.16), ()),
+    # The same closeness of the centres, but the plans end before anybody has finished.
+    Drive("o3", "baseline", "N_0_0", 3, (*SIDE_BY_SIDE, 0.5, 0.5), (*SIDE_BY_SIDE, *DOWN)),
+    # Side by side to the end.
+    Drive("o3", "baseline", "N_0_0", 4, (), ()),
+    Drive("o3", "baseline", "L_4_0", 5, (0.5, 0.5), ()),
+]
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    path = tmp_path_factory.mktemp("collisions") / "study.duckdb"
+    return Study(write_study(path, HAND_MADE, STRONG))
+
+
+def test_each_trial_is_judged_by_both_rules(study):
+    (group,) = study.models
+    trials = group.trials.set_index("rep")
+    assert trials["collided"].to_dict() == {1: True, 2: False, 3: True, 4: True, 5: False}
+    boxes = trials["collided_boxes"]
+    assert boxes.drop(3).to_dict() == {1: False, 2: True, 4: True, 5: False}
+    assert boxes.isna()[3]
+    assert counts(group, COLLISIONS) == (3, 5)
+    assert counts(group, BOXES) == (2, 4)
+
+
+def test_boxes_that_touch_between_two_steps_are_seen_by_no_rule_of_the_steps(study):
+    (table,) = make_tables(study, ["robustness"])
+    rows = {row.values["rule"]: row.values for row in table.rows if row.groups[0] != "human"}
+    assert rows["rectangle"]["collided"] == 1
+    assert rows["rectangle at 20 Hz"]["collided"] == 2
+    assert rows["rectangle at 20 Hz"]["undecided"] == 1
+
+
+def test_both_rates_stand_in_the_tables_with_what_is_left_out(study):
+    quantitative, indicators, fallbacks = make_tables(
+        study, ["ablation-quantitative", "indicators", "fallbacks"]
+    )
+    row = next(row for row in quantitative.rows if row.id == "o3/baseline")
+    assert row.values["collided_percent"] == 60
+    assert row.values["collided_boxes_percent"] == 50
+    for table, row_id in (
+        (quantitative, "o3/baseline"),
+        (indicators, "o3/baseline/collided_boxes_percent"),
+        (fallbacks, "o3/baseline/collided_boxes_percent"),
+    ):
+        note = next(row.note for row in table.rows if row.id == row_id)
+        assert "coll. boxes (%): 1 of 5 trials end undecided and are left out" in note
+        assert any("boxes that overlap, looked for at 20 Hz" in note for note in table.notes)
+    by_disc = next(r for r in indicators.rows if r.id == "o3/baseline/collided_percent")
+    assert by_disc.note == ""
+
+
+def test_a_driver_is_compared_with_humans_by_the_rule_of_the_humans(study):
+    (table,) = make_tables(study, ["contrasts"])
+    rows = {r.values["measure"]: r.values for r in table.rows if r.values["reference"] == "human"}
+    assert "coll. (%)" not in rows
+    found = rows["coll. boxes (%)"]
+    assert (found["n"], found["n_reference"]) == (4, 990)
+    assert found["difference"] == pytest.approx(50 - 100 * 28 / 990)
+
+
+@pytest.mark.parametrize("measure", [COLLISIONS, BOXES])
+def test_explain_lists_the_trials_that_are_decided(study, measure):
+    (table,) = make_tables(study, ["indicators"])
+    found = explain(study, table, f"o3/baseline/{measure.name}:n")
+    (source,) = found.sources
+    assert str(len(source.trials)) == found.value
+    with duckdb.connect(str(study.db), read_only=True) as connection:
+        rows = connection.execute(source.query).fetchall()
+    assert tuple(trial_id for trial_id, *_ in rows) == source.trials
+
+
+def test_humans_have_no_rate_by_the_drivers_rule_before_an_import_and_the_row_says_why(study):
+    (table,) = make_tables(study, ["ablation-quantitative"])
+    human = next(row for row in table.rows if row.id == "human")
+    assert human.values.get("collided_percent") is None
+    assert human.values["collided_boxes_percent"] == pytest.approx(100 * 28 / 990)
+    assert "coll. (%): published human collisions are boxes that overlap" in human.note
+
+
+def test_longer_boxes_touch_where_shorter_ones_do_not(tmp_path):
+    drives = [Drive("o3", "baseline", "L_4_0", 1, (0.1, 0.1), ())]
+    for length_m, touching in ((4.5, False), (8.0, True)):
+        scenario = Scenario(vehicle_length_m=length_m, collision_rule="shared_lane")
+        path = write_study(tmp_path / f"{length_m}.duckdb", drives, scenario)
+        (group,) = Study(path).models
+        assert group.trials["collided_boxes"].tolist() == [touching]
+
+
+def test_what_is_seen_between_steps_is_what_a_finer_simulation_sees():
+    """Four steps of 0.05 s with one action are one of 0.2 s; braking vehicles stop within one."""
+    rng = np.random.default_rng(3)
+    coarse = Scenario(collision_rule="rectangle")
+    fine = coarse.model_copy(update={"step_s": 0.05, "timeout_steps": 4 * coarse.timeout_steps})
+    seen = 0
+    for _ in range(300):
+        condition = str(rng.choice(list(CONDITIONS)))
+        plans = rng.uniform(-1, 1, (2, 8)).round(1)
+        sides = [[[action] * 5 for action in side] for side in plans]
+        found = redrive(coarse, condition, sides, [[], []], between=True)
+        finer = [[[action] * 20 for action in side] for side in plans]
+        expected = redrive(fine, condition, finer, [[], []])
+        assert found[0] == expected[0]
+        seen += found[0] == "collided" != redrive(coarse, condition, sides, [[], []])[0]
+    assert seen > 0
+
+
+def test_measures_have_names_of_their_own():
+    assert len({measure.name for measure in MEASURES}) == len(MEASURES) == 5
+
+
+def test_where_nothing_comes_near_both_rules_agree(tmp_path):
+    db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
+    (group,) = Study(db).models
+    assert len(load_trials(db)) == 22
+    assert counts(group, BOXES) == counts(group, COLLISIONS) == (0, 22)

@@ -1,0 +1,254 @@
+"""Differences between groups, against enumerations and figures worked out by hand."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import comb, sqrt
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from analysis.stats.contrasts import (
+    PERMUTATIONS,
+    contrast_means,
+    contrast_rates,
+    corrected,
+    detectable_rate,
+    rejected,
+    shuffled_sums,
+)
+
+
+def fisher(first, second) -> float:
+    """Fisher's two-sided p: all tables with these margins that are no likelier."""
+    (a, n), (b, m) = first, second
+    total = a + b
+    ways = {k: comb(n, k) * comb(m, total - k) for k in range(max(0, total - m), min(n, total) + 1)}
+    return sum(w for w in ways.values() if w <= ways[a]) / sum(ways.values())
+
+
+def wilson(successes, n):
+    """Wilson's bounds of a proportion."""
+    z = 1.959964
+    centre, width = successes + z**2 / 2, z * sqrt(successes * (n - successes) / n + z**2 / 4)
+    return (centre - width) / (n + z**2), (centre + width) / (n + z**2)
+
+
+def newcombe(first, second):
+    """Newcombe's (1998) hybrid score interval, his method 10."""
+    p, q = first[0] / first[1], second[0] / second[1]
+    (p_low, p_high), (q_low, q_high) = wilson(*first), wilson(*second)
+    low = p - q - sqrt((p - p_low) ** 2 + (q_high - q) ** 2)
+    high = p - q + sqrt((p_high - p) ** 2 + (q - q_low) ** 2)
+    return low, high
+
+
+RATES = [
+    ((0, 110), (28, 990)),
+    ((28, 110), (28, 990)),
+    ((16, 110), (28, 110)),
+    ((3, 110), (0, 110)),
+    ((5, 5), (0, 4)),
+]
+
+
+@pytest.mark.parametrize(("first", "second"), RATES)
+def test_rates_are_compared_by_fishers_test_and_newcombes_interval(first, second):
+    found = contrast_rates(first, second)
+    assert found.difference == pytest.approx(first[0] / first[1] - second[0] / second[1])
+    assert (found.low, found.high) == pytest.approx(newcombe(first, second), abs=1e-6)
+    assert found.p == pytest.approx(fisher(first, second), rel=1e-6)
+    assert found.low <= found.difference <= found.high
+
+
+def test_o3s_collisions_do_not_differ_from_the_humans_and_geminis_do():
+    assert contrast_rates((0, 110), (28, 990)).p == pytest.approx(0.10, abs=0.005)
+    assert contrast_rates((28, 110), (28, 990)).p == pytest.approx(3e-15, rel=0.2)
+    assert contrast_rates((3, 110), (0, 110)).p == pytest.approx(0.25, abs=0.005)
+
+
+def test_which_outcomes_fishers_test_rejects_is_known_beforehand():
+    for n, m in ((7, 12), (20, 9)):
+        expected = [[fisher((a, n), (b, m)) < 0.05 for b in range(m + 1)] for a in range(n + 1)]
+        assert rejected(n, m).tolist() == expected
+
+
+def power(n, m, rate, other, studies=2000) -> float:
+    """Share of simulated studies in which Fisher's test finds the difference."""
+    rng = np.random.default_rng(1)
+    drawn = zip(rng.binomial(n, other, studies), rng.binomial(m, rate, studies), strict=True)
+    pairs, times = np.unique(list(drawn), axis=0, return_counts=True)
+    found = [stats.fisher_exact([[a, n - a], [b, m - b]]).pvalue < 0.05 for a, b in pairs.tolist()]
+    return float(times @ found) / studies
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "rate", "sign"),
+    [(110, 990, 28 / 990, 1), (110, 110, 0.0, 1), (60, 60, 0.95, -1), (40, 50, 0.4, -1)],
+)
+def test_the_detectable_difference_of_rates_is_found_in_four_of_five_studies(n, m, rate, sign):
+    found = detectable_rate(n, m, rate)
+    assert power(n, m, rate, rate + sign * found) == pytest.approx(0.8, abs=0.03)
+
+
+def test_110_trials_without_a_collision_could_show_no_less_than_7_percent():
+    assert contrast_rates((3, 110), (0, 110)).detectable == pytest.approx(0.071, abs=0.001)
+
+
+def test_so_few_trials_show_no_difference_however_large():
+    assert contrast_rates((2, 2), (0, 2)).detectable is None
+
+
+def group(**values) -> pd.DataFrame:
+    """Trials by condition: one row a value."""
+    rows = [(name, value) for name, column in values.items() for value in column]
+    return pd.DataFrame(rows, columns=["condition", "gap_m"])
+
+
+FIRST = group(N_0_0=[1.0, 4.5, 5.0], L_4_8=[9.0, 12.0])
+SECOND = group(N_0_0=[2.0, 3.0], L_4_8=[6.0, 7.5, 7.0, 9.5])
+
+
+NAMES = ("N_0_0", "L_4_8")
+
+
+def within(first, second) -> float:
+    """The difference of means within conditions, weighted by n m / (n + m)."""
+    total = weights = 0.0
+    for name in NAMES:
+        x, y = (g.loc[g["condition"] == name, "gap_m"] for g in (first, second))
+        weight = len(x) * len(y) / (len(x) + len(y))
+        total, weights = total + weight * (x.mean() - y.mean()), weights + weight
+    return total / weights
+
+
+def enumerated(first, second) -> float:
+    """The exact share of all shuffles within conditions with as large a difference."""
+    ways = []
+    for name in NAMES:
+        mine, other = (list(g.loc[g["condition"] == name, "gap_m"]) for g in (first, second))
+        pool, n = mine + other, len(mine)
+        weight = n * len(other) / len(pool)
+        differences = [
+            sum(chosen) / n - (sum(pool) - sum(chosen)) / len(other)
+            for chosen in combinations(pool, n)
+        ]
+        ways.append((weight, differences))
+    (u, one), (v, two) = ways
+    found = [abs(u * a + v * b) / (u + v) for a in one for b in two]
+    assert len(found) == 150
+    observed = abs(within(first, second))
+    return sum(difference >= observed - 1e-9 for difference in found) / len(found)
+
+
+def test_the_permutation_p_is_that_of_all_shuffles_within_conditions():
+    exact = enumerated(FIRST, SECOND)
+    assert 0.1 < exact < 0.9
+    error = sqrt(exact * (1 - exact) / PERMUTATIONS)
+    assert contrast_means(FIRST, SECOND, "gap_m").p == pytest.approx(exact, abs=4 * error)
+
+
+def test_the_permutation_p_is_two_sided():
+    assert enumerated(SECOND, FIRST) == enumerated(FIRST, SECOND)
+    found = [contrast_means(*pair, "gap_m").p for pair in ((FIRST, SECOND), (SECOND, FIRST))]
+    assert found[0] == pytest.approx(found[1], abs=0.02)
+
+
+def test_the_interval_is_that_of_least_squares_with_a_level_for_each_condition():
+    found = contrast_means(FIRST, SECOND, "gap_m")
+    both = pd.concat([FIRST, SECOND])
+    group_of = np.repeat([1.0, 0.0], [len(FIRST), len(SECOND)])
+    x = np.column_stack([group_of, *(both["condition"] == name for name in NAMES)]).astype(float)
+    y = both["gap_m"].to_numpy()
+    b, residual, _, _ = np.linalg.lstsq(x, y, rcond=None)
+    freedom = len(y) - 3
+    se = sqrt(residual[0] / freedom * np.linalg.inv(x.T @ x)[0, 0])
+    half = stats.t.ppf(0.975, freedom) * se
+    assert found.difference == pytest.approx(b[0]) == pytest.approx(within(FIRST, SECOND))
+    assert (found.low, found.high) == pytest.approx((b[0] - half, b[0] + half))
+    t = stats.t(freedom)
+    assert found.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * se)
+
+
+def mixes(shift, seed=2):
+    """Equal drivers but for ``shift`` in one condition; each has lost many trials of another."""
+    rng = np.random.default_rng(seed)
+    first = group(N_0_0=rng.normal(2, 1, 40), L_4_8=rng.normal(8, 1, 10))
+    second = group(N_0_0=rng.normal(2 + shift, 1, 10), L_4_8=rng.normal(8 + shift, 1, 40))
+    return first, second
+
+
+def test_another_mix_of_conditions_alone_is_no_difference():
+    found = contrast_means(*mixes(0), "gap_m")
+    assert found.low < 0 < found.high
+    assert found.p > 0.2
+
+
+@pytest.mark.parametrize("shift", [-1.0, 1.0])
+def test_a_difference_is_found_in_either_direction_whatever_the_mix(shift):
+    found = contrast_means(*mixes(shift), "gap_m")
+    assert found.p < 0.005
+    assert found.low < -shift < found.high
+
+
+def test_groups_that_share_no_condition_cannot_be_compared():
+    assert contrast_means(group(N_0_0=[1.0, 2.0]), group(L_4_8=[1.0, 2.0]), "gap_m") is None
+
+
+def test_a_difference_within_conditions_is_found():
+    rng = np.random.default_rng(2)
+    first = group(N_0_0=rng.normal(2, 1, 20), L_4_8=rng.normal(8, 1, 20))
+    second = first.assign(gap_m=first["gap_m"] + 1.5)
+    assert contrast_means(first, second, "gap_m").p == 1 / (PERMUTATIONS + 1)
+
+
+def test_trials_without_the_measure_do_not_count():
+    missing = group(N_0_0=[np.nan, np.nan], L_4_8=[np.nan])
+    found = contrast_means(pd.concat([FIRST, missing]), pd.concat([missing, SECOND]), "gap_m")
+    assert found == contrast_means(FIRST, SECOND, "gap_m")
+
+
+def test_a_contrast_of_means_is_the_same_every_time():
+    found = contrast_means(FIRST, SECOND, "gap_m")
+    assert found == contrast_means(FIRST.copy(), SECOND.copy(), "gap_m")
+    assert found.p == 0.1072
+
+
+def test_where_nothing_varies_there_is_no_difference():
+    equal = group(N_0_0=[3.0] * 4)
+    found = contrast_means(equal, equal, "gap_m")
+    assert (found.difference, found.low, found.high, found.p) == (0, 0, 0, 1)
+
+
+def test_two_trials_alone_have_no_interval():
+    found = contrast_means(group(N_0_0=[3.0]), group(N_0_0=[4.0]), "gap_m")
+    assert (found.difference, found.low, found.detectable, found.p) == (-1, None, None, 1)
+
+
+def test_a_family_is_corrected_by_holm_and_by_benjamini_and_hochberg():
+    holm, false_discovery = corrected([0.01, 0.04, 0.03, 0.005])
+    assert list(holm) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert list(false_discovery) == pytest.approx([0.02, 0.04, 0.04, 0.02])
+
+
+def test_corrected_p_values_stay_at_most_1():
+    holm, false_discovery = corrected([0.6, 0.9, 0.2])
+    assert list(holm) == pytest.approx([1.0, 1.0, 0.6])
+    assert list(false_discovery) == pytest.approx([0.9, 0.9, 0.6])
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 40), st.data())
+def test_the_sums_of_shuffles_are_those_of_the_first_in_each_order(n, data):
+    """Drawn in parts, from the same stream of numbers, and leaving it where a whole draw does."""
+    count, seed = data.draw(st.integers(0, n)), data.draw(st.integers(0, 2**32))
+    value = np.random.default_rng(seed).normal(size=n)
+    plain, parts = np.random.default_rng(seed), np.random.default_rng(seed)
+    order = np.argsort(plain.random((PERMUTATIONS, n)), axis=1)
+    expected = value[order[:, :count]].sum(axis=1)
+    assert np.allclose(shuffled_sums(parts, value, count), expected, atol=1e-12)
+    assert plain.random() == parts.random()

@@ -1,0 +1,304 @@
+"""The joint model of a driver and the humans, against fits of one design and simulated pairs."""
+
+from __future__ import annotations
+
+from functools import cache
+from math import sqrt
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import optimize, stats
+from scipy.special import expit
+from statsmodels.discrete.discrete_model import Logit
+from statsmodels.regression.linear_model import OLS
+
+from analysis.data.imported_humans import imported
+from analysis.data.reference_data import human_outcomes, published
+from analysis.data.study import Group
+from analysis.stats.intervals import detectable
+from analysis.stats.joint import GAP, WHO_FIRST, by_pairs, differences
+from analysis.stats.regressions import gap_data, gap_ols, who_first_data
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+
+H, V = np.array([(c.projected_headway_m, c.relative_velocity_mps) for c in CONDITIONS.values()]).T
+# Between pairs of humans: SD of the logit's intercept and of the gap in m, as published (S4, S6).
+LOGIT_SD, GAP_SD_M = 0.5, 1.3
+
+
+def driven(rng, pairs, reps, *, alone=False, gap_more=0.0, turned=0.0) -> pd.DataFrame:
+    """Finished trials of pairs who differ; ``alone``: of a copy whose every trial is a new pair."""
+    names = np.tile(list(CONDITIONS), reps * pairs)
+    h, v = np.tile(H, reps * pairs), np.tile(V, reps * pairs)
+    who = np.arange(len(h)) if alone else np.repeat(np.arange(pairs), len(H) * reps)
+    bias, offset = rng.normal(0, [[LOGIT_SD], [GAP_SD_M]], (2, who[-1] + 1))[:, who]
+    left = rng.random(len(h)) < expit(-0.3 + bias + 0.6 * h - (1.5 + turned) * v)
+    gap = 4.1 + gap_more + offset + 0.15 * abs(h) - 0.18 * abs(v) + 0.06 * h * v
+    trials = pd.DataFrame(
+        {
+            "condition": names,
+            "projected_headway_m": h,
+            "relative_velocity_mps": v,
+            "status": "finished",
+            "merged_first": np.where(left, "left", "right"),
+            "gap_m": gap + rng.normal(0, 1.3, len(h)),
+        }
+    )
+    return trials if alone else trials.assign(pair=[f"pair{i}" for i in who])
+
+
+def group(trials, setting="baseline", **more) -> Group:
+    name = "driver" if setting else "human"
+    return Group(name, setting, "s", trials, label=name, model=name, **more)
+
+
+def humans(trials) -> Group:
+    return group(trials, "")
+
+
+def driver(seed=1, reps=10, **more) -> Group:
+    return group(driven(np.random.default_rng(seed), 1, reps, alone=True, **more))
+
+
+@cache
+def not_imported() -> Group:
+    return group(human_outcomes(), "", measured=False)
+
+
+def of(found, outcome):
+    chosen = [one for one in found if one.outcome == outcome]
+    assert [one.problem for one in chosen] == [""] * len(chosen)
+    return chosen
+
+
+def joined(one, other):
+    """The design of both with the source in every term, the second being the source 1."""
+    return np.vstack([np.hstack([one, 0 * one]), np.hstack([other, other])])
+
+
+def test_it_is_the_logit_of_both_with_the_source_in_every_term():
+    (x, left), (own, own_left) = (who_first_data(g.outcomes) for g in (not_imported(), driver()))
+    fit = Logit(np.concatenate([left, own_left]), joined(x, own)).fit(disp=0)
+    found = of(differences(not_imported(), driver()), WHO_FIRST)
+    assert [one.method for one in found] == ["ML"] * 3
+    assert [one.b for one in found] == pytest.approx(fit.params[3:], abs=1e-6)
+    assert [one.human for one in found] == pytest.approx(fit.params[:3], abs=1e-6)
+    assert [one.driver for one in found] == pytest.approx(fit.params[:3] + fit.params[3:], abs=1e-6)
+    assert [one.p for one in found] == pytest.approx(fit.pvalues[3:], rel=1e-4)
+    bounds = np.array([(one.low, one.high) for one in found])
+    assert bounds == pytest.approx(fit.conf_int()[3:], abs=1e-5)
+    assert [(one.n, one.n_human, one.freedom) for one in found] == [(110, 962, None)] * 3
+
+
+def test_the_gaps_interactions_are_those_of_least_squares_over_both():
+    human, own = humans(driven(np.random.default_rng(2), 9, 2)), driver()
+    (x, gap, _), (z, own_gap, _) = gap_data(human.trials), gap_data(own.trials)
+    fit = OLS(np.concatenate([gap, own_gap]), joined(x, z)).fit()
+    found = of(differences(human, own), GAP)
+    assert [one.b for one in found] == pytest.approx(fit.params[4:])
+    assert [one.human for one in found] == pytest.approx(fit.params[:4])
+
+
+def test_with_a_pair_for_each_trial_the_jackknife_gives_hc3_errors():
+    trials = driver().trials.assign(pair=[f"pair{i}" for i in range(110)])
+    found, hc3 = by_pairs(gap_ols, trials, "gap_m"), gap_ols(trials, robust=True)
+    for name, term in found.terms.items():
+        # HC3 leaves out the factor (n - 1) / n.
+        assert term.se == pytest.approx(hc3.terms[name].se * sqrt(109 / 110))
+
+
+def leverage_errors(trials):
+    """The jackknife's errors without a refit: each pair's residuals, corrected by its leverage."""
+    x, gap, chosen = gap_data(trials)
+    inverse = np.linalg.inv(x.T @ x)
+    residual = gap - x @ inverse @ x.T @ gap
+    total = np.zeros((4, 4))
+    pairs = chosen["pair"].to_numpy()
+    for pair in np.unique(pairs):
+        own = x[pairs == pair]
+        hat = own @ inverse @ own.T
+        moved = inverse @ own.T @ np.linalg.solve(np.eye(len(own)) - hat, residual[pairs == pair])
+        total += np.outer(moved, moved)
+    g = len(np.unique(pairs))
+    return np.sqrt(np.diag(total) * (g - 1) / g)
+
+
+def test_errors_by_pairs_add_up_with_those_of_the_driver():
+    human, own = humans(driven(np.random.default_rng(2), 9, 2)), driver()
+    mine, theirs = gap_ols(own.trials, robust=True).terms.values(), leverage_errors(human.trials)
+    for one, term, se in zip(of(differences(human, own), GAP), mine, theirs, strict=True):
+        total = term.se**2 + se**2
+        # Satterthwaite: 9 pairs have 8 degrees of freedom, 110 trials and 4 terms 106.
+        freedom = total**2 / (term.se**4 / 106 + se**4 / 8)
+        half = stats.t.ppf(0.975, freedom) * sqrt(total)
+        assert one.freedom == pytest.approx(freedom)
+        assert (one.low, one.high) == pytest.approx((one.b - half, one.b + half))
+        assert one.p == pytest.approx(2 * stats.t.sf(abs(one.b) / sqrt(total), freedom))
+        assert "9 pairs" in one.remark
+
+
+def test_before_an_import_the_gap_is_compared_with_the_published_regression():
+    found = of(differences(not_imported(), driver()), GAP)
+    rows = published("paper_gap").query("driver == 'human'").set_index("term")
+    mine = gap_ols(driver().trials, robust=True).terms
+    for one in found:
+        b, se = rows.loc[one.term, ["b", "se"]].astype(float)
+        assert (one.human, one.n_human) == (b, 962)
+        assert one.b == pytest.approx(mine[one.term].b - b)
+        total = sqrt(mine[one.term].se ** 2 + se**2)
+        half = stats.t.ppf(0.975, one.freedom) * total
+        assert one.high - one.b == pytest.approx(half)
+        assert "as published" in one.remark
+
+
+def test_unknown_pairs_are_said_to_make_the_intervals_too_narrow():
+    found = differences(not_imported(), driver())
+    assert len(found) == 7
+    assert all("not published" in one.remark and "too narrow" in one.remark for one in found)
+
+
+def partly(pairs) -> Group:
+    trials = driven(np.random.default_rng(3), pairs, 1)
+    assert not imported(trials).complete
+    return group(trials, "", published_outcomes=human_outcomes())
+
+
+def test_of_a_partial_import_the_gaps_count_and_the_published_outcomes_stay():
+    found = differences(partly(3), driver())
+    assert {one.n_human for one in of(found, GAP)} == {33}
+    assert {one.n_human for one in of(found, WHO_FIRST)} == {962}
+    assert all("3 pairs" in one.remark for one in of(found, GAP))
+    assert of(found, WHO_FIRST) == of(differences(not_imported(), driver()), WHO_FIRST)
+
+
+def test_two_pairs_are_no_reference_for_the_gap():
+    found = differences(partly(2), driver())
+    assert {one.n_human for one in of(found, GAP)} == {962}
+    assert of(found, GAP) == of(differences(not_imported(), driver()), GAP)
+
+
+def separated() -> Group:
+    """Who is ahead goes first, and else who is slower: without an exception."""
+    trials = driver(reps=4).trials
+    ahead = trials["projected_headway_m"] - 2 * trials["relative_velocity_mps"]
+    left = (ahead > 0) | ((ahead == 0) & (np.arange(len(trials)) % 2 == 0))
+    return group(trials.assign(merged_first=np.where(left, "left", "right")))
+
+
+def penalised(design, left, at) -> float:
+    """Firth's log-likelihood."""
+    linear = design @ at
+    p = expit(linear)
+    information = design.T @ (design * (p * (1 - p))[:, None])
+    return left @ linear - np.logaddexp(0, linear).sum() + np.linalg.slogdet(information)[1] / 2
+
+
+def best(design, left, start, term, value):
+    """The largest penalised log-likelihood with one coefficient held at a value."""
+    free = [i for i in range(6) if i != term]
+
+    def loss(rest):
+        at = np.empty(6)
+        at[free], at[term] = rest, value
+        return -penalised(design, left, at)
+
+    return -optimize.minimize(loss, np.asarray(start)[free], method="BFGS").fun
+
+
+def test_under_separation_the_joint_fit_is_firths_with_its_likelihood_ratios():
+    human, own = not_imported(), separated()
+    found = of(differences(human, own), WHO_FIRST)
+    assert [one.method for one in found] == ["Firth"] * 3
+    (x, left), (z, own_left) = (who_first_data(g.outcomes) for g in (human, own))
+    design, left = joined(x, z), np.concatenate([left, own_left])
+    at = [one.human for one in found] + [one.b for one in found]
+    top = penalised(design, left, np.array(at))
+    for i, one in enumerate(found):
+        without = best(design, left, at, 3 + i, 0.0)
+        assert one.p == pytest.approx(stats.chi2.sf(2 * (top - without), 1), abs=2e-3)
+        for bound in (one.low, one.high):
+            drop = top - best(design, left, at, 3 + i, bound)
+            assert drop == pytest.approx(stats.chi2.ppf(0.95, 1) / 2, abs=0.01)
+
+
+def test_firths_fit_beside_pairs_says_that_it_takes_trials_as_independent():
+    human = humans(driven(np.random.default_rng(2), 9, 2))
+    found = of(differences(human, separated()), WHO_FIRST)
+    assert all(one.method == "Firth" and "independent" in one.remark for one in found)
+
+
+def without(trials):
+    return group(trials.assign(status="collided", merged_first=None, gap_m=np.nan))
+
+
+DEGENERATE = {
+    "no finished trial": without(driver().trials),
+    "the left vehicle merged first in all 110 trials": group(
+        driver().trials.assign(merged_first="left")
+    ),
+    "too few conditions": group(driver().trials.query("condition == 'N_0_0'")),
+    "1 finished trial": group(driver().trials.head(1)),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("reason", DEGENERATE)
+def test_data_that_allow_no_comparison_give_a_reason(reason):
+    found = differences(not_imported(), DEGENERATE[reason])
+    lacking = [one for one in found if one.problem]
+    assert {one.term for one in lacking} >= {"intercept", "projected_headway", "relative_velocity"}
+    assert any(reason in one.problem for one in lacking)
+    assert {(one.b, one.low, one.p, one.detectable) for one in lacking} == {(None,) * 4}
+
+
+def test_humans_whose_fit_hangs_on_one_pair_are_compared_by_firths():
+    trials = driven(np.random.default_rng(2), 3, 2)
+    ahead = np.where(trials["projected_headway_m"] > 0, "left", "right")
+    trials.loc[trials["pair"] != "pair0", "merged_first"] = ahead[trials["pair"] != "pair0"]
+    found = of(differences(humans(trials), driver()), WHO_FIRST)
+    assert {one.method for one in found} == {"Firth"}
+
+
+def test_the_detectable_difference_is_found_in_four_of_five_studies():
+    found = of(differences(not_imported(), driver()), WHO_FIRST)
+    for one in found:
+        se = (one.high - one.b) / stats.norm.ppf(0.975)
+        assert stats.norm.sf(stats.norm.ppf(0.975) - one.detectable / se) == pytest.approx(0.8)
+    # Few degrees of freedom cost power: the exact power is that of the noncentral t.
+    found = 1 - stats.nct.cdf(stats.t.ppf(0.975, 8), 8, detectable(1.0, 8))
+    assert found == pytest.approx(0.8, abs=0.02)
+
+
+def alarms(tested, count, **kept):
+    """How often copies of nine pairs are said to differ from them at p < .05, by term."""
+    rng = np.random.default_rng(260409609)
+    found = [
+        tested(driven(rng, 9, 10).assign(**kept), driven(rng, 1, 40, alone=True).assign(**kept))
+        for _ in range(count)
+    ]
+    return (np.array(found) < 0.05).sum(axis=0)
+
+
+def jointly(human, own):
+    return [one.p for one in differences(humans(human), group(own)) if not one.problem]
+
+
+def pooled(human, own):
+    """The gap's intercept, with all trials as independent."""
+    (x, gap, _), (z, own_gap, _) = gap_data(human), gap_data(own)
+    fit = OLS(np.concatenate([gap, own_gap]), joined(x, z)).fit()
+    return [fit.get_robustcov_results("HC3").pvalues[4]]
+
+
+# The other outcome is left out, which saves its fits.
+@pytest.mark.parametrize(
+    ("terms", "count", "kept"), [(4, 60, {"merged_first": "left"}), (3, 20, {"gap_m": np.nan})]
+)
+def test_copies_of_the_humans_are_seldom_said_to_differ(terms, count, kept):
+    found = alarms(jointly, count, **kept)
+    assert len(found) == terms
+    assert max(found) <= stats.binom.ppf(0.995, count, 0.05)
+
+
+def test_with_pooled_trials_copies_of_the_humans_are_often_said_to_differ():
+    assert alarms(pooled, 60)[0] > 12

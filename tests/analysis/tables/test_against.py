@@ -1,0 +1,180 @@
+"""Which of the paper's rows a row stands beside, and what is not compared with itself."""
+
+from __future__ import annotations
+
+import duckdb
+import pytest
+
+from analysis.data.reference_data import published
+from analysis.data.study import Study
+from analysis.human.archive import open_files
+from analysis.human.load import import_trials, sort_files
+from analysis.tables import finished_tables, make_tables
+from analysis.tables.against import DRIVERS, against, in_paper
+from merge_runner.errors import UsageError
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.recordings import drive, write_folder
+from tests.analysis.studies import write_study, yielding
+
+pytestmark = pytest.mark.usefixtures("few_draws")
+TABLE_VII = "ablation-quantitative"
+
+
+def cell(table, row_id, column):
+    (row,) = [row for row in table.rows if row.id == row_id]
+    return row.values.get(column)
+
+
+def paper(driver, setting="baseline", column="gap_m"):
+    rows = published("paper_ablation_quantitative").query(
+        "driver == @driver and setting == @setting"
+    )
+    return rows[column].item()
+
+
+@pytest.fixture(scope="module")
+def met(tmp_path_factory):
+    """Models, a program, and the emulator under its own name and in gemini's."""
+    path = tmp_path_factory.mktemp("met") / "t.duckdb"
+    drives = [
+        *yielding("o3", reps=1),
+        *yielding("o3", "A2", reps=1),
+        *yielding("gemini-2.5-pro", reps=1),
+        *yielding("emulator", reps=1),
+        *yielding("constant", reps=1),
+    ]
+    write_study(path, drives)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(
+            "UPDATE trials SET scripted = true WHERE model_left IN ('gemini-2.5-pro', 'emulator')"
+        )
+    return Study(path)
+
+
+AT = '{"endpoint": "http://localhost:8080/v1"}'
+ELSEWHERE = f"""UPDATE specs SET spec = '{{"left": {AT}, "right": {AT}}}'"""
+ANEW = "UPDATE trials SET sample_set = 1"
+
+
+def changed(folder, sql) -> Study:
+    """A study of o3, in which this was otherwise."""
+    path = write_study(folder / "t.duckdb", yielding("o3", reps=1))
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(sql)
+    return Study(path)
+
+
+@pytest.fixture(scope="module")
+def partly(tmp_path_factory):
+    """Three pairs of humans with one trial in every condition."""
+    folder = tmp_path_factory.mktemp("partly")
+    files = {
+        f"experiment_{pair}/experiment_{pair}_iter_{number}.csv": drive(name).csv()
+        for pair in (4, 6, 8)
+        for number, name in enumerate(CONDITIONS, 1)
+    }
+    db = write_study(folder / "t.duckdb", yielding("o3", reps=1))
+    with open_files(write_folder(folder / "recordings", files)) as found:
+        import_trials(sort_files(found).trials, Store(db))
+    return Study(db)
+
+
+def beside(study, name=TABLE_VII, driver=None):
+    (table,) = make_tables(study, [name])
+    return against(table, "paper", driver)
+
+
+def test_the_paper_has_these_drivers():
+    assert tuple(published("paper_gap")["driver"].unique()) == DRIVERS
+
+
+def differences(table, row_id):
+    (row,) = [row for row in table.rows if row.id == row_id]
+    return [name for name in row.values if name.endswith("_difference")]
+
+
+def test_published_human_values_stand_there_and_are_not_compared_with_themselves(met):
+    tables = [against(table, "paper") for table in make_tables(met) if in_paper(table)]
+    assert len(tables) == 5
+    for table in tables:
+        rows = [row for row in table.rows if row.groups[0] == "human"]
+        # The published collisions are by boxes: by the other rule there are none to stand beside.
+        rows = [row for row in rows if row.id != "human/collided_percent"]
+        assert all(any(name.endswith("_in_paper") for name in row.values) for row in rows)
+        assert [differences(table, row.id) for row in rows] == [[]] * len(rows)
+
+
+def test_of_a_partial_import_the_traces_are_compared_and_the_published_outcomes_are_not(partly):
+    assert differences(beside(partly), "human") == [
+        "gap_m_difference",
+        "rmse_mps_difference",
+        "joint_percent_difference",
+    ]
+    assert differences(beside(partly, "who-first"), "human/intercept") == []
+    assert differences(beside(partly, "gap"), "human/intercept") != []
+    table = beside(partly, "indicators")
+    assert cell(table, "human/collided_boxes_percent", "value_in_paper") == 2.83
+    assert differences(table, "human/collided_boxes_percent") == []
+    assert differences(table, "human/score") == []
+    assert differences(table, "human/gap_m") == ["value_difference"]
+
+
+def test_a_stand_in_never_stands_beside_the_model_in_whose_name_it_answered(met):
+    for driver in (None, "gemini-2.5-pro"):
+        table = beside(met, driver=driver)
+        assert cell(table, "gemini-2.5-pro/baseline", "gap_m_in_paper") is None
+        note = "gemini-2.5-pro (scripted stand-in, not gemini-2.5-pro) does not stand beside the"
+        assert sum(note in text for text in table.notes) == 1
+    assert cell(beside(met), "o3/baseline", "gap_m_in_paper") == paper("o3")
+
+
+def test_any_driver_stands_beside_a_named_one_setting_for_setting(met):
+    table = beside(met, driver="gemini-2.5-pro")
+    expected = paper("gemini-2.5-pro")
+    for name in ("o3", "emulator", "constant"):
+        assert cell(table, f"{name}/baseline", "gap_m_in_paper") == expected
+        assert cell(table, f"{name}/baseline", "gap_m_difference") == pytest.approx(
+            cell(table, f"{name}/baseline", "gap_m") - expected
+        )
+    assert cell(table, "o3/A2", "gap_m_in_paper") == paper("gemini-2.5-pro", "A2")
+    assert "every driver stands beside the paper's gemini-2.5-pro" in table.notes
+    gap = beside(met, "gap", "o3")
+    assert cell(gap, "emulator/baseline/intercept", "b_in_paper") == 8.14
+    assert cell(beside(met, "indicators", "o3"), "emulator/baseline/I2", "paper_in_paper") is False
+
+
+def test_beside_the_humans_stands_every_setting(met):
+    table = beside(met, driver="human")
+    assert {row.values["gap_m_in_paper"] for row in table.rows} == {3.85}
+
+
+def test_a_model_at_another_endpoint_stands_beside_the_papers_only_when_told_to(tmp_path):
+    elsewhere, name = changed(tmp_path, ELSEWHERE), "o3 at localhost:8080/baseline"
+    assert cell(beside(elsewhere), name, "gap_m_in_paper") is None
+    assert cell(beside(elsewhere, driver="o3"), name, "gap_m_in_paper") == paper("o3")
+
+
+def test_another_sample_set_of_a_driver_stands_beside_the_papers(tmp_path):
+    study = changed(tmp_path, ANEW)
+    assert cell(beside(study), "o3/set1/baseline", "gap_m_in_paper") == paper("o3")
+
+
+def test_a_kept_table_is_placed_as_one_just_made(met):
+    made = [against(table, "paper", "o3") for table in make_tables(met, [TABLE_VII])]
+    for _ in range(2):
+        tables = finished_tables(met.db, None, [TABLE_VII])
+        kept = [against(table, "paper", "o3") for table in tables]
+        assert [[row.values for row in t.rows] for t in kept] == [
+            [row.values for row in t.rows] for t in made
+        ]
+
+
+def test_as_needs_the_paper_and_one_of_its_drivers(met, in_process, capsys):
+    with pytest.raises(UsageError, match=r"--as gpt: the paper has human, o3, gemini-2\.5-pro"):
+        beside(met, driver="gpt")
+    assert in_process("tables", TABLE_VII, "--db", met.db, "--as", "o3") == 2
+    assert "--against paper" in capsys.readouterr().err
+    told = ("tables", TABLE_VII, "--db", met.db, "--against", "paper", "--as", "o3")
+    assert in_process(*told) == 0
+    assert "every driver stands beside the paper's o3" in capsys.readouterr().out

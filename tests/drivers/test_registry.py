@@ -1,0 +1,90 @@
+"""The two drivers that need no model, from the first to the last step of every condition."""
+
+import pytest
+
+from merge_runner.config import Scenario
+from merge_runner.drivers.constant import ConstantDriver
+from merge_runner.drivers.projected_order import ProjectedOrderDriver
+from merge_runner.records import SIDES, TrialSpec
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.trial import play_trial
+
+MERGE_POINT_M = 100.0
+LENGTH_M = 4.5
+RULES = ("euclid2d", "rectangle", "shared_lane")
+
+
+async def play(condition, driver, **scenario):
+    """A trial with the same kind of driver on both sides."""
+    scenario = Scenario(**scenario)
+    spec = TrialSpec(
+        trial_id="test",
+        spec_hash="test",
+        source="driver",
+        model_left="test",
+        model_right="test",
+        variant="baseline",
+        condition=condition,
+        repetition=1,
+        sample_set=0,
+        order=0,
+    )
+    return await play_trial(spec, scenario, {side: driver(scenario, side) for side in SIDES})
+
+
+def constant(scenario, side):
+    return ConstantDriver(scenario)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("condition", CONDITIONS)
+async def test_two_constant_drivers_collide_in_every_condition(condition, rule):
+    trial = await play(condition, constant, collision_rule=rule)
+    assert (trial.status, trial.merged_first) == ("collided", None)
+    assert {row.acceleration_mps2 for row in trial.states} == {0.0}
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("condition", CONDITIONS)
+async def test_the_projected_order_lets_the_earlier_arrival_go_first_without_a_collision(
+    condition, rule
+):
+    trial = await play(condition, ProjectedOrderDriver, collision_rule=rule)
+    # The condition's name says who is projected to lead; on a tie the right one yields.
+    first = "right" if CONDITIONS[condition].projected_headway_m < 0 else "left"
+    assert (trial.status, trial.merged_first) == ("finished", first)
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+async def test_under_the_projected_order_only_the_second_car_brakes_and_gently(condition):
+    trial = await play(condition, ProjectedOrderDriver)
+    first = trial.merged_first
+    assert {row.acceleration_mps2 for row in trial.states if row.side == first} == {0.0}
+    braking = [row.acceleration_mps2 for row in trial.states if row.side != first]
+    assert -1.5 - 1e-9 <= min(braking) < 0
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+async def test_under_the_projected_order_a_human_gap_is_open_at_the_merge_point(condition):
+    """Net of the vehicle length, at the moment when the first car is there: 3.85 m."""
+    trial = await play(condition, ProjectedOrderDriver)
+    first = [row.position_m for row in trial.states if row.side == trial.merged_first]
+    second = [row.position_m for row in trial.states if row.side != trial.merged_first]
+    step = next(k for k, position in enumerate(first) if position >= MERGE_POINT_M)
+    # The moment lies within a step, during which the cars drive at nearly constant speed.
+    share = (MERGE_POINT_M - first[step - 1]) / (first[step] - first[step - 1])
+    behind = second[step - 1] + share * (second[step] - second[step - 1])
+    assert MERGE_POINT_M - behind - LENGTH_M == pytest.approx(3.85, abs=0.01)
+
+
+@pytest.mark.parametrize("driver", [constant, ProjectedOrderDriver])
+async def test_a_program_holds_one_action_over_a_whole_plan(driver):
+    trial = await play("L_4_-8", driver)
+    for row in trial.decisions:
+        decision = row.decision
+        assert decision.valid
+        assert len(decision.plan) == 20
+        assert decision.applied == decision.plan[:5]
+        assert len(set(decision.plan)) == 1
+        assert abs(decision.plan[0]) <= 1
+        assert decision.prompt is None

@@ -1,0 +1,327 @@
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+from dataclasses import replace
+
+import pytest
+
+from merge_runner.config import Scenario
+from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.emulator.chance import draw, draw_between, draw_index
+from merge_runner.emulator.driver import answer
+from merge_runner.llm.keys import make_request
+from merge_runner.prompts.blocks import VARIANTS
+from merge_runner.prompts.parse import parse_reply
+from merge_runner.prompts.render import render_prompt
+from merge_runner.records import SIDES, ChatReply, Slot, TrialSpec
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
+from merge_runner.trial import play_trial
+
+SCENARIO = Scenario()
+SAMPLE_SETS = range(6)
+REPETITIONS = range(1, 11)
+
+
+def first_prompt(condition, side, variant="baseline"):
+    seen = World(SCENARIO, CONDITIONS[condition]).observe(side)
+    return render_prompt(seen, None, variant=variant, scenario=SCENARIO)
+
+
+def straight_prompt(variant="baseline", previous=None, **changes):
+    seen = World(SCENARIO, CONDITIONS["L_4_0"]).observe("right")
+    seen = replace(seen, road="straight", distance_to_merge_m=None, **changes)
+    return render_prompt(seen, previous, variant=variant, scenario=SCENARIO)
+
+
+FIRST_PROMPTS = {(name, side): first_prompt(name, side) for name in CONDITIONS for side in SIDES}
+
+
+def first_token(condition, repetition, side, sample_set=0):
+    slot = Slot(condition, repetition, side, 0, sample_set)
+    return answer(FIRST_PROMPTS[condition, side], slot).split("\n")[0]
+
+
+def first_tokens(condition, repetition, sample_set=0):
+    return tuple(first_token(condition, repetition, side, sample_set) for side in SIDES)
+
+
+def first_action(prompt, slot=None):
+    return parse_reply(answer(prompt, slot), SCENARIO.plan_actions).plan[0]
+
+
+async def play(condition, repetition, sample_set):
+    """A trial in this process, the scripted driver on either side."""
+
+    def ask_as(side):
+        async def ask(prompt, number):
+            slot = Slot(condition, repetition, side, number, sample_set)
+            request = make_request(
+                provider="emulator",
+                endpoint="emulator",
+                model="scripted-driver",
+                path="/",
+                headers={},
+                body={"prompt": prompt},
+                slot=slot,
+            )
+            return ChatReply(answer(prompt, slot), "ok", request, (), earlier=0)
+
+        return ask
+
+    spec = TrialSpec(
+        trial_id="t",
+        spec_hash="h",
+        source="llm",
+        model_left="emulator",
+        model_right="emulator",
+        variant="baseline",
+        condition=condition,
+        repetition=repetition,
+        sample_set=sample_set,
+        order=0,
+    )
+    drivers = {side: LlmDriver(ask_as(side), "baseline", SCENARIO) for side in SIDES}
+    return await play_trial(spec, SCENARIO, drivers)
+
+
+@pytest.fixture(scope="module")
+def trials():
+    """The baseline's 110 trials of six sample sets, by condition, repetition and sample set."""
+
+    async def play_all():
+        return {
+            (condition, repetition, sample_set): await play(condition, repetition, sample_set)
+            for sample_set in SAMPLE_SETS
+            for repetition in REPETITIONS
+            for condition in CONDITIONS
+        }
+
+    return asyncio.run(play_all())
+
+
+def test_draws_are_the_same_on_every_machine():
+    # Committed recordings hold answers that were drawn like this.
+    assert draw("who first", "N_0_0", 1, 0) == 0.05226905135811813
+    assert draw_index(3, "words", 7) == 1
+    assert draw_between(-2, 2, "gap") == -0.6744470744659119
+
+
+def test_draws_keep_their_arguments_apart():
+    assert draw("a", "bc") != draw("ab", "c")
+    assert draw("a", 1) == draw("a", "1")
+
+
+def test_draws_fill_their_range_and_stay_in_it():
+    uniform = [draw("uniform", n) for n in range(1000)]
+    assert 0 <= min(uniform) < 0.01
+    assert 0.99 < max(uniform) < 1
+    assert {draw_index(3, n) for n in range(100)} == {0, 1, 2}
+    between = [draw_between(-3, 5, n) for n in range(1000)]
+    assert -3 <= min(between) < -2.9
+    assert 4.9 < max(between) < 5
+
+
+def test_an_answer_depends_on_prompt_and_slot_alone():
+    questions = [
+        (FIRST_PROMPTS[condition, side], Slot(condition, repetition, side, number, 0))
+        for condition in CONDITIONS
+        for repetition in (1, 2)
+        for side in SIDES
+        for number in (0, 1)
+    ]
+    forwards = [answer(*question) for question in questions]
+    backwards = [answer(*question) for question in reversed(questions)]
+    assert forwards == backwards[::-1]
+
+
+@pytest.mark.parametrize(
+    "change", [{"repetition": 2}, {"sample_set": 1}, {"decision": 1}, {"side": "right"}]
+)
+def test_each_part_of_a_slot_changes_some_plan(change):
+    def actions(**changes):
+        slots = [replace(Slot(condition, 1, "left", 0, 0), **changes) for condition in CONDITIONS]
+        return [first_action(FIRST_PROMPTS[s.condition, "left"], s) for s in slots]
+
+    assert actions() == actions()
+    assert actions() != actions(**change)
+
+
+def test_both_sides_agree_on_who_goes_first_unless_the_trial_is_contested():
+    tokens = {
+        (condition, repetition): first_tokens(condition, repetition)
+        for condition in CONDITIONS
+        for repetition in range(1, 31)
+    }
+    assert set(tokens.values()) == {("M", "Y"), ("Y", "M"), ("M", "M")}
+    contested = sorted(repetition for (_, repetition), pair in tokens.items() if pair == ("M", "M"))
+    # One condition in every third repetition.
+    assert len(contested) == 10
+    assert contested == list(range(contested[0], 31, 3))
+
+
+def test_who_goes_first_does_not_change_within_a_trial():
+    for decision in range(10):
+        slot = Slot("L_4_8", 3, "left", decision, 0)
+        told = answer(FIRST_PROMPTS["L_4_8", "left"], slot).split("\n")[0]
+        assert told == first_token("L_4_8", 3, "left")
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_the_share_of_left_first_follows_the_human_odds(condition):
+    h = CONDITIONS[condition].projected_headway_m
+    dv = CONDITIONS[condition].relative_velocity_mps
+    expected = 1 / (1 + math.exp(-(-0.30 + 1.11 * h - 3.30 * dv)))
+    pairs = [
+        first_tokens(condition, repetition, sample_set)
+        for repetition in range(1, 401)
+        for sample_set in range(3)
+    ]
+    agreed = [pair for pair in pairs if pair != ("M", "M")]
+    share = agreed.count(("M", "Y")) / len(agreed)
+    standard_error = math.sqrt(expected * (1 - expected) / len(agreed))
+    assert abs(share - expected) < 3 * standard_error
+
+
+def test_who_goes_first_is_drawn_anew_for_each_trial():
+    def left_first(condition, sample_set=0):
+        return {n for n in range(1, 401) if first_tokens(condition, n, sample_set) == ("M", "Y")}
+
+    # Left goes first more rarely in N_0_0; were the draws shared, never in it alone.
+    assert left_first("N_0_0") - left_first("L_4_8")
+    assert left_first("N_0_0", 0) != left_first("N_0_0", 1)
+
+
+def test_one_to_six_of_110_trials_collide_and_none_times_out(trials):
+    for sample_set in SAMPLE_SETS:
+        statuses = [t.status for key, t in trials.items() if key[2] == sample_set]
+        assert len(statuses) == 110
+        assert set(statuses) == {"finished", "collided"}
+        assert 1 <= statuses.count("collided") <= 6
+
+
+def test_those_who_both_take_the_right_of_way_collide_and_nobody_else(trials):
+    collided = {key for key, trial in trials.items() if trial.status == "collided"}
+    assert collided == {key for key in trials if first_tokens(*key) == ("M", "M")}
+
+
+def test_who_was_drawn_to_go_first_reaches_the_merge_point_first(trials):
+    for key, trial in trials.items():
+        if trial.status == "finished":
+            assert trial.merged_first == ("left" if first_tokens(*key)[0] == "M" else "right")
+
+
+def test_whoever_does_not_collide_drives_gently_and_leaves_a_gap(trials):
+    for trial in trials.values():
+        if trial.status == "finished":
+            # The hardest that the driver means to do, and the wobble of its hand.
+            assert min(row.acceleration_mps2 for row in trial.states) >= -2.2 - 0.1
+            assert max(row.acceleration_mps2 for row in trial.states) <= 1.4 + 0.1
+            left = [row.position_m for row in trial.states if row.side == "left"]
+            right = [row.position_m for row in trial.states if row.side == "right"]
+            merging = next(pair for pair in zip(left, right, strict=True) if max(pair) >= 100)
+            # Between the bumpers of two cars of 4.5 m.
+            assert 1 < abs(merging[0] - merging[1]) - 4.5 < 8
+
+
+def test_every_decision_of_the_trials_is_a_valid_plan(trials):
+    decisions = [row.decision for trial in trials.values() for row in trial.decisions]
+    assert {decision.failure for decision in decisions} == {None}
+
+
+def distinct(trials):
+    """How many of the trials differ in what was said, and in how the vehicles moved."""
+    said = {tuple(row.decision.reply.text for row in trial.decisions) for trial in trials}
+    return len(said), len({trial.states for trial in trials})
+
+
+def test_ten_repetitions_of_a_condition_differ(trials):
+    for condition in CONDITIONS:
+        for sample_set in SAMPLE_SETS:
+            said, driven = distinct([trials[condition, n, sample_set] for n in REPETITIONS])
+            assert said == 10
+            # Plans have two decimals, so two of ten may happen to drive the same.
+            assert driven >= 8
+
+
+def test_another_sample_set_differs_in_every_trial(trials):
+    for condition in CONDITIONS:
+        for repetition in REPETITIONS:
+            said, driven = distinct([trials[condition, repetition, n] for n in SAMPLE_SETS])
+            assert said == 6
+            assert driven >= 4
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_merge_prompt_of_any_variant_gets_a_valid_plan_and_the_token_it_asks_for(variant):
+    for condition in CONDITIONS:
+        for side in SIDES:
+            prompt = first_prompt(condition, side, variant)
+            for slot in (None, Slot(condition, 1, side, 0, 0)):
+                parsed = parse_reply(answer(prompt, slot), SCENARIO.plan_actions)
+                assert parsed.failure is None
+                assert len(parsed.plan) == SCENARIO.plan_actions
+                assert parsed.rationale
+                assert (parsed.tactical is None) == (variant == "A7")
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("relative_m", [-10.0, 5.0, 10.0])
+def test_a_straight_prompt_of_any_variant_gets_a_valid_plan_and_no_token(variant, relative_m):
+    prompt = straight_prompt(variant, [0.1] * 15, relative_distance_m=relative_m)
+    for slot in (None, Slot("L_4_0", 1, "right", 5, 0)):
+        parsed = parse_reply(answer(prompt, slot), SCENARIO.plan_actions)
+        assert parsed.failure is None
+        assert parsed.tactical is None
+        assert parsed.rationale
+
+
+def test_the_plan_has_as_many_actions_as_the_prompt_asks_for():
+    prompt = FIRST_PROMPTS["N_0_0", "left"]
+    shorter = prompt.replace("exactly 20 numbers", "exactly 8 numbers")
+    assert shorter != prompt
+    assert len(parse_reply(answer(shorter, None), 8).plan) == 8
+
+
+def test_who_goes_first_does_not_brake_and_who_yields_does_not_accelerate():
+    for condition in CONDITIONS:
+        for repetition in REPETITIONS:
+            for side in SIDES:
+                slot = Slot(condition, repetition, side, 0, 0)
+                action = first_action(FIRST_PROMPTS[condition, side], slot)
+                # Within the wobble of the hand, 0.05 of 2.5 m/s^2.
+                if first_token(condition, repetition, side) == "M":
+                    assert action >= -0.02
+                else:
+                    assert action <= 0.02
+
+
+def test_a_follower_brakes_for_a_slower_car_close_ahead_and_for_none_behind():
+    ahead = straight_prompt(relative_distance_m=7.0, own_speed_mps=10.0, other_speed_mps=7.0)
+    behind = straight_prompt(relative_distance_m=-7.0, own_speed_mps=10.0, other_speed_mps=7.0)
+    assert first_action(ahead) < 0
+    assert first_action(behind) == 0
+
+
+def test_without_a_slot_an_answer_depends_on_the_prompt_alone():
+    left, right = FIRST_PROMPTS["L_4_0", "left"], FIRST_PROMPTS["L_4_0", "right"]
+    assert answer(left, None) == answer(left, None)
+    # The projected leader goes first.
+    assert answer(left, None).startswith("M\n")
+    assert answer(right, None).startswith("Y\n")
+
+
+@pytest.mark.parametrize("slot", [None, Slot("N_0_0", 1, "left", 0, 0)])
+@pytest.mark.parametrize("prompt", ["", "What is the capital of France?", "Your speed: x m/s"])
+def test_a_prompt_about_something_else_gets_a_polite_text(prompt, slot):
+    text = answer(prompt, slot)
+    assert text.startswith("I am a scripted stand-in for a language model and can only answer")
+    assert parse_reply(text, SCENARIO.plan_actions).plan is None
+
+
+@pytest.mark.parametrize("line", ["Your speed", "Speed of the other car", "Relative distance"])
+def test_a_prompt_with_a_number_missing_is_no_driving_prompt(line):
+    prompt = re.sub(f"- {line}.*", "", FIRST_PROMPTS["N_0_0", "left"])
+    assert "can only answer driving prompts" in answer(prompt, None)

@@ -1,0 +1,621 @@
+import json
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.http_outcome import RawReply, is_web_page, judge, may_be_charged
+
+OPENAI_QUOTA = (
+    "You exceeded your current quota, please check your plan and billing details. For more "
+    "information on this error, read the docs: https://platform.openai.com/docs/guides."
+)
+# Gemini says the same for a limit per minute, which passes.
+GEMINI_QUOTA = (
+    "You exceeded your current quota, please check your plan and billing details. Please retry in "
+    "38.804097346s."
+)
+HTML = "<html>\n<head><title>502 Bad Gateway</title></head>\n<body>nginx</body></html>"
+TOKENS = (
+    "Rate limit reached for o4-mini in organization org-x on tokens per min (TPM): Limit 200000, "
+    "Used 162960, Requested 42288. Please try again in 1.574s. Visit https://platform.openai.com."
+)
+TOO_LARGE = (
+    "Request too large for o3 in organization org-x on tokens per min (TPM): Limit 30000, "
+    "Requested 31538."
+)
+
+
+def openai(message="m", kind="invalid_request_error", code=None, param=None):
+    return {"error": {"message": message, "type": kind, "param": param, "code": code}}
+
+
+def gemini(code, status, message="m", *details):
+    kind = "type.googleapis.com/google.rpc."
+    listed = [{"@type": kind + name, **detail} for name, detail in details]
+    return {"error": {"code": code, "message": message, "status": status, "details": listed}}
+
+
+def violations(*quota_ids):
+    return "QuotaFailure", {"violations": [{"quotaId": each} for each in quota_ids]}
+
+
+def anthropic(kind, message="m", **details):
+    error = {"type": kind, "message": message}
+    if details:
+        error["details"] = details
+    return {"type": "error", "error": error, "request_id": "req_1"}
+
+
+def openrouter(code, message="m", **metadata):
+    return {"error": {"code": code, "message": message, "metadata": metadata}}
+
+
+PER_MINUTE = "GenerateRequestsPerMinutePerProjectPerModel-FreeTier"
+PER_DAY = "GenerateRequestsPerDayPerProjectPerModel-FreeTier"
+RETRY_38 = ("RetryInfo", {"retryDelay": "38s"})
+HELP = ("Help", {"links": [{"description": "quotas", "url": "https://ai.google.dev"}]})
+BAD_KEY = ("ErrorInfo", {"reason": "API_KEY_INVALID", "domain": "googleapis.com"})
+
+
+def judged(wire, status, body, headers=None):
+    text = body if isinstance(body, str) else json.dumps(body)
+    return judge(RawReply(status, headers or {}, text), FORMATS[wire])
+
+
+# An error: format, status, body, headers, and what is to be done.
+ERRORS = [
+    # OpenAI.
+    ("openai-chat", 400, openai(code="unsupported_value"), {}, "fail", "bad_request"),
+    ("openai-chat", 400, openai(code="unsupported_parameter"), {}, "fail", "bad_request"),
+    ("openai-chat", 400, openai(code="context_length_exceeded"), {}, "fail", "bad_request"),
+    ("openai-chat", 400, openai(code="invalid_prompt"), {}, "fail", "bad_request"),
+    ("openai-chat", 400, openai(param="service_tier"), {}, "fail", "bad_request"),
+    ("openai-responses", 400, openai(code="model_not_found"), {}, "refused", "unknown_model"),
+    ("openai-chat", 404, openai(code="model_not_found"), {}, "refused", "unknown_model"),
+    ("openai-chat", 401, openai(code="invalid_api_key"), {}, "refused", "not_allowed"),
+    ("openai-chat", 403, openai(code="unsupported_country"), {}, "refused", "not_allowed"),
+    ("openai-chat", 408, openai("timeout"), {}, "retry", "request_timeout"),
+    ("openai-chat", 409, openai("lock"), {}, "retry", "conflict"),
+    ("openai-chat", 413, openai("too large"), {}, "fail", "bad_request"),
+    ("openai-chat", 422, openai("unprocessable"), {}, "fail", "bad_request"),
+    ("openai-chat", 500, openai("oops", "server_error"), {}, "retry", "server_error"),
+    ("openai-chat", 502, HTML, {}, "retry", "server_error"),
+    ("openai-chat", 503, openai(code="server_is_overloaded"), {}, "retry", "overloaded"),
+    ("openai-chat", 504, "", {}, "retry", "server_timeout"),
+    ("openai-chat", 520, HTML, {}, "retry", "server_error"),
+    ("openai-chat", 521, HTML, {}, "retry", "server_error"),
+    ("openai-chat", 522, HTML, {}, "retry", "server_error"),
+    ("openai-chat", 523, HTML, {}, "retry", "server_error"),
+    ("openai-chat", 524, HTML, {}, "retry", "server_timeout"),
+    # Quotas, whatever the message says; the type alone or the code alone is enough.
+    *(
+        ("openai-chat", 429, body, {}, "quota", "quota_exhausted")
+        for code in (
+            "insufficient_quota",
+            "billing_hard_limit_reached",
+            "credit_balance_exhausted",
+            "organization_spend_limit_exceeded",
+            "project_spend_limit_exceeded",
+            "organization_usage_limit_exceeded",
+        )
+        for body in (
+            openai(OPENAI_QUOTA, "insufficient_quota", code),
+            openai("other words", "x", code),
+        )
+    ),
+    ("openai-chat", 429, openai("m", "insufficient_quota"), {}, "quota", "quota_exhausted"),
+    (
+        "openai-chat",
+        429,
+        openai(OPENAI_QUOTA, "insufficient_quota", "insufficient_quota"),
+        {"retry-after": "1", "x-should-retry": "true"},
+        "quota",
+        "quota_exhausted",
+    ),
+    # It can never succeed, however long one waits.
+    (
+        "openai-chat",
+        429,
+        openai(TOO_LARGE, "tokens", "rate_limit_exceeded"),
+        {},
+        "fail",
+        "request_too_large",
+    ),
+    # The server's own word on a retry goes before the rule for the status.
+    ("openai-chat", 500, openai(), {"x-should-retry": "false"}, "fail", "server_error"),
+    ("openai-chat", 400, openai(), {"x-should-retry": "true"}, "retry", "http_400"),
+    ("openai-chat", 404, openai(), {"x-should-retry": "true"}, "retry", "http_404"),
+    ("openai-chat", 500, openai(), {"x-should-retry": "true"}, "retry", "server_error"),
+    (
+        "openai-chat",
+        429,
+        openai(TOKENS, "tokens", "rate_limit_exceeded"),
+        {"x-should-retry": "false"},
+        "fail",
+        "rate_limited",
+    ),
+    # Gemini.
+    ("gemini", 400, gemini(400, "INVALID_ARGUMENT"), {}, "fail", "bad_request"),
+    ("gemini", 400, gemini(400, "FAILED_PRECONDITION"), {}, "fail", "bad_request"),
+    ("gemini", 400, gemini(400, "INVALID_ARGUMENT", "m", BAD_KEY), {}, "refused", "not_allowed"),
+    ("gemini", 401, gemini(401, "UNAUTHENTICATED"), {}, "refused", "not_allowed"),
+    ("gemini", 402, gemini(402, "RESOURCE_EXHAUSTED"), {}, "quota", "quota_exhausted"),
+    ("gemini", 403, gemini(403, "PERMISSION_DENIED"), {}, "refused", "not_allowed"),
+    ("gemini", 404, gemini(404, "NOT_FOUND"), {}, "refused", "unknown_model"),
+    (
+        "gemini",
+        429,
+        gemini(429, "RESOURCE_EXHAUSTED", GEMINI_QUOTA, violations(PER_DAY), RETRY_38),
+        {},
+        "quota",
+        "quota_exhausted",
+    ),
+    (
+        "gemini",
+        429,
+        gemini(429, "RESOURCE_EXHAUSTED", GEMINI_QUOTA, RETRY_38, violations(PER_MINUTE, PER_DAY)),
+        {},
+        "quota",
+        "quota_exhausted",
+    ),
+    ("gemini", 500, gemini(500, "INTERNAL"), {}, "retry", "server_error"),
+    ("gemini", 503, gemini(503, "UNAVAILABLE"), {}, "retry", "overloaded"),
+    ("gemini", 503, gemini(503, "RESOURCE_EXHAUSTED"), {}, "retry", "overloaded"),
+    ("gemini", 504, gemini(504, "DEADLINE_EXCEEDED"), {}, "retry", "server_timeout"),
+    # Anthropic.
+    ("anthropic", 400, anthropic("invalid_request_error"), {}, "fail", "bad_request"),
+    (
+        "anthropic",
+        400,
+        anthropic("invalid_request_error", "Your credit balance is too low to access the API."),
+        {},
+        "quota",
+        "quota_exhausted",
+    ),
+    (
+        "anthropic",
+        400,
+        anthropic("invalid_request_error", "You have reached your spend limit."),
+        {},
+        "quota",
+        "quota_exhausted",
+    ),
+    ("anthropic", 401, anthropic("authentication_error"), {}, "refused", "not_allowed"),
+    ("anthropic", 402, anthropic("billing_error"), {}, "quota", "quota_exhausted"),
+    ("anthropic", 403, anthropic("permission_error"), {}, "refused", "not_allowed"),
+    ("anthropic", 404, anthropic("not_found_error"), {}, "refused", "unknown_model"),
+    ("anthropic", 408, anthropic("timeout_error"), {}, "retry", "request_timeout"),
+    ("anthropic", 409, anthropic("conflict_error"), {}, "retry", "conflict"),
+    ("anthropic", 413, HTML, {}, "fail", "bad_request"),
+    *(
+        (
+            "anthropic",
+            429,
+            anthropic("rate_limit_error", error_code=code),
+            {},
+            "quota",
+            "quota_exhausted",
+        )
+        for code in ("enforced_spend_limit_reached", "contract_spend_limit_reached")
+    ),
+    ("anthropic", 500, anthropic("api_error"), {}, "retry", "server_error"),
+    ("anthropic", 504, anthropic("timeout_error"), {}, "retry", "server_timeout"),
+    ("anthropic", 529, anthropic("overloaded_error"), {}, "retry", "overloaded"),
+    # vLLM: the code is a number; older ones send no envelope.
+    (
+        "openai-chat",
+        400,
+        {"error": {"message": "m", "type": "BadRequestError", "param": None, "code": 400}},
+        {},
+        "fail",
+        "bad_request",
+    ),
+    (
+        "openai-chat",
+        400,
+        {"object": "error", "message": "m", "type": "BadRequestError", "code": 400},
+        {},
+        "fail",
+        "bad_request",
+    ),
+    (
+        "openai-chat",
+        404,
+        {"object": "error", "message": "m", "type": "NotFoundError", "code": 404},
+        {},
+        "refused",
+        "unknown_model",
+    ),
+    # Ollama.
+    ("openai-chat", 400, {"error": "m"}, {}, "fail", "bad_request"),
+    ("openai-chat", 404, {"error": "model 'm' not found"}, {}, "refused", "unknown_model"),
+    ("openai-chat", 503, {"error": "m: server busy"}, {}, "retry", "overloaded"),
+    # llama.cpp.
+    (
+        "openai-chat",
+        503,
+        {"error": {"code": 503, "message": "Loading model m", "type": "unavailable_error"}},
+        {},
+        "retry",
+        "overloaded",
+    ),
+    (
+        "openai-chat",
+        400,
+        {"error": {"code": 400, "message": "m", "type": "exceed_context_size_error", "n_ctx": 1}},
+        {},
+        "fail",
+        "bad_request",
+    ),
+    # OpenRouter.
+    ("openai-chat", 402, openrouter(402), {}, "quota", "quota_exhausted"),
+    (
+        "openai-chat",
+        402,
+        openrouter(402, limit_source="openrouter_credits"),
+        {"retry-after": "3"},
+        "quota",
+        "quota_exhausted",
+    ),
+    (
+        "openai-chat",
+        402,
+        openrouter(402, limit_source="openrouter_in_flight_budget"),
+        {},
+        "quota",
+        "quota_exhausted",
+    ),
+    ("openai-chat", 502, openrouter(502, raw="upstream"), {}, "retry", "server_error"),
+    ("openai-chat", 503, openrouter(503), {}, "retry", "overloaded"),
+    # LiteLLM's own budgets.
+    (
+        "openai-chat",
+        429,
+        openai("Budget has been exceeded! Current cost: 10.51", "budget_exceeded", "429"),
+        {},
+        "quota",
+        "quota_exhausted",
+    ),
+    # Azure.
+    ("openai-chat", 401, {"error": {"code": "401", "message": "m"}}, {}, "refused", "not_allowed"),
+    (
+        "openai-chat",
+        404,
+        {"error": {"code": "DeploymentNotFound", "message": "m"}},
+        {},
+        "refused",
+        "unknown_model",
+    ),
+    # Gemini's OpenAI endpoint puts errors into a list.
+    ("openai-chat", 400, [gemini(400, "INVALID_ARGUMENT")], {}, "fail", "bad_request"),
+    (
+        "openai-chat",
+        429,
+        [gemini(429, "RESOURCE_EXHAUSTED", "m", violations(PER_DAY))],
+        {},
+        "quota",
+        "quota_exhausted",
+    ),
+]
+
+
+@pytest.mark.parametrize(("wire", "status", "body", "headers", "action", "outcome"), ERRORS)
+def test_what_an_error_means(wire, status, body, headers, action, outcome):
+    verdict = judged(wire, status, body, headers)
+    assert (verdict.action, verdict.outcome, verdict.pause) == (action, outcome, False)
+    assert verdict.reading.outcome == "error"
+    assert str(status) in verdict.message
+
+
+# A rate limit: format, status, body, headers, and how long everybody waits.
+LIMITS = [
+    ("openai-chat", 429, openai(TOKENS, "tokens", "rate_limit_exceeded"), {}, 1.574),
+    ("openai-chat", 429, openai("m", "rate_limit_error", "slow_down"), {}, None),
+    ("openai-chat", 429, openai("Resource Unavailable", "x", "resource_unavailable"), {}, None),
+    (
+        "openai-chat",
+        429,
+        openai("m", "requests", "rate_limit_exceeded"),
+        {"x-ratelimit-remaining-requests": "0", "x-ratelimit-reset-requests": "6m0s"},
+        360,
+    ),
+    (
+        "openai-chat",
+        429,
+        openai(TOKENS, "tokens", "rate_limit_exceeded"),
+        {"retry-after": "3", "x-should-retry": "true"},
+        3,
+    ),
+    ("openai-chat", 429, HTML, {"retry-after": "3"}, 3),
+    # Per minute, with the words of a quota; the RetryInfo is believed before the message.
+    (
+        "gemini",
+        429,
+        gemini(429, "RESOURCE_EXHAUSTED", GEMINI_QUOTA, violations(PER_MINUTE), HELP, RETRY_38),
+        {},
+        38,
+    ),
+    (
+        "gemini",
+        429,
+        gemini(429, "RESOURCE_EXHAUSTED", "m", ("RetryInfo", {"retryDelay": "45.837906927s"})),
+        {},
+        45.837906927,
+    ),
+    (
+        "gemini",
+        429,
+        gemini(429, "RESOURCE_EXHAUSTED", GEMINI_QUOTA, violations(PER_MINUTE)),
+        {},
+        38.804097346,
+    ),
+    ("gemini", 429, gemini(429, "RESOURCE_EXHAUSTED", "Resource has been exhausted."), {}, None),
+    ("anthropic", 429, anthropic("rate_limit_error"), {"retry-after": "12"}, 12),
+    (
+        "anthropic",
+        429,
+        anthropic("rate_limit_error", error_code="ramp_limit_exceeded"),
+        {"retry-after": "12"},
+        12,
+    ),
+    (
+        "openai-chat",
+        402,
+        openrouter(402, limit_source="openrouter_in_flight_budget"),
+        {"retry-after": "3"},
+        3,
+    ),
+    # LiteLLM: the code is a number in a text.
+    ("openai-chat", 429, openai("m", "throttling_error", "429"), {}, None),
+    # Azure.
+    (
+        "openai-chat",
+        429,
+        {"error": {"code": "RateLimitReached", "message": "m"}},
+        {"retry-after": "1", "retry-after-ms": "640"},
+        0.64,
+    ),
+    ("openai-chat", 429, [gemini(429, "RESOURCE_EXHAUSTED", "m", RETRY_38)], {}, 38),
+    # Answers with status 200 that carry a rate limit.
+    ("openai-chat", 200, openrouter(429), {"retry-after": "3"}, 3),
+    ("openai-chat", 200, {"choices": [{"error": {"code": 429, "message": "m"}}]}, {}, None),
+    (
+        "openai-responses",
+        200,
+        {"status": "failed", "error": {"code": "rate_limit_exceeded", "message": TOKENS}},
+        {},
+        1.574,
+    ),
+]
+
+
+@pytest.mark.parametrize(("wire", "status", "body", "headers", "delay"), LIMITS)
+def test_a_rate_limit_makes_all_calls_of_the_key_wait(wire, status, body, headers, delay):
+    verdict = judged(wire, status, body, headers)
+    assert (verdict.action, verdict.outcome, verdict.pause) == ("retry", "rate_limited", True)
+    assert verdict.delay_s == (None if delay is None else pytest.approx(delay))
+
+
+@pytest.mark.parametrize("status", [408, 409, 500, 502, 503, 504, 520, 524, 529])
+def test_the_delay_that_a_failing_server_asks_for_is_kept_for_this_call_alone(status):
+    verdict = judged("openai-chat", status, HTML, {"retry-after": "9"})
+    assert (verdict.action, verdict.delay_s, verdict.pause) == ("retry", 9, False)
+
+
+def choice(content="M", finish="stop", **changes):
+    return {"choices": [{"message": {"content": content}, "finish_reason": finish, **changes}]}
+
+
+def candidate(finish, *parts):
+    return {"candidates": [{"content": {"parts": list(parts)}, "finishReason": finish}]}
+
+
+def failed(code):
+    return {"status": "failed", "error": {"code": code, "message": "m"}, "output": []}
+
+
+# A body of status 200: format, body, and what is to be done.
+SUCCESSES = [
+    ("openai-chat", choice(), "accept", "ok"),
+    ("openai-chat", choice("", "length"), "accept", "truncated"),
+    ("openai-chat", choice(None, "content_filter"), "accept", "refusal"),
+    ("openai-chat", choice(""), "accept", "empty"),
+    ("openai-chat", " \n\n" + json.dumps(choice()), "accept", "ok"),
+    ("gemini", candidate("STOP", {"text": "M"}), "accept", "ok"),
+    ("gemini", candidate("STOP"), "accept", "empty"),
+    ("gemini", candidate("SAFETY"), "accept", "refusal"),
+    ("gemini", candidate("MAX_TOKENS"), "accept", "truncated"),
+    ("gemini", gemini(503, "UNAVAILABLE"), "retry", "overloaded"),
+    # Bodies that are cut, or come from somebody else than the server.
+    ("openai-chat", json.dumps(choice())[:-3], "retry", "bad_body"),
+    ("openai-chat", "", "retry", "bad_body"),
+    ("openai-chat", HTML, "retry", "bad_body"),
+    ("openai-chat", "null", "retry", "bad_body"),
+    ("openai-chat", "[]", "retry", "bad_body"),
+    ("openai-chat", {"choices": []}, "retry", "bad_body"),
+    ("openai-chat", {"id": "x", "choices": None, "usage": None}, "retry", "bad_body"),
+    *((wire, {"status_page": "maintenance"}, "retry", "bad_body") for wire in FORMATS),
+    ("anthropic", {"content": [], "stop_reason": "end_turn"}, "accept", "empty"),
+    # Responses fail with status 200.
+    ("openai-responses", failed("server_error"), "retry", "server_error"),
+    ("openai-responses", failed("invalid_prompt"), "fail", "bad_request"),
+    # One that ended early, whatever the reason.
+    ("openai-responses", {"status": "incomplete", "output": []}, "accept", "truncated"),
+    # So does OpenRouter, at the top or in the choice.
+    ("openai-chat", openrouter(502), "retry", "server_error"),
+    ("openai-chat", openrouter(503), "retry", "overloaded"),
+    ("openai-chat", openrouter(400), "fail", "bad_request"),
+    ("openai-chat", openrouter(402), "quota", "quota_exhausted"),
+    ("openai-chat", openrouter(401), "refused", "not_allowed"),
+    ("openai-chat", choice(error={"code": 502, "message": "m"}), "retry", "server_error"),
+    ("openai-chat", choice(error={"code": 400, "message": "m"}), "fail", "bad_request"),
+    ("openai-chat", choice("", "error"), "retry", "server_error"),
+    (
+        "openai-chat",
+        {**choice("", "error"), "usage": {"prompt_tokens": None, "completion_tokens": None}},
+        "retry",
+        "server_error",
+    ),
+    ("openai-chat", {**choice("", "error"), "usage": None}, "retry", "server_error"),
+    ("openai-chat", {"error": "m"}, "retry", "server_error"),
+    ("openai-chat", openai("m", "insufficient_quota"), "quota", "quota_exhausted"),
+]
+
+
+@pytest.mark.parametrize(("wire", "body", "action", "outcome"), SUCCESSES)
+def test_what_a_body_of_status_200_means(wire, body, action, outcome):
+    verdict = judged(wire, 200, body)
+    assert (verdict.action, verdict.outcome, verdict.pause) == (action, outcome, False)
+
+
+AZURE_FILTER = {
+    "message": "The response was filtered",
+    "type": None,
+    "param": "prompt",
+    "code": "content_filter",
+    "status": 400,
+    "innererror": {"code": "ResponsibleAIPolicyViolation"},
+}
+OPENROUTER_FILTER = openrouter(403, "Your input was flagged", flagged_input="PROMPT", reasons=["x"])
+
+
+@pytest.mark.parametrize(
+    ("status", "body"), [(400, {"error": AZURE_FILTER}), (403, OPENROUTER_FILTER)]
+)
+def test_a_filter_is_a_refusal_and_no_failure(status, body):
+    verdict = judged("openai-chat", status, body)
+    assert (verdict.action, verdict.outcome) == ("accept", "refusal")
+    assert verdict.reading.outcome == "refusal"
+    assert verdict.reading.text == ""
+
+
+@pytest.mark.parametrize(("status", "outcome"), [(200, "bad_body"), (500, "server_error")])
+def test_a_body_that_is_nested_too_deep_is_no_json(status, outcome):
+    verdict = judged("openai-chat", status, "[" * 100_000)
+    assert (verdict.action, verdict.outcome) == ("retry", outcome)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (openai("the words"), "HTTP 400: the words"),
+        (openai("the words\n* in  lines\n"), "HTTP 400: the words * in lines"),
+        ([openai("the words")], "HTTP 400: the words"),
+        ({"error": "the words"}, "HTTP 400: the words"),
+        ({"message": "the words", "object": "error"}, "HTTP 400: the words"),
+        ("some\n  text\twithout JSON", "HTTP 400: some text without JSON"),
+        ("x" * 1000, "HTTP 400: " + "x" * 200),
+    ],
+)
+def test_the_servers_words_are_the_message(body, message):
+    assert judged("openai-chat", 400, body).message == message
+
+
+def test_what_was_read_of_a_failed_answer_is_kept():
+    body = {**failed("server_error"), "model": "m-1", "usage": {"input_tokens": 7}}
+    reading = judged("openai-responses", 200, body).reading
+    assert (reading.model_served, reading.usage.input_tokens) == ("m-1", 7)
+
+
+NAMES = [
+    *("error", "message", "type", "code", "status", "details", "choices", "violations"),
+    *("quotaId", "retryDelay", "reason", "error_code", "finish_reason", "output"),
+]
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(NAMES), inner, max_size=4)
+    ),
+    max_leaves=12,
+)
+
+
+@settings(deadline=None)
+@given(
+    st.sampled_from(list(FORMATS)),
+    st.sampled_from([200, 400, 402, 404, 429, 500]),
+    st.text() | json_values.map(json.dumps),
+)
+# A digit, but not a decimal one.
+@example("openai-chat", 200, '{"error": {"code": "²"}}')
+def test_no_body_makes_it_raise(wire, status, body):
+    verdict = judged(wire, status, body)
+    assert verdict.action in ("accept", "retry", "fail", "quota", "refused")
+    assert verdict.outcome
+
+
+OPENAI_ERROR = {"error": {"message": "m", "type": "server_error", "param": None, "code": None}}
+GEMINI_ERROR = {"error": {"code": 503, "message": "m", "status": "UNAVAILABLE"}}
+ANTHROPIC_ERROR = {"type": "error", "error": {"type": "overloaded_error", "message": "m"}}
+
+
+@pytest.mark.parametrize(
+    ("provider", "status", "body", "charged"),
+    [
+        ("openai", 500, OPENAI_ERROR, False),
+        ("gemini", 503, GEMINI_ERROR, False),
+        ("gemini", 503, [GEMINI_ERROR], False),
+        ("anthropic", 529, ANTHROPIC_ERROR, False),
+        ("openrouter", 502, {"error": {"code": 502, "message": "m"}}, False),
+        # In no form that the provider documents, so that a proxy may have made it.
+        ("openai", 500, {"error": {"message": "m"}}, True),
+        ("openai", 502, "<html>502 Bad Gateway</html>", True),
+        ("anthropic", 500, OPENAI_ERROR | {"error": "m"}, True),
+        ("local", 500, OPENAI_ERROR, True),
+        # For want of time, perhaps after the work.
+        ("openai", 408, OPENAI_ERROR, True),
+        ("gemini", 504, GEMINI_ERROR, True),
+        (None, 499, OPENAI_ERROR, True),
+        # Another server in the provider's format.
+        (None, 500, OPENAI_ERROR, True),
+        (None, 503, "", True),
+        # Before any work.
+        (None, 429, OPENAI_ERROR, False),
+        (None, 401, "", False),
+        (None, 404, "<html>", False),
+        (None, 302, "", False),
+        # What is not counted, or not to be understood.
+        ("openai", 200, OPENAI_ERROR, True),
+        (None, 201, "", True),
+        ("openai", 500, OPENAI_ERROR | {"usage": {"prompt_tokens": 5}}, True),
+        (None, 429, OPENAI_ERROR | {"usage": "much"}, True),
+        # Azure charges for a prompt that its filter has read.
+        (None, 400, {"error": {"code": "content_filter", "message": "m"}}, True),
+        (None, 400, {"error": {"code": "context_length_exceeded", "message": "m"}}, True),
+        ("openai", 400, {"error": {"code": "context_length_exceeded", "message": "m"}}, False),
+        (None, 400, {"error": {"code": "unsupported_value", "message": "m"}}, False),
+    ],
+)
+def test_what_may_be_charged_though_no_usage_is_told(provider, status, body, charged):
+    text = body if isinstance(body, str) else json.dumps(body)
+    assert may_be_charged(RawReply(status, {}, text), provider) == charged
+
+
+@pytest.mark.parametrize("status", [400, 429, 500, 503])
+def test_usage_in_an_error_is_read_in_every_format(status):
+    bodies = {
+        "openai-chat": {"usage": {"prompt_tokens": 7, "completion_tokens": 9}},
+        "openai-responses": {"usage": {"input_tokens": 7, "output_tokens": 9}},
+        "anthropic": {"usage": {"input_tokens": 7, "output_tokens": 9}},
+        "gemini": {"usageMetadata": {"promptTokenCount": 7, "candidatesTokenCount": 9}},
+    }
+    for wire, told in bodies.items():
+        body = json.dumps({"error": {"message": "m"}} | told)
+        usage = judge(RawReply(status, {}, body), FORMATS[wire]).reading.usage
+        assert (usage.input_tokens, usage.output_tokens) == (7, 9)
+
+
+@pytest.mark.parametrize(
+    ("body", "page"),
+    [
+        ("<!DOCTYPE html><p>", True),
+        ("\ufeff\n <HTML lang=en>", True),
+        ('{"html": "<html>"}', False),
+        ("<hr>", False),
+        ("", False),
+    ],
+)
+def test_a_web_page_is_told_from_all_else(body, page):
+    assert is_web_page(RawReply(200, {}, body)) == page

@@ -1,0 +1,115 @@
+"""A trial that is played again is compared with the stored one in every column."""
+
+import asyncio
+import json
+
+import pytest
+
+from merge_runner.results.comparison import PLACES, stored_rows
+from merge_runner.config import Scenario
+from merge_runner.results.database import SCHEMA, in_memory
+from merge_runner.drivers.constant import ConstantDriver
+from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.llm.keys import make_request
+from merge_runner.records import Attempt, ChatReply, Slot, TrialRecord, TrialSpec, Usage
+from merge_runner.results.rows import rows_of
+from merge_runner.results.store import OF_A_RUN
+from merge_runner.trial import play_trial
+
+CLOCK = "2026-01-01T00:00:00.000+00:00"
+SPEC = TrialSpec(
+    "m/baseline/L_4_0/rep01", "h", "llm", "m", "constant", "baseline", "L_4_0", 1, 0, 0
+)
+KEY = (SPEC.trial_id, SPEC.spec_hash)
+ANOTHER = {
+    "VARCHAR": "coalesce({0}, '') || 'x'", "JSON": "'[0]'", "BOOLEAN": "NOT {0}",
+    "DOUBLE[]": "[1.0]", "TIMESTAMP": "{0} + INTERVAL 1 SECOND",
+}  # fmt: skip
+
+
+def played() -> TrialRecord:
+    """A trial that a language model drove, with a reply beyond ASCII and one attempt in vain."""
+    scenario = Scenario()
+
+    async def ask(prompt: str, number: int) -> ChatReply:
+        text = f"M\nI go, \u00fcber alles \u20ac.\n```python\n{[0.1] * 20}\n```"
+        request = make_request(
+            provider="local", endpoint="local", model="m", path="/", headers={},
+            body={"prompt": prompt}, slot=Slot("L_4_0", 1, "left", number, 0),
+        )  # fmt: skip
+        attempts = (
+            Attempt(1, "overloaded", 503, reply="<html>", error="HTTP 503", started_at=CLOCK),
+            Attempt(2, "ok", 200, "m", "stop", Usage(9, 1, 5, 2), 1.5, CLOCK,
+                    json.dumps({"id": str(number), "text": text}, ensure_ascii=False), None, 0.25),
+        )  # fmt: skip
+        return ChatReply(text, "ok", request, attempts, earlier=0)
+
+    drivers = {"left": LlmDriver(ask, "baseline", scenario), "right": ConstantDriver(scenario)}
+    return asyncio.run(play_trial(SPEC, scenario, drivers))
+
+
+RECORD = played()
+
+
+@pytest.fixture
+def stored():
+    """A database with the trial, and another one beside it."""
+    connection = in_memory({})
+    connection.execute(SCHEMA.read_text())
+    for table, rows in rows_of(RECORD).items():
+        appender = connection.appender(table)
+        appender.append_rows(rows)
+        appender.append_rows([tuple("g" if v == "h" else v for v in row) for row in rows])
+        appender.flush()
+    yield connection
+    connection.close()
+
+
+def differing(connection, **how) -> list[str]:
+    """The names of what is stored otherwise."""
+    made = rows_of(RECORD)
+    return [
+        difference.name
+        for table in PLACES
+        for difference in stored_rows(connection, table, [KEY]).differences(KEY, made[table], **how)
+    ]
+
+
+def columns():
+    with in_memory({}) as connection:
+        connection.execute(SCHEMA.read_text())
+        return connection.execute(
+            "SELECT table_name, column_name, data_type FROM duckdb_columns() "
+            "WHERE table_name IN ('trials', 'states', 'decisions', 'calls') "
+            "AND column_name NOT IN ('trial_id', 'spec_hash')"
+        ).fetchall()
+
+
+def test_what_is_stored_as_it_was_played_differs_in_nothing(stored):
+    assert differing(stored) == []
+
+
+@pytest.mark.parametrize(("table", "column", "kind"), columns())
+def test_one_changed_value_of_a_column_is_found_and_no_other(stored, table, column, kind):
+    other = ANOTHER.get(kind, "coalesce({0}, 0) + 1").format(column)
+    stored.execute(f"UPDATE {table} SET {column} = {other} WHERE rowid = "
+                   f"(SELECT min(rowid) FROM {table} WHERE spec_hash = 'h')")  # fmt: skip
+    name = f"rows of {table}" if column in PLACES[table] else f"{table}.{column}"
+    assert differing(stored) == [name]
+    assert differing(stored, ignored=OF_A_RUN) == ([] if column in OF_A_RUN else [name])
+
+
+def test_rows_that_lack_or_are_too_many_are_counted(stored):
+    stored.execute("DELETE FROM states WHERE spec_hash = 'h' AND step = 3")
+    stored.execute("INSERT INTO decisions FROM decisions WHERE spec_hash = 'h' AND decision = 1")
+    states = stored_rows(stored, "states", [KEY])
+    (difference,) = states.differences(KEY, rows_of(RECORD)["states"])
+    assert (difference.rows, difference.place) == (2, {"step": 3, "side": "left"})
+    assert differing(stored) == ["rows of states", "rows of decisions"]
+
+
+def test_a_tolerance_holds_for_numbers_alone_and_those_of_lists_too(stored):
+    stored.execute("UPDATE states SET position_m = position_m + 1e-12 WHERE step = 3")
+    stored.execute("UPDATE decisions SET applied = list_transform(applied, lambda a : a + 1e-12)")
+    assert differing(stored) == ["states.position_m", "decisions.applied"]
+    assert differing(stored, tolerance=1e-9) == []

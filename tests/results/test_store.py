@@ -1,0 +1,259 @@
+"""The results database: whole trials, one version, read-only queries, and patience with locks."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from datetime import datetime
+
+import duckdb
+import pytest
+
+from merge_runner.run import flusher
+from merge_runner.config import Scenario
+from merge_runner.drivers.constant import ConstantDriver
+from merge_runner.drivers.projected_order import ProjectedOrderDriver
+from merge_runner.errors import StoreError, UsageError
+from merge_runner.run.flusher import Flusher
+from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.results.store import Store, SweepRow, query, results_digest, sweep_facts
+from merge_runner.trial import play_trial
+
+SCENARIO = Scenario()
+SWEEP = SweepRow("s1", "baseline", datetime(2026, 1, 1), "{}", None, None, "{}")  # noqa: DTZ001
+LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True); input()"
+
+
+def spec(condition="L_4_0", repetition=1, spec_hash="h"):
+    trial_id = f"m/baseline/{condition}/rep{repetition:02d}"
+    return TrialSpec(
+        trial_id, spec_hash, "driver", "m", "m", "baseline", condition, repetition, 0, 0
+    )
+
+
+def played(condition="L_4_0", *, driver=ProjectedOrderDriver, **of_spec) -> TrialRecord:
+    drivers = (
+        {side: driver(SCENARIO, side) for side in ("left", "right")}
+        if driver is ProjectedOrderDriver
+        else {side: driver(SCENARIO) for side in ("left", "right")}
+    )
+    return asyncio.run(play_trial(spec(condition, **of_spec), SCENARIO, drivers))
+
+
+def failed(record: TrialRecord) -> TrialRecord:
+    return TrialRecord(record.spec, "failed", None, 1.0, "it broke", record.states[:4], ())
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "deep/results.duckdb"
+
+
+@pytest.fixture
+def store(path):
+    made = Store(path)
+    made.begin_sweep(SWEEP, {"h": "{}"}, [])
+    return made
+
+
+def rows(path, sql):
+    return query(path, sql)[1]
+
+
+def test_a_trial_is_stored_whole_and_once(store, path):
+    record = played()
+    store.write("s1", [record], patience_s=1)
+    store.write("s1", [record], patience_s=1)
+    assert rows(path, "select count(*) from trials") == [(1,)]
+    assert rows(path, "select count(*) from states") == [(len(record.states),)]
+    assert rows(path, "select count(*), count_if(valid) from decisions") == [
+        (len(record.decisions), len(record.decisions))
+    ]
+    stored = rows(path, "select step, side, position_m, velocity_mps from states order by all")
+    assert stored == sorted((s.step, s.side, s.position_m, s.velocity_mps) for s in record.states)
+
+
+def test_a_failed_trial_is_replaced_and_an_ended_one_never(store, path):
+    record = played()
+    store.write("s1", [failed(record)], patience_s=1)
+    assert store.ended_trials([("m/baseline/L_4_0/rep01", "h")]) == set()
+    assert sweep_facts(path, "s1").failed == [("m/baseline/L_4_0/rep01", "it broke")]
+    store.write("s1", [record], patience_s=1)
+    assert store.write("s1", [failed(record)], patience_s=1) == {}
+    assert rows(path, "select status, error from trials") == [("finished", None)]
+    assert rows(path, "select count(*) from states") == [(len(record.states),)]
+
+
+def test_a_trial_that_ends_otherwise_than_the_stored_one_is_named_and_not_stored(store, path):
+    record = played()
+    assert store.write("s1", [record], patience_s=1) == {}
+    assert store.write("s1", [record], patience_s=1) == {}
+    other = replace(played("L_4_8"), spec=record.spec)
+    assert store.write("s1", [other], patience_s=1).keys() == {"m/baseline/L_4_0/rep01"}
+    plan = record.decisions[3].decision
+    swerve = replace(record.decisions[3], decision=replace(plan, applied=(0.5,) * 5))
+    decided = replace(record, decisions=(*record.decisions[:3], swerve, *record.decisions[4:]))
+    assert store.write("s1", [decided], patience_s=1) == {
+        "m/baseline/L_4_0/rep01": ["decisions.applied"]
+    }
+    assert rows(path, "select count(*) from states") == [(len(record.states),)]
+
+
+def test_two_specs_of_one_trial_stay_apart(store, path):
+    one, other = played(), played(spec_hash="g")
+    store.write("s1", [one, other], patience_s=1)
+    assert store.ended_trials([(one.spec.trial_id, "g"), (one.spec.trial_id, "x")]) == {
+        (one.spec.trial_id, "g")
+    }
+    assert results_digest(path)[1] == 2
+
+
+def test_the_digest_sees_every_result_and_no_order(tmp_path):
+    records = [played(c) for c in ("L_4_0", "N_0_0", "R_0_8")]
+
+    def digest(name, order):
+        store = Store(tmp_path / name)
+        store.begin_sweep(SWEEP, {}, [])
+        for record in order:
+            store.write("s1", [record], patience_s=1)
+        return results_digest(tmp_path / name)[0]
+
+    base = digest("a", records)
+    assert digest("b", records[::-1]) == base
+    for table, change in (
+        ("states", "velocity_mps = velocity_mps + 1e-15 * velocity_mps"),
+        ("trials", "merged_first = 'nobody'"),
+        ("decisions", "plan[1] = plan[1]"),
+    ):
+        name = f"changed-{table}"
+        digest(name, records)
+        with duckdb.connect(str(tmp_path / name)) as connection:
+            if table == "decisions":
+                connection.execute("UPDATE decisions SET applied = [0.125]")
+            else:
+                connection.execute(f"UPDATE {table} SET {change}")
+        assert results_digest(tmp_path / name)[0] != base, table
+
+
+def test_the_metrics_are_those_computed_by_hand(store, path):
+    record = played("L_4_-8")
+    store.write("s1", [record, played("N_0_0", driver=ConstantDriver)], patience_s=1)
+    left = [s for s in record.states if s.side == "left"]
+    right = [s for s in record.states if s.side == "right"]
+    first = next(k for k in range(len(left)) if max(left[k].position_m, right[k].position_m) >= 100)
+    leader = left if left[first].position_m >= 100 else right
+    part = (100 - leader[first - 1].position_m) / (
+        leader[first].position_m - leader[first - 1].position_m
+    )
+
+    def at_merge(trace):
+        before, after = trace[first - 1].position_m, trace[first].position_m
+        return before + part * (after - before)
+
+    def rmse(trace, initial_mps):
+        squares = [(s.velocity_mps - initial_mps) ** 2 for s in trace[: first + 1]]
+        return math.sqrt(sum(squares) / len(squares))
+
+    expected = {
+        "gap_m": abs(at_merge(left) - at_merge(right)) - 4.5,
+        "rmse_left_mps": rmse(left, CONDITIONS["L_4_-8"].speeds_mps[0]),
+        "rmse_right_mps": rmse(right, CONDITIONS["L_4_-8"].speeds_mps[1]),
+        "time_to_merge_s": left[first - 1].time_s + part * 0.2,
+    }
+    columns = ", ".join(expected)
+    finished, collided = rows(path, f"select {columns} from trial_metrics order by trial_id")
+    assert finished == pytest.approx(tuple(expected.values()))
+    assert collided[:3] == (None, None, None), "a collided trial has no gap and no deviation"
+
+
+def test_a_query_changes_nothing_and_reads_no_file(store, path, tmp_path):
+    (tmp_path / "secret.csv").write_text("a\n1\n")
+    for sql in (
+        "delete from trials",
+        f"select * from '{tmp_path / 'secret.csv'}'",
+        f"copy trials to '{tmp_path / 'out.csv'}'",
+        "set enable_external_access = true",
+        "select nothing",
+    ):
+        with pytest.raises(UsageError):
+            query(path, sql)
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_another_program_s_database_and_another_version_are_refused(tmp_path):
+    foreign = tmp_path / "foreign.duckdb"
+    with duckdb.connect(str(foreign)) as connection:
+        connection.execute("CREATE TABLE mine (a INTEGER)")
+    with pytest.raises(UsageError, match="no database of merge-runner"):
+        Store(foreign)
+    newer = tmp_path / "newer.duckdb"
+    Store(newer)
+    with duckdb.connect(str(newer)) as connection:
+        connection.execute("UPDATE meta SET schema_version = 99")
+    with pytest.raises(UsageError, match="schema version 99"):
+        Store(newer)
+    broken = tmp_path / "broken.duckdb"
+    broken.write_bytes(b"not a database at all" * 1000)
+    with pytest.raises(UsageError, match="cannot be opened"):
+        Store(broken)
+
+
+@pytest.fixture
+def holder(path):
+    """Another process that holds the database until its standard input closes."""
+
+    def hold():
+        process = subprocess.Popen(
+            [sys.executable, "-c", LOCK, str(path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout.readline() == "held\n"
+        return process
+
+    return hold
+
+
+async def test_trials_wait_in_memory_while_the_database_is_locked(store, path, holder):
+    record = await asyncio.to_thread(played)
+    process = holder()
+    said = []
+    waiting = Flusher(store, "s1", said.append)
+    waiting.add(record)
+    closing = asyncio.create_task(waiting.close())
+    while not said:
+        await asyncio.sleep(0.05)
+    process.communicate("")
+    await closing
+    assert "locked by another program" in said[0]
+    assert rows(path, "select count(*) from trials") == [(1,)]
+
+
+async def test_a_database_that_stays_locked_is_given_up_with_what_to_do(
+    store, path, holder, monkeypatch
+):
+    monkeypatch.setattr(flusher, "LAST_LOCK_PATIENCE_S", 0.5)
+    monkeypatch.setattr(flusher, "LOCK_PATIENCE_S", 0.2)
+    record = await asyncio.to_thread(played)
+    process = holder()
+    waiting = Flusher(store, "s1", lambda line: None)
+    waiting.add(record)
+    with pytest.raises(StoreError, match=r"1 trials are not stored.*run the same command again"):
+        await waiting.close()
+    process.communicate("")
+
+
+def test_a_slow_query_draws_no_bar_on_the_output():
+    # DuckDB takes -c for a person at a prompt.
+    asked = (
+        "from merge_runner.results.database import in_memory; query = "
+        "\"SELECT current_setting('enable_progress_bar')\"; "
+        "print(in_memory({}).execute(query).fetchone())"
+    )
+    run = subprocess.run([sys.executable, "-c", asked], capture_output=True, check=True)
+    assert run.stdout == b"(False,)\n"

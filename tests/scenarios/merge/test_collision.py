@@ -1,0 +1,117 @@
+"""The three collision rules, against figures that were computed apart from this code."""
+
+from math import sqrt
+
+import pytest
+
+from merge_runner.config import Scenario
+from merge_runner.scenarios.merge.collision import collided, rectangles_overlap, squared_distance_m2
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
+
+LENGTH_M = 4.5
+WIDTH_M = 1.8
+FIRST_CONTACT_M = 90.606  # no rectangles overlap while either vehicle is before it
+RULES = ("euclid2d", "rectangle", "shared_lane")
+
+# s of one vehicle: the interval of the other's s in which the rectangles overlap, all in m
+INTERVALS = {
+    91: (90.61, 95.51),
+    93: (90.61, 97.57),
+    95: (90.61, 99.64),
+    97: (92.45, 101.60),
+    99: (94.38, 103.60),
+    100: (95.35, 104.59),
+    102: (97.39, 106.49),
+    105: (100.50, 109.49),
+}
+
+
+def overlaps(position_m, spacing_m=0.005):
+    """The positions of the right vehicle, 80 to 115 m, that overlap with the left one's."""
+    grid = (80 + spacing_m * k for k in range(round(35 / spacing_m)))
+    return [other for other in grid if rectangles_overlap(position_m, other, LENGTH_M, WIDTH_M)]
+
+
+@pytest.mark.parametrize(("position", "interval"), INTERVALS.items())
+def test_rectangles_overlap_in_the_known_interval_and_without_a_hole(position, interval):
+    hits = overlaps(position)
+    assert (hits[0], hits[-1]) == pytest.approx(interval, abs=0.02)
+    assert len(hits) == round((hits[-1] - hits[0]) / 0.005) + 1
+
+
+def test_rectangles_cannot_overlap_before_the_first_possible_contact():
+    for position in (80.0, 88.0, 90.0, 90.5, FIRST_CONTACT_M - 0.002):
+        assert overlaps(position) == []
+    assert overlaps(FIRST_CONTACT_M + 0.01) != []
+
+
+def test_every_rule_treats_left_and_right_alike():
+    places = [85 + 1.7 * k for k in range(18)]
+    for rule in RULES:
+        scenario = Scenario(collision_rule=rule)
+        for a in places:
+            for b in places:
+                assert collided(scenario, a, b) == collided(scenario, b, a)
+
+
+def test_the_vehicles_start_between_12_48_and_13_77_m_apart():
+    distances = []
+    for condition in CONDITIONS.values():
+        left, right = condition.positions_m(max(condition.exit_times_s))
+        distances.append(sqrt(squared_distance_m2(left, right)))
+    assert (min(distances), max(distances)) == pytest.approx((12.48, 13.77), abs=0.005)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("start", ["both_exits", "own_exit"])
+def test_no_condition_starts_in_a_collision(rule, start):
+    scenario = Scenario(collision_rule=rule, control_start=start)
+    assert all(World(scenario, condition).status is None for condition in CONDITIONS.values())
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_every_condition_ends_in_a_collision_at_constant_speed(rule, name):
+    world = World(Scenario(collision_rule=rule), CONDITIONS[name])
+    while world.status is None:
+        world.advance({"left": 0.0, "right": 0.0})
+    assert world.status == "collided"
+
+
+@pytest.mark.parametrize("follower", ["left", "right"])
+def test_at_equal_speed_a_headway_of_4_6_m_passes_and_one_of_4_4_m_collides(follower):
+    def any_collision(headway_m):
+        ways = [(50 + 0.01 * k, 50 + 0.01 * k + headway_m) for k in range(10_000)]
+        pairs = ways if follower == "left" else [(right, left) for left, right in ways]
+        return any(collided(Scenario(), left, right) for left, right in pairs)
+
+    assert not any_collision(4.6)
+    assert any_collision(4.4)
+
+
+def test_euclid2d_needs_less_than_a_vehicle_length_between_the_centres():
+    """Level vehicles 18 m before the merge point are exactly 4.5 m apart, also in binary."""
+    assert squared_distance_m2(82.0, 82.0) == LENGTH_M**2
+    assert not collided(Scenario(), 82.0, 82.0)
+    assert collided(Scenario(), 82.01, 82.01)
+
+
+def test_rectangles_that_touch_do_not_collide():
+    assert not rectangles_overlap(101.0, 105.5, LENGTH_M, WIDTH_M)
+    assert rectangles_overlap(101.0, 105.49, LENGTH_M, WIDTH_M)
+
+
+def test_shared_lane_needs_one_vehicle_at_the_merge_point_and_less_than_a_length():
+    scenario = Scenario(collision_rule="shared_lane")
+    assert not collided(scenario, 99.99, 99.99)
+    assert collided(scenario, 100.0, 99.99)
+    assert collided(scenario, 99.99, 100.0)
+    assert collided(scenario, 95.51, 100.0)
+    assert not collided(scenario, 95.5, 100.0)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_vehicle_length_is_the_scenarios(rule):
+    assert not collided(Scenario(collision_rule=rule), 110.0, 115.0)
+    assert collided(Scenario(collision_rule=rule, vehicle_length_m=6.0), 110.0, 115.0)

@@ -1,0 +1,73 @@
+"""The 11 conditions have the start of control that the human experiment gave its participants."""
+
+import pytest
+
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+
+TOLERANCE = 1e-4  # the table is rounded to 1e-4 m and 1e-4 s
+
+# Speeds in m/s, travelled distances in m, times in s, always (left, right).
+# name: (speeds, starts, exit times, time at which both are out, positions at that time)
+TABLE = {
+    "N_0_0": ((10.0, 10.0), (0, 0), (5.0, 5.0), 5.0, (50, 50)),
+    "L_0_-8": ((9.6, 10.4), (7.6923, 0), (4.4071, 4.8077), 4.8077, (53.8462, 50)),
+    "L_2_-8": ((9.6, 10.4), (9.5385, 0), (4.2147, 4.8077), 4.8077, (55.6923, 50)),
+    "L_4_-8": ((9.6, 10.4), (11.3846, 0), (4.0224, 4.8077), 4.8077, (57.5385, 50)),
+    "L_4_0": ((10.0, 10.0), (4.0, 0), (4.6, 5.0), 5.0, (54, 50)),
+    "L_4_8": ((10.4, 9.6), (0, 3.6923), (4.8077, 4.8237), 4.8237, (50.1667, 50)),
+    "R_0_8": ((10.4, 9.6), (0, 7.6923), (4.8077, 4.4071), 4.8077, (50, 53.8462)),
+    "R_-2_8": ((10.4, 9.6), (0, 9.5385), (4.8077, 4.2147), 4.8077, (50, 55.6923)),
+    "R_-4_8": ((10.4, 9.6), (0, 11.3846), (4.8077, 4.0224), 4.8077, (50, 57.5385)),
+    "R_-4_0": ((10.0, 10.0), (0, 4.0), (5.0, 4.6), 5.0, (50, 54)),
+    "R_-4_-8": ((9.6, 10.4), (3.6923, 0), (4.8237, 4.8077), 4.8237, (50, 50.1667)),
+}
+
+
+def near(values):
+    return pytest.approx(values, abs=TOLERANCE)
+
+
+def test_there_are_exactly_the_11_conditions():
+    assert set(CONDITIONS) == set(TABLE)
+    assert all(name == condition.name for name, condition in CONDITIONS.items())
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_speeds_starts_exits_and_the_start_of_control_match_the_table(name):
+    condition = CONDITIONS[name]
+    speeds, starts, exits, both_out, positions = TABLE[name]
+    assert condition.speeds_mps == near(speeds)
+    assert condition.starts_m == near(starts)
+    assert condition.exit_times_s == near(exits)
+    assert max(condition.exit_times_s) == near(both_out)
+    assert condition.positions_m(max(condition.exit_times_s)) == near(positions)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_the_projected_leader_is_ahead_by_the_named_headway_at_the_merge_point(name):
+    condition = CONDITIONS[name]
+    _, headway, velocity = name.split("_")
+    seconds = min(
+        (100 - start) / speed
+        for start, speed in zip(condition.starts_m, condition.speeds_mps, strict=True)
+    )
+    left, right = condition.positions_m(seconds)
+    assert max(left, right) == near(100)
+    assert left - right == near(int(headway))
+    # The name counts in 0.1 m/s: -8 is a left vehicle that is 0.8 m/s slower.
+    assert condition.speeds_mps[0] - condition.speeds_mps[1] == near(int(velocity) / 10)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_the_mirror_image_of_every_condition_is_a_condition(name):
+    """Exactly, not nearly: mirrored trials must give mirrored traces."""
+    condition = CONDITIONS[name]
+    mirror = next(
+        other
+        for other in CONDITIONS.values()
+        if other.projected_headway_m == -condition.projected_headway_m
+        and other.relative_velocity_mps == -condition.relative_velocity_mps
+    )
+    assert mirror.speeds_mps == condition.speeds_mps[::-1]
+    assert mirror.starts_m == condition.starts_m[::-1]
+    assert mirror.exit_times_s == condition.exit_times_s[::-1]

@@ -1,0 +1,100 @@
+"""The track and the vehicles in SQL are those of the simulator, for vehicles of any size."""
+
+from __future__ import annotations
+
+import json
+
+import duckdb
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from merge_runner.config import Scenario
+from merge_runner.results.database import SCHEMA
+from merge_runner.scenarios.merge.collision import rectangles_overlap
+from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
+from merge_runner.scenarios.merge.geometry import LATERAL, MERGE_POINT_M, TRACK_END_M
+
+HAIR_M = 1e-6
+
+
+@pytest.fixture(scope="module")
+def database():
+    with duckdb.connect() as connection:
+        connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        yield connection
+
+
+def geometry(database, spec):
+    """The row of a spec as a dict."""
+    database.execute("DELETE FROM specs")
+    database.execute("INSERT INTO specs VALUES ('feed', ?)", [json.dumps(spec)])
+    (row,) = database.execute("FROM geometry").fetchall()
+    return dict(zip((column[0] for column in database.description), row, strict=True))
+
+
+def of_size(database, length_m, width_m):
+    scenario = {"vehicle_length_m": length_m, "vehicle_width_m": width_m}
+    return geometry(database, {"scenario": scenario})
+
+
+def test_the_track_in_sql_is_the_simulators(database):
+    sql = "SELECT merge_point_m(), track_end_m(), branch_sine(), mean_speed_mps()"
+    track = (MERGE_POINT_M, TRACK_END_M, LATERAL, MEAN_SPEED_MPS)
+    assert database.execute(sql).fetchall() == [track]
+
+
+@pytest.mark.parametrize("spec", [{"source": "human"}, {"scenario": {}}])
+def test_a_size_that_a_spec_does_not_say_is_that_of_the_experiment(database, spec):
+    found, default = geometry(database, spec), Scenario()
+    assert found["length_m"] == default.vehicle_length_m
+    assert found["width_m"] == default.vehicle_width_m
+
+
+def test_the_bounds_of_the_experiments_vehicles_are_the_known_ones(database):
+    found = of_size(database, 4.5, 1.8)
+    expected = {
+        "front_m": 97.75,
+        "rear_m": 102.25,
+        "contact_m": 90.6065,
+        "contact_high_m": 95.1065,
+        "merge_low_m": 95.3471,
+        "merge_high_m": 104.5949,
+    }
+    assert {name: round(found[name], 4) for name in expected} == expected
+
+
+@given(st.floats(0.5, 30), st.floats(0.2, 6))
+@example(4.5, 1.8)
+@example(8.0, 2.5)
+@example(8.0, 1.0)  # longer than eight widths: what is at the contact point reaches past the merge
+@example(30.0, 0.2)
+@example(0.5, 6.0)
+def test_boxes_overlap_between_the_bounds_and_nowhere_else(database, length_m, width_m):
+    found = of_size(database, length_m, width_m)
+    points = (
+        (found["contact_m"] + HAIR_M / 1000, found["contact_m"], found["contact_high_m"]),
+        (MERGE_POINT_M, found["merge_low_m"], found["merge_high_m"]),
+        (TRACK_END_M, TRACK_END_M - length_m, TRACK_END_M + length_m),
+    )
+    for at_m, low_m, high_m in points:
+        inside = [low_m + HAIR_M, high_m - HAIR_M]
+        outside = [
+            edge + way * (HAIR_M + far_m)
+            for edge, way in ((low_m, -1), (high_m, 1))
+            for far_m in (0, 0.1, 1, 5, 20)
+        ]
+        for other_m in inside:
+            assert rectangles_overlap(at_m, other_m, length_m, width_m)
+        for other_m in outside:
+            assert not rectangles_overlap(at_m, other_m, length_m, width_m)
+
+
+@given(st.floats(0.5, 30), st.floats(0.2, 6), st.floats(0, 60), st.floats(0, 1))
+def test_boxes_on_the_two_branches_cannot_overlap_before_the_contact_point(
+    database, length_m, width_m, before_m, share
+):
+    contact_m = of_size(database, length_m, width_m)["contact_m"]
+    own_m = contact_m - HAIR_M - before_m
+    other_m = own_m + share * (MERGE_POINT_M - own_m)
+    assert not rectangles_overlap(own_m, other_m, length_m, width_m)

@@ -1,0 +1,290 @@
+"""One trial's world: symmetry, bounds, ends, and what the drivers see."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.config import Scenario
+from merge_runner.records import SIDES
+from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.scenarios.merge.world import World
+
+STEP_S = 0.2
+STEPS_PER_SECOND = 5
+A_MAX_MPS2 = 2.5
+START_SPEED_MPS = 10.0  # of both vehicles in N_0_0
+OTHER = {"left": "right", "right": "left"}
+
+law = settings(deadline=None, derandomize=True)  # the gate must not depend on luck or load
+actions = st.floats(-1, 1)
+# Each pair is held for a second, so that many trials get to an end.
+action_pairs = st.lists(st.tuples(actions, actions), max_size=30)
+names = st.sampled_from(sorted(CONDITIONS))
+scenarios = st.builds(
+    Scenario,
+    collision_rule=st.sampled_from(["euclid2d", "rectangle", "shared_lane"]),
+    control_start=st.sampled_from(["both_exits", "own_exit"]),
+    resistance=st.sampled_from(["none", "human"]),
+    straight_after=st.sampled_from(["own", "both"]),
+    history_start=st.sampled_from(["cruise", "empty"]),
+)
+
+
+def start(name="N_0_0", **scenario):
+    return World(Scenario(**scenario), CONDITIONS[name])
+
+
+def drive(world, left, right, steps=10_000):
+    """Hold both actions for so many steps, or until the end."""
+    for _ in range(steps):
+        if world.status is not None:
+            return
+        world.advance({"left": left, "right": right})
+
+
+def trace(world, side):
+    return [
+        (row.step, row.time_s, row.position_m, row.velocity_mps, row.acceleration_mps2)
+        for row in world.states()
+        if row.side == side
+    ]
+
+
+def mirrored(name):
+    condition = CONDITIONS[name]
+    return Condition("mirror", -condition.projected_headway_m, -condition.relative_velocity_mps)
+
+
+@law
+@given(names, scenarios, action_pairs)
+def test_mirroring_left_and_right_mirrors_the_whole_trial(name, scenario, pairs):
+    """Exactly: a bias towards one side would pass for a finding about who goes first."""
+    world, mirror = World(scenario, CONDITIONS[name]), World(scenario, mirrored(name))
+    for left, right in pairs:
+        drive(world, left, right, STEPS_PER_SECOND)
+        drive(mirror, right, left, STEPS_PER_SECOND)
+        for side in SIDES:
+            assert world.observe(side) == mirror.observe(OTHER[side])
+            assert world.in_control(side) == mirror.in_control(OTHER[side])
+    for side in SIDES:
+        assert trace(world, side) == trace(mirror, OTHER[side])
+    assert mirror.status == world.status
+    first = world.merged_first()
+    assert mirror.merged_first() == (first and OTHER[first])
+
+
+@law
+@given(names, action_pairs)
+def test_acceleration_stays_within_its_bound_and_explains_every_change_of_speed(name, pairs):
+    world = start(name)
+    for left, right in pairs:
+        drive(world, left, right, STEPS_PER_SECOND)
+    for side in SIDES:
+        rows = trace(world, side)
+        for (_, _, _, before, _), (_, _, _, after, acceleration) in pairwise(rows):
+            assert abs(acceleration) <= A_MAX_MPS2 + 1e-9
+            assert after - before == pytest.approx(acceleration * STEP_S, abs=1e-9)
+
+
+def test_each_side_executes_its_own_action_times_the_greatest_acceleration():
+    world = start()
+    world.advance({"left": 1.0, "right": -0.5})
+    assert [row.acceleration_mps2 for row in world.states()[2:]] == [2.5, -1.25]
+    assert [row.velocity_mps for row in world.states()[2:]] == [10.5, 9.75]
+    assert [row.position_m for row in world.states()[2:]] == pytest.approx([52.05, 51.975])
+
+
+def test_resistance_slows_a_driven_vehicle_and_not_a_cruising_one():
+    world = start(resistance="human")
+    world.advance({"left": 0.0, "right": None})
+    left, right = world.states()[2:]
+    assert (left.acceleration_mps2, right.acceleration_mps2) == (-1.0, 0.0)
+    assert right.velocity_mps == START_SPEED_MPS
+
+
+def test_the_trace_has_a_row_for_every_side_and_step_from_time_0_on():
+    world = start()
+    drive(world, 0.0, -0.4, steps=3)
+    rows = [(row.step, row.time_s, row.side) for row in world.states()]
+    assert rows == [(k, t, s) for k, t in enumerate([0.0, 0.2, 0.4, 0.6]) for s in SIDES]
+    assert [row.acceleration_mps2 for row in world.states()[:2]] == [0.0, 0.0]
+
+
+def test_a_trial_is_finished_when_the_first_vehicle_reaches_the_end():
+    world = start()
+    drive(world, 0.0, -1.0, steps=49)
+    assert world.status is None
+    drive(world, 0.0, -1.0, steps=1)
+    # 100 m at 10 m/s: exactly at the end of the track, while the right vehicle stands at 70 m.
+    assert (world.status, world.time_s) == ("finished", 10.0)
+    assert world.states()[-2].position_m == 150.0
+    assert world.merged_first() == "left"
+
+
+def test_the_right_vehicle_can_finish_a_trial_too_and_not_a_metre_early():
+    """At 20 Hz and 10 m/s there is a sample at 149.5 m."""
+    world = start(step_s=0.05)
+    drive(world, -1.0, 0.0)
+    assert (world.status, world.time_s, world.merged_first()) == ("finished", 10.0, "right")
+
+
+def test_a_trial_times_out_at_30_s_when_both_brake_to_a_stop():
+    world = start()
+    drive(world, -1.0, -1.0, steps=149)
+    assert world.status is None
+    drive(world, -1.0, -1.0, steps=1)
+    assert (world.status, world.step, world.time_s) == ("timeout", 150, 30.0)
+    assert world.merged_first() is None
+
+
+def test_after_a_collision_nobody_merged_first_although_one_passed_the_merge_point():
+    world = start()
+    drive(world, 0.2, -0.2, steps=24)
+    assert world.status is None
+    assert world.merged_first() == "left"
+    drive(world, -1.0, 1.0)
+    assert world.status == "collided"
+    assert world.states()[-2].position_m > 100
+    assert world.merged_first() is None
+
+
+@pytest.mark.parametrize(("headway_m", "first"), [(1.0, "left"), (-1.0, "right")])
+def test_who_merged_first_is_told_apart_within_one_step(headway_m, first):
+    """Short vehicles 1 m apart both pass the merge point within the same 2 m step."""
+    world = World(Scenario(vehicle_length_m=0.5), Condition("close", headway_m, 0.0))
+    drive(world, 0.0, 0.0)
+    assert world.status == "finished"
+    crossings = [
+        next(row.step for row in world.states() if row.side == side and row.position_m >= 100)
+        for side in SIDES
+    ]
+    assert crossings[0] == crossings[1]
+    assert world.merged_first() == first
+
+
+def test_a_vehicle_that_comes_from_behind_can_merge_first():
+    world = start("R_-4_8")
+    drive(world, 1.0, -1.0)
+    assert (world.status, world.merged_first()) == ("finished", "left")
+
+
+def test_before_control_the_histories_show_cruising():
+    world = start("L_4_-8")
+    left, right = world.observe("left"), world.observe("right")
+    assert left.own_accelerations_mps2 == right.own_accelerations_mps2 == (0.0,) * 10
+    assert left.other_speeds_mps == (10.4,) * 10
+    assert right.other_speeds_mps == (9.6,) * 10
+
+
+def test_before_control_the_histories_are_empty_where_the_scenario_says_so():
+    seen = start(history_start="empty").observe("left")
+    assert (seen.own_accelerations_mps2, seen.other_speeds_mps) == ((), ())
+
+
+@pytest.mark.parametrize(
+    ("history_start", "accelerations", "speeds"),
+    [
+        ("cruise", (0.0,) * 7 + (0.25, 0.5, 0.75), (10.0,) * 8 + (9.95, 9.85)),
+        ("empty", (0.25, 0.5, 0.75), (10.0, 9.95, 9.85)),
+    ],
+)
+def test_histories_begin_with_the_start_of_control(history_start, accelerations, speeds):
+    """The oldest value comes first, and the other's present speed (9.70 m/s) is not history."""
+    world = start(history_start=history_start)
+    for k in (1, 2, 3):
+        world.advance({"left": 0.1 * k, "right": -0.1 * k})
+    seen = world.observe("left")
+    assert seen.own_accelerations_mps2 == pytest.approx(accelerations)
+    assert seen.other_speeds_mps == pytest.approx(speeds)
+    assert seen.other_speed_mps == pytest.approx(9.7)
+
+
+@pytest.mark.parametrize("history_start", ["cruise", "empty"])
+def test_histories_hold_the_last_ten_steps(history_start):
+    world = start(history_start=history_start)
+    for k in range(1, 13):
+        world.advance({"left": 0.01 * k, "right": -0.01 * k})
+    left, right = world.observe("left"), world.observe("right")
+    executed = [A_MAX_MPS2 * 0.01 * k for k in range(3, 13)]
+    assert left.own_accelerations_mps2 == pytest.approx(executed)
+    assert right.own_accelerations_mps2 == pytest.approx([-a for a in executed])
+    # The speeds before steps 3 to 12, that is after steps 2 to 11.
+    right_speeds = [row.velocity_mps for row in world.states() if row.side == "right"]
+    assert left.other_speeds_mps == tuple(right_speeds[2:12])
+    assert left.other_speed_mps == right_speeds[12]
+
+
+def test_an_observation_is_told_from_the_own_seat():
+    world = start("L_4_-8")
+    left, right = world.observe("left"), world.observe("right")
+    assert (left.own_speed_mps, left.other_speed_mps) == (9.6, 10.4)
+    assert (right.own_speed_mps, right.other_speed_mps) == (10.4, 9.6)
+    # The left vehicle is ahead at 57.54 m, so to it the other is behind.
+    assert left.relative_distance_m == pytest.approx(-7.5385, abs=1e-4)
+    assert right.relative_distance_m == -left.relative_distance_m
+    assert left.distance_to_merge_m == pytest.approx(42.4615, abs=1e-4)
+    assert right.distance_to_merge_m == pytest.approx(50.0)
+
+
+def test_a_vehicle_that_stops_within_a_step_has_executed_less_than_it_commanded():
+    """At -2.25 m/s^2 a vehicle is down to 0.1 m/s after 22 steps; 0.5 m/s^2 end its 23rd."""
+    world = start()
+    drive(world, -0.9, 0.0, steps=24)
+    rows = trace(world, "left")
+    assert rows[22][3] == pytest.approx(0.1)
+    assert [rows[k][4] for k in (22, 23, 24)] == pytest.approx([-2.25, -0.5, 0.0])
+    assert [rows[k][3] for k in (23, 24)] == [0.0, 0.0]
+    assert rows[23][2] - rows[22][2] == pytest.approx(0.1**2 / (2 * 2.25))
+    assert rows[24][2] == rows[23][2]
+    assert world.observe("left").own_accelerations_mps2[-3:] == pytest.approx([-2.25, -0.5, 0.0])
+
+
+def test_control_starts_for_both_when_both_are_out_of_their_tunnels():
+    world = start("L_4_-8")
+    assert [row.position_m for row in world.states()] == pytest.approx([57.5385, 50.0], abs=1e-4)
+    assert world.in_control("left")
+    assert world.in_control("right")
+
+
+def test_own_exit_starts_at_the_earlier_exit_and_the_other_cruises_on_to_its_own():
+    world = start("L_4_-8", control_start="own_exit")
+    # 4.0224 s into the run the left vehicle is out, and the right one 50 - 0.7852 * 10.4 m far.
+    assert world.time_s == 0.0
+    assert [row.position_m for row in world.states()] == pytest.approx([50, 41.8333], abs=1e-3)
+    in_control = []
+    for _ in range(5):
+        in_control.append((world.in_control("left"), world.in_control("right")))
+        world.advance({"left": 0.0, "right": None})
+    # The right vehicle leaves its tunnel after 0.785 s, so the fifth sample sees it outside.
+    assert in_control == [(True, False)] * 4 + [(True, True)]
+    assert {row[3] for row in trace(world, "right")} == {10.4}
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_the_road_turns_straight_behind_the_own_merge_point(side):
+    world = start()
+    other = OTHER[side]
+    while world.observe(side).road == "merge":
+        distance = world.observe(side).distance_to_merge_m
+        assert distance > 0
+        world.advance({side: 0.0, other: -1.0})
+    # Exactly at the merge point, after 50 m at 10 m/s.
+    assert world.time_s == 5.0
+    assert world.observe(side).distance_to_merge_m is None
+    assert world.observe(other).road == "merge"
+    assert world.observe(other).distance_to_merge_m > 0
+
+
+def test_the_road_turns_straight_for_both_at_once_where_the_scenario_says_so():
+    world = start("L_4_-8", straight_after="both")
+    drive(world, 0.5, -0.25, steps=20)
+    assert world.states()[-2].position_m > 100 > world.states()[-1].position_m
+    assert [world.observe(side).road for side in SIDES] == ["merge", "merge"]
+    # The leader is told how far it is past the merge point.
+    assert world.observe("left").distance_to_merge_m < 0
+    while world.states()[-1].position_m < 100:
+        world.advance({"left": 0.5, "right": -0.25})
+    assert world.status is None
+    assert [world.observe(side).road for side in SIDES] == ["straight", "straight"]

@@ -1,0 +1,105 @@
+"""All that tell of another model's answers tell the same, by the aliases of all sweeps."""
+
+from __future__ import annotations
+
+import json
+
+import duckdb
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from analysis.data.load import load_calls
+from analysis.data.provenance import provenance, tally
+from analysis.data.study import Study
+from analysis.explorer.catalogue import Catalogue, Filter
+from analysis.explorer.sweeps import find_sweep
+from analysis.tables.attempts import attempts
+from merge_runner.audit import audit_sweep
+from merge_runner.results.database import in_memory
+from merge_runner.results.store import sweep_facts
+from merge_runner.served_model import is_other_model, others_among, sql_of
+from tests.analysis.studies import Drive, Said, write_study
+
+SERVED = ("another", "o3", "o3-2025", "o3-2026", "it's")
+OTHERS = ["another", "it's"]
+
+
+@pytest.fixture
+def db(tmp_path):
+    """One sweep with answers under several names, and a later one of which it has an alias."""
+    path = tmp_path / "m.duckdb"
+    drives = [
+        Drive("o3", "baseline", "L_4_0", rep, (0.5,), (-0.5,), said={0: Said(served=name)})
+        for rep, name in enumerate(SERVED, 1)
+    ]
+    models = {"o3": {"id": "o3", "provider": "openai", "aliases": ["o3-2025"]}}
+    write_study(path, drives, config={"models": models})
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE calls SET http_status = 200")
+        models["o3"]["aliases"] = ["o3-2026"]
+        connection.execute(
+            "INSERT INTO sweeps BY NAME SELECT * REPLACE ('sweep-2' AS sweep_id, ? AS config) "
+            "FROM sweeps",
+            [json.dumps({"models": models})],
+        )
+    return path
+
+
+def test_all_that_tell_of_other_models_tell_the_same(db):
+    assert sorted(served for _, served, _ in sweep_facts(db, "sweep-1").others) == OTHERS
+    assert sorted(served for _, served in load_calls(db).others) == OTHERS
+    assert sorted(one.served for one in provenance(db).mismatches) == OTHERS
+    found = [f.text for f in audit_sweep(db, "sweep-1").findings if f.kind == "served"]
+    assert sorted(text.split(": ")[0] for text in found) == [f"o3 -> {name}" for name in OTHERS]
+    catalogue = Catalogue(db)
+    sweep = find_sweep(catalogue, "sweep-1")
+    assert sorted(sweep.mismatches) == [f"o3 → {name}" for name in OTHERS]
+    causes = [cause for cause, _ in catalogue.facets(Filter())["cause"]]
+    assert [c for c in causes if c.startswith("model: ")] == [f"model: o3 → {n}" for n in OTHERS]
+
+
+def test_a_configuration_that_declares_nonsense_declares_nothing(db):
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(
+            "UPDATE sweeps SET config = ? WHERE sweep_id = 'sweep-2'",
+            ['{"models": {"o3": {"id": "o3", "aliases": 5}, "x": [], "y": null}}'],
+        )
+    assert sorted(served for _, served in load_calls(db).others) == [*OTHERS, "o3-2026"]
+
+
+def test_the_table_and_the_trials_behind_its_cell_agree(db):
+    study = Study(db)
+    (group,) = study.models
+    assert tally(study, group).others == len(OTHERS)
+    (column,) = (c for c in attempts(study).columns if c.name == "other_model")
+    with duckdb.connect(str(db), read_only=True) as connection:
+        sql = f"SELECT count(*) FROM trials WHERE {column.counts}"
+        assert connection.execute(sql).fetchone() == (len(OTHERS),)
+
+
+names = st.text(max_size=3)
+
+
+@pytest.fixture(scope="module")
+def memory():
+    with in_memory({}) as connection:
+        yield connection
+
+
+@given(st.lists(st.tuples(names, names)), st.lists(st.tuples(names, names)))
+def test_the_condition_in_sql_is_the_rule(memory, pairs, aliases):
+    others = others_among(pairs, aliases)
+    declared = {asked: {a for model, a in aliases if model == asked} for asked, _ in pairs}
+    assert others == [p for p in pairs if is_other_model(*p, declared[p[0]])]
+    for pair in pairs:
+        (other,) = memory.execute(
+            f"SELECT {sql_of(others)} FROM (SELECT ? AS model_requested, ? AS model_served)", pair
+        ).fetchone()
+        assert other is (pair in others)
+
+
+def test_an_unnamed_answer_is_nobody_elses():
+    assert not is_other_model("o3", None)
+    assert is_other_model("o3", "gpt-4o", ["o3-2025"])
+    assert not is_other_model("o3", "o3-2025", ["o3-2025"])
