@@ -40,7 +40,7 @@ lint: .venv/dev ## formatting, lint, types, import contract
 
 check: lint test ## formatting, lint, types, import contract and tests
 
-bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/performance.md
+bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/reference/performance.md
 	@.venv/bin/python -m benchmarks $(ARGS)
 
 lock: ## renew the lock files (needs uv)

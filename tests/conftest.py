@@ -22,7 +22,7 @@ os.environ["XDG_RUNTIME_DIR"] = RUNTIME.name
 
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)
-# For an hour of one's own; docs/reliability.md has the command.
+# For an hour of one's own; docs/explanation/reliability.md has the command.
 settings.register_profile("100000", max_examples=100_000, derandomize=False, deadline=None)
 settings.load_profile("gate")
 

@@ -23,7 +23,16 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.recordings import drive, write_folder
 from tests.harness import CONFIGURING, PROJECT, environment, watched
 
-PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
+DOCS = PROJECT / "docs"
+TUTORIAL = DOCS / "tutorial.md"
+# Pages of users, in the order in which their commands are run.
+PAGES = [PROJECT / "README.md", *sorted(set(DOCS.rglob("*.md")) - {TUTORIAL})]
+LINKING = [
+    *PAGES,
+    TUTORIAL,
+    *(PROJECT / f"{name}.md" for name in ("CHANGELOG", "CONTRIBUTING", "SECURITY")),
+    *(PROJECT / f"{folder}/README.md" for folder in ("benchmarks", "cache")),
+]
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
 # The environment is the project's own: a make in another folder must not install into it.
 INSTALLED = (
@@ -169,7 +178,7 @@ def test_every_command_and_every_make_target_is_in_the_docs():
 
 
 def test_the_readings_of_the_docs_are_those_of_the_report():
-    text = (PROJECT / "docs/reproduction.md").read_text(encoding="utf-8")
+    text = (PROJECT / "docs/explanation/reproduction.md").read_text(encoding="utf-8")
     shown = [line for line in text.splitlines() if line.startswith("| ")][1:]
     readings = published("readings").itertuples(index=False)
     assert shown == ["| " + " | ".join(c.replace("|", r"\|") for c in r) + " |" for r in readings]

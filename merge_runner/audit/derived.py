@@ -57,7 +57,7 @@ from merge_runner.trial import play_trial
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
 SHOWN = 60
-# The columns that neither a reply nor a spec tells: docs/audit.md says of each why. A cache tells
+# The columns that neither a reply nor a spec tells: docs/reference/audit.md says why. A cache tells
 # those of ``calls`` but ``cached``.
 NOT_DERIVED = (
     "calls.cached",

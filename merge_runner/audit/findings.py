@@ -12,7 +12,7 @@ SHOWN = 10
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that does not hold, and where; docs/audit.md lists the kinds."""
+    """One thing that does not hold, and where; docs/reference/audit.md lists the kinds."""
 
     kind: str
     text: str

@@ -114,7 +114,7 @@ def _in_its_form(provider: str, payload: dict[str, Any]) -> bool:
 
 
 def judge(raw: RawReply, wire: WireFormat) -> Verdict:
-    """The verdict on a reply, by the rules of docs/providers.md."""
+    """The verdict on a reply, by the rules of docs/reference/providers.md."""
     payload = _json(raw.body)
     if raw.status == 200:
         return _judge_success(raw, payload, wire)

@@ -1,6 +1,6 @@
 """Speeds whose control is known, and how far measures of I5 tell them apart.
 
-``python -m tests.analysis.controls`` prints the tables of docs/analysis.md.
+``python -m tests.analysis.controls`` prints the tables of docs/reference/analysis.md.
 """
 
 from __future__ import annotations

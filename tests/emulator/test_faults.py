@@ -112,7 +112,7 @@ def test_a_file_sets_every_part_of_a_plan(tmp_path):
 
 
 def test_the_file_of_the_docs_is_one_and_every_scenario_is_told(tmp_path):
-    page = (PROJECT / "docs/emulator.md").read_text(encoding="utf-8")
+    page = (PROJECT / "docs/reference/emulator.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     plan = load(tmp_path, example)
     assert set(plan.rates) == set(FAULTS)

@@ -1,4 +1,4 @@
-"""docs/reliability.md and SECURITY.md name a test for each promise, docs/scaling.md for most."""
+"""The reliability page and SECURITY.md name a test for each promise, scaling.md for most."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from tests.harness import PROJECT
 
 
 def test_every_promise_has_its_test():
-    text = (PROJECT / "docs/reliability.md").read_text()
-    others = [(PROJECT / page).read_text() for page in ("docs/scaling.md", "SECURITY.md")]
+    text = (PROJECT / "docs/explanation/reliability.md").read_text()
+    others = [(PROJECT / page).read_text() for page in ("docs/explanation/scaling.md", "SECURITY.md")]
     named = set(re.findall(r"`(test_\w+)`", "".join([text, *others])))
     defined = Counter(
         name

@@ -1,4 +1,4 @@
-"""What providers are known to send, by name; see docs/emulator.md."""
+"""What providers are known to send, by name; see docs/reference/emulator.md."""
 
 from __future__ import annotations
 

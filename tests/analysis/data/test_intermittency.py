@@ -32,7 +32,7 @@ from tests.analysis.controls import (
     separation,
 )
 
-DOCS = Path(__file__).parents[3] / "docs/analysis.md"
+DOCS = Path(__file__).parents[3] / "docs/reference/analysis.md"
 
 
 @pytest.mark.parametrize("cell", CELLS, ids=str)
