@@ -303,10 +303,10 @@ ERRORS = [
 
 @pytest.mark.parametrize(("wire", "status", "body", "headers", "action", "outcome"), ERRORS)
 def test_what_an_error_means(wire, status, body, headers, action, outcome):
-    verdict = judged(wire, status, body, headers)
-    assert (verdict.action, verdict.outcome, verdict.pause) == (action, outcome, False)
-    assert verdict.reading.outcome == "error"
-    assert str(status) in verdict.message
+    found = judged(wire, status, body, headers)
+    assert (found.action, found.name, found.pause) == (action, outcome, False)
+    assert found.reading.outcome == "error"
+    assert str(status) in found.message
 
 
 # A rate limit: format, status, body, headers, and how long everybody waits.
@@ -393,15 +393,15 @@ LIMITS = [
 
 @pytest.mark.parametrize(("wire", "status", "body", "headers", "delay"), LIMITS)
 def test_a_rate_limit_makes_all_calls_of_the_key_wait(wire, status, body, headers, delay):
-    verdict = judged(wire, status, body, headers)
-    assert (verdict.action, verdict.outcome, verdict.pause) == ("retry", "rate_limited", True)
-    assert verdict.delay_s == (None if delay is None else pytest.approx(delay))
+    found = judged(wire, status, body, headers)
+    assert (found.action, found.name, found.pause) == ("retry", "rate_limited", True)
+    assert found.delay_s == (None if delay is None else pytest.approx(delay))
 
 
 @pytest.mark.parametrize("status", [408, 409, 500, 502, 503, 504, 520, 524, 529])
 def test_the_delay_that_a_failing_server_asks_for_is_kept_for_this_call_alone(status):
-    verdict = judged("openai-chat", status, HTML, {"retry-after": "9"})
-    assert (verdict.action, verdict.delay_s, verdict.pause) == ("retry", 9, False)
+    found = judged("openai-chat", status, HTML, {"retry-after": "9"})
+    assert (found.action, found.delay_s, found.pause) == ("retry", 9, False)
 
 
 def choice(content="M", finish="stop", **changes):
@@ -466,8 +466,8 @@ SUCCESSES = [
 
 @pytest.mark.parametrize(("wire", "body", "action", "outcome"), SUCCESSES)
 def test_what_a_body_of_status_200_means(wire, body, action, outcome):
-    verdict = judged(wire, 200, body)
-    assert (verdict.action, verdict.outcome, verdict.pause) == (action, outcome, False)
+    found = judged(wire, 200, body)
+    assert (found.action, found.name, found.pause) == (action, outcome, False)
 
 
 AZURE_FILTER = {
@@ -485,16 +485,16 @@ OPENROUTER_FILTER = openrouter(403, "Your input was flagged", flagged_input="PRO
     ("status", "body"), [(400, {"error": AZURE_FILTER}), (403, OPENROUTER_FILTER)]
 )
 def test_a_filter_is_a_refusal_and_no_failure(status, body):
-    verdict = judged("openai-chat", status, body)
-    assert (verdict.action, verdict.outcome) == ("accept", "refusal")
-    assert verdict.reading.outcome == "refusal"
-    assert verdict.reading.text == ""
+    found = judged("openai-chat", status, body)
+    assert (found.action, found.name) == ("accept", "refusal")
+    assert found.reading.outcome == "refusal"
+    assert found.reading.text == ""
 
 
 @pytest.mark.parametrize(("status", "outcome"), [(200, "bad_body"), (500, "server_error")])
 def test_a_body_that_is_nested_too_deep_is_no_json(status, outcome):
-    verdict = judged("openai-chat", status, "[" * 100_000)
-    assert (verdict.action, verdict.outcome) == ("retry", outcome)
+    found = judged("openai-chat", status, "[" * 100_000)
+    assert (found.action, found.name) == ("retry", outcome)
 
 
 @pytest.mark.parametrize(
@@ -541,9 +541,9 @@ json_values = st.recursive(
 # A digit, but not a decimal one.
 @example("openai-chat", 200, '{"error": {"code": "²"}}')
 def test_no_body_makes_it_raise(wire, status, body):
-    verdict = judged(wire, status, body)
-    assert verdict.action in ("accept", "retry", "fail", "quota", "refused")
-    assert verdict.outcome
+    found = judged(wire, status, body)
+    assert found.action in ("accept", "retry", "fail", "quota", "refused")
+    assert found.name
 
 
 OPENAI_ERROR = {"error": {"message": "m", "type": "server_error", "param": None, "code": None}}
@@ -590,7 +590,7 @@ ANTHROPIC_ERROR = {"type": "error", "error": {"type": "overloaded_error", "messa
 )
 def test_what_may_be_charged_though_no_usage_is_told(provider, status, body, charged):
     text = body if isinstance(body, str) else json.dumps(body)
-    assert may_be_charged(RawReply(status, {}, text), provider) == charged
+    assert may_be_charged(RawReply(status, {}, text), FORMATS["openai-chat"], provider) == charged
 
 
 @pytest.mark.parametrize("status", [400, 429, 500, 503])
