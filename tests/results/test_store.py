@@ -12,15 +12,15 @@ from datetime import datetime
 import duckdb
 import pytest
 
-from merge_runner.run import flusher
 from merge_runner.config import Scenario
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.projected_order import ProjectedOrderDriver
 from merge_runner.errors import StoreError, UsageError
-from merge_runner.run.flusher import Flusher
 from merge_runner.records import TrialRecord, TrialSpec
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.results.store import Store, SweepRow, query, results_digest, sweep_facts
+from merge_runner.run import flusher
+from merge_runner.run.flusher import Flusher
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
 SCENARIO = Scenario()
