@@ -129,7 +129,8 @@ async def test_a_format_from_outside_goes_through_the_whole_house(run, tmp_path)
         assert done.code == 0, f"{command}\n{done.err}"
     assert (await run("digest", "--db", "replayed.duckdb")).out == digest
     assert "talker-1" in (tmp_path / "pages/trials.html").read_text()
-    assert "talker-1" in (tmp_path / "report.html").read_text()
+    sent = "for what was sent with it: at_most = 2000, engine = talker-1, temperature = 0.7."
+    assert sent in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
