@@ -13,11 +13,11 @@ from pathlib import Path
 
 import duckdb
 
-from merge_runner.config import load_models
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.models import load_models
 from merge_runner.llm.shared_limits import BURST_S
 from merge_runner.records import SIDES, Attempt, ChatReply, Side, Slot, TrialRecord, TrialSpec
 from merge_runner.results.database import SCHEMA

@@ -347,7 +347,8 @@ def _agree(what: str, *, yes: bool) -> None:
 @app.command()
 def models() -> None:
     """List the registry: provider, id, key, price, known shutdown date."""
-    from merge_runner.config import Price, key_status, load_models
+    from merge_runner.config import Price, key_status
+    from merge_runner.llm.models import load_models
     from merge_runner.llm.prices import pricing
     from merge_runner.records import Usage
     from merge_runner.results.query_output import write_table

@@ -27,6 +27,7 @@ from pydantic import (
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
+from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -49,7 +50,6 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(gt=0, strict=True)]
 Json = Annotated[JsonValue, AfterValidator(_finite)]
-Format = Literal["openai-chat", "openai-responses", "gemini", "anthropic"]
 CollisionRule = Literal["euclid2d", "rectangle", "shared_lane"]
 Resistance = Literal["none", "human"]
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -142,17 +142,17 @@ class Price(Frozen):
 class ModelEntry(Frozen):
     """One model of ``experiments/models.toml``.
 
-    ``id`` is what is sent; a served model that is neither it nor one of ``aliases`` is reported
-    as a mismatch. ``parameters`` go into the request as they are; what is not listed is not
-    sent, so that the provider's default applies; ``applied_defaults`` puts on record which.
-    ``price`` is ``free``, ``genai-prices`` (the
-    table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
-    minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of
-    ``--dry-run`` alone. A reply longer than ``max_reply_mb`` (unpacked) is refused.
+    ``provider`` is one of PROVIDERS, ``format`` one of the wire formats (llm/formats). ``id`` is
+    what is sent; a served model that is neither it nor one of ``aliases`` is reported as a
+    mismatch. ``parameters`` go into the request as they are; what is not listed is not sent, so
+    that the provider's default applies; ``applied_defaults`` puts on record which. ``price`` is
+    ``free``, ``genai-prices`` (the table of that package) or explicit figures. ``rpm`` and ``tpm``
+    are requests and tokens a minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the
+    estimate of ``--dry-run`` alone. A reply longer than ``max_reply_mb`` (unpacked) is refused.
     """
 
     provider: str
-    format: Format
+    format: str
     id: str
     aliases: tuple[str, ...] = ()
     parameters: dict[str, Json] = {}
@@ -186,36 +186,66 @@ class SweepFile(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class Provider:
-    """Where a provider is reached and which variables configure it."""
+    """Where a provider is reached, which variables configure it, and how it takes a key.
+
+    ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are those that the
+    provider documents for all of its errors, so that what lacks one may be a gateway's.
+    """
 
     base_url: str
     base_url_env: str | None = None
     key_envs: tuple[str, ...] = ()
-    auth: Literal["bearer", "api-key", "x-goog-api-key", "x-api-key"] = "bearer"
+    auth: str = "bearer"
     key_needed: bool = True
+    error_members: frozenset[str] = frozenset()
 
 
-PROVIDERS: dict[str, Provider] = {
-    "openai": Provider("https://api.openai.com/v1", "OPENAI_BASE_URL", ("OPENAI_API_KEY",)),
-    # The official SDK prefers GOOGLE_API_KEY where both are set.
-    "gemini": Provider(
+PROVIDERS: Registry[Provider] = Registry("provider")
+PROVIDERS.register(
+    "openai",
+    Provider(
+        "https://api.openai.com/v1",
+        "OPENAI_BASE_URL",
+        ("OPENAI_API_KEY",),
+        error_members=frozenset({"message", "type", "code"}),
+    ),
+)
+PROVIDERS.register(
+    "gemini",
+    Provider(
         "https://generativelanguage.googleapis.com",
         "GOOGLE_GEMINI_BASE_URL",
+        # The official SDK prefers GOOGLE_API_KEY where both are set.
         ("GOOGLE_API_KEY", "GEMINI_API_KEY"),
         auth="x-goog-api-key",
+        error_members=frozenset({"message", "code", "status"}),
     ),
-    "anthropic": Provider(
+)
+PROVIDERS.register(
+    "anthropic",
+    Provider(
         "https://api.anthropic.com",
         "ANTHROPIC_BASE_URL",
         ("ANTHROPIC_API_KEY",),
         auth="x-api-key",
+        error_members=frozenset({"message", "type"}),
     ),
-    "openrouter": Provider("https://openrouter.ai/api/v1", None, ("OPENROUTER_API_KEY",)),
-    "local": Provider(
-        "http://localhost:8000/v1", "LOCAL_BASE_URL", ("LOCAL_API_KEY",), key_needed=False
+)
+PROVIDERS.register(
+    "openrouter",
+    Provider(
+        "https://openrouter.ai/api/v1",
+        key_envs=("OPENROUTER_API_KEY",),
+        error_members=frozenset({"message", "code"}),
     ),
-    "emulator": Provider("http://127.0.0.1/v1", "EMULATOR_BASE_URL", key_needed=False),
-}
+)
+PROVIDERS.register(
+    "local",
+    Provider("http://localhost:8000/v1", "LOCAL_BASE_URL", ("LOCAL_API_KEY",), key_needed=False),
+)
+PROVIDERS.register(
+    "emulator", Provider("http://127.0.0.1/v1", "EMULATOR_BASE_URL", key_needed=False)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +274,7 @@ def resolve_endpoint(
     Raises UsageError where a key is needed and none is set.
     """
     env = os.environ if environment is None else environment
-    provider = _provider(name, entry)
+    provider = PROVIDERS.require(entry.provider)
     key_envs = (entry.key_env,) if entry.key_env else provider.key_envs
     key = next((env[variable] for variable in key_envs if env.get(variable)), None)
     if key is None and provider.key_needed:
@@ -259,18 +289,16 @@ def resolve_endpoint(
         )
     return Endpoint(
         provider=entry.provider,
-        identity=endpoint_identity(name, entry, env),
+        identity=endpoint_identity(entry, env),
         base_url=_base_url(entry, provider, env),
         auth_headers=_auth_headers(entry.auth or provider.auth, key),
     )
 
 
-def endpoint_identity(
-    name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None
-) -> str:
+def endpoint_identity(entry: ModelEntry, environment: Mapping[str, str] | None = None) -> str:
     """What stands for the endpoint in cache keys; see Endpoint."""
     env = os.environ if environment is None else environment
-    provider = _provider(name, entry)
+    provider = PROVIDERS.require(entry.provider)
     base_url = _base_url(entry, provider, env)
     if entry.provider == "emulator":
         return "emulator"
@@ -296,7 +324,7 @@ def key_status(
     name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None
 ) -> Literal["set", "missing", "not needed"]:
     """Whether the environment holds the key that a live run of the model needs."""
-    if not _provider(name, entry).key_needed:
+    if not PROVIDERS.require(entry.provider).key_needed:
         return "not needed"
     try:
         resolve_endpoint(name, entry, environment)
@@ -386,28 +414,13 @@ def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | 
 
 def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
     """The variables of this environment that say where the entries' providers are reached."""
-    variables = {_provider(name, entry).base_url_env for name, entry in entries.items()}
+    variables = {PROVIDERS.require(entry.provider).base_url_env for entry in entries.values()}
     return {v: os.environ[v] for v in variables if v is not None and os.environ.get(v)}
 
 
 def with_base_urls(urls: Mapping[str, str]) -> dict[str, str]:
     """The environment of this process, with the base URLs that another process has found."""
     return {**os.environ, **urls}
-
-
-def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
-    """The registry, name to entry; raises UsageError."""
-    path = path or find_experiments() / "models.toml"
-    entries = {
-        name: _validate(ModelEntry, table, f"{path}: [{name}]")
-        for name, table in read_toml(path).items()
-    }
-    for name, entry in entries.items():
-        try:
-            endpoint_identity(name, entry, {})
-        except UsageError as exc:
-            raise UsageError(one_line(f"{path}: [{name}]: {exc}")) from exc
-    return entries
 
 
 def load_sweep(name: str) -> tuple[str, SweepFile]:
@@ -419,7 +432,7 @@ def load_sweep(name: str) -> tuple[str, SweepFile]:
         known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "models")
         if name not in known:
             raise UsageError(f"there is no sweep {name!r}; valid: {', '.join(known)}, or a path")
-    return path.stem, _validate(SweepFile, read_toml(path), str(path))
+    return path.stem, validated(SweepFile, read_toml(path), str(path))
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -434,18 +447,18 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path} is no TOML file: {exc}") from exc
 
 
+def validated(model: type[ModelT], value: object, where: str) -> ModelT:
+    """A value as a configuration object; raises UsageError, which says ``where`` it stands."""
+    try:
+        return model.model_validate(value)
+    except ValidationError as exc:
+        raise UsageError(one_line(f"{where}: {'; '.join(_explain(exc, model))}")) from exc
+
+
 def find_experiments() -> Path:
     """The experiments folder: of the working directory, else of the project."""
     here = Path("experiments")
     return here if here.is_dir() else PROJECT / "experiments"
-
-
-def _provider(name: str, entry: ModelEntry) -> Provider:
-    if entry.provider not in PROVIDERS:
-        raise UsageError(
-            f"model {name}: unknown provider {entry.provider!r}; valid: {', '.join(PROVIDERS)}"
-        )
-    return PROVIDERS[entry.provider]
 
 
 def _base_url(entry: ModelEntry, provider: Provider, env: Mapping[str, str]) -> str:
@@ -457,13 +470,6 @@ def _auth_headers(scheme: str, key: str | None) -> dict[str, str]:
     if key is None:
         return {}
     return {"authorization": f"Bearer {key}"} if scheme == "bearer" else {scheme: key}
-
-
-def _validate(model: type[ModelT], value: object, where: str) -> ModelT:
-    try:
-        return model.model_validate(value)
-    except ValidationError as exc:
-        raise UsageError(one_line(f"{where}: {'; '.join(_explain(exc, model))}")) from exc
 
 
 NESTED: dict[str, type[BaseModel]] = {"scenario": Scenario, "price": Price}

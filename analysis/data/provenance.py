@@ -89,8 +89,6 @@ DRIVERS = """
 SELECT DISTINCT driver FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE source = 'llm' AND NOT scripted ORDER BY ALL
 """
-# What of a request's body is no parameter.
-NO_PARAMETERS = frozenset({"messages", "input", "contents", "model"})
 # Failures with an own column of the tables; the others are malformed answers.
 ANSWERS = ("refusal", "truncated", "empty")
 
@@ -237,11 +235,14 @@ def _alike(db: Path) -> dict[str, int]:
 def _sent(spec: Mapping[str, Any]) -> dict[str, dict[str, object]]:
     """The parameters of the model on each side of a spec, by the last part of their names.
 
-    A program on a side has none, and is left out.
+    A program on a side has none, and is left out. A spec is made with an empty prompt, by which
+    that is known in any format.
     """
     bodies = {side: spec[side]["body"] for side in SIDES if "body" in spec.get(side, {})}
     return {
-        side: dict(_leaves({k: v for k, v in body.items() if k not in NO_PARAMETERS}))
+        side: dict(
+            _leaves({k: v for k, v in body.items() if k != "model" and '""' not in json.dumps(v)})
+        )
         for side, body in bodies.items()
     }
 

@@ -150,8 +150,16 @@ def _differences(driver: dict[str, Any], name: str, config: SweepConfig) -> Iter
         return
     # Gemini names the model in the path alone.
     in_path = f"/{model.id}:" in str(driver.get("path")) or model.path is not None
-    if body["model"] != model.id if "model" in body else not in_path:
+    sent = list(_members(body))
+    named = model.id in [value for _, value in sent] or in_path
+    if body["model"] != model.id if "model" in body else not named:
         yield "model"
-    sent = {**body, **(body.get("generationConfig") or {})}
-    if any(sent.get(parameter) != value for parameter, value in model.parameters.items()):
+    if any(parameter not in sent for parameter in model.parameters.items()):
         yield "parameters"
+
+
+def _members(value: object) -> Iterator[tuple[str, object]]:
+    """All members of the objects in a JSON value: formats put the parameters where they like."""
+    for name, each in value.items() if isinstance(value, dict) else ():
+        yield name, each
+        yield from _members(each)

@@ -26,8 +26,14 @@ from merge_runner.errors import (
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.first_call import NOBODY_S, FirstCall, refusal, set_base_url, set_key
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.base import Reading
-from merge_runner.llm.http_outcome import RawReply, Verdict, is_web_page, judge, may_be_charged
+from merge_runner.llm.formats.base import WireFormat
+from merge_runner.llm.http_outcome import (
+    AttemptOutcome,
+    RawReply,
+    is_web_page,
+    judge,
+    may_be_charged,
+)
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
 from merge_runner.llm.meter import Meter, Wait
@@ -62,7 +68,8 @@ class _Call:
     """A call under way: its attempts so far, of which the first ``earlier`` by earlier runs.
 
     ``worst`` bounds its tokens, ``worst_usd`` its cost where the server keeps to the output cap;
-    ``aside_usd`` is set aside for the attempt, and ``spent_usd`` what the answer cost.
+    ``aside_usd`` is set aside for the attempt, and ``spent_usd`` what the answer cost, whose text
+    is ``text``.
     ``began`` is when the call did, on the event loop's clock.
     """
 
@@ -75,6 +82,7 @@ class _Call:
     began: float
     aside_usd: float = 0.0
     spent_usd: float | None = None
+    text: str = ""
 
 
 @dataclass(slots=True)
@@ -102,7 +110,7 @@ class LlmClient:
     strict: bool = False
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
     meter: Meter = field(default_factory=Meter)
-    _calls: dict[str, asyncio.Task[tuple[Entry, int]]] = field(default_factory=dict)
+    _calls: dict[str, asyncio.Task[ChatReply]] = field(default_factory=dict)
     _stopping: bool = False
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
@@ -112,13 +120,12 @@ class LlmClient:
         """
         request = self._request(prompt, slot)
         if recorded := self._recorded(request):
-            entry, earlier = recorded, len(recorded.attempts)
+            reply = self._read(recorded)
         elif call := self._calls.get(request.key):
-            entry, _ = await asyncio.shield(call)
-            earlier = len(entry.attempts)  # who asked first tells of them
+            reply = await asyncio.shield(call)
+            reply = replace(reply, earlier=len(reply.attempts))  # who asked first tells of them
         else:
-            entry, earlier = await asyncio.shield(self._start(request, order))
-        reply = self._reply(entry, earlier)
+            reply = await asyncio.shield(self._start(request, order))
         other_model = self._other_model(reply)
         self.meter.count_reply(reply, other_model)
         if self.strict and other_model is not None:
@@ -145,6 +152,10 @@ class LlmClient:
     def flying(self) -> int:
         """How many calls are in flight or being saved."""
         return len(self._calls) - len(self.meter.waits)
+
+    @property
+    def _format(self) -> WireFormat:
+        return FORMATS[self.entry.format]
 
     @property
     def driver(self) -> str:
@@ -183,7 +194,7 @@ class LlmClient:
         return served if is_other_model(self.entry.id, served, self.entry.aliases) else None
 
     def _request(self, prompt: str, slot: Slot) -> ChatRequest:
-        wire = FORMATS[self.entry.format].request(self.entry, prompt)
+        wire = self._format.request(self.entry, prompt)
         return make_request(
             provider=self.entry.provider,
             endpoint=self.endpoint,
@@ -194,11 +205,11 @@ class LlmClient:
             slot=slot,
         )
 
-    def _start(self, request: ChatRequest, order: int) -> asyncio.Task[tuple[Entry, int]]:
+    def _start(self, request: ChatRequest, order: int) -> asyncio.Task[ChatReply]:
         call = asyncio.create_task(self._claimed(request, order))
         self._calls[request.key] = call
 
-        def forget(done: asyncio.Task[tuple[Entry, int]]) -> None:
+        def forget(done: asyncio.Task[ChatReply]) -> None:
             del self._calls[request.key]
             if not done.cancelled():
                 done.exception()  # all who asked may be gone by now
@@ -206,8 +217,8 @@ class LlmClient:
         call.add_done_callback(forget)
         return call
 
-    async def _claimed(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
-        """Make a call when its turn has come; returns the entry and its earlier attempts."""
+    async def _claimed(self, request: ChatRequest, order: int) -> ChatReply:
+        """Make a call when its turn has come."""
         if self.budget is not None:
             # Before the claim: nobody waits for money with a call that another process needs.
             with self._giving_way(request, "for trials before it to end, under --max-cost"):
@@ -231,21 +242,21 @@ class LlmClient:
         with self._giving_way(request, f"for the first answer of {self.driver}"):
             return await self.first.turn()
 
-    async def _unless_made(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
+    async def _unless_made(self, request: ChatRequest, order: int) -> ChatReply:
         """Make a call unless another process does."""
         while self.claims is not None and not await self.claims.claim(request.key):
             with self._giving_way(request, "for another merge-runner that makes the same call"):
                 await asyncio.sleep(CLAIM_POLL_S)
         try:
             made, earlier = self._known(request)  # maybe just now
-            return (made, len(made.attempts)) if made else await self._make(request, order, earlier)
+            return self._read(made) if made else await self._make(request, order, earlier)
         finally:
             if self.claims is not None:
                 self.claims.release(request.key)
 
     async def _make(
         self, request: ChatRequest, order: int, earlier: tuple[Attempt, ...]
-    ) -> tuple[Entry, int]:
+    ) -> ChatReply:
         """Make attempts until there is an answer, and save it with all of them."""
         worst = self._worst_case(request)
         worst_usd = self.pricing.cost_usd(worst) or 0.0
@@ -286,7 +297,12 @@ class LlmClient:
         finally:
             if not answered:
                 await self._keep_unanswered(call)
-        return await self._keep(call), call.earlier
+        kept = await self._keep(call)
+        if kept.attempts[-1] is not call.attempts[-1]:  # another process was first
+            return self._read(kept, call.earlier)
+        return ChatReply(
+            call.text, call.attempts[-1].outcome, kept.request, kept.attempts, call.earlier
+        )
 
     async def _keep(self, call: _Call) -> Entry:
         entry = Entry(call.request, tuple(call.attempts))
@@ -341,12 +357,12 @@ class LlmClient:
             raw = await self.transport.send(
                 call.request, attempt=number, timeout_s=min(self.entry.timeout_s, seconds_left)
             )
-            verdict = judge(raw, FORMATS[self.entry.format])
-            record = self._record(number, raw, verdict, call.worst)
+            outcome = judge(raw, self._format)
+            record = self._record(number, raw, outcome, call.worst)
             spent = record.cost_usd
             self._settle_tokens(permit, record.usage)
         except TransportFailure as exc:
-            verdict = Verdict(exc.action, exc.outcome, Reading("error"), str(exc))
+            outcome = AttemptOutcome(exc.action, exc.outcome, str(exc))
             free = self.entry.price == "free" or not exc.sent
             spent = 0.0 if free else None
             record = Attempt(number, exc.outcome, error=str(exc), cost_usd=spent)
@@ -358,12 +374,12 @@ class LlmClient:
             if raw is None:
                 self._give_up_on_nobody(call)
             else:
-                self._check_endpoint(raw, verdict)
-            self._act_on(verdict, call)
+                self._check_endpoint(raw, outcome)
+            self._act_on(outcome, call)
         except MergeRunnerError:
             await self._settle_failed(call, spent)
             raise
-        call.spent_usd = spent
+        call.spent_usd, call.text = spent, outcome.reading.text
 
     async def _begin(self, call: _Call) -> None:
         """Note durably that an attempt is made, where it may cost something."""
@@ -405,53 +421,53 @@ class LlmClient:
                 f"or {set_base_url(self.name, self.entry)}"
             )
 
-    def _check_endpoint(self, raw: RawReply, verdict: Verdict) -> None:
+    def _check_endpoint(self, raw: RawReply, outcome: AttemptOutcome) -> None:
         """End the run at its first call where no other one would fare better."""
         if not self.first.passed:
-            why = refusal(self.name, self.entry, raw, verdict)
-            if why is not None and self.first.is_final(verdict):
+            why = refusal(self.name, self.entry, raw, outcome)
+            if why is not None and self.first.is_final(outcome):
                 raise EndpointRefused(f"{self.driver}: {why}")
-        if verdict.action == "accept":
+        if outcome.action == "accept":
             self.first.answered()
 
-    def _act_on(self, verdict: Verdict, call: _Call) -> None:
+    def _act_on(self, outcome: AttemptOutcome, call: _Call) -> None:
         attempts = call.attempts[call.earlier :]
-        message = verdict.message or verdict.outcome
-        delay_s = verdict.delay_s or 0.0
-        if verdict.pause and delay_s > self.entry.deadline_s:
+        message = outcome.message or outcome.name
+        delay_s = outcome.delay_s or 0.0
+        if outcome.pause and delay_s > self.entry.deadline_s:
             raise QuotaExhausted(
                 f"{self.driver}: the provider asks to wait {delay_s:.0f} s, longer than a "
                 f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
                 "is saved; run the same command again later to go on."
             )
-        if verdict.pause:
-            pause_s = verdict.delay_s or backoff_s(len(attempts))
+        if outcome.pause:
+            pause_s = outcome.delay_s or backoff_s(len(attempts))
             self.limiter.pause(pause_s)
             until = datetime.now(UTC) + timedelta(seconds=pause_s)
             self.meter.notes.append(
                 f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
                 f"{message}"
             )
-        if verdict.action == "retry":
-            raise TryAgain(message, verdict.delay_s)
-        if verdict.action == "fail":
-            which = "reply" if verdict.outcome == "reply_refused" else "request"
+        if outcome.action == "retry":
+            raise TryAgain(message, outcome.delay_s)
+        if outcome.action == "fail":
+            which = "reply" if outcome.name == "reply_refused" else "request"
             raise RequestFailed(f"the {which} was rejected")
-        if verdict.action == "quota":
+        if outcome.action == "quota":
             raise QuotaExhausted(
                 f"{self.driver}: the account's quota is exhausted ({message}). Every reply so far "
                 "is saved; when there is credit again, run the same command to go on."
             )
-        if verdict.action == "refused":
-            raise EndpointRefused(f"{self.driver}: {self._refusal_advice(verdict)} ({message})")
-        empty_again = verdict.outcome == "empty" and FORMATS[self.entry.format].retries_empty
+        if outcome.action == "refused":
+            raise EndpointRefused(f"{self.driver}: {self._refusal_advice(outcome)} ({message})")
+        empty_again = outcome.name == "empty" and self._format.retries_empty
         if empty_again and sum(a.outcome == "empty" for a in attempts) <= EMPTY_RETRIES:
             raise TryAgain("empty answer")
 
-    def _refusal_advice(self, verdict: Verdict) -> str:
-        if verdict.outcome == "not_allowed":
+    def _refusal_advice(self, outcome: AttemptOutcome) -> str:
+        if outcome.name == "not_allowed":
             return f"the endpoint does not accept the key; {set_key(self.name, self.entry)}"
-        if verdict.outcome == "bad_certificate":
+        if outcome.name == "bad_certificate":
             return (
                 "the endpoint's certificate is not to be trusted, and nothing was sent; check the "
                 "base URL, or set SSL_CERT_FILE to the certificates of who signed it"
@@ -466,17 +482,17 @@ class LlmClient:
         """The provider whose own host is asked; None: another server in its format."""
         return self.entry.provider if self.endpoint == self.entry.provider else None
 
-    def _record(self, number: int, raw: RawReply, verdict: Verdict, worst: Usage) -> Attempt:
-        usage = verdict.reading.usage
+    def _record(self, number: int, raw: RawReply, outcome: AttemptOutcome, worst: Usage) -> Attempt:
+        usage = outcome.reading.usage
         return Attempt(
             number=number,
-            outcome=verdict.outcome,
+            outcome=outcome.name,
             http_status=raw.status,
-            model_served=verdict.reading.model_served,
-            finish_reason=verdict.reading.finish_reason,
+            model_served=outcome.reading.model_served,
+            finish_reason=outcome.reading.finish_reason,
             usage=usage,
             reply=raw.body,
-            error=verdict.message,
+            error=outcome.message,
             cost_usd=self._cost_usd(raw, usage, worst),
             scripted=SCRIPTED_HEADER in raw.headers or says_scripted(raw.body),
         )
@@ -495,7 +511,7 @@ class LlmClient:
                 Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
             )
         stray = raw.status == 200 and is_web_page(raw) and not self.first.known
-        return 0.0 if stray or not may_be_charged(raw, self._own_host) else None
+        return 0.0 if stray or not may_be_charged(raw, self._format, self._own_host) else None
 
     def _worst_case(self, request: ChatRequest) -> Usage:
         """An upper bound on a request's tokens: no tokeniser makes more tokens than bytes."""
@@ -507,16 +523,16 @@ class LlmClient:
         if usage.output_tokens is not None:
             permit.settle((usage.input_tokens or 0) + usage.output_tokens)
 
-    def _reply(self, entry: Entry, earlier: int) -> ChatReply:
+    def _read(self, entry: Entry, earlier: int | None = None) -> ChatReply:
+        """A recorded reply; all its attempts are ``earlier`` ones unless it says otherwise."""
         last = entry.attempts[-1]
-        payload: Any = json.loads(last.reply or "{}")
-        text = FORMATS[self.entry.format].read(payload).text if last.http_status == 200 else ""
+        payload: Any = json.loads(last.reply or "{}") if last.http_status == 200 else {}
         return ChatReply(
-            text=text,
+            text=self._format.read(payload).text,
             outcome=last.outcome,
             request=entry.request,
             attempts=entry.attempts,
-            earlier=earlier,
+            earlier=len(entry.attempts) if earlier is None else earlier,
         )
 
 

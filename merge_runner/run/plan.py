@@ -12,7 +12,6 @@ from merge_runner.config import (
     ModelEntry,
     Scenario,
     SweepFile,
-    load_models,
     load_sweep,
     pair_name,
 )
@@ -20,6 +19,7 @@ from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import SPEC_VERSION, canonical_json, spec_hash
+from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests
 from merge_runner.records import Side, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS

@@ -411,7 +411,7 @@ class Sweep:
 
     def _endpoint(self, name: str, entry: ModelEntry) -> str:
         """The endpoint's identity: in a replay, the one under which the model is recorded."""
-        configured = endpoint_identity(name, entry)
+        configured = endpoint_identity(entry)
         if entry.provider == "emulator":
             configured += self._options.faults_identity
         if not self._options.replay:

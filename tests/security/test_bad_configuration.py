@@ -75,7 +75,10 @@ def refused(program, *arguments):
         ),
         (model(provider="3"), "provider: Input should be a valid string"),
         (model(provider='"opnai"'), f"unknown provider 'opnai'; valid: {', '.join(PROVIDERS)}"),
-        (model(format='"openai"'), "'openai-chat', 'openai-responses', 'gemini' or 'anthropic'"),
+        (
+            model(format='"openai"'),
+            "[m]: unknown wire format 'openai'; valid: openai-chat, openai-responses, gemini,",
+        ),
         (model(rpm="-5"), "rpm: Input should be greater than 0"),
         (model(tpm="-5"), "tpm: Input should be greater than 0"),
         (model(rpm="0"), "rpm: Input should be greater than 0"),
