@@ -99,6 +99,8 @@ async def _decide(world: World, seats: Mapping[Side, _Seated]) -> dict[Side, Dec
         for side, seated in seats.items()
         if seated.is_due(world.step) and world.in_control(side)
     }
+    if not asked:
+        return {}
     answers = await asyncio.gather(
         *(answer(seated, world.observe(side)) for side, seated in asked.items())
     )

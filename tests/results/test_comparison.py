@@ -40,7 +40,8 @@ def played() -> TrialRecord:
         attempts = (
             Attempt(1, "overloaded", 503, reply="<html>", error="HTTP 503", started_at=CLOCK),
             Attempt(2, "ok", 200, "m", "stop", Usage(9, 1, 5, 2), 1.5, CLOCK,
-                    json.dumps({"id": str(slot.decision), "text": text}, ensure_ascii=False), None, 0.25),
+                    json.dumps({"id": str(slot.decision), "text": text}, ensure_ascii=False),
+                    None, 0.25),
         )  # fmt: skip
         return ChatReply(text, "ok", request, attempts, earlier=0)
 
