@@ -16,6 +16,7 @@ baseline = 2
 [scenario]
 step_s = 0.05
 plan_step_s = 0.2
+control_start = "own_exit"
 """
 PAIRS = ("hesitant+impulsive", "emulator+impulsive")
 RATES = {"emulator": 1, "hesitant": 5, "impulsive": 20}
