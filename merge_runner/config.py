@@ -61,6 +61,16 @@ class Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+def whole_steps(name: str, seconds: float, step_s: float) -> int:
+    """How many steps a time takes; raises ValueError where that is no whole number from 1."""
+    steps = seconds / step_s
+    if steps > MOST_STEPS:
+        raise ValueError(f"{name} = {seconds:g} s is more than {MOST_STEPS} steps")
+    if abs(steps - round(steps)) > 1e-9 or round(steps) < 1:
+        raise ValueError(f"{name} = {seconds:g} s is no whole number of {step_s} s")
+    return round(steps)
+
+
 class Scenario(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
@@ -75,10 +85,15 @@ class Scenario(Frozen):
     ``empty``. ``fallback``: after an invalid reply the last valid plan ``continue``s where it
     was left, or ``restart``s at its first action. ``straight_after``: the prompt says "straight"
     once the ``own`` vehicle, or once ``both``, have passed the merge point.
+    ``step_s`` is the world's step. ``plan_step_s`` is how long an action of a language model's plan
+    lasts and how far apart the samples of its histories are, ``step_s`` where it is not given.
+    ``prompt_rate_hz`` is a language model's, and that of a program without a rate of its own.
     """
 
     horizon_s: Positive = 4.0
     step_s: Positive = 0.2
+    # Left out where it is not given, so that specs from before it keep their hashes.
+    plan_step_s: Positive | None = Field(default=None, exclude_if=lambda value: value is None)
     prompt_rate_hz: Positive = 1.0
     memory_s: Positive = 2.0
     max_acceleration_mps2: Positive = 2.5
@@ -93,18 +108,28 @@ class Scenario(Frozen):
     straight_after: Literal["own", "both"] = "own"
 
     @cached_property
+    def action_s(self) -> float:
+        """How long an action of a language model's plan lasts."""
+        return self.step_s if self.plan_step_s is None else self.plan_step_s
+
+    @cached_property
+    def action_steps(self) -> int:
+        """How many steps of the world an action of a language model's plan lasts."""
+        return round(self.action_s / self.step_s)
+
+    @cached_property
     def plan_actions(self) -> int:
-        """N, the number of actions of a plan."""
-        return round(self.horizon_s / self.step_s)
+        """N, the number of actions of a language model's plan."""
+        return round(self.horizon_s / self.action_s)
 
     @cached_property
     def executed_actions(self) -> int:
         """How many actions of a plan are driven before the next prompt."""
-        return round(1 / (self.prompt_rate_hz * self.step_s))
+        return round(1 / (self.prompt_rate_hz * self.action_s))
 
     @cached_property
     def memory_samples(self) -> int:
-        """The number of samples in each history."""
+        """The number of the world's samples in each history."""
         return round(self.memory_s / self.step_s)
 
     @cached_property
@@ -114,17 +139,14 @@ class Scenario(Frozen):
 
     @model_validator(mode="after")
     def _whole_steps(self) -> Scenario:
-        for name, seconds in (
-            ("horizon_s", self.horizon_s),
-            ("memory_s", self.memory_s),
-            ("timeout_s", self.timeout_s),
-            ("1 / prompt_rate_hz", 1 / self.prompt_rate_hz),
+        for name, seconds, step_s in (
+            ("plan_step_s", self.action_s, self.step_s),
+            ("horizon_s", self.horizon_s, self.action_s),
+            ("memory_s", self.memory_s, self.action_s),
+            ("timeout_s", self.timeout_s, self.step_s),
+            ("1 / prompt_rate_hz", 1 / self.prompt_rate_hz, self.action_s),
         ):
-            steps = seconds / self.step_s
-            if steps > MOST_STEPS:
-                raise ValueError(f"{name} = {seconds:g} s is more than {MOST_STEPS} steps")
-            if abs(steps - round(steps)) > 1e-9 or round(steps) < 1:
-                raise ValueError(f"{name} = {seconds:g} s is no whole number of {self.step_s} s")
+            whole_steps(name, seconds, step_s)
         if self.executed_actions > self.plan_actions:
             raise ValueError("the horizon is shorter than the time between two prompts")
         return self

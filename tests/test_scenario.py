@@ -19,6 +19,19 @@ def test_the_counts_follow_from_the_times():
     assert (scenario.memory_samples, scenario.timeout_steps) == (15, 120)
 
 
+def test_a_plan_may_have_steps_of_its_own():
+    scenario = Scenario(step_s=0.05, plan_step_s=0.2)
+    assert (scenario.plan_actions, scenario.executed_actions, scenario.action_steps) == (20, 5, 4)
+    assert (scenario.memory_samples, scenario.timeout_steps) == (40, 600)
+    with pytest.raises(ValidationError, match=r"plan_step_s = 0\.3 s is no whole number"):
+        Scenario(plan_step_s=0.3)
+
+
+def test_a_knob_that_is_not_turned_stands_in_no_spec():
+    assert "plan_step_s" not in Scenario().model_dump()
+    assert Scenario(plan_step_s=1.0).model_dump()["plan_step_s"] == 1.0
+
+
 @pytest.mark.parametrize(
     ("field", "seconds"),
     [

@@ -8,7 +8,7 @@ driven again, and the last ones go on as far as they reach; what is open then st
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, pairwise
 from math import ceil, hypot, isclose
 from pathlib import Path
@@ -18,6 +18,8 @@ import pandas as pd
 
 from analysis.data.load import SPECS, load_each
 from merge_runner.config import CollisionRule, Scenario
+from merge_runner.drivers.pace import pace_of
+from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.collision import collided, rectangles_overlap
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import FORWARD, LATERAL, MERGE_POINT_M
@@ -51,6 +53,7 @@ SELECT trial_id, spec_hash FROM decisions GROUP BY ALL HAVING count(DISTINCT sid
 """
 PLANS = (
     "SELECT trial_id, spec_hash, side, list(applied ORDER BY decision) AS applied, "
+    "min(time_s) AS since_s, "
     "arg_max(coalesce(plan, []), decision) AS last_plan FROM decisions "
     "SEMI JOIN (FROM trials WHERE status = 'collided') USING (trial_id, spec_hash) "
     "GROUP BY ALL ORDER BY ALL"
@@ -100,7 +103,9 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     """
     ended = trials[trials["status"] != "failed"]
     specs = load_each({"specs": SPECS}, db)["specs"]
-    scenarios = _scenarios(ended["spec_hash"].unique(), specs)
+    texts = dict(zip(specs["spec_hash"], specs["spec"], strict=True))
+    told = {name: json.loads(texts.get(name, "{}")) for name in ended["spec_hash"].unique()}
+    scenarios = _scenarios(told)
     found = load_each({"plans": PLANS, "near": _near(scenarios.values()), "decided": DECIDED}, db)
     near = {
         (row.trial_id, row.spec_hash): [Sample(*sample) for sample in row.near]
@@ -129,12 +134,20 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
             elif trial.source == "human":
                 outcome = UNDECIDED, None
             else:
-                sides = [plans[key][side] for side in ("left", "right")]
+                sides = [plans[key][side] for side in SIDES]
+                lasting = [
+                    pace_of(scenario, told[trial.spec_hash].get(side, {})).action_steps
+                    for side in SIDES
+                ]
                 outcome = redrive(
                     scenario,
                     trial.condition,
-                    [side.applied for side in sides],
-                    [side.last_plan for side in sides],
+                    [
+                        [_in_steps(actions, n) for actions in side.applied]
+                        for side, n in zip(sides, lasting, strict=True)
+                    ],
+                    [_in_steps(side.last_plan, n) for side, n in zip(sides, lasting, strict=True)],
+                    begins=[round(side.since_s / scenario.step_s) for side in sides],
                     between=reading == BOXES,
                 )
             rows.append((*key, reading, *outcome))
@@ -200,20 +213,21 @@ def _is_multiple(time_s: float, step_s: float) -> bool:
     return isclose(time_s / step_s, round(time_s / step_s), abs_tol=1e-6)
 
 
-def _scenarios(spec_hashes: Iterable[str], specs: pd.DataFrame) -> dict[tuple[str, str], Scenario]:
+def _scenarios(told: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], Scenario]:
     """The scenario of each spec under each reading; that of humans is the default one."""
-    texts = dict(zip(specs["spec_hash"], specs["spec"], strict=True))
-    found = {
-        spec_hash: json.loads(texts.get(spec_hash, "{}")).get("scenario", {})
-        for spec_hash in spec_hashes
-    }
     return {
         (spec_hash, reading): Scenario.model_validate(
-            scenario | {"collision_rule": "rectangle" if reading == BOXES else reading}
+            spec.get("scenario", {})
+            | {"collision_rule": "rectangle" if reading == BOXES else reading}
         )
-        for spec_hash, scenario in found.items()
+        for spec_hash, spec in told.items()
         for reading in READINGS
     }
+
+
+def _in_steps(actions: Iterable[float], lasting: int) -> list[float]:
+    """Actions that each last so many steps of the world, step by step."""
+    return [action for action in actions for _ in range(lasting)]
 
 
 def redrive(
@@ -222,21 +236,21 @@ def redrive(
     applied: Sequence[Sequence[Sequence[float]]],
     last_plans: Sequence[Sequence[float]],
     *,
+    begins: Sequence[int] = (0, 0),
     between: bool = False,
 ) -> Outcome:
     """Drive a trial's plans again: (status, merged_first).
 
     ``between``: collisions are looked for at 20 Hz between the steps too.
-    ``applied`` holds, for left and right, the normalised actions of each decision; a vehicle that
-    decided later than the other cruised before. ``last_plans`` are whole plans, empty if unknown.
+    ``applied`` holds, for left and right, the normalised actions of each decision, one a step of
+    the world; until the step at which it ``begins`` a vehicle cruises. ``last_plans`` are whole
+    plans, empty if unknown.
     """
     world = World(scenario, CONDITIONS[condition])
-    actions = [[action for actions in side for action in actions] for side in applied]
-    steps = max(map(len, actions))
     queues: list[list[float | None]] = []
-    for side, last, own in zip(applied, last_plans, actions, strict=True):
+    for begin, side, last in zip(begins, applied, last_plans, strict=True):
         rest = last[len(side[-1]) :] if side else []
-        queues.append([*[None] * (steps - len(own)), *own, *rest])
+        queues.append([*[None] * begin, *(action for own in side for action in own), *rest])
     for left, right in zip(*queues, strict=False):
         if world.status is not None:
             break

@@ -13,6 +13,7 @@ import duckdb
 from analysis.explorer.prompts import Part, parts_of
 from analysis.explorer.reading import reading
 from merge_runner.config import Scenario
+from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
 
 Row = dict[str, Any]
@@ -49,11 +50,15 @@ SELECT * FROM calls WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A trial's samples by side and its decisions without prompts; ``scenario`` is its task's."""
+    """A trial's samples by side and its decisions without prompts; ``scenario`` is its task's.
+
+    ``paces`` say when each driver decided.
+    """
 
     trial_id: str
     spec_hash: str
     scenario: Scenario
+    paces: dict[Side, Pace]
     states: dict[Side, Row]
     decisions: list[Row]
 
@@ -61,6 +66,10 @@ class Trial:
     def end_s(self) -> float:
         """The time of the last sample."""
         return max((samples["time_s"][-1] for samples in self.states.values()), default=0.0)
+
+    def interval_s(self, side: Side) -> float:
+        """How long a decision of a side is driven."""
+        return self.paces[side].interval_steps * self.scenario.step_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +95,8 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     told = json.loads(task["spec"] or "{}")
     scenario = scenario_of(task["source"], told.get("scenario"))
     ordered = {side: states[side] for side in SIDES if side in states}
-    trial = Trial(trial_id, spec_hash, scenario, ordered, decisions)
+    paces = {side: pace_of(scenario, told.get(side, {})) for side in SIDES}
+    trial = Trial(trial_id, spec_hash, scenario, paces, ordered, decisions)
     for row in decisions:
         if row["lost"]:
             row["time_s"] = trial.end_s

@@ -15,6 +15,7 @@ from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.display_text import visible
 from analysis.explorer.query_process import Sandbox
 from analysis.explorer.urls import Links
+from analysis.explorer.views import clock
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
 
@@ -72,6 +73,7 @@ class Site:
             static=self.static,
             study=self.db.name if self.static else str(self.db),
             visible=visible,
+            clock=clock,
             **self.shared,
         )
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import ceil, floor
 from typing import Any
 
 from analysis.explorer.details import Decision, Row, Trial
 from analysis.explorer.display_text import visible
 from merge_runner.config import Scenario
-from merge_runner.prompts.blocks import VARIANTS
+from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge import geometry as track
 from merge_runner.scenarios.merge.collision import collided
@@ -18,18 +18,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 BISECTIONS = 14
 # What a picture shows of the plane around the track, in m.
 BEFORE_M, BEYOND_M, BESIDE_M = 3.0, 5.8, 4.5
-# What each part of a prompt is for.
-BLOCK_MEANINGS = {
-    "C0": "situation",
-    "C1": "history",
-    "C2": "previous plan",
-    "C3.safety": "avoid a collision",
-    "C3.human": "drive like a human",
-    "C3.distance": "keep a distance",
-    "C3.reassess": "reassess",
-    "C4": "tactical decision",
-    "C5": "output format",
-}
+UNKNOWN = "no meaning is known here"
 
 
 Scale = tuple[int, int]
@@ -91,8 +80,31 @@ def prompt_text(variant: str | None) -> str:
     """A prompt variant in words."""
     if variant is None:
         return ""
-    without = sorted(VARIANTS.get(variant, ()))
-    return "the whole prompt" if not without else f"the prompt without {', '.join(without)}"
+    known = VARIANTS.get(variant)
+    if known is None:
+        return f"a prompt of which {UNKNOWN}"
+    changes = changes_text(known, str)
+    return f"the prompt {changes}" if changes else "the whole prompt"
+
+
+def changes_text(variant: Variant, shown: Callable[[str], str]) -> str:
+    """What a variant's prompt leaves out and adds, each block as it is to be shown."""
+    return " and ".join(
+        f"{word} {', '.join(shown(name) for name in sorted(names))}"
+        for word, names in (("without", variant.removes), ("with", variant.adds))
+        if names
+    )
+
+
+def block_meaning(name: str) -> str:
+    """What a block of a prompt is for."""
+    block = BLOCKS.get(name)
+    return UNKNOWN if block is None else block.meaning
+
+
+def clock(time_s: float) -> str:
+    """A time in seconds, to a tenth or, where that is not exact, a hundredth."""
+    return f"{time_s:.1f}" if abs(time_s - round(time_s, 1)) < 1e-6 else f"{time_s:.2f}"
 
 
 def outcome_text(row: Row, scenario: Scenario) -> str:
@@ -203,7 +215,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
         "label": label(row),
         "status": row["status"],
         "end": trial.end_s,
-        "every": 1 / trial.scenario.prompt_rate_hz,
+        "every": {side: trial.interval_s(side) for side in SIDES},
         "sides": {
             side: {
                 "t": _rounded(samples["time_s"], 3),
@@ -308,6 +320,7 @@ def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
     None where there is no plan.
     """
     row, before, scenario = decision.row, decision.before, trial.scenario
+    pace = trial.paces[row["side"]]
     if row["lost"]:
         return None
     applied = (row["applied"] or []) if row["time_s"] < trial.end_s else []
@@ -318,9 +331,9 @@ def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
         "plan": row["plan"] or [],
         "before": old,
         "applied": applied,
-        "step_s": scenario.step_s,
+        "step_s": pace.action_steps * scenario.step_s,
         "most_mps2": scenario.max_acceleration_mps2,
-        "steps": scenario.plan_actions,
+        "steps": pace.plan_actions,
     }
 
 
@@ -334,15 +347,15 @@ def step_points(values: Sequence[float], width: float, height: float, steps: int
 
 
 def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:
-    """Both vehicles where a decision was made and a second later, or at the end."""
+    """Both vehicles where a decision was made and where the next one was, or at the end."""
     if decision.row["lost"]:
         return []
     start = decision.row["time_s"]
-    second = 1 / trial.scenario.prompt_rate_hz
+    until = start + trial.interval_s(decision.row["side"])
     found = []
     for side, samples in trial.states.items():
         times = samples["time_s"]
-        inside = [i for i, t in enumerate(times) if start - 1e-9 <= t <= start + second + 1e-9]
+        inside = [i for i, t in enumerate(times) if start - 1e-9 <= t <= until + 1e-9]
         if len(inside) > 1:
             first, last = inside[0], inside[-1]
             found.append(

@@ -1,9 +1,10 @@
 """What must hold of every trial, as queries for what does not: trial_id, side, decision, text.
 
 They read the tables of a database and the temporary ones that sweeps.py makes: ``audited`` (the
-trials), ``rules`` (numbers of a spec's scenario), ``drivers`` (per spec and side the endpoint and
-the body of an empty request, NULL for a program), ``entries`` (the models of the sweep) and
-``other_models`` (who answered in place of whom).
+trials), ``rules`` (numbers of a spec's scenario), ``paces`` (when the driver of a spec's side
+decides), ``drivers`` (per spec and side the endpoint and the body of an empty request, NULL for a
+program), ``entries`` (the models of the sweep) and ``other_models`` (who answered in place of
+whom).
 """
 
 from __future__ import annotations
@@ -67,9 +68,9 @@ WITH last_steps AS (
     SELECT trial_id, spec_hash, max(step) AS last_step FROM states
     SEMI JOIN audited USING (trial_id, spec_hash) GROUP BY ALL
 ), implied AS (
-    SELECT trial_id, spec_hash, side, step // executed AS decision, time_s AS due_s
-    FROM states JOIN last_steps USING (trial_id, spec_hash) JOIN rules USING (spec_hash)
-    WHERE step % executed = 0 AND step < last_step AND position_m > {IN_CONTROL_M}
+    SELECT trial_id, spec_hash, side, step // interval_steps AS decision, time_s AS due_s
+    FROM states JOIN last_steps USING (trial_id, spec_hash) JOIN paces USING (spec_hash, side)
+    WHERE step % interval_steps = 0 AND step < last_step AND position_m > {IN_CONTROL_M}
 ), made AS (
     SELECT trial_id, spec_hash, side, decision, count(*) AS times, min(time_s) AS at_s
     FROM decisions SEMI JOIN audited USING (trial_id, spec_hash) GROUP BY ALL
@@ -77,14 +78,14 @@ WITH last_steps AS (
     SELECT trial_id, side, decision, CASE
         WHEN times IS NULL THEN 'it is missing: the driver was in control'
         WHEN times > 1 THEN format('it is stored {{}} times', times)
-        WHEN due_s IS NULL AND NOT (status = 'failed' AND decision * executed = last_step)
+        WHEN due_s IS NULL AND NOT (status = 'failed' AND decision * interval_steps = last_step)
             THEN 'nothing was to be decided: the trial was over, or the driver not in control'
         WHEN abs(at_s - due_s) > 1e-6
             THEN format('it was due at {{}} s and made at {{}} s', due_s, at_s)
         END AS text
     FROM implied FULL JOIN made USING (trial_id, spec_hash, side, decision)
     JOIN audited USING (trial_id, spec_hash)
-    JOIN rules USING (spec_hash)
+    JOIN paces USING (spec_hash, side)
     LEFT JOIN last_steps USING (trial_id, spec_hash)
 )
 SELECT trial_id, side, decision, text FROM compared WHERE text IS NOT NULL
@@ -97,6 +98,7 @@ WITH numbered AS (
     SELECT *, row_number() OVER (
         PARTITION BY trial_id, spec_hash, side ORDER BY decision) AS place
     FROM decisions SEMI JOIN audited USING (trial_id, spec_hash) JOIN rules USING (spec_hash)
+    JOIN paces USING (spec_hash, side)
 ), older AS (
     SELECT *,
         last_value(if(valid, plan, NULL) IGNORE NULLS) OVER before AS older_plan,

@@ -11,6 +11,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
 from merge_runner.config import Scenario
+from merge_runner.drivers.pace import Pace, pace_of
+from merge_runner.errors import UsageError
 from merge_runner.llm.keys import between_body_and_slot
 from merge_runner.records import SIDES
 
@@ -106,6 +108,15 @@ class Spec:
         """What drives on a side."""
         driver = self.content.get(side)
         return driver if isinstance(driver, dict) else {}
+
+    def pace(self, side: str) -> Pace | None:
+        """When the driver of a side decides, None where that cannot be read."""
+        if self.scenario is None:
+            return None
+        try:
+            return pace_of(self.scenario, self.driver(side))
+        except UsageError:
+            return None
 
     def asks(self, side: str) -> bool:
         """Whether a language model drives on a side."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
+from merge_runner.drivers.pace import model_pace
 from merge_runner.llm.cache import Totals
 from merge_runner.llm.prices import pricing
 from merge_runner.prompts.render import render_prompt
@@ -100,7 +101,7 @@ def worst_trial_usd(plan: Plan) -> float:
     """What a whole trial may cost: to the timeout, every byte a token, every answer at its cap."""
     prompt_bytes = len(_typical_prompt(plan).encode()) * PROMPT_MARGIN
     return sum(
-        math.ceil(plan.scenario.timeout_steps / plan.scenario.executed_actions)
+        math.ceil(plan.scenario.timeout_steps / model_pace(plan.scenario).interval_steps)
         * (
             pricing(entry).cost_usd(
                 Usage(input_tokens=int(prompt_bytes), output_tokens=entry.max_output_tokens)

@@ -6,16 +6,16 @@ import asyncio
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Protocol
 
-from merge_runner.drivers.base import Driver
-from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.drivers.base import MakeDriver
+from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
-from merge_runner.records import SIDES, Cell, ChatReply, Side, Slot, TrialRecord, TrialSpec
+from merge_runner.records import SIDES, Cell, ChatReply, Slot, TrialRecord, TrialSpec
 from merge_runner.run.plan import Plan
 from merge_runner.run.scheduler import Gate, run_bounded
 from merge_runner.trial import play_trial
@@ -71,7 +71,7 @@ class Crew(Protocol):
         ...
 
 
-@dataclass(slots=True)
+@dataclass
 class Players:
     """Plays at most ``in_flight`` trials at once."""
 
@@ -81,6 +81,12 @@ class Players:
     gate: Gate = field(default_factory=Gate)
     playing: Counter[Cell] = field(default_factory=Counter)
     workers: None = None
+
+    @cached_property
+    def drivers(self) -> Mapping[str, MakeDriver]:
+        """Who makes the drivers of a name: a program, or a model that one of the clients asks."""
+        models = {name: LanguageModel(partial(self._ask, name)) for name in self.clients}
+        return {**PROGRAMS, **models}
 
     @property
     def running(self) -> int:
@@ -117,10 +123,13 @@ class Players:
         self, spec: TrialSpec, room: Room
     ) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
         await room()
-        drivers = {side: self._driver(spec, side) for side in SIDES}
+        scenario = self.plan.scenario
+        drivers = {
+            side: self.drivers[self.plan.sides[side]].make(scenario, spec, side) for side in SIDES
+        }
         self.playing[spec.cell] += 1
         try:
-            return spec, await play_trial(spec, self.plan.scenario, drivers)
+            return spec, await play_trial(spec, scenario, drivers)
         except TrialSuspended as exc:
             return spec, exc
         finally:
@@ -128,16 +137,6 @@ class Players:
             for client in self.clients.values():
                 client.leave(spec.order)
 
-    def _driver(self, spec: TrialSpec, side: Side) -> Driver:
-        name, scenario = self.plan.sides[side], self.plan.scenario
-        if name in PROGRAMS:
-            return PROGRAMS[name].make(scenario, side)
-        client = self.clients[name]
-
-        async def ask(prompt: str, number: int) -> ChatReply:
-            await self.gate.enter()
-            slot = Slot(spec.condition, spec.repetition, side, number, spec.sample_set)
-            return await client.ask(prompt, slot, order=spec.order)
-
-        assert spec.variant is not None, "only human trials have no prompt variant"
-        return LlmDriver(ask, spec.variant, scenario)
+    async def _ask(self, model: str, prompt: str, slot: Slot, spec: TrialSpec) -> ChatReply:
+        await self.gate.enter()
+        return await self.clients[model].ask(prompt, slot, order=spec.order)

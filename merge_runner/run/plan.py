@@ -15,12 +15,13 @@ from merge_runner.config import (
     load_sweep,
     pair_name,
 )
+from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.models import load_models
-from merge_runner.prompts.blocks import VARIANTS, block_digests
+from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import Side, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
@@ -162,12 +163,7 @@ class Plan:
     def _driver(self, name: str, endpoints: Mapping[str, str]) -> dict[str, object]:
         entry = self.entries.get(name)
         if entry is None:
-            program = PROGRAMS[name]
-            return {
-                "program": name,
-                "parameters": dict(program.parameters),
-                "source": program.source,
-            }
+            return PROGRAMS[name].told(name)
         sent = FORMATS[entry.format].request(entry, "")
         return {
             "endpoint": endpoints[name],
@@ -191,6 +187,8 @@ def make_plan(choice: Choice) -> Plan:
     valid = (*models, *PROGRAMS)
     for driver in sides.values():
         _require(driver, valid, "model", "two joined by + drive left and right")
+    for driver in {*sides.values()} - {*models}:
+        pace_of(file.scenario, PROGRAMS[driver].told(driver))
     wanted = choice.conditions if choice.conditions is not None else file.conditions
     conditions = tuple(dict.fromkeys(CONDITIONS if wanted is None else wanted))
     if not conditions:
@@ -214,7 +212,7 @@ def make_plan(choice: Choice) -> Plan:
 
 def _repetitions(name: str, file: SweepFile, choice: Choice) -> dict[str, int]:
     for variant in (*file.repetitions, *(choice.variants or ())):
-        _require(variant, tuple(VARIANTS), "variant")
+        blocks_of(variant)
     if choice.repetitions is not None and not 1 <= choice.repetitions <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
     wanted: dict[str, int] = {}

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from merge_runner.config import Scenario
-from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.emulator.chance import draw, draw_between, draw_index
 from merge_runner.emulator.driver import answer
 from merge_runner.llm.keys import make_request
@@ -55,21 +55,17 @@ def first_action(prompt, slot=None):
 async def play(condition, repetition, sample_set):
     """A trial in this process, the scripted driver on either side."""
 
-    def ask_as(side):
-        async def ask(prompt, number):
-            slot = Slot(condition, repetition, side, number, sample_set)
-            request = make_request(
-                provider="emulator",
-                endpoint="emulator",
-                model="scripted-driver",
-                path="/",
-                headers={},
-                body={"prompt": prompt},
-                slot=slot,
-            )
-            return ChatReply(answer(prompt, slot), "ok", request, (), earlier=0)
-
-        return ask
+    async def ask(prompt, slot, _):
+        request = make_request(
+            provider="emulator",
+            endpoint="emulator",
+            model="scripted-driver",
+            path="/",
+            headers={},
+            body={"prompt": prompt},
+            slot=slot,
+        )
+        return ChatReply(answer(prompt, slot), "ok", request, (), earlier=0)
 
     spec = TrialSpec(
         trial_id="t",
@@ -83,7 +79,7 @@ async def play(condition, repetition, sample_set):
         sample_set=sample_set,
         order=0,
     )
-    drivers = {side: LlmDriver(ask_as(side), "baseline", SCENARIO) for side in SIDES}
+    drivers = {side: LanguageModel(ask).make(SCENARIO, spec, side) for side in SIDES}
     return await play_trial(spec, SCENARIO, drivers)
 
 

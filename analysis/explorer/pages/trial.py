@@ -87,7 +87,7 @@ def rendered(site: Site, row: Row, trial: Trial, found: Decision) -> str:
         d=found.row,
         before=found.before,
         parts=found.parts,
-        meanings=views.BLOCK_MEANINGS,
+        meaning=views.block_meaning,
         attempts=found.attempts,
         others=site.catalogue.others,
         reply=None if body is None else {"text": text, "more": more},

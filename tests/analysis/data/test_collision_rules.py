@@ -182,7 +182,7 @@ def test_a_driver_that_decided_later_cruised_in_the_steps_before():
     """Full throttle from the right's first decision on, five steps late, comes too late to pass."""
     scenario = Scenario(control_start="own_exit")
     early = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 12], [[], []])
-    late = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 8], [[], []])
+    late = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 8], [[], []], begins=(0, 20))
     assert early == ("finished", "right")
     assert late == ("collided", None)
     drawn_out = redrive(
