@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
-from merge_runner.llm.cache import Totals
+from merge_runner.llm.cache import CallTotals
 from merge_runner.llm.prices import pricing
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
@@ -30,7 +30,7 @@ class Missing:
 
     trials: int
     calls: Mapping[str, float]
-    facts: Mapping[str, Totals]
+    facts: Mapping[str, CallTotals]
     endpoints: Mapping[str, str]
 
 
@@ -111,7 +111,7 @@ def worst_trial_usd(plan: Plan) -> float:
     )
 
 
-def _per_call(plan: Plan, entry: ModelEntry, facts: Totals) -> _PerCall:
+def _per_call(plan: Plan, entry: ModelEntry, facts: CallTotals) -> _PerCall:
     if facts.measured:
         usage = Usage(
             input_tokens=round(facts.input_tokens / facts.measured),

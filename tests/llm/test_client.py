@@ -19,7 +19,7 @@ from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.transport import SealedTransport, TransportFailure
@@ -405,7 +405,7 @@ async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     client.transport.open.clear()
     asked = asyncio.create_task(client.ask("prompt", slot()))
     await ticks()
-    assert client.flying == 1
+    assert client.in_flight_calls == 1
     asked.cancel()
     drained = asyncio.create_task(client.drain())
     await ticks()
@@ -413,7 +413,7 @@ async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     assert not drained.done()
     client.transport.open.set()
     await drained
-    assert client.flying == 0
+    assert client.in_flight_calls == 0
     (kept,) = cache.entries()
     assert kept.request == client.transport.sent[0]
     assert outcomes(kept.attempts) == ["ok"]
@@ -560,7 +560,7 @@ async def test_a_call_that_gets_no_turn_gives_its_money_back(make):
     await ticks()
     await client.drain()
     await asyncio.gather(asked, return_exceptions=True)
-    await client.budget.reserve(0, 0.0015)
+    await client.budget.set_aside(0, "key", Asked("", "", 0.0015))
     assert client.budget.ledger.read().committed_usd == 0
 
 

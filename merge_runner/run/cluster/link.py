@@ -30,8 +30,8 @@ class LinkLost(SweepStopped):
 class Link:
     """One end. ``handlers`` answer what the other end asks or tells, by name.
 
-    Those named in ``lasting`` end also when the other side is gone meanwhile; the others wait for
-    something on its behalf, and are cancelled.
+    Those named in ``survives_disconnect`` end also when the other side is gone meanwhile; the
+    others wait for something on its behalf, and are cancelled.
     """
 
     def __init__(
@@ -39,11 +39,11 @@ class Link:
         comm: Comm,
         handlers: Mapping[str, Callable[..., Any]],
         *,
-        lasting: frozenset[str] = frozenset(),
+        survives_disconnect: frozenset[str] = frozenset(),
     ) -> None:
         self._comm = comm
         self._handlers = handlers
-        self._lasting = lasting
+        self._survives_disconnect = survives_disconnect
         self._out = BatchedSend(interval=TOGETHER)
         self._out.start(comm)
         self._asked: dict[int, asyncio.Future[Any]] = {}
@@ -85,7 +85,7 @@ class Link:
                 if not future.done():
                     future.set_exception(LinkLost("the other side is gone"))
             for task in self._answering.values():
-                if task.get_name() not in self._lasting:
+                if task.get_name() not in self._survives_disconnect:
                     task.cancel()
             await asyncio.gather(*self._answering.values(), return_exceptions=True)
         if self._broken is not None:
