@@ -14,10 +14,12 @@ import heapq
 from collections import deque
 from dataclasses import dataclass, field
 
+from asyncio_throttle.throttler import Throttler
+
 from merge_runner.errors import UsageError
 from merge_runner.llm.shared_limits import WINDOW_S, SharedLimits, request_rules
 
-CLOCK_STEP_S = 1e-6
+CLOCK_STEP_S, POLL_S = 1e-6, 1e-3
 
 
 @dataclass(slots=True, eq=False)
@@ -130,7 +132,7 @@ class Limiter:
                 await self._wait(wait)
                 continue
             for throttle in self._throttles:
-                await throttle.take()  # at once: it has room
+                await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
             heapq.heappop(self._waiters)
             permit = Permit(loop.time(), waiter.tokens, self, counts=self._tpm is not None)
             if permit.counts:
@@ -162,27 +164,16 @@ class Limiter:
                 await self._changed.wait()
 
 
-class _Throttle:
+class _Throttle(Throttler):
     """asyncio-throttle, and when it has room again, which it does not tell."""
-
-    def __init__(self, limit: int, period_s: float) -> None:
-        from asyncio_throttle.throttler import Throttler
-
-        self._period_s = period_s
-        self._throttler = Throttler(limit, period_s, retry_interval=0.001)
-        self._taken: deque[float] = deque(maxlen=limit)
 
     @property
     def free_at(self) -> float:
-        """The earliest next turn, on the event loop's clock."""
-        full = len(self._taken) == self._taken.maxlen
-        return self._taken[0] + self._period_s + CLOCK_STEP_S if full else 0.0
-
-    async def take(self) -> None:
-        """Take a turn; at once where there is room."""
-        await self._throttler.acquire()  # type: ignore[no-untyped-call] # ships no types
-        self._taken.append(asyncio.get_running_loop().time())
+        """The earliest next turn, on the event loop's clock, which is the throttle's too."""
+        full = len(self._task_logs) >= self.rate_limit
+        # A little later than that, since it holds a turn for longer than its period.
+        return self._task_logs[0] + self.period + CLOCK_STEP_S if full else 0.0
 
 
 def _throttles(rpm: int, window_s: float) -> list[_Throttle]:
-    return [_Throttle(*rule) for rule in request_rules(rpm, window_s)]
+    return [_Throttle(*rule, retry_interval=POLL_S) for rule in request_rules(rpm, window_s)]

@@ -13,12 +13,12 @@ import json
 import os
 import stat
 import struct
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from merge_runner.config import runtime_folder
 from merge_runner.errors import UsageError
 
 WINDOW_S = 60.0
@@ -200,9 +200,7 @@ def _unusable(place: Path, exc: OSError) -> UsageError:
 
 def _own_folder() -> Path:
     """A folder of this user alone, of this machine."""
-    runtime = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
-    parent = runtime if runtime.is_dir() else Path(tempfile.gettempdir())
-    folder = parent / f"merge-runner-{os.getuid()}"
+    folder = runtime_folder() / f"merge-runner-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()
