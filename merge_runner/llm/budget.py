@@ -104,6 +104,7 @@ class Budget:
             raise TrialSuspended("its trial is suspended")
         self._at_the_door.append(trial)
         try:
+            # Only the oldest trial takes an allowance: were others let by, it might wait for ever.
             while trial not in self._allowances:
                 allowed = sum(self._allowances.values())
                 fits = (
@@ -196,6 +197,9 @@ class Budget:
         if self.cap_usd is None:
             return True
         own = min(worst_usd, self._allowances.get(trial, 0.0))
+        # Beside this attempt there must be room for the rest of all allowances, and, where several
+        # are in flight, for each of them to cost twice its worst case: a server that ignores the
+        # output cap is known only by its first dear reply, when the others are sent already.
         others = self._in_flight + 1 if self._in_flight else 0
         spare_usd = max(
             sum(self._allowances.values()) - own, others * max(worst_usd, self._largest_usd)
@@ -219,6 +223,7 @@ class Budget:
         return loop.time() - began
 
     def _tell(self) -> None:
+        # A fresh event: who waits for the next change does not see this one again.
         self._changed.set()
         self._changed = asyncio.Event()
 

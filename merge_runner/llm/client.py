@@ -234,7 +234,7 @@ class LlmClient:
             call.attempts, call.earlier = list(earlier), len(earlier)
             if made is None:
                 return await self._make(call)
-            call.earlier = len(made.attempts)  # all of them are told of elsewhere
+            call.earlier = len(made.attempts)  # whoever made them tells of them
             return made
         finally:
             if self.claims is not None:
@@ -273,12 +273,11 @@ class LlmClient:
             with deadline.attempt() as seconds_left:
                 verdict, raw = await self._send(call, permit, seconds_left)
             self._tell_overrun(call, paid.aside_usd)
-            # Whatever follows, the money is settled first: an error may end the whole run.
             error = self._consequences.error(call, verdict, raw)
             if error is None:
                 return await paid.keep(Entry(call.request, tuple(call.attempts)))
             self._pause(call, verdict)
-            await paid.settle(call.attempts)
+            await paid.settle(call.attempts)  # first, since the error may end the whole run
             raise error
 
     @asynccontextmanager

@@ -1,7 +1,8 @@
 """Requests and tokens a minute, behind one dispatcher that serves the oldest trial first.
 
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
-only the dispatcher ever asks it, and not before it has room. Tokens are counted in a sliding window
+only the dispatcher ever asks it, and not before it has room: a turn that was taken early, and then
+held up by a pause, would be counted at the wrong time. Tokens are counted in a sliding window
 of a minute: an estimate at dispatch, settled to the actual usage afterwards. What other processes
 send with the same key counts too, see shared_limits.py.
 """
@@ -89,6 +90,7 @@ class Limiter:
                 "experiments/models.toml"
             )
         loop = asyncio.get_running_loop()
+        # No limit and nobody before it: the dispatcher, a task of its own, is not worth its time.
         if not self.limited and not self._waiters and not self.paused_s:
             return Permit(loop.time(), tokens, self, counts=False)
         waiter = _Waiter(order, self._arrivals, tokens, loop.create_future())
@@ -126,6 +128,7 @@ class Limiter:
         loop = asyncio.get_running_loop()
         while waiter := self._head():
             wait = self._blocked_for(waiter, loop.time())
+            # The others' file last: who takes a turn there counts for everybody at once.
             if wait <= 0 and self._shared is not None:
                 wait = self._shared.take(waiter.tokens)
             if wait > 0:
@@ -141,6 +144,7 @@ class Limiter:
             waiter.turn.set_result(permit)
 
     def _head(self) -> _Waiter | None:
+        # Whoever was cancelled while waiting has a done turn that nobody will use.
         while self._waiters and self._waiters[0].turn.done():
             heapq.heappop(self._waiters)
         return self._waiters[0] if self._waiters else None
@@ -153,6 +157,7 @@ class Limiter:
             self._tokens_in_window -= expired.tokens
         free_at = max(self._pause.until, *(throttle.free_at for throttle in self._throttles), 0.0)
         if self._tpm is not None and self._tokens_in_window + waiter.tokens > self._tpm:
+            # At least until the oldest leaves the window; if that frees too little, looked at anew.
             free_at = max(free_at, self._window[0].dispatched_at + self._window_s)
         return free_at - now
 

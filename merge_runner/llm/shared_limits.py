@@ -63,7 +63,7 @@ class SharedLimits:
         """Take a turn; 0 where it is taken, else how long in s to wait at least."""
         with self._locked() as locked:
             if not locked:
-                return BUSY_S
+                return BUSY_S  # the event loop never waits for another process, which may hang
             now = self._clock()
             sent, paused_until = self._head(now)
             buckets = self._buckets(now)
@@ -82,6 +82,7 @@ class SharedLimits:
 
     def settle(self, taken_at: float, more_tokens: int) -> None:
         """So many tokens more, or less, were used than a turn had counted."""
+        # Kept here until the file is free: an unused estimate must not be lost for the others.
         self._owed.append((int(taken_at / BUCKET_S), more_tokens))
         self._tell()
 

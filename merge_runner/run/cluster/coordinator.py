@@ -208,6 +208,7 @@ class Coordinator:
             )
         self._refuse_unreachable_emulator(host)
         await self._room()
+        # All --in-flight trials may be given out; the next worker waits until a batch has ended.
         while not self._free and self._waiting:
             self._freed.clear()
             await self._freed.wait()
@@ -216,6 +217,8 @@ class Coordinator:
         slots = max(1, min(self._slots, self._in_flight))
         share = min(self._free, max(1, self._in_flight // slots))
         idle = max(1, slots - sum(bool(other.trials) for other in self._sessions))
+        # Many at first, so that little is said, and fewer toward the end, so that no worker is left
+        # with a long rest; never fewer than it plays at once.
         size = min(
             math.ceil(len(self._waiting) / idle),
             max(share, math.ceil(len(self._waiting) / (BATCHES_PER_WORKER * slots))),
@@ -255,6 +258,8 @@ class Coordinator:
             self.fail(error)  # a fault of ours: the run raises it
         if self._stopping:
             return
+        # What it had not ended goes to the front, in order: a trial is played where its replies are
+        # found, in the main cache, whoever plays it.
         rest = sorted(session.trials.values(), key=lambda spec: spec.order)
         self._waiting.extendleft(reversed(rest))
         if rest and not session.ended:

@@ -21,7 +21,8 @@ from merge_runner.run.cluster.link import Link, rebuilt
 if TYPE_CHECKING:
     from merge_runner.run.cluster.coordinator import Coordinator
 
-# What a dead worker had sent is kept, and what it had paid for is booked.
+# What a dead worker had sent is kept, and what it had paid for is booked; whatever it waited for is
+# given up.
 SURVIVES_DISCONNECT = frozenset({"keep", "unanswered", "settle", "begin", "end"})
 
 
@@ -78,6 +79,7 @@ class Session:
         finally:
             for key in self._claimed.copy():
                 self._release(key)
+            # What was sent stays aside in the ledger; see PaidAttempt.
             for number in list(self._attempts):
                 self._close(number)
             self._services.budget.readmit(self.trials)
