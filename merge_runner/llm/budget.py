@@ -34,11 +34,12 @@ PATIENCE_S = 90.0
 class PaidAttempt:
     """The money of one attempt, from being set aside to the end of the attempt.
 
-    ``aside_usd`` is set aside in this process, and with ``begin`` in the ledger too. Who ends
+    ``aside_usd`` is set aside in this process, and from ``begin`` on in the ledger. An attempt that
+    ends
 
-    - without ``begin`` (cancelled while waiting, refused by the cap): gets all of it back;
-    - after it (the process may be charged): leaves it aside in the ledger, for ever if need be;
-    - after ``settle`` or ``keep``: has told the ledger what the attempt cost.
+    - before ``begin`` (cancelled while waiting, refused by the cap) gives all of it back;
+    - after it (it may have been charged) leaves it in the ledger, until a user releases it;
+    - after ``settle`` or ``keep`` has told the ledger its cost, where that is known.
     """
 
     budget: Budget
@@ -68,10 +69,9 @@ class PaidAttempt:
 
     def close(self) -> None:
         """The attempt has ended."""
-        if self._queued:
-            self.budget.give_back(self.trial, queued_usd=self.aside_usd, freed_usd=self.aside_usd)
-        else:
-            self.budget.give_back(self.trial, queued_usd=0.0, freed_usd=self._freed_usd)
+        queued_usd = self.aside_usd if self._queued else 0.0
+        freed_usd = queued_usd or self._freed_usd
+        self.budget.give_back(self.trial, queued_usd=queued_usd, freed_usd=freed_usd)
 
 
 class Budget:

@@ -35,7 +35,7 @@ SPARE_FILES = 64
 
 @dataclass(frozen=True, slots=True)
 class SpendingTerms:
-    """On what terms a sweep asks.
+    """What a sweep may send and spend.
 
     ``ledger`` holds its spending, over all its runs; ``trial_usd`` is the worst case of a whole
     trial.
@@ -48,7 +48,7 @@ class SpendingTerms:
 
 @dataclass(frozen=True, slots=True)
 class EndpointPlan:
-    """Whom a sweep asks: the identities of its endpoints, and the variables of their base URLs.
+    """Where a sweep asks: its endpoints' identities, and the variables that hold their base URLs.
 
     ``known`` are the models whose endpoint has ever answered in its format, ``passed`` those where
     it has done so in this run. ``strict`` stops at an answer of another model.
