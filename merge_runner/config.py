@@ -6,6 +6,7 @@ import ipaddress
 import json
 import os
 import re
+import tempfile
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -426,6 +427,16 @@ def _check_proxy(variable: str, value: str) -> None:
         usable = False
     if not usable or " " in value or not (value.isascii() and value.isprintable()):
         raise UsageError(f"{variable} is no URL of a proxy: set it to http://HOST:PORT or unset it")
+
+
+def runtime_folder(environment: Mapping[str, str] | None = None) -> Path:
+    """Where a user's processes share what a session needs: XDG_RUNTIME_DIR, else among temporaries.
+
+    Nothing there outlives the machine's next start.
+    """
+    env = os.environ if environment is None else environment
+    named = Path(env.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
+    return named if named.is_dir() else Path(tempfile.gettempdir())
 
 
 def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | None:

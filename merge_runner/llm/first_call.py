@@ -31,7 +31,7 @@ class FirstCall:
     async def turn(self) -> bool:
         """Wait until a call may go; True: it goes alone, until ``give_turn``."""
         await self._alone.acquire()
-        if self.passed:
+        if self.passed:  # answered while this one waited: nobody goes alone any more
             self._alone.release()
         return not self.passed
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
 from merge_runner.drivers.pace import model_pace
-from merge_runner.llm.cache import Totals
+from merge_runner.llm.cache import CallTotals
 from merge_runner.llm.prices import pricing
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
@@ -31,7 +31,7 @@ class Missing:
 
     trials: int
     calls: Mapping[str, float]
-    facts: Mapping[str, Totals]
+    facts: Mapping[str, CallTotals]
     endpoints: Mapping[str, str]
 
 
@@ -112,7 +112,7 @@ def worst_trial_usd(plan: Plan) -> float:
     )
 
 
-def _per_call(plan: Plan, entry: ModelEntry, facts: Totals) -> _PerCall:
+def _per_call(plan: Plan, entry: ModelEntry, facts: CallTotals) -> _PerCall:
     if facts.measured:
         usage = Usage(
             input_tokens=round(facts.input_tokens / facts.measured),

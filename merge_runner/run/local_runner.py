@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Protocol
@@ -13,6 +13,7 @@ from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import TrialSuspended
+from merge_runner.llm.call import Wait
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
 from merge_runner.records import SIDES, Cell, ChatReply, Slot, TrialRecord, TrialSpec
@@ -30,7 +31,7 @@ async def no_wait() -> None:
     """Room without end."""
 
 
-class Crew(Protocol):
+class TrialRunner(Protocol):
     """Whoever plays the trials of a sweep: this process, or workers in a cluster."""
 
     @property
@@ -49,8 +50,13 @@ class Crew(Protocol):
         ...
 
     @property
-    def flying(self) -> int:
+    def in_flight_calls(self) -> int:
         """How many calls are in flight or being saved."""
+        ...
+
+    @property
+    def waits(self) -> Sequence[Wait]:
+        """What the other calls wait for."""
         ...
 
     @property
@@ -72,7 +78,7 @@ class Crew(Protocol):
 
 
 @dataclass
-class Players:
+class LocalRunner:
     """Plays at most ``in_flight`` trials at once."""
 
     plan: Plan
@@ -99,16 +105,21 @@ class Players:
         return {name: client.meter for name, client in self.clients.items()}
 
     @property
-    def flying(self) -> int:
+    def in_flight_calls(self) -> int:
         """How many calls are in flight or being saved."""
-        return sum(client.flying for client in self.clients.values())
+        return sum(client.in_flight_calls for client in self.clients.values())
+
+    @property
+    def waits(self) -> Sequence[Wait]:
+        """What the other calls wait for."""
+        return [wait for client in self.clients.values() for wait in client.waits]
 
     def answers(self, name: str) -> int:
         """How many live replies a model's trials have used."""
         return self.clients[name].meter.calls_live
 
     async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
-        """See Crew."""
+        """See TrialRunner."""
         await run_bounded(
             (partial(self._trial, spec, room) for spec in specs),
             in_flight=self.in_flight,
@@ -116,7 +127,7 @@ class Players:
         )
 
     async def drain(self) -> None:
-        """See Crew."""
+        """See TrialRunner."""
         await asyncio.gather(*(client.drain() for client in self.clients.values()))
 
     async def _trial(
