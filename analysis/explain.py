@@ -116,7 +116,7 @@ def query_of(group: Group, predicate: str) -> str:
     for metric in METRICS.values():
         judged = metric.value in JUDGED
         told = _decided(group, metric.column) if judged else metric.counts_in_database
-        predicate = re.sub(rf"\b{metric.counts}", lambda _, told=told: told, predicate)
+        predicate = re.sub(rf"\b{metric.counts}", told.replace("\\", r"\\"), predicate)
     variant = f" AND variant = '{group.setting}'" if group.setting else ""
     narrowed = f" AND {group.narrowed}" if group.narrowed else ""
     return (
