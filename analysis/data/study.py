@@ -21,12 +21,11 @@ from analysis.data.load import (
     SPECS,
     SPEEDS,
     TRACES,
-    TRIALS,
     Calls,
     load_calls,
     load_each,
 )
-from analysis.data.reference_data import human_outcomes
+from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
 from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
@@ -133,8 +132,10 @@ class Study:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
         self.db = Path(db)
         self.chosen = models
-        found = load_each({"trials": TRIALS, "specs": SPECS, "traces": TRACES}, self.db)
-        trials = found["trials"].merge(found["traces"], on=["trial_id", "spec_hash"], how="left")
+        found = load_each({"specs": SPECS, "traces": TRACES}, self.db)
+        trials = trials_with_metrics(self.db).merge(
+            found["traces"], on=["trial_id", "spec_hash"], how="left"
+        )
         trials = judged(self.db, trials)
         recorded = trials["source"] == HUMAN
         self.imported = imported(trials[recorded]) if recorded.any() else None
@@ -220,14 +221,14 @@ def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
         label=known.label,
         model=HUMAN,
         narrowed=f"pair IN ({pairs})" if known.left_out else "",
-        published_outcomes=None if known.complete else human_outcomes(),
+        published_outcomes=None if known.complete else outcomes_with_metrics(),
     )
 
 
 @cache
 def _published_group() -> Group:
     """One object for all studies: what is computed from it is computed once."""
-    return Group(HUMAN, "", None, human_outcomes(), label=HUMAN, model=HUMAN, measured=False)
+    return Group(HUMAN, "", None, outcomes_with_metrics(), label=HUMAN, model=HUMAN, measured=False)
 
 
 def _tasks(specs: pd.DataFrame) -> dict[str, str]:

@@ -16,6 +16,7 @@ from analysis.explorer.display_text import visible
 from analysis.explorer.query_process import Sandbox
 from analysis.explorer.urls import Links
 from analysis.explorer.views import clock
+from analysis.metrics import METRICS
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
 
@@ -66,6 +67,7 @@ class Site:
         )
         self._environment.globals.update(
             at=self.at,
+            metrics=METRICS,
             pages={name: page for name, page in PAGES.items() if self.at.to(page)},
             share=self.share,
             program=self.program,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator
 from functools import cache
+from math import ceil
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,9 +41,10 @@ from analysis.figures.panels import (
     published_gap_line,
 )
 from analysis.figures.variant_figure import figure_2_variants
+from analysis.metrics import Metric, shown_in
 from analysis.stats.group_scores import score
 from analysis.stats.indicators import INDICATORS
-from analysis.stats.measures import GAP, RMSE, known, published_human
+from analysis.stats.measures import human_reference, known, values
 from merge_runner.errors import UsageError
 
 # Okabe and Ito's palette, safe for the colour-blind; each driver has a marker as well.
@@ -121,37 +123,56 @@ def ablation_matrix(study: Study) -> Figure:
 
 
 def distributions(study: Study) -> Figure:
-    """Gaps and speed deviations of finished trials: median, quartiles, and every trial."""
-    groups = study.groups
+    """Each metric that is no rate, of every group: median, quartiles, and every trial."""
+    groups, metrics = study.groups, _distributed()
     names = [wrapped(named(group), PAGE_IN / 4) for group in groups]
     row_in = max(0.28, LINE_IN * line_count(names) + 0.04)
-    figure = Figure(figsize=(PAGE_IN, 0.8 + row_in * len(groups)), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, measure in zip(axes, (GAP, RMSE), strict=True):
+    lines = ceil(len(metrics) / 2)
+    size = (PAGE_IN, lines * (0.8 + row_in * len(groups)))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(lines, 2, sharey=True, squeeze=False)
+    for axis, metric in zip(axes.flat, metrics, strict=False):
         for row, group in enumerate(groups):
-            colour, _ = _style(study, group)
-            if not known(group, measure):
-                axis.plot(published_human(measure), row, "D", color=colour, ms=4)
-                axis.annotate(
-                    "published mean", (published_human(measure), row), (6, -2),
-                    textcoords="offset points", fontsize=6,
-                )  # fmt: skip
-                continue
-            values = group.finished[measure.column].dropna().to_numpy(float)
-            if not len(values):
-                axis.annotate("no finished trial", (0.02, row), xycoords=("axes fraction", "data"))
-                continue
-            # Spread by rank, not by chance: the same trials give the same picture.
-            spread = row + 0.36 * (np.arange(len(values)) % 7 / 6 - 0.5)
-            axis.plot(values, spread, ".", color=colour, ms=1.5, alpha=0.4, rasterized=True)
-            axis.boxplot(
-                values, positions=[row], orientation="horizontal", widths=0.6, showfliers=False,
-                medianprops={"color": colour, "lw": 1.4}, manage_ticks=False,
-            )  # fmt: skip
-        axis.set_xlabel(measure.heading)
-    axes[0].set_yticks(range(len(groups)), names)
-    axes[0].set_ylim(len(groups) - 0.5, -0.5)
+            _distribution(axis, row, group, metric, _style(study, group)[0])
+        axis.set_xlabel(metric.heading)
+    for axis in axes.flat[len(metrics) :]:
+        axis.set_visible(False)
+    axes[0, 0].set_yticks(range(len(groups)), names)
+    axes[0, 0].set_ylim(len(groups) - 0.5, -0.5)
     return figure
+
+
+def _distributed() -> list[Metric]:
+    """Those with values to spread; a rate has two."""
+    return [metric for metric in shown_in("distributions") if not metric.rate]
+
+
+def _distribution(axis: Axes, row: int, group: Group, metric: Metric, colour: str) -> None:
+    if not known(group, metric):
+        _reference(axis, row, metric, colour)
+        return
+    found = values(group, metric).to_numpy(float)
+    if not len(found):
+        axis.annotate("no finished trial", (0.02, row), xycoords=("axes fraction", "data"))
+        return
+    # Spread by rank, not by chance: the same trials give the same picture.
+    spread = row + 0.36 * (np.arange(len(found)) % 7 / 6 - 0.5)
+    axis.plot(found, spread, ".", color=colour, ms=1.5, alpha=0.4, rasterized=True)
+    axis.boxplot(
+        found, positions=[row], orientation="horizontal", widths=0.6, showfliers=False,
+        medianprops={"color": colour, "lw": 1.4}, manage_ticks=False,
+    )  # fmt: skip
+
+
+def _reference(axis: Axes, row: int, metric: Metric, colour: str) -> None:
+    """The published value of humans without traces, or that there is none."""
+    found = human_reference(metric)
+    if found is None:
+        axis.annotate("no published value", (0.02, row), xycoords=("axes fraction", "data"))
+        return
+    axis.plot(found.value, row, "D", color=colour, ms=4)
+    text = f"published {metric.estimator}"
+    axis.annotate(text, (found.value, row), (6, -2), textcoords="offset points", fontsize=6)
 
 
 METADATA: dict[str, dict[str, None]] = {
@@ -184,7 +205,7 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
     ),
     "distributions": (
         distributions,
-        "Gap at the merge point and RMSE of the speed of all finished trials: medians, quartiles, "
+        "Every metric that is not a share, of all trials that count in it: medians, quartiles, "
         "whiskers to 1.5 times the quartiles' distance, and every trial.",
     ),
 }

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from analysis.data.study import Group, Study
-from analysis.report.ablated import NAMES, listed
+from analysis.report.ablated import SLOPES
 from analysis.stats.contrasts import corrected
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import POWER
 from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Difference, differences
+from analysis.tables.notes import listed
 
 LEVELS = {
     WHO_FIRST: ("who merges first where nobody is ahead or faster", "logits"),
@@ -43,7 +44,7 @@ def unlike(study: Study, group: Group) -> Iterator[str]:
 
 
 def _name(one: Difference) -> tuple[str, str]:
-    return LEVELS[one.outcome] if one.term == "intercept" else NAMES[one.term]
+    return LEVELS[one.outcome] if one.term == "intercept" else SLOPES[one.term]
 
 
 def _size(one: Difference) -> str:

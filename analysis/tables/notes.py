@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 
 from analysis.data.intermittency import STEADY_MPS
@@ -10,6 +10,11 @@ from analysis.data.reference_data import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
 from analysis.data.study import Group, Study
 from analysis.stats import ceiling
 from analysis.stats.likeness import MARGIN_SD
+
+
+def listed(items: Sequence[str]) -> str:
+    """``a, b and c``."""
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
 def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) -> list[str]:

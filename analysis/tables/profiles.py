@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from analysis.data.study import Group, Study, of_group
-from analysis.stats.intervals import Estimate
 from analysis.stats.likeness import NO_ACTION, difference, gains, mean_gain
+from analysis.stats.measures import bounds
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import intermittency_notes, sample_notes
 
@@ -94,8 +94,3 @@ def gain_values(
         return {}
     found = mean_gain(study, group)
     return {value: found.value, interval: bounds(found)}
-
-
-def bounds(found: Estimate) -> tuple[float, float] | None:
-    """The interval of an estimate, where it has one."""
-    return None if found.low is None or found.high is None else (found.low, found.high)

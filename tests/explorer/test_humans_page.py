@@ -12,7 +12,7 @@ from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
-from analysis.explorer.pages.humans import KINDS, chart
+from analysis.explorer.pages.humans import chart, kinds
 from analysis.explorer.site import Site
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
@@ -98,7 +98,7 @@ def test_the_page_says_what_counts_as_a_collision_for_whom(ask):
 def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
     content = Numbers(db).answer(["humans"])
     gap, rmse = (
-        next(kind for kind in KINDS if kind.name == name) for name in ("gap_m", "rmse_mps")
+        next(kind for kind in kinds() if kind.name == name) for name in ("gap_m", "rmse_mps")
     )
     (killed,) = (group for group in content["groups"] if group["id"] == "killed/baseline")
     huge = killed["conditions"]["L_4_0"]["gap_m"]

@@ -13,6 +13,8 @@ from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.reading import reading
 from analysis.explorer.site import NotThere, Site
+from analysis.metrics import COLLISIONS
+from analysis.metrics import JOINT as JOINT_RATE
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Column, Row, Table, Value, from_text
 from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
@@ -25,7 +27,7 @@ SELECT variant, any_value(names) FROM trials JOIN (
 ) USING (spec_hash) WHERE len(names) > 0 GROUP BY ALL
 """
 # Rates are decided trial by trial, and differ in single trials. Collisions are outcomes.
-FATES = {"collided_percent": "outcome", "joint_percent": "joint"}
+FATES = {COLLISIONS.name: "outcome", JOINT_RATE.name: "joint"}
 JOINT = {True: "joint", False: "not joint"}
 # What the rates count of it.
 COUNTED: dict[str, str | bool] = {"outcome": "collided", "joint": True}
@@ -176,7 +178,7 @@ def _cell(
     limits = row.values.get(interval.name)
     n = of_baseline.get((row.id, column.name)) if found is None else found.values["n"]
     # Collisions are counted over all that ended, which is the n of the row.
-    n = row.values["n"] if column.name == "collided_percent" else n
+    n = row.values["n"] if column.name == COLLISIONS.name else n
     return Cell(
         column.name,
         row.id,

@@ -12,6 +12,7 @@ from analysis.explorer import views
 from analysis.explorer.details import scenario_of
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import Site
+from analysis.metrics import Metric, intervals_of, shown_in
 from analysis.tables.formats import notes_of, shown_value
 from analysis.tables.model import Table, from_text
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -33,62 +34,48 @@ SHAPE_WORDS = {
 LEFT, TOP, HEIGHT, FOOT, STEP, LEAST, ARROW = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0, 3.0
 
 
+# Shares of the few trials of a condition are not known to more digits.
+PERCENT_DIGITS = 1
+
+
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A row of panels: one measure. ``least`` and ``most``: the ends of a scale that has them."""
+    """A row of panels: a metric as this page shows it."""
 
-    name: str
-    heading: str
-    unit: str
-    digits: int
-    meaning: str
-    least: float | None = 0.0
-    most: float | None = None
+    metric: Metric
+
+    @property
+    def name(self) -> str:
+        """The metric's."""
+        return self.metric.name
+
+    @property
+    def heading(self) -> str:
+        """``The gap``."""
+        return self.metric.in_sentences[0].upper() + self.metric.in_sentences[1:]
+
+    @property
+    def meaning(self) -> str:
+        """What is drawn."""
+        return f"{self.metric.meaning}; intervals: {intervals_of([self.metric])}"
+
+    @property
+    def digits(self) -> int:
+        """How many decimals a value has."""
+        digits = self.metric.decimals
+        return min(digits, PERCENT_DIGITS) if self.metric.rate else digits
+
+    @property
+    def denominators(self) -> bool:
+        """Whether its table tells those who ended from all, of whom some may be undecided."""
+        return self.metric.rate and self.metric.trials == "ended"
 
 
-KINDS = (
-    Kind(
-        "left_first_percent",
-        "The left vehicle merges first",
-        "%",
-        0,
-        "of finished trials with a first merger; Wilson intervals",
-        most=100.0,
-    ),
-    Kind(
-        "gap_m",
-        "Gap",
-        "m",
-        2,
-        "mean of finished trials; Student's t",
-        least=None,
-    ),
-    Kind(
-        "rmse_mps",
-        "RMSE of the speed",
-        "m/s",
-        2,
-        "from the initial speed to the first merge, mean of both vehicles and of finished trials; "
-        "Student's t",
-    ),
-    Kind(
-        "collided_boxes_percent",
-        "Collisions by the humans' rule",
-        "%",
-        1,
-        "boxes that overlap, looked for at 20 Hz, of the trials that ended and are decided; Wilson "
-        "intervals; the table has both denominators",
-    ),
-    Kind(
-        "collided_percent",
-        "Collisions by the drivers' rule",
-        "%",
-        1,
-        "by the rule of the trials' scenario, in the paper centres closer than a vehicle length, "
-        "of the trials that ended and are decided; Wilson intervals",
-    ),
-)
-COLLISIONS = ("collided_boxes_percent", "collided_percent")
+def kinds() -> list[Kind]:
+    """The rows of panels, those with denominators last, and what humans have outcomes of first."""
+    metrics = shown_in("humans")
+    metrics.sort(key=lambda one: (one.trials == "ended", one.humans_from != "outcomes"))
+    return [Kind(metric) for metric in metrics]
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +106,15 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         values = {
             "human": next((group for group in groups if group["id"] == HUMAN), None),
             "measured": content["measured"],
-            "published": content["published"],
+            "outcomes_from": content["outcomes_from"],
+            "published": [one["text"] for one in content["published"].values()],
             "groups": groups,
             "rules": {group["id"]: rule_text(group) for group in groups},
             "marks": marks(groups),
-            "charts": [chart(kind, groups, content["published"]) for kind in KINDS],
-            "collisions": {name: collisions(groups, name) for name in COLLISIONS},
+            "charts": [chart(kind, groups, content["published"]) for kind in kinds()],
+            "collisions": {
+                kind.name: collisions(groups, kind.name) for kind in kinds() if kind.denominators
+            },
             "caveat": content["caveat"],
             "notes": content["notes"],
             "differences": differences(contrasts),
@@ -137,6 +127,7 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         here="humans",
         computed=found,
         conditions={name: views.condition_text(name) for name in CONDITIONS},
+        in_table={metric.name for metric in shown_in("tables")},
         path=marker,
         value=value_text,
         **values,
@@ -207,13 +198,13 @@ def differences(contrasts: Table) -> list[dict[str, Any]]:
 def chart(
     kind: Kind,
     groups: Sequence[Mapping[str, Any]],
-    published: Mapping[str, Any] | None,
+    published: Mapping[str, Any],
 ) -> dict[str, Any]:
     """One row of panels: where everything is drawn, in the units of the picture.
 
     ``cut`` names the intervals that go on beyond the axis.
     """
-    printed = _printed(kind, published)
+    printed: dict[str, float] = published.get(kind.name, {}).get("values", {})
     labels = {group["id"]: group["driver"] for group in groups}
     known = [
         found
@@ -296,8 +287,9 @@ def reach(estimates: Sequence[Mapping[str, Any]], printed: Sequence[float]) -> t
 
 def scale(kind: Kind, low: float, high: float) -> tuple[float, float, list[float]]:
     """Both ends of an axis, and its ticks: round steps, with 0 in it."""
-    low = min(low, 0.0) if kind.least is None else kind.least
-    high = max(high, 0.0) if kind.most is None else kind.most
+    lowest, highest = kind.metric.lowest, kind.metric.highest
+    low = min(low, 0.0) if lowest is None else lowest
+    high = max(high, 0.0) if highest is None else highest
     high = high if high > low else low + 1.0
     rough = (high - low) / 4
     size = 10.0 ** floor(log10(rough))
@@ -336,11 +328,3 @@ def value_text(found: Mapping[str, Any] | None, digits: int) -> str:
     if found["low"] is not None:
         interval = f" [{found['low']:.{digits}f}, {found['high']:.{digits}f}]"
     return f"{found['value']:.{digits}f}{interval}, n {found['n']}"
-
-
-def _printed(kind: Kind, published: Mapping[str, Any] | None) -> dict[str, float]:
-    """The published human value in each condition, where no trial of humans has the measure."""
-    value = (published or {}).get(kind.name)
-    if value is None:
-        return {}
-    return dict(value) if isinstance(value, Mapping) else dict.fromkeys(CONDITIONS, float(value))

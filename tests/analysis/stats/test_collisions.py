@@ -10,7 +10,8 @@ from analysis.data.collision_rules import redrive
 from analysis.data.load import load_trials
 from analysis.data.study import Study
 from analysis.explain import explain
-from analysis.stats.measures import BOXES, COLLISIONS, MEASURES, counts
+from analysis.metrics import BOXES, COLLISIONS
+from analysis.stats.measures import counts
 from analysis.tables import make_tables
 from merge_runner.config import Scenario
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -132,10 +133,6 @@ def test_what_is_seen_between_steps_is_what_a_finer_simulation_sees():
         assert found[0] == expected[0]
         seen += found[0] == "collided" != redrive(coarse, condition, sides, [[], []])[0]
     assert seen > 0
-
-
-def test_measures_have_names_of_their_own():
-    assert len({measure.name for measure in MEASURES}) == len(MEASURES) == 5
 
 
 def test_where_nothing_comes_near_both_rules_agree(tmp_path):
