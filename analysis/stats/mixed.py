@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import optimize
 from scipy.special import expit, logsumexp
 
 from analysis.stats.regressions import (
@@ -18,6 +18,7 @@ from analysis.stats.regressions import (
     Term,
     gap_data,
     unfit_for_logit,
+    wald_term,
     who_first_data,
 )
 
@@ -87,7 +88,7 @@ def who_first_mixed(trials: pd.DataFrame) -> Regression:
 
 def _wald(names: tuple[str, ...], estimates: Array, errors: Array) -> dict[str, Term]:
     return {
-        name: Term(float(b), float(se), float(b / se), float(2 * stats.norm.sf(abs(b / se))))
+        name: wald_term(float(b), float(se))
         for name, b, se in zip(names, estimates, errors, strict=True)
     }
 

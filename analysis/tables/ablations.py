@@ -170,8 +170,8 @@ def _quantitative_row(group: Group) -> Row:
             continue
         found = estimate(group, measure)
         values[measure.name] = found.value
-        if found.low is not None and found.high is not None:
-            values[f"{measure.name}_ci"] = (found.low, found.high)
+        if (interval := found.bounds()) is not None:
+            values[f"{measure.name}_ci"] = interval
         if found.value is None:
             missing.append(measure.heading)
     if missing:

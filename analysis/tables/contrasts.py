@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from analysis.data.study import BASELINE, Group, Study
-from analysis.stats.contrasts import Contrast, contrast_means, contrast_rates, corrected
+from analysis.stats.contrasts import contrast_means, contrast_rates, corrected
+from analysis.stats.intervals import Difference
 from analysis.stats.measures import (
     BOXES,
     JOINT,
@@ -119,8 +120,8 @@ def _corrected(pairs: list[tuple[Group, Group]], measure: Measure, reference: st
                 "setting": group.setting,
                 "reference": reference,
                 "measure": measure.heading,
-                "difference": contrast.difference * (100 if measure.rate else 1),
-                "ci": _scaled(contrast, measure),
+                "difference": contrast.value * (100 if measure.rate else 1),
+                "ci": contrast.bounds(100 if measure.rate else 1),
                 "p": contrast.p,
                 "p_holm": float(holm[i]),
                 "p_bh": float(bh[i]),
@@ -144,7 +145,7 @@ def _note(group: Group, other: Group, measure: Measure) -> str:
     return "; ".join(filter(None, [*remarks, outcomes_note(other)]))
 
 
-def _contrast(group: Group, other: Group, measure: Measure) -> Contrast | None:
+def _contrast(group: Group, other: Group, measure: Measure) -> Difference | None:
     if measure.rate:
         first, second = counts(group, measure), _rate(other, measure)
         return contrast_rates(first, second) if first[1] and second[1] else None
@@ -165,11 +166,7 @@ def _n(group: Group, measure: Measure) -> int:
     return estimate(group, measure).n
 
 
-def _joint_note(other: Group, measure: Measure) -> str:
-    return "" if known(other, measure) else JOINT_NOTE
-
-
-def _powerless(contrast: Contrast, measure: Measure) -> str:
+def _powerless(contrast: Difference, measure: Measure) -> str:
     if contrast.detectable is not None:
         return ""
     return f"{measure.heading}: so few trials can show no difference, however large"
@@ -177,13 +174,6 @@ def _powerless(contrast: Contrast, measure: Measure) -> str:
 
 def _percent(value: float | None, measure: Measure) -> float | None:
     return 100 * value if value is not None and measure.rate else value
-
-
-def _scaled(contrast: Contrast, measure: Measure) -> tuple[float, float] | None:
-    if contrast.low is None or contrast.high is None:
-        return None
-    factor = 100 if measure.rate else 1
-    return factor * contrast.low, factor * contrast.high
 
 
 def shared_notes(study: Study) -> list[str]:

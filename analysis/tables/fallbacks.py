@@ -142,7 +142,7 @@ def _measure_row(group: Group, kept: Group, measure: Measure, why: str) -> Row:
 
 
 def _estimated(found: Estimate, name: str, suffix: str) -> dict[str, Value]:
-    interval = None if found.low is None or found.high is None else (found.low, found.high)
+    interval = found.bounds()
     return {f"n{suffix}": found.n, name: found.value, f"ci{suffix}": interval}
 
 

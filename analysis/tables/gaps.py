@@ -49,14 +49,13 @@ def gap_definitions(study: Study) -> Table:
 def _row(group: Group, column: str) -> Row:
     found = mean(group.finished[column].to_numpy(float))
     fit = gap_ols(group.trials, column)
-    interval = None if found.low is None or found.high is None else (found.low, found.high)
     values: dict[str, Value] = {
         "driver": group.label,
         "setting": group.setting,
         "definition": DEFINITIONS[column],
         "n": found.n,
         "gap_m": found.value,
-        "gap_m_ci": interval,
+        "gap_m_ci": found.bounds(),
         **_coefficients(fit),
     }
     return Row(f"{group.id}/{column}", (group.id,), values, fit.problem, f"{column} IS NOT NULL")

@@ -198,7 +198,7 @@ def _measure_row(group: Group, measure: Measure) -> Row:
         values = {**key, "value": published_human(measure)}
         return Row(row, (group.id,), values, source, printed=("value",))
     found = estimate(group, measure)
-    interval = None if found.low is None or found.high is None else (found.low, found.high)
+    interval = found.bounds()
     return Row(
         row,
         (group.id,),

@@ -85,10 +85,10 @@ def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
             ),
         }
         note = "no trial ended"
-        if share.value is not None and share.low is not None and share.high is not None:
+        if share.value is not None:
             values |= {
                 "collided_percent": 100 * share.value,
-                "collided_percent_ci": (100 * share.low, 100 * share.high),
+                "collided_percent_ci": share.bounds(100),
             }
             note = ""
         rows.append(Row(f"{group.id}/{rule}", (group.id,), values, note))
