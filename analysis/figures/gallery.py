@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from analysis.data.study import Group, Study
@@ -23,6 +22,7 @@ from analysis.figures.drawing import (
     MISSING,
     PAGE_IN,
     draw_points,
+    key,
     line_count,
     named,
     remarks,
@@ -39,24 +39,15 @@ from analysis.figures.panels import (
     left_traces,
     published_gap_line,
 )
+from analysis.figures.styles import HUMAN_STYLE, ORANGE, SKY_BLUE, Style, driver_style
 from analysis.figures.variant_figure import figure_2_variants
 from analysis.stats.group_scores import score
 from analysis.stats.indicators import INDICATORS
 from analysis.stats.measures import GAP, RMSE, known, published_human
 from merge_runner.errors import UsageError
 
-# Okabe and Ito's palette, safe for the colour-blind; each driver has a marker as well.
-HUMAN_STYLE = ("#000000", "o")
-STYLES = (
-    ("#0072B2", "s"),
-    ("#D55E00", "^"),
-    ("#009E73", "D"),
-    ("#CC79A7", "v"),
-    ("#56B4E9", "P"),
-    ("#E69F00", "X"),
-)
 LEGEND_COLUMNS = 4
-PASSED, FAILED, UNKNOWN = "#56B4E9", "#E69F00", "#DDDDDD"
+PASSED, FAILED, UNKNOWN = SKY_BLUE, ORANGE, "#dddddd"
 # The same input gives the same file.
 SETTINGS: Any = {
     "font.size": 7,
@@ -129,7 +120,7 @@ def distributions(study: Study) -> Figure:
     axes = figure.subplots(1, 2, sharey=True)
     for axis, measure in zip(axes, (GAP, RMSE), strict=True):
         for row, group in enumerate(groups):
-            colour, _ = _style(study, group)
+            colour = _style(study.baselines, group).colour
             if not known(group, measure):
                 axis.plot(published_human(measure), row, "D", color=colour, ms=4)
                 axis.annotate(
@@ -227,7 +218,7 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
         for row, (first, panel) in enumerate((("left", "A"), ("right", "B"))):
             axis: Axes = axes[row, column]
             found = left_traces(study, group, first)
-            colour, _ = _style(study, group)
+            colour = _style(study.baselines, group).colour
             alpha = min(0.4, max(0.06, 25 / max(len(found), 1)))  # many lines must not be one blot
             lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
             lines.set(capstyle="projecting", joinstyle="round")
@@ -263,33 +254,26 @@ def _curves(
             found = points(group, velocity)
             # Side by side, so that intervals do not hide each other.
             shift = 0.16 * (index - (len(groups) - 1) / 2)
-            draw_points(axis, found, shift, *_group_style(groups, group))
+            draw_points(axis, found, shift, _style(groups, group))
         axis.set_xticks([-4, -2, 0, 2, 4])
 
 
 def _legend(figure: SubFigure, study: Study, groups: list[Group]) -> None:
     handles = []
     for group in groups:
-        colour, marker = _group_style(groups, group)
         label = wrapped(group.label, PAGE_IN / LEGEND_COLUMNS - 0.4)
-        handles.append(
-            Line2D([], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white", label=label)
-        )
+        handles.append(key(_style(groups, group), label))
     handles += remarks(study, "black")
     figure.legend(handles=handles, loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False)
 
 
-def _style(study: Study, group: Group) -> tuple[str, str]:
-    return _group_style(study.baselines, group)
-
-
-def _group_style(groups: list[Group], group: Group) -> tuple[str, str]:
-    """Colour and marker of a driver, the same for all its variants."""
+def _style(groups: list[Group], group: Group) -> Style:
+    """The style of a driver, the same for all its variants."""
     if not group.setting:
         return HUMAN_STYLE
     drivers = list(dict.fromkeys(g.driver for g in groups if g.setting))
     index = drivers.index(group.driver) if group.driver in drivers else len(drivers)
-    return STYLES[index % len(STYLES)]
+    return driver_style(index)
 
 
 def _mark(passed: bool | None) -> str:

@@ -227,7 +227,10 @@ def _firth(draws: Draws, alive: NDArray[np.bool_], free: tuple[int, ...]) -> tup
 
 
 def _penalised(n: Array, left: Array, b: Array) -> Array:
-    """Log-likelihoods of the coefficients ``b`` (sets, 3) with Firth's penalty."""
+    """Log-likelihoods of the coefficients ``b`` (sets, 3) with Firth's penalty.
+
+    It is half the logarithm of the determinant of the information: Jeffreys' prior (Firth 1993).
+    """
     linear = b @ LOGIT_DESIGN.T
     p = expit(linear)
     determinant = np.linalg.det(_information(LOGIT_DESIGN, n * p * (1 - p)))
@@ -242,7 +245,7 @@ def _firth_step(n: Array, left: Array, b: Array, free: tuple[int, ...]) -> Array
     weights = n * p * (1 - p)
     covariance, _ = _inverse(design, weights, alive)
     # Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were split,
-    # and half of its leverage had gone either way (Heinze and Schemper 2002, eq. 2).
+    # and half of its leverage had gone either way (Heinze and Schemper 2002).
     leverage = weights * (covariance.reshape(-1, 9) @ _products(design).T)
     score = (left - n * p + leverage * (0.5 - p)) @ design
     step = np.zeros_like(b)
@@ -263,6 +266,7 @@ def gap_fits(draws: Draws) -> tuple[Fits, Fits]:
     residual = draws.squared_gap - 2 * fitted * draws.gap + n * fitted**2
     freedom = np.maximum(n.sum(axis=1) - x.shape[1], 1)
     classic = np.einsum("bjj->bj", inverse) * (residual.sum(axis=1) / freedom)[:, None]
+    # HC3 divides each residual by 1 - leverage (MacKinnon and White 1985).
     leverage = np.einsum("ij,bjk,ik->bi", x, inverse, x)
     meat = np.einsum("bi,ij,ik->bjk", residual / np.maximum(1 - leverage, 1e-9) ** 2, x, x)
     hc3 = np.einsum("bjk,bkl,blj->bj", inverse, meat, inverse)

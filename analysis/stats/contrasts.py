@@ -76,6 +76,8 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> D
     by_condition = both.groupby("condition")
     value = (both[measure].astype(float) - by_condition[measure].transform("mean")).to_numpy(float)
     group = (both["_first"] - by_condition["_first"].transform("mean")).to_numpy(float)
+    # Of what is left of both within conditions, the slope is that of the whole model (Frisch and
+    # Waugh 1933; Lovell 1963).
     weight = float((group**2).sum())
     if weight < 1e-12:
         return None
@@ -111,6 +113,7 @@ def _permutation_p(
         for start, end in zip(ends - sizes, ends, strict=True)
     ]
     extreme = int((np.abs(np.sum(parts, axis=0) / weight) >= abs(observed) - 1e-12).sum())
+    # The trials as they are count as a shuffle, so that p is never 0 (Phipson and Smyth 2010).
     return (extreme + 1) / (PERMUTATIONS + 1)
 
 

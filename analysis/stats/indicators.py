@@ -117,12 +117,13 @@ def _verdicts(
     criteria: Mapping[str, Criterion], who_first: Regression, gap: Regression
 ) -> dict[str, Verdict]:
     return {
-        name: _verdict(criterion, who_first if criterion.of_who_first else gap)
+        name: judged(criterion, who_first if criterion.of_who_first else gap)
         for name, criterion in criteria.items()
     }
 
 
-def _verdict(criterion: Criterion, fit: Regression) -> Verdict:
+def judged(criterion: Criterion, fit: Regression) -> Verdict:
+    """The verdict on one fit."""
     if fit.problem:
         return Verdict(None, None, fit.problem)
     term = fit.terms[criterion.term]

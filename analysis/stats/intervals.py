@@ -119,7 +119,7 @@ def difference(value: float, *errors: tuple[float, float], by: str = "") -> Diff
 
 
 def satterthwaite(*errors: tuple[float, float]) -> float:
-    """Degrees of freedom of a sum of variances, se² of each (Satterthwaite 1946, eq. 17)."""
+    """Degrees of freedom of a sum of variances, se² of each (Satterthwaite 1946)."""
     spread = sum(se**4 / freedom for se, freedom in errors)
     return sum(se**2 for se, _ in errors) ** 2 / spread if spread else inf
 

@@ -87,6 +87,7 @@ def by_pairs(
     lacking = [f"without {pair}: {part.problem}" for pair, part in parts.items() if part.problem]
     if whole.problem or lacking:
         return Regression(whole.n, {}, whole.problem or lacking[0])
+    # CV3: the squares of what each pair moves an estimate by, about the whole fit and not the mean.
     freedom = len(pairs) - 1
     terms = {}
     for name, term in whole.terms.items():

@@ -7,11 +7,14 @@ from collections.abc import Iterable, Iterator
 import pandas as pd
 
 from analysis.data.collision_rules import BOXES, READINGS, UNDECIDED, outcomes
-from analysis.data.load import SIZES, load_each
+from analysis.data.load import load_each
 from analysis.data.study import Group, Study, of_group
 from analysis.stats.intervals import proportion
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
+
+# The size of a spec's vehicles in words.
+SIZES = "SELECT spec_hash, format('{:g} m x {:g} m', length_m, width_m) AS size FROM geometry"
 
 
 def robustness(study: Study) -> Table:

@@ -49,7 +49,7 @@ def driven(rng, pairs, reps, *, alone=False, gap_more=0.0, turned=0.0) -> pd.Dat
 
 def group(trials, setting="baseline", **more) -> Group:
     name = "driver" if setting else "human"
-    return Group(name, setting, "s", trials, label=name, model=name, **more)
+    return Group(name, setting, "s", trials, label=name, models=(name,), name=name, **more)
 
 
 def humans(trials) -> Group:
