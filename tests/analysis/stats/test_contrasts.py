@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
+from statsmodels.stats.multitest import multipletests
 
 from analysis.stats.contrasts import (
     PERMUTATIONS,
@@ -233,6 +234,13 @@ def test_a_family_is_corrected_by_holm_and_by_benjamini_and_hochberg():
     holm, false_discovery = corrected([0.01, 0.04, 0.03, 0.005])
     assert list(holm) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert list(false_discovery) == pytest.approx([0.02, 0.04, 0.04, 0.02])
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 40])
+def test_the_corrections_are_those_of_statsmodels(n):
+    family = list(np.random.default_rng(n).random(n).round(1) ** 3)  # with ties
+    for found, method in zip(corrected(family), ("holm", "fdr_bh"), strict=True):
+        assert list(found) == pytest.approx(list(multipletests(family, method=method)[1]))
 
 
 def test_corrected_p_values_stay_at_most_1():
