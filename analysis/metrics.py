@@ -6,9 +6,10 @@ Tables, figures, conclusions and pages ask this list, and name no metric that is
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
+from analysis.bounded import Bounded
 from merge_runner.errors import UsageError
 from merge_runner.registry import Registry
 
@@ -32,17 +33,17 @@ JUDGED = ("collided", "collided_boxes")
 
 
 @dataclass(frozen=True, slots=True)
-class HumanReference:
+class HumanReference(Bounded):
     """A published human value in the unit of its metric, with its 95 % interval if it has one.
 
     ``source`` cites it. ``n``: the trials that a share is of, without which it is not tested.
     """
 
     value: float
+    low: float | None = field(default=None, kw_only=True)
+    high: float | None = field(default=None, kw_only=True)
     source: str
-    low: float | None = None
-    high: float | None = None
-    n: int | None = None
+    n: int | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

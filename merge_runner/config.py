@@ -28,6 +28,7 @@ from pydantic import (
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
+from merge_runner.records import Side
 from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
 
@@ -335,6 +336,12 @@ def driver_name(model: str, endpoint: str | None) -> str:
     """
     host = re.search("://([^/]+)", endpoint or "")
     return f"{model} at {host[1]}" if host else model
+
+
+def both_sides(model: str) -> dict[Side, str]:
+    """Who drives on each side, by what ``--model`` says: one name, or two that + joins."""
+    left, _, right = model.partition("+")
+    return {"left": left, "right": right or left}
 
 
 def pair_name(sides: Iterable[str], endpoints: Mapping[str, str]) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.data.load import load_each, rows
+from analysis.data.load import ANSWERED, load_each, rows
 from analysis.data.study import Group, Study, of_group
 from merge_runner.audit.replies import answers_alike
 from merge_runner.config import Scenario
@@ -55,14 +55,14 @@ FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spe
 WHERE source <> 'human' ORDER BY ALL
 """
 # Answers by each model that answered.
-SERVED = """
+SERVED = f"""
 SELECT model_requested, model_served,
     count(DISTINCT (trial_id, spec_hash, side, decision)) AS answers,
     list_sort(list(DISTINCT sweep_id) FILTER (sweep_id IS NOT NULL)) AS sweeps
 FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
-WHERE fate IN ('driven', 'fallback') AND model_served IS NOT NULL
+WHERE fate IN {ANSWERED} AND model_served IS NOT NULL
 GROUP BY ALL ORDER BY ALL
-"""
+"""  # noqa: S608 # constants
 SWEEP_COSTS = """
 SELECT sweep_id, name, sweep_costs.* EXCLUDE (sweep_id)
 FROM sweeps JOIN sweep_costs USING (sweep_id) ORDER BY started_at, sweep_id
@@ -196,7 +196,7 @@ def tally(study: Study, group: Group) -> Tally:
     attempts = of_group(study.calls.attempts, group, group.trials)
     decisions = of_group(study.calls.decisions, group, group.trials)
     by_fate = Counter(attempts.groupby("fate")["attempts"].sum().to_dict())
-    answered = attempts[attempts["fate"].isin(("driven", "fallback"))]
+    answered = attempts[attempts["fate"].isin(ANSWERED)]
     return Tally(
         trials=len(group.trials),
         failed=len(group.trials) - len(group.ended),

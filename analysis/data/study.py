@@ -15,6 +15,7 @@ from analysis.data.collision_rules import judged
 from analysis.data.imported_humans import Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
+    DEVIATIONS,
     LEFT_SPEEDS,
     PLANS,
     SHARED,
@@ -29,13 +30,15 @@ from analysis.data.metric_values import outcomes_with_metrics, trials_with_metri
 from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
-from merge_runner.records import SIDES
+from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.text_safety import quoted
 
 HUMAN = "human"
 # What tells groups apart, and is no measure.
-COLUMNS_OF_GROUPS = ["driver", "task", "trace", "left_scripted", "right_scripted"]
+COLUMNS_OF_GROUPS = [
+    "driver", "task", "mark", "apart", "trace", "left_scripted", "right_scripted",
+]  # fmt: skip
 BASELINE = "baseline"
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
@@ -47,12 +50,15 @@ class Group:
 
     ``trials`` are rows of ``load_trials``; for humans before an import only the outcomes that are
     published, and ``measured`` is False. ``setting`` is the prompt variant, empty for humans.
-    ``label`` is how tables name the driver, ``model`` the name that was asked for, and ``posing``
-    what is said of a scripted stand-in. Of a driver without chance, whose repetitions are the same
-    trial again, only the first are ``trials``, and ``repeated`` counts the others; ``equal`` counts
-    such trials of a driver that samples. ``narrowed`` is what tells the trials in SQL from others
-    of their spec and variant, empty where there are none. ``published_outcomes`` stand in the place
-    of the trials' outcomes where these are a part of the published ones.
+    ``driver`` is its ``name`` with the ``mark`` that tells it from itself under other settings, and
+    with ``[scripted]`` where a stand-in answered only some of its trials. ``label`` is how tables
+    name the driver, ``models`` are the names that were asked for, left and right, an equal one
+    once, and ``posing`` is what is said of a scripted stand-in. Of a driver without chance, whose
+    repetitions are the same trial again, only the first are ``trials``, and ``repeated`` counts the
+    others; ``equal`` counts such trials of a driver that samples. ``narrowed`` is what tells the
+    trials in SQL from others of their spec and variant, empty where there are none.
+    ``published_outcomes`` stand in the place of the trials' outcomes where these are a part of the
+    published ones.
     """
 
     driver: str
@@ -60,7 +66,9 @@ class Group:
     spec_hash: str | None
     trials: pd.DataFrame
     label: str
-    model: str
+    models: tuple[str, ...]
+    name: str
+    mark: str = ""
     measured: bool = True
     posing: str = ""
     repeated: int = 0
@@ -180,7 +188,7 @@ class Study:
     @cached_property
     def deviations(self) -> pd.DataFrame:
         """One row a trial and window: RMSE of the speeds from the initial ones, and joint."""
-        return self._read("SELECT * FROM speed_deviations ORDER BY ALL")
+        return self._read(DEVIATIONS)
 
     @cached_property
     def plans(self) -> pd.DataFrame:
@@ -219,7 +227,8 @@ def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
         str(trials["spec_hash"].iloc[0]),
         trials,
         label=known.label,
-        model=HUMAN,
+        models=(HUMAN,),
+        name=HUMAN,
         narrowed=f"pair IN ({pairs})" if known.left_out else "",
         published_outcomes=None if known.complete else outcomes_with_metrics(),
     )
@@ -228,7 +237,10 @@ def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
 @cache
 def _published_group() -> Group:
     """One object for all studies: what is computed from it is computed once."""
-    return Group(HUMAN, "", None, outcomes_with_metrics(), label=HUMAN, model=HUMAN, measured=False)
+    return Group(
+        HUMAN, "", None, outcomes_with_metrics(), label=HUMAN, models=(HUMAN,), name=HUMAN,
+        measured=False,
+    )  # fmt: skip
 
 
 def _tasks(specs: pd.DataFrame) -> dict[str, str]:
@@ -253,14 +265,11 @@ def _model_groups(trials: pd.DataFrame, tasks: dict[str, str]) -> list[Group]:
         return []
     task = trials["spec_hash"].map(lambda spec_hash: tasks.get(spec_hash, spec_hash[:8]))
     keyed = trials.assign(task=task)
-    keyed["driver"] += _marks(keyed, ["driver"], "task")
-    keyed["driver"] += _marks(keyed, ["driver", "variant"], "spec_hash")
-    both = keyed.groupby("driver")["scripted"].transform("nunique") > 1
-    keyed.loc[both & keyed["scripted"], "driver"] += " [scripted]"
-    groups = [
-        _model_group(driver, variant, spec_hash, rows, both[rows.index].any())
-        for (driver, variant, spec_hash), rows in keyed.groupby(["driver", "variant", "spec_hash"])
-    ]
+    keyed["mark"] = _marks(keyed, ["driver"], "task")
+    keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "spec_hash")
+    keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
+    keys = ["driver", "mark", "apart", "scripted", "variant", "spec_hash"]
+    groups = [_model_group(rows) for _, rows in keyed.groupby(keys)]
     return sorted(
         groups,
         key=lambda group: (
@@ -272,25 +281,28 @@ def _model_groups(trials: pd.DataFrame, tasks: dict[str, str]) -> list[Group]:
     )
 
 
-def _model_group(
-    driver: str, variant: str, spec_hash: str, rows: pd.DataFrame, told_apart: bool
-) -> Group:
-    model = str(rows["trial_id"].iloc[0]).split("/", maxsplit=1)[0]
-    scripted = bool(rows["scripted"].any())
+def _model_group(rows: pd.DataFrame) -> Group:
+    """The group of these trials, which have equal keys."""
+    first = rows.iloc[0]
+    scripted = bool(first["scripted"])
+    models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
-    posing = stand_in(model, sides or SIDES) if scripted else ""
+    posing = stand_in(models, sides or SIDES) if scripted else ""
+    driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
     distinct = _distinct(rows)
-    narrowed = [f"scripted = {str(scripted).lower()}"] if told_apart else []
+    narrowed = [f"scripted = {str(scripted).lower()}"] if first["apart"] else []
     if len(distinct) < len(rows):
         names = ", ".join(quoted(trial_id) for trial_id in distinct["trial_id"])
         narrowed.append(f"trials.trial_id IN ({names})")
     return Group(
         driver,
-        variant,
-        spec_hash,
+        first["variant"],
+        first["spec_hash"],
         distinct.drop(columns=COLUMNS_OF_GROUPS),
         label=f"{driver} ({posing})" if scripted else driver,
-        model=model,
+        models=tuple(dict.fromkeys(models.values())),
+        name=first["driver"],
+        mark=first["mark"],
         posing=posing,
         repeated=len(rows) - len(distinct),
         equal=len(_again(distinct)),

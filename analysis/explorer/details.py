@@ -8,15 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import duckdb
-
 from analysis.explorer.prompts import Part, parts_of
-from analysis.explorer.reading import reading
+from analysis.explorer.reading import Row, reading, records
 from merge_runner.config import Scenario
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
 
-Row = dict[str, Any]
 OF_TRIAL = "trial_id = $trial AND spec_hash = $spec"
 STATES = f"""
 SELECT side, list(time_s ORDER BY step) AS time_s, list(position_m ORDER BY step) AS position_m,
@@ -89,9 +86,9 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     """Read a trial that is known to be there."""
     key = {"trial": trial_id, "spec": spec_hash}
     with reading(db) as connection:
-        states = {row.pop("side"): row for row in _records(connection, STATES, key)}
-        decisions = _records(connection, DECISIONS, key)
-        (task,) = _records(connection, TASK, key)
+        states = {row.pop("side"): row for row in records(connection, STATES, key)}
+        decisions = records(connection, DECISIONS, key)
+        (task,) = records(connection, TASK, key)
     told = json.loads(task["spec"] or "{}")
     scenario = scenario_of(task["source"], told.get("scenario"))
     ordered = {side: states[side] for side in SIDES if side in states}
@@ -119,8 +116,8 @@ def read_decisions(
     """
     key = {"trial": trial_id, "spec": spec_hash, "side": side, "number": number}
     with reading(db) as connection:
-        rows = _records(connection, DECIDED, key)
-        calls = _records(connection, ATTEMPTS, key)
+        rows = records(connection, DECIDED, key)
+        calls = records(connection, ATTEMPTS, key)
     decided = {(row["side"], row["decision"]): row for row in rows}
     attempts: dict[tuple[str, int], list[Row]] = {}
     for call in calls:
@@ -142,11 +139,3 @@ def _decision(
     before = decided.get((side, number - 1))
     parts = parts_of(row["prompt"] or "", before["prompt"] if before else None)
     return Decision({**row, "lost": False}, before, parts, attempts)
-
-
-def _records(
-    connection: duckdb.DuckDBPyConnection, sql: str, values: Mapping[str, object]
-) -> list[Row]:
-    found = connection.execute(sql, dict(values))
-    names = [column[0] for column in found.description]
-    return [dict(zip(names, row, strict=True)) for row in found.fetchall()]

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from math import ceil, floor
 from typing import Any
 
-from analysis.explorer.details import Decision, Row, Trial
+from analysis.explorer.details import Decision, Trial
 from analysis.explorer.display_text import visible
+from analysis.explorer.reading import Row
 from merge_runner.config import Scenario
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
 from merge_runner.records import SIDES

@@ -14,7 +14,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from analysis.data.study import Group, Study
@@ -24,6 +23,7 @@ from analysis.figures.drawing import (
     MISSING,
     PAGE_IN,
     draw_points,
+    key,
     line_count,
     named,
     remarks,
@@ -40,6 +40,7 @@ from analysis.figures.panels import (
     left_traces,
     published_gap_line,
 )
+from analysis.figures.styles import HUMAN_STYLE, ORANGE, SKY_BLUE, Style, driver_style
 from analysis.figures.variant_figure import figure_2_variants
 from analysis.metrics import Metric, shown_in
 from analysis.stats.group_scores import score
@@ -47,18 +48,8 @@ from analysis.stats.indicators import INDICATORS
 from analysis.stats.measures import human_reference, known, values
 from merge_runner.errors import UsageError
 
-# Okabe and Ito's palette, safe for the colour-blind; each driver has a marker as well.
-HUMAN_STYLE = ("#000000", "o")
-STYLES = (
-    ("#0072B2", "s"),
-    ("#D55E00", "^"),
-    ("#009E73", "D"),
-    ("#CC79A7", "v"),
-    ("#56B4E9", "P"),
-    ("#E69F00", "X"),
-)
 LEGEND_COLUMNS = 4
-PASSED, FAILED, UNKNOWN = "#56B4E9", "#E69F00", "#DDDDDD"
+PASSED, FAILED, UNKNOWN = SKY_BLUE, ORANGE, "#dddddd"
 # The same input gives the same file.
 SETTINGS: Any = {
     "font.size": 7,
@@ -133,7 +124,7 @@ def distributions(study: Study) -> Figure:
     axes = figure.subplots(lines, 2, sharey=True, squeeze=False)
     for axis, metric in zip(axes.flat, metrics, strict=False):
         for row, group in enumerate(groups):
-            _distribution(axis, row, group, metric, _style(study, group)[0])
+            _distribution(axis, row, group, metric, _style(study.baselines, group).colour)
         axis.set_xlabel(metric.heading)
     for axis in axes.flat[len(metrics) :]:
         axis.set_visible(False)
@@ -248,7 +239,7 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
         for row, (first, panel) in enumerate((("left", "A"), ("right", "B"))):
             axis: Axes = axes[row, column]
             found = left_traces(study, group, first)
-            colour, _ = _style(study, group)
+            colour = _style(study.baselines, group).colour
             alpha = min(0.4, max(0.06, 25 / max(len(found), 1)))  # many lines must not be one blot
             lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
             lines.set(capstyle="projecting", joinstyle="round")
@@ -284,33 +275,26 @@ def _curves(
             found = points(group, velocity)
             # Side by side, so that intervals do not hide each other.
             shift = 0.16 * (index - (len(groups) - 1) / 2)
-            draw_points(axis, found, shift, *_group_style(groups, group))
+            draw_points(axis, found, shift, _style(groups, group))
         axis.set_xticks([-4, -2, 0, 2, 4])
 
 
 def _legend(figure: SubFigure, study: Study, groups: list[Group]) -> None:
     handles = []
     for group in groups:
-        colour, marker = _group_style(groups, group)
         label = wrapped(group.label, PAGE_IN / LEGEND_COLUMNS - 0.4)
-        handles.append(
-            Line2D([], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white", label=label)
-        )
+        handles.append(key(_style(groups, group), label))
     handles += remarks(study, "black")
     figure.legend(handles=handles, loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False)
 
 
-def _style(study: Study, group: Group) -> tuple[str, str]:
-    return _group_style(study.baselines, group)
-
-
-def _group_style(groups: list[Group], group: Group) -> tuple[str, str]:
-    """Colour and marker of a driver, the same for all its variants."""
+def _style(groups: list[Group], group: Group) -> Style:
+    """The style of a driver, the same for all its variants."""
     if not group.setting:
         return HUMAN_STYLE
     drivers = list(dict.fromkeys(g.driver for g in groups if g.setting))
     index = drivers.index(group.driver) if group.driver in drivers else len(drivers)
-    return STYLES[index % len(STYLES)]
+    return driver_style(index)
 
 
 def _mark(passed: bool | None) -> str:

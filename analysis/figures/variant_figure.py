@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from analysis.data.study import Group, Study
@@ -17,6 +16,7 @@ from analysis.figures.drawing import (
     MISSING,
     PAGE_IN,
     draw_points,
+    key,
     line_count,
     remarks,
     say,
@@ -32,6 +32,7 @@ from analysis.figures.panels import (
     left_traces,
     published_gap_line,
 )
+from analysis.figures.styles import BLUE, GREEN, VERMILION, Style
 from analysis.stats.intervals import Estimate
 from analysis.tables.formats import VARIANTS
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -40,8 +41,8 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 LABEL_IN, ROW_IN = 1.15, 0.62
 LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = LABEL_IN + 0.35, 0.08, 0.4, 0.62
 BETWEEN_ROWS_IN, BETWEEN_COLUMNS_IN = 0.16, 0.3
-# Of Okabe and Ito's palette, with a marker each, in the order of VELOCITIES_MPS.
-STYLES = (("#0072B2", "v"), ("#009E73", "o"), ("#D55E00", "^"))
+# In the order of VELOCITIES_MPS.
+STYLES = (Style(BLUE, "down"), Style(GREEN, "circle"), Style(VERMILION, "triangle"))
 HEADINGS = (
     "left first:\nv left (m/s)",
     "left second:\nv left (m/s)",
@@ -111,8 +112,8 @@ def _traces(axis: Axes, study: Study, group: Group, first: str) -> None:
     parts = [left_traces(study, _part(group, velocity), first) for velocity in VELOCITIES_MPS]
     count = sum(map(len, parts))
     alpha = min(0.4, max(0.06, 25 / max(count, 1)))  # many lines must not be one blot
-    for found, (colour, _) in zip(parts, STYLES, strict=True):
-        lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
+    for found, style in zip(parts, STYLES, strict=True):
+        lines = LineCollection(found, color=style.colour, lw=0.4, alpha=alpha, rasterized=True)
         lines.set(capstyle="projecting", joinstyle="round")
         axis.add_collection(lines)
     axis.autoscale_view()
@@ -133,7 +134,7 @@ def _points(axis: Axes, group: Group, points: Callable[[Group, float], list[Poin
     """Estimates of the three relative velocities, side by side."""
     found = [points(group, velocity) for velocity in VELOCITIES_MPS]
     for index, (part, style) in enumerate(zip(found, STYLES, strict=True)):
-        draw_points(axis, part, 0.3 * (index - 1), *style)
+        draw_points(axis, part, 0.3 * (index - 1), style)
     if group.measured and not any(found):
         say(axis, "no such trial")
     elif points is deviations and not group.measured:
@@ -142,8 +143,8 @@ def _points(axis: Axes, group: Group, points: Callable[[Group, float], list[Poin
 
 def _published(axis: Axes) -> None:
     """The humans' gaps as the paper's regression has them."""
-    for velocity, (colour, _) in zip(VELOCITIES_MPS, STYLES, strict=True):
-        axis.plot(*published_gap_line(velocity), color=colour, ls="--", lw=0.8)
+    for velocity, style in zip(VELOCITIES_MPS, STYLES, strict=True):
+        axis.plot(*published_gap_line(velocity), color=style.colour, ls="--", lw=0.8)
 
 
 def _scales(axes: NDArray[np.object_], groups: list[Group]) -> None:
@@ -185,11 +186,8 @@ def _headings(axes: NDArray[np.object_]) -> None:
 
 def _legend(figure: Figure, study: Study) -> None:
     handles = [
-        Line2D(
-            [], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white",
-            label=f"Δv = {velocity_text(velocity)}",
-        )
-        for velocity, (colour, marker) in zip(VELOCITIES_MPS, STYLES, strict=True)
-    ]  # fmt: skip
+        key(style, f"Δv = {velocity_text(velocity)}")
+        for velocity, style in zip(VELOCITIES_MPS, STYLES, strict=True)
+    ]
     handles += remarks(study, "#555555")
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False)

@@ -16,7 +16,6 @@ from analysis.stats.contrasts import contrast_rates
 from analysis.stats.group_scores import Score, score, unjudged
 from analysis.stats.indicators import ALPHA, INDICATORS, Verdict
 from analysis.stats.measures import (
-    bounds,
     counts,
     estimate,
     human_reference,
@@ -173,7 +172,7 @@ def _told(study: Study, group: Group, metric: Metric) -> str:
         estimator=metric.estimator,
         trials=_trials(found.n),
     )
-    low_high = bounds(found)
+    low_high = found.bounds()
     interval = f" (95 % CI {' to '.join(_digits(metric, x) for x in low_high)})" if low_high else ""
     return f"{group.driver} {told}{interval}; {_of_humans(study, group, metric)}."
 

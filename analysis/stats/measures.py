@@ -94,11 +94,6 @@ def estimate_or_reference(group: Group, metric: Metric) -> Estimate | HumanRefer
     return estimate(group, metric) if known(group, metric) else human_reference(metric)
 
 
-def bounds(found: Estimate | HumanReference) -> tuple[float, float] | None:
-    """The interval of a value, where it has one."""
-    return None if found.low is None or found.high is None else (found.low, found.high)
-
-
 def no_human_value(metric: Metric) -> str:
     """Why the humans have no value of a metric before their recordings are imported."""
     if metric.humans_from == "all recordings":

@@ -7,7 +7,6 @@ from analysis.metrics import RULES_NOTE, HumanReference, Metric, intervals_of, s
 from analysis.stats.group_scores import score
 from analysis.stats.indicators import INDICATORS
 from analysis.stats.measures import (
-    bounds,
     estimate_or_reference,
     no_human_value,
     outcomes_note,
@@ -163,7 +162,8 @@ def _quantitative_row(group: Group) -> Row:
             absent.append(no_human_value(metric))
             continue
         values[metric.name] = found.value
-        values[f"{metric.name}_ci"] = bounds(found)
+        if (interval := found.bounds()) is not None:
+            values[f"{metric.name}_ci"] = interval
         if isinstance(found, HumanReference):
             shipped.setdefault(found.source, []).append(metric)
         elif found.value is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -20,7 +19,6 @@ from merge_runner.errors import UsageError
 PAPER = "paper"
 # Whom the paper has rows of, and what may follow the name of a driver that is one of them.
 DRIVERS = ("human", "o3", "gemini-2.5-pro")
-MARKS = re.compile(r"(/set\d+)?( \[[^]]+\])*")
 METRICS_FILE = "paper_ablation_quantitative"
 INDICATORS_FILE = "paper_ablation_qualitative"
 # Table to its published file.
@@ -55,12 +53,14 @@ def placed(table: Table, groups: Iterable[Group]) -> Table:
 
 
 def _placed(table: Table, row: Row, group: Group) -> Row:
-    own = MARKS.fullmatch(group.driver.removeprefix(group.model)) and not group.scripted
-    posing = group.scripted and group.model != EMULATOR
+    (asked, *others) = group.models
+    sample_set = "" if group.name == asked else f"/set{group.trials['sample_set'].iloc[0]}"
+    own = not others and group.name == asked + sample_set and not group.scripted
+    posing = group.scripted and group.models != (EMULATOR,)
     return replace(
         row,
-        beside=group.model if own and group.model in DRIVERS else "",
-        stand_in_for=group.model if posing else "",
+        beside=asked if own and asked in DRIVERS else "",
+        stand_in_for=group.models if posing else (),
         printed=_printed(table, row, group),
     )
 
@@ -114,7 +114,7 @@ def _placements(table: Table, driver: str | None) -> list[str]:
         (row.values["driver"], name)
         for row in table.rows
         for name in names
-        if name in row.stand_in_for.split("+")
+        if name in row.stand_in_for
     ]
     return [
         *([] if driver is None else [f"every driver stands beside the paper's {driver}"]),
@@ -189,7 +189,7 @@ def _key(row: Row, named: str | None) -> tuple[str, str, str]:
     item = row.id.removeprefix(group).lstrip("/")
     driver = row.beside
     if named is not None and driver != HUMAN:
-        driver = "" if named in row.stand_in_for.split("+") else named
+        driver = "" if named in row.stand_in_for else named
     # The humans had no prompt: whatever a driver's was, they stand beside it.
     return driver, "" if driver == HUMAN else group.rpartition("/")[2], item
 

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 from analysis.data.study import BASELINE, Group, Study
 from analysis.metrics import RULES_NOTE, Metric, compared
-from analysis.stats.contrasts import Contrast, contrast_means, contrast_rates, corrected
+from analysis.stats.contrasts import contrast_means, contrast_rates, corrected
+from analysis.stats.intervals import Difference
 from analysis.stats.measures import (
     counts,
     human_reference,
@@ -118,8 +119,8 @@ def _corrected(pairs: list[tuple[Group, Group]], metric: Metric, reference: str)
                 "setting": group.setting,
                 "reference": reference,
                 "measure": metric.heading,
-                "difference": contrast.difference * (100 if metric.rate else 1),
-                "ci": _scaled(contrast, metric),
+                "difference": contrast.value * (100 if metric.rate else 1),
+                "ci": contrast.bounds(100 if metric.rate else 1),
                 "p": contrast.p,
                 "p_holm": float(holm[i]),
                 "p_bh": float(bh[i]),
@@ -143,7 +144,7 @@ def _note(group: Group, other: Group, metric: Metric) -> str:
     return "; ".join(filter(None, [*remarks, outcomes_note(other)]))
 
 
-def _contrast(group: Group, other: Group, metric: Metric) -> Contrast | None:
+def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
     if metric.rate:
         first, second = counts(group, metric), _rate(other, metric)
         return contrast_rates(first, second) if first[1] and second[1] else None
@@ -178,7 +179,7 @@ def _n(group: Group, metric: Metric) -> int:
     return _rate(group, metric)[1] if metric.rate else len(values(group, metric))
 
 
-def _powerless(contrast: Contrast, metric: Metric) -> str:
+def _powerless(contrast: Difference, metric: Metric) -> str:
     if contrast.detectable is not None:
         return ""
     return f"{metric.heading}: so few trials can show no difference, however large"
@@ -186,13 +187,6 @@ def _powerless(contrast: Contrast, metric: Metric) -> str:
 
 def _percent(value: float | None, metric: Metric) -> float | None:
     return 100 * value if value is not None and metric.rate else value
-
-
-def _scaled(contrast: Contrast, metric: Metric) -> tuple[float, float] | None:
-    if contrast.low is None or contrast.high is None:
-        return None
-    factor = 100 if metric.rate else 1
-    return factor * contrast.low, factor * contrast.high
 
 
 def shared_notes(study: Study) -> list[str]:

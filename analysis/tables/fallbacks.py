@@ -7,7 +7,7 @@ from analysis.metrics import GAP, LEFT_FIRST, RULES_NOTE, Metric, intervals_of, 
 from analysis.stats.group_scores import Fits, fits
 from analysis.stats.indicators import INDICATORS, TESTED, Verdict, paper_verdicts, robust_verdicts
 from analysis.stats.intervals import Estimate
-from analysis.stats.measures import bounds, estimate, undecided, values
+from analysis.stats.measures import estimate, undecided, values
 from analysis.tables.attempts import FALLBACK
 from analysis.tables.indicators import RULES
 from analysis.tables.model import Column, Row, Table, Value
@@ -131,7 +131,8 @@ def _metric_row(group: Group, kept: Group, metric: Metric, why: str) -> Row:
 
 
 def _estimated(found: Estimate, name: str, suffix: str) -> dict[str, Value]:
-    return {f"n{suffix}": found.n, name: found.value, f"ci{suffix}": bounds(found)}
+    interval = found.bounds()
+    return {f"n{suffix}": found.n, name: found.value, f"ci{suffix}": interval}
 
 
 def _verdict_row(group: Group, kept: Group, name: str, why: str) -> Row:

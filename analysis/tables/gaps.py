@@ -5,7 +5,6 @@ from __future__ import annotations
 from analysis.data.study import Group, Study
 from analysis.metrics import GAP
 from analysis.stats.intervals import mean
-from analysis.stats.measures import bounds
 from analysis.stats.regressions import Regression, gap_ols
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
@@ -57,7 +56,7 @@ def _row(group: Group, column: str) -> Row:
         "definition": DEFINITIONS[column],
         "n": found.n,
         GAP.name: found.value,
-        "gap_m_ci": bounds(found),
+        "gap_m_ci": found.bounds(),
         **_coefficients(fit),
     }
     return Row(f"{group.id}/{column}", (group.id,), values, fit.problem, f"{column} IS NOT NULL")

@@ -8,7 +8,6 @@ from analysis.stats.group_scores import PAPER_RULE, ROBUST_RULE, Score, score, t
 from analysis.stats.indicators import INDICATORS, Verdict
 from analysis.stats.likeness import gains
 from analysis.stats.measures import (
-    bounds,
     estimate_or_reference,
     no_human_value,
     outcomes_note,
@@ -187,7 +186,7 @@ def _metric_row(group: Group, metric: Metric) -> Row:
     found = estimate_or_reference(group, metric)
     if found is None:
         return Row(row, (group.id,), key, no_human_value(metric))
-    values: dict[str, Value] = {**key, "value": found.value, "interval": bounds(found)}
+    values: dict[str, Value] = {**key, "value": found.value, "interval": found.bounds()}
     if isinstance(found, HumanReference):
         source = f"published value, no human traces are imported ({found.source})"
         return Row(row, (group.id,), values, source, printed=("value",))

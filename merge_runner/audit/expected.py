@@ -57,7 +57,7 @@ class SweepConfig(_Facts):
 
     @property
     def sides(self) -> dict[str, str]:
-        """Side to the name of its driver."""
+        """Side to the name of its driver; read here on its own, so that the plan is audited too."""
         left, _, right = self.model.partition("+")
         return {"left": left, "right": right or left}
 

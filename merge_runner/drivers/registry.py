@@ -59,10 +59,8 @@ class Program:
 PROGRAMS = Registry[Program]("driver")
 
 
-def stand_in(model: str, sides: Collection[Side] = SIDES) -> str:
-    """What is said of trials of ``model`` in which a scripted stand-in answered on these sides."""
-    left, _, right = model.partition("+")
-    names: dict[Side, str] = {"left": left, "right": right or left}
+def stand_in(names: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:
+    """What is said of trials of these models in which a stand-in answered on these sides."""
     models = {side: name for side, name in names.items() if name not in {EMULATOR, *PROGRAMS}}
     posing = "+".join(dict.fromkeys(name for side, name in models.items() if side in sides))
     real = [side for side in models if side not in sides]

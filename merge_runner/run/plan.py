@@ -12,6 +12,7 @@ from merge_runner.config import (
     ModelEntry,
     Scenario,
     SweepFile,
+    both_sides,
     load_sweep,
     pair_name,
 )
@@ -182,8 +183,7 @@ def make_plan(choice: Choice) -> Plan:
     """Resolve a choice against the sweep's file and the registry; raises UsageError."""
     name, file = load_sweep(choice.sweep)
     models = load_models()
-    left, _, right = choice.model.partition("+")
-    sides: dict[Side, str] = {"left": left, "right": right or left}
+    sides = both_sides(choice.model)
     valid = (*models, *PROGRAMS)
     for driver in sides.values():
         _require(driver, valid, "model", "two joined by + drive left and right")
@@ -199,7 +199,7 @@ def make_plan(choice: Choice) -> Plan:
         raise UsageError("--sample-set is a whole number from 0")
     return Plan(
         name=name,
-        model=left if left == sides["right"] else f"{left}+{right}",
+        model="+".join(dict.fromkeys(sides.values())),
         sides=sides,
         entries={driver: models[driver] for driver in sides.values() if driver in models},
         scenario=file.scenario,

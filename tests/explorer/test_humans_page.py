@@ -12,8 +12,9 @@ from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
-from analysis.explorer.pages.humans import chart, kinds
+from analysis.explorer.pages.humans import HUMAN, chart, kinds, marker, marks
 from analysis.explorer.site import Site
+from analysis.figures.styles import HUMAN_STYLE, MARKERS, driver_style
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
 from analysis.tables.notes import sample_notes
@@ -93,6 +94,18 @@ def test_the_page_says_what_counts_as_a_collision_for_whom(ask):
         "o3: their centres came closer than 4 m, a vehicle's length, looked for 5 times a second"
     ) in text
     assert "human: their outlines overlapped, looked for 20 times a second" in text
+
+
+def test_a_driver_looks_as_in_the_figures_and_no_other_driver_does():
+    groups = [{"id": HUMAN, "driver": HUMAN}]
+    groups += [{"id": f"{i}/baseline", "driver": str(i)} for i in range(12)]
+    human, *drivers = marks(groups).values()
+    assert human.style == HUMAN_STYLE
+    assert [mark.style for mark in drivers] == [driver_style(i) for i in range(12)]
+    assert len({mark.style for mark in drivers}) == 12
+    shapes = {mark.style.shape for mark in (human, *drivers)}
+    assert shapes == set(MARKERS)
+    assert len({marker(shape, 7, 7) for shape in shapes}) == len(shapes)
 
 
 def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):

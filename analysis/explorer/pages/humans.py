@@ -12,24 +12,14 @@ from analysis.explorer import views
 from analysis.explorer.details import scenario_of
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import Site
+from analysis.figures.styles import HUMAN_STYLE, Style, driver_style
 from analysis.metrics import Metric, intervals_of, shown_in
 from analysis.tables.formats import notes_of, shown_value
 from analysis.tables.model import Table, from_text
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 HUMAN = "human"
-# Okabe and Ito's colours that show on white, each with a shape; humans are black circles.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-SHAPES = ("square", "triangle", "diamond", "down", "cross", "plus")
-SHAPE_WORDS = {
-    "circle": "circle",
-    "square": "square",
-    "triangle": "triangle",
-    "diamond": "diamond",
-    "down": "triangle that points down",
-    "cross": "cross",
-    "plus": "plus",
-}
+SHAPE_WORDS = {"down": "triangle that points down"}
 # Of a picture, in its units.
 LEFT, TOP, HEIGHT, FOOT, STEP, LEAST, ARROW = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0, 3.0
 
@@ -83,14 +73,13 @@ class Mark:
     """How a group is drawn."""
 
     group: str
-    colour: str
-    shape: str
+    style: Style
     label: str
 
     @property
     def word(self) -> str:
         """The shape in words."""
-        return SHAPE_WORDS[self.shape]
+        return SHAPE_WORDS.get(self.style.shape, self.style.shape)
 
 
 def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
@@ -146,13 +135,11 @@ def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
     found: dict[str, Mark] = {}
     models = 0
     for group in groups:
-        colour, shape = "#000000", "circle"
+        style = HUMAN_STYLE
         if group["id"] != HUMAN:
-            # With more drivers than colours the next round pairs them otherwise.
-            colour = COLOURS[models % len(COLOURS)]
-            shape = SHAPES[(models + models // len(COLOURS)) % len(SHAPES)]
+            style = driver_style(models)
             models += 1
-        found[group["id"]] = Mark(group["id"], colour, shape, group["driver"])
+        found[group["id"]] = Mark(group["id"], style, group["driver"])
     return found
 
 

@@ -13,7 +13,7 @@ from markupsafe import escape
 
 from analysis.explorer.display_text import visible
 from analysis.explorer.site import NothingNew, NotThere, Site
-from analysis.explorer.sweeps import Cell, Sweep, duration, find_sweep, list_sweeps
+from analysis.explorer.sweeps import Sweep, VariantCondition, duration, find_sweep, list_sweeps
 from analysis.explorer.views import condition_text, prompt_text
 from merge_runner.errors import MergeRunnerError
 from merge_runner.prompts.blocks import VARIANTS
@@ -128,12 +128,12 @@ class _Watched:
         shown = self.site.render("_sweep.html", seen="", **_values(sweep))
         events = [("sweep", shown)] if shown != self.shown else []
         self.shown = shown
-        if sweep.verdict.text != self.said:
+        if sweep.assessment.text != self.said:
             # Read out once per state, and not once a second.
             quiet = ' aria-live="off"' if sweep.entry.state == self.state else ""
-            text = escape(visible(sweep.verdict.text))
+            text = escape(visible(sweep.assessment.text))
             events.append(("state", f"<span{quiet}>{text}</span>"))
-            self.said, self.state = sweep.verdict.text, sweep.entry.state
+            self.said, self.state = sweep.assessment.text, sweep.entry.state
         return events if sweep.entry.followed else [*events, ("done", "")]
 
 
@@ -155,7 +155,7 @@ def _values(sweep: Sweep) -> dict[str, object]:
     return {
         "sweep": sweep,
         "entry": sweep.entry,
-        "verdict": sweep.verdict,
+        "assessment": sweep.assessment,
         "variants": variants,
         "matrix": rows,
         "totals": [_total(variant, [cells[i] for _, cells in rows]) for i, variant in
@@ -180,7 +180,7 @@ def _ordered(names: Iterable[str], usual: Iterable[str]) -> list[str]:
     return sorted(names, key=lambda name: (places.get(name, len(places)), name))
 
 
-def bar(cell: Cell) -> list[tuple[str, float, float]]:
+def bar(cell: VariantCondition) -> list[tuple[str, float, float]]:
     """(what, from, width) of a bar of 100 units for the planned trials of a cell."""
     whole = max(cell.planned, cell.ended + cell.failed + (cell.running or 0), 1)
     parts, begin = [], 0.0
@@ -196,11 +196,11 @@ def bar(cell: Cell) -> list[tuple[str, float, float]]:
     return parts
 
 
-def _total(variant: str, cells: list[Cell | None]) -> Cell:
+def _total(variant: str, cells: list[VariantCondition | None]) -> VariantCondition:
     """One variant over all conditions."""
     there = [cell for cell in cells if cell is not None]
     running = [cell.running for cell in there]
-    return Cell(
+    return VariantCondition(
         variant,
         "",
         planned=sum(cell.planned for cell in there),

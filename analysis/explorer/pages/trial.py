@@ -11,9 +11,10 @@ from markupsafe import Markup, escape
 
 from analysis.explorer import views
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.details import Decision, Row, Trial, read_decisions, read_trial
+from analysis.explorer.details import Decision, Trial, read_decisions, read_trial
 from analysis.explorer.display_text import shortened
 from analysis.explorer.query_params import whole
+from analysis.explorer.reading import Row
 from analysis.explorer.site import NotThere, Site
 from merge_runner.records import SIDES
 
