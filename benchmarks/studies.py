@@ -19,7 +19,7 @@ import numpy as np
 
 from analysis.data.reference_data import PAIRS
 from analysis.human.record import SPEC, SPEC_HASH
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import (
     SIDES,
     Attempt,
@@ -43,9 +43,9 @@ SEED = 1
 BATCH = 500
 MODELS = (*(("o3", v) for v in ("baseline", *(f"A{i}" for i in range(1, 8)))), ("o1", "baseline"))
 GROUPS = len(MODELS) + 1
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 # Humans are recorded at 20 Hz.
-HUMAN_SCENARIO = Scenario(step_s=0.05)
+HUMAN_SCENARIO = ScenarioConfig(step_s=0.05)
 PROMPT = "You drive a car towards a merge point and see another one. " * 30
 HORIZON, HELD = 20, 5
 STARTED = datetime(2026, 11, 21, tzinfo=UTC).replace(tzinfo=None)

@@ -61,7 +61,7 @@ class Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Scenario(Frozen):
+class ScenarioConfig(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
     ``collision_rule``: ``euclid2d`` (centres closer than a vehicle length), ``rectangle`` (the
@@ -113,7 +113,7 @@ class Scenario(Frozen):
         return round(self.timeout_s / self.step_s)
 
     @model_validator(mode="after")
-    def _whole_steps(self) -> Scenario:
+    def _whole_steps(self) -> ScenarioConfig:
         for name, seconds in (
             ("horizon_s", self.horizon_s),
             ("memory_s", self.memory_s),
@@ -181,7 +181,7 @@ class SweepFile(Frozen):
     description: str = ""
     repetitions: dict[str, Annotated[Count, Field(le=MOST_REPETITIONS)]]
     conditions: tuple[str, ...] | None = None
-    scenario: Scenario = Scenario()
+    scenario: ScenarioConfig = ScenarioConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -466,7 +466,7 @@ def _validate(model: type[ModelT], value: object, where: str) -> ModelT:
         raise UsageError(one_line(f"{where}: {'; '.join(_explain(exc, model))}")) from exc
 
 
-NESTED: dict[str, type[BaseModel]] = {"scenario": Scenario, "price": Price}
+NESTED: dict[str, type[BaseModel]] = {"scenario": ScenarioConfig, "price": Price}
 
 
 def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
 from merge_runner.errors import CallFailed
 from merge_runner.records import (
@@ -22,7 +22,7 @@ from merge_runner.scenarios.merge.world import World
 
 
 async def play_trial(
-    spec: TrialSpec, scenario: Scenario, drivers: dict[Side, Driver]
+    spec: TrialSpec, scenario: ScenarioConfig, drivers: dict[Side, Driver]
 ) -> TrialRecord:
     """Play a trial to its end, or until a call fails."""
     world = World(scenario, CONDITIONS[spec.condition])

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import held
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.errors import CallFailed
@@ -43,7 +43,7 @@ def spec_of(condition):
 
 async def play(left, right, condition="N_0_0", **scenario):
     drivers = {"left": left, "right": right}
-    return await play_trial(spec_of(condition), Scenario(**scenario), drivers)
+    return await play_trial(spec_of(condition), ScenarioConfig(**scenario), drivers)
 
 
 class Holding:
@@ -137,7 +137,7 @@ async def test_decisions_are_made_once_a_second_from_time_0_on():
 
 
 async def test_the_prompt_rate_decides_when_the_drivers_are_asked():
-    scenario = Scenario(prompt_rate_hz=2.5)
+    scenario = ScenarioConfig(prompt_rate_hz=2.5)
     drivers = {side: ConstantDriver(scenario) for side in SIDES}
     trial = await play_trial(spec_of("N_0_0"), scenario, drivers)
     times = [row.time_s for row in trial.decisions if row.side == "left"]
@@ -158,7 +158,7 @@ async def test_the_actions_of_a_decision_are_driven_in_their_order():
 
 
 async def test_a_trial_ends_within_a_second_when_the_cars_collide():
-    scenario = Scenario()
+    scenario = ScenarioConfig()
     trial = await play(ConstantDriver(scenario), ConstantDriver(scenario))
     # Level cars at 10 m/s are closer than 4.5 m from 82 m on: after 3.2 s, at 3.4 s in steps.
     assert (trial.status, trial.end_time_s, trial.merged_first) == ("collided", 3.4, None)

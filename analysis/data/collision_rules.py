@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, get_args
 import pandas as pd
 
 from analysis.data.load import SPECS, load_each
-from merge_runner.config import CollisionRule, Scenario
+from merge_runner.config import CollisionRule, ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided, rectangles_overlap
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import FORWARD, LATERAL, MERGE_POINT_M
@@ -141,9 +141,9 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     return pd.DataFrame(rows, columns=["trial_id", "spec_hash", "rule", "status", "merged_first"])
 
 
-def _near(scenarios: Iterable[Scenario]) -> str:
+def _near(scenarios: Iterable[ScenarioConfig]) -> str:
     """The query of the samples at or next to which vehicles can collide."""
-    every = [Scenario(), *scenarios]
+    every = [ScenarioConfig(), *scenarios]
     step_s = max(one.step_s for one in every)
     # What accelerations against each other, and a resistance, add to the way within a step.
     added_m = 2 * (max(one.max_acceleration_mps2 for one in every) + 2) * step_s**2
@@ -157,7 +157,7 @@ def _near(scenarios: Iterable[Scenario]) -> str:
     )
 
 
-def seen(scenario: Scenario, samples: Sequence[Sample], *, between: bool) -> bool:
+def seen(scenario: ScenarioConfig, samples: Sequence[Sample], *, between: bool) -> bool:
     """Whether a collision is seen at the scenario's steps, and ``between`` them at 20 Hz."""
     if any(
         collided(scenario, sample.left_m, sample.right_m)
@@ -200,7 +200,9 @@ def _is_multiple(time_s: float, step_s: float) -> bool:
     return isclose(time_s / step_s, round(time_s / step_s), abs_tol=1e-6)
 
 
-def _scenarios(spec_hashes: Iterable[str], specs: pd.DataFrame) -> dict[tuple[str, str], Scenario]:
+def _scenarios(
+    spec_hashes: Iterable[str], specs: pd.DataFrame
+) -> dict[tuple[str, str], ScenarioConfig]:
     """The scenario of each spec under each reading; that of humans is the default one."""
     texts = dict(zip(specs["spec_hash"], specs["spec"], strict=True))
     found = {
@@ -208,7 +210,7 @@ def _scenarios(spec_hashes: Iterable[str], specs: pd.DataFrame) -> dict[tuple[st
         for spec_hash in spec_hashes
     }
     return {
-        (spec_hash, reading): Scenario.model_validate(
+        (spec_hash, reading): ScenarioConfig.model_validate(
             scenario | {"collision_rule": "rectangle" if reading == BOXES else reading}
         )
         for spec_hash, scenario in found.items()
@@ -217,7 +219,7 @@ def _scenarios(spec_hashes: Iterable[str], specs: pd.DataFrame) -> dict[tuple[st
 
 
 def redrive(
-    scenario: Scenario,
+    scenario: ScenarioConfig,
     condition: str,
     applied: Sequence[Sequence[Sequence[float]]],
     last_plans: Sequence[Sequence[float]],

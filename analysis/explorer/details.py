@@ -12,7 +12,7 @@ import duckdb
 
 from analysis.explorer.prompts import Part, parts_of
 from analysis.explorer.reading import reading
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES, Side
 
 Row = dict[str, Any]
@@ -53,7 +53,7 @@ class Trial:
 
     trial_id: str
     spec_hash: str
-    scenario: Scenario
+    scenario: ScenarioConfig
     states: dict[Side, Row]
     decisions: list[Row]
 
@@ -94,10 +94,10 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     return trial
 
 
-def scenario_of(source: str, told: Mapping[str, Any] | None) -> Scenario:
+def scenario_of(source: str, told: Mapping[str, Any] | None) -> ScenarioConfig:
     """The task of a trial, as its spec tells it, or as it usually is."""
     usual = HUMAN_TASK if source == "human" else {}
-    return Scenario.model_validate(usual if told is None else told)
+    return ScenarioConfig.model_validate(usual if told is None else told)
 
 
 def read_decisions(

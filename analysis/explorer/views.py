@@ -8,7 +8,7 @@ from typing import Any
 
 from analysis.explorer.details import Decision, Row, Trial
 from analysis.explorer.display_text import visible
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge import geometry as track
@@ -95,7 +95,7 @@ def prompt_text(variant: str | None) -> str:
     return "the whole prompt" if not without else f"the prompt without {', '.join(without)}"
 
 
-def outcome_text(row: Row, scenario: Scenario) -> str:
+def outcome_text(row: Row, scenario: ScenarioConfig) -> str:
     """How a trial ended, in a sentence."""
     end = f"{row['end_time_s']:.1f} s"
     if row["status"] == "collided":
@@ -113,7 +113,7 @@ def outcome_text(row: Row, scenario: Scenario) -> str:
     return f"The {other} vehicle yielded: the {first} one reached the merge point first{when}{gap}."
 
 
-def collision_text(scenario: Scenario) -> str:
+def collision_text(scenario: ScenarioConfig) -> str:
     """What the scenario takes for a collision."""
     length = f"{scenario.vehicle_length_m:g} m"
     return {
@@ -123,7 +123,7 @@ def collision_text(scenario: Scenario) -> str:
     }[scenario.collision_rule]
 
 
-def judged_text(scenario: Scenario) -> str:
+def judged_text(scenario: ScenarioConfig) -> str:
     """What the picture draws of the rule by which the scenario judges a collision."""
     length = f"{scenario.vehicle_length_m:g} m"
     return {
@@ -277,7 +277,7 @@ def collision_bounds(trial: Trial) -> list[float | None]:
     ]
 
 
-def _bound(scenario: Scenario, left_m: float, right_m: float) -> float | None:
+def _bound(scenario: ScenarioConfig, left_m: float, right_m: float) -> float | None:
     """At the vehicles' mean position, or on the shared lane once one of them is there.
 
     By bisection: the further apart two vehicles are along the road, the less they overlap.

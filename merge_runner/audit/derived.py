@@ -19,7 +19,7 @@ import duckdb
 from merge_runner.audit.answers import COLUMNS, Answer, answers_another, read_answer
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Finding
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.drivers.registry import PROGRAMS
@@ -105,7 +105,7 @@ class _Trial:
 
     key: TrialKey
     row: dict[str, Any]
-    scenario: Scenario
+    scenario: ScenarioConfig
     attempts: list[Answer]
     plans: dict[tuple[str, int], Decision]
     scripted: bool

@@ -9,7 +9,7 @@ import duckdb
 
 from merge_runner.audit.expected import Spec
 from merge_runner.audit.findings import Finding
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import FORWARD, LATERAL, MERGE_POINT_M
 
@@ -41,7 +41,7 @@ ORDER BY ALL
 """  # noqa: S608 # constants
 
 
-def reach_m(scenario: Scenario) -> float:
+def reach_m(scenario: ScenarioConfig) -> float:
     """A distance of the centres from which on no rule sees a collision, with room for rounding."""
     return hypot(scenario.vehicle_length_m, scenario.vehicle_width_m) + TOLERANCE_M
 
@@ -65,7 +65,7 @@ def check_traces(
 
 
 def _collision(
-    scenario: Scenario, status: str, last_step: int, close: Iterable[tuple[int, float, float]]
+    scenario: ScenarioConfig, status: str, last_step: int, close: Iterable[tuple[int, float, float]]
 ) -> str | None:
     """What contradicts the status; a trial ends with its first collision."""
     first = next((step for step, *both in close if collided(scenario, *both)), None)

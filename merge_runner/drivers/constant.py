@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import held
 from merge_runner.records import Decision, Observation
 
@@ -13,7 +13,7 @@ from merge_runner.records import Decision, Observation
 class ConstantDriver:
     """Keeps its speed where there is no resistance."""
 
-    scenario: Scenario
+    scenario: ScenarioConfig
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Accelerate by nothing."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.parse import ParsedReply, parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import ChatReply, Decision, Observation
@@ -20,7 +20,7 @@ class LlmDriver:
 
     ask: Ask
     variant: str
-    scenario: Scenario
+    scenario: ScenarioConfig
     _plan: tuple[float, ...] | None = None
     _executed: int = 0
 

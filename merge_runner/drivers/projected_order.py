@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import held
 from merge_runner.records import Decision, Observation, Side
 
@@ -23,7 +23,7 @@ class ProjectedOrderDriver:
     merge point, but never harder than 1.5 m/s^2, and then follows at that gap.
     """
 
-    scenario: Scenario
+    scenario: ScenarioConfig
     side: Side
 
     async def decide(self, observation: Observation, number: int) -> Decision:

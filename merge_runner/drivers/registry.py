@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec, resolve_name
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers import projected_order
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.constant import ConstantDriver
@@ -26,7 +26,7 @@ class Program:
     """A driver's class, how one is made for a trial, and the parameters of its rule."""
 
     driver: type
-    make: Callable[[Scenario, Side], Driver]
+    make: Callable[[ScenarioConfig, Side], Driver]
     parameters: Mapping[str, float]
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import cache
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS
 from merge_runner.records import Observation, Road
 
@@ -15,7 +15,7 @@ def render_prompt(
     remaining_plan: Sequence[float] | None,
     *,
     variant: str,
-    scenario: Scenario,
+    scenario: ScenarioConfig,
 ) -> str:
     """The prompt of a variant.
 
@@ -35,7 +35,7 @@ def _template(variant: str, road: Road) -> str:
 
 
 def _fields(
-    observation: Observation, remaining_plan: Sequence[float] | None, scenario: Scenario
+    observation: Observation, remaining_plan: Sequence[float] | None, scenario: ScenarioConfig
 ) -> dict[str, str]:
     distance = observation.distance_to_merge_m
     return {

@@ -10,7 +10,7 @@ from typing import Literal
 from merge_runner.config import (
     MOST_REPETITIONS,
     ModelEntry,
-    Scenario,
+    ScenarioConfig,
     SweepFile,
     load_models,
     load_sweep,
@@ -59,7 +59,7 @@ class Plan:
     model: str
     sides: dict[Side, str]
     entries: dict[str, ModelEntry]
-    scenario: Scenario
+    scenario: ScenarioConfig
     repetitions: dict[str, int]
     conditions: tuple[str, ...]
     sample_set: int

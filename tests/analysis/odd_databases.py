@@ -17,7 +17,7 @@ from analysis.explorer.export import export_folder
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
 from analysis.report.writer import write_report
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.results.database import open_database
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -63,7 +63,7 @@ def partial_import(db: Path) -> None:
 
 def other_vehicle_length(db: Path) -> None:
     """Vehicles of 8 m."""
-    write_study(db, yielding("o3", reps=3), Scenario(vehicle_length_m=8.0), asked=OWN)
+    write_study(db, yielding("o3", reps=3), ScenarioConfig(vehicle_length_m=8.0), asked=OWN)
 
 
 def temperature(db: Path) -> None:

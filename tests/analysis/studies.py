@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import duckdb
 
 from analysis.data.study import Study
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import (
     SIDES,
     Attempt,
@@ -31,7 +31,7 @@ from merge_runner.results.store import Store, SweepRow
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.world import World
 
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 ANSWERS = ("ok", "refusal", "truncated", "empty")
 
 
@@ -66,7 +66,7 @@ class Drive:
     said: Mapping[int, Said] | None = None
 
 
-def played(drive: Drive, scenario: Scenario = SCENARIO) -> TrialRecord:
+def played(drive: Drive, scenario: ScenarioConfig = SCENARIO) -> TrialRecord:
     """Play a trial; after the last given second the drivers keep their speed."""
     world = World(scenario, CONDITIONS[drive.condition])
     decisions: list[DecisionRow] = []
@@ -145,7 +145,7 @@ def answered(drive: Drive, side: Side, number: int, decision: Decision) -> Decis
 def write_study(
     path: Path,
     drives: Iterable[Drive],
-    scenario: Scenario = SCENARIO,
+    scenario: ScenarioConfig = SCENARIO,
     config: object = None,
     asked: Mapping[str, object] | None = None,
 ) -> Path:

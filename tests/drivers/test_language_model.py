@@ -2,7 +2,7 @@
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.records import ChatReply, ChatRequest, Observation, Slot
 
@@ -41,7 +41,7 @@ async def decide(*replies, seen=SEEN, variant="baseline", **scenario):
         reply = replies[number]
         return chat_reply(reply) if isinstance(reply, str) else reply
 
-    driver = LlmDriver(ask, variant, Scenario(**scenario))
+    driver = LlmDriver(ask, variant, ScenarioConfig(**scenario))
     decisions = [await driver.decide(seen, number) for number in range(len(replies))]
     assert [prompt for prompt, _ in asked] == [decision.prompt for decision in decisions]
     assert [number for _, number in asked] == list(range(len(replies)))

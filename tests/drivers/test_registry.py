@@ -2,7 +2,7 @@
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.projected_order import ProjectedOrderDriver
 from merge_runner.records import SIDES, TrialSpec
@@ -16,7 +16,7 @@ RULES = ("euclid2d", "rectangle", "shared_lane")
 
 async def play(condition, driver, **scenario):
     """A trial with the same kind of driver on both sides."""
-    scenario = Scenario(**scenario)
+    scenario = ScenarioConfig(**scenario)
     spec = TrialSpec(
         trial_id="test",
         spec_hash="test",

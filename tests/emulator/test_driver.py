@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.emulator.chance import draw, draw_between, draw_index
 from merge_runner.emulator.driver import answer
@@ -20,7 +20,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.world import World
 from merge_runner.trial import play_trial
 
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 SAMPLE_SETS = range(6)
 REPETITIONS = range(1, 11)
 

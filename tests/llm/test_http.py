@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 from aiohttp import web
 
-from merge_runner.config import Endpoint, ModelEntry, Scenario, resolve_endpoint
+from merge_runner.config import Endpoint, ModelEntry, ScenarioConfig, resolve_endpoint
 from merge_runner.emulator.driver import answer
 from merge_runner.emulator.faults import FaultPlan, transient_faults
 from merge_runner.emulator.server import serve
@@ -407,7 +407,7 @@ def is_quick(plan):
 
 
 def driving_prompt():
-    scenario = Scenario()
+    scenario = ScenarioConfig()
     seen = World(scenario, CONDITIONS["L_4_8"]).observe("left")
     return render_prompt(seen, None, variant="baseline", scenario=scenario)
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, block_digests
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import SIDES, Observation
@@ -65,7 +65,7 @@ law = settings(deadline=None, derandomize=True)  # the gate must not depend on l
 
 def render(variant, form, **scenario):
     observation, rest = FORMS[form]
-    return render_prompt(observation, rest, variant=variant, scenario=Scenario(**scenario))
+    return render_prompt(observation, rest, variant=variant, scenario=ScenarioConfig(**scenario))
 
 
 @pytest.mark.parametrize(("variant", "form"), CASES)
@@ -108,7 +108,7 @@ def test_the_first_decision_is_told_that_it_has_no_previous_plan():
 
 
 def test_both_sides_of_the_symmetric_condition_get_the_identical_prompt():
-    scenario = Scenario()
+    scenario = ScenarioConfig()
     world = World(scenario, CONDITIONS["N_0_0"])
     for action in (0.0, 0.3, -0.7):
         left, right = (
@@ -128,7 +128,7 @@ def test_no_prompt_tells_left_from_right(form):
 @pytest.mark.parametrize("value", [-0.0, -0.001, -0.00499])
 def test_a_value_that_rounds_to_zero_has_no_sign(value):
     seen = Observation("merge", value, value, value, value, (value,) * 10, (value,) * 10)
-    prompt = render_prompt(seen, (value,) * 15, variant="baseline", scenario=Scenario())
+    prompt = render_prompt(seen, (value,) * 15, variant="baseline", scenario=ScenarioConfig())
     assert "-0.00" not in prompt
     # Three speeds and distances, one to the merge point, two histories and the plan.
     assert prompt.count("0.00") == 4 + 2 * 10 + 15
@@ -138,7 +138,7 @@ def test_a_value_that_rounds_to_zero_has_no_sign(value):
 @given(st.floats(-200, 200))
 def test_every_value_is_shown_to_two_decimals(value):
     seen = replace(FIRST, relative_distance_m=value)
-    prompt = render_prompt(seen, None, variant="baseline", scenario=Scenario())
+    prompt = render_prompt(seen, None, variant="baseline", scenario=ScenarioConfig())
     line = next(x for x in prompt.splitlines() if x.startswith("- Relative distance"))
     shown = line.split("): ")[1].removesuffix(" m")
     assert abs(float(shown) - value) <= 0.005 + 1e-9

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from merge_runner.results.comparison import PLACES, stored_rows
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.results.database import SCHEMA, in_memory
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.language_model import LlmDriver
@@ -29,7 +29,7 @@ ANOTHER = {
 
 def played() -> TrialRecord:
     """A trial that a language model drove, with a reply beyond ASCII and one attempt in vain."""
-    scenario = Scenario()
+    scenario = ScenarioConfig()
 
     async def ask(prompt: str, number: int) -> ChatReply:
         text = f"M\nI go, \u00fcber alles \u20ac.\n```python\n{[0.1] * 20}\n```"

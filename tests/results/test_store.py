@@ -13,7 +13,7 @@ import duckdb
 import pytest
 
 from merge_runner.run import flusher
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.projected_order import ProjectedOrderDriver
 from merge_runner.errors import StoreError, UsageError
@@ -23,7 +23,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.results.store import Store, SweepRow, query, results_digest, sweep_facts
 from merge_runner.trial import play_trial
 
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 SWEEP = SweepRow("s1", "baseline", datetime(2026, 1, 1), "{}", None, None, "{}")  # noqa: DTZ001
 LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True); input()"
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
@@ -63,7 +63,7 @@ def every_audit_event():
 
 def emulated():
     """Real replies of the emulator, in every condition, with and without the tactical token."""
-    scenario = Scenario()
+    scenario = ScenarioConfig()
     for name, condition in CONDITIONS.items():
         for variant in ("baseline", "A1"):
             seen = World(scenario, condition).observe("left")

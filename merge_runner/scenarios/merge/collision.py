@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, heading, place
 
 Vector = tuple[float, float]
 
 
-def collided(scenario: Scenario, left_m: float, right_m: float) -> bool:
+def collided(scenario: ScenarioConfig, left_m: float, right_m: float) -> bool:
     """Whether vehicles at these travelled distances collide under the scenario's rule."""
     length = scenario.vehicle_length_m
     if scenario.collision_rule == "euclid2d":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES, Observation, Side, StateRow, Status
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
@@ -19,7 +19,7 @@ class World:
     kept from step 0 on, in SI units.
     """
 
-    def __init__(self, scenario: Scenario, condition: Condition) -> None:
+    def __init__(self, scenario: ScenarioConfig, condition: Condition) -> None:
         exits = condition.exit_times_s
         start = max(exits) if scenario.control_start == "both_exits" else min(exits)
         self._scenario = scenario

@@ -19,7 +19,7 @@ from analysis.data.collision_rules import (
 from analysis.data.load import load, load_trials
 from analysis.data.study import Study
 from analysis.tables.robustness import robustness
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import StateRow, TrialRecord, TrialSpec
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -53,7 +53,8 @@ def driven(condition, left, right, rest=0):
     decided = [[side[k : k + 5] for k in range(0, len(side), 5)] for side in (left, right)]
     last = [[*decisions[-1], *[0.0] * rest] for decisions in decided]
     return {
-        rule: redrive(Scenario(collision_rule=rule), condition, decided, last) for rule in RULES
+        rule: redrive(ScenarioConfig(collision_rule=rule), condition, decided, last)
+        for rule in RULES
     }
 
 
@@ -155,7 +156,7 @@ def test_a_last_plan_goes_on_after_the_actions_that_were_driven():
     """
     applied = [[CRUISE, [1.0, 1.0]], [CRUISE, [0.0, 0.0]]]
     last = [1.0, 1.0, -1.0, -1.0, *[0.0] * 64]
-    scenario = Scenario(collision_rule="shared_lane")
+    scenario = ScenarioConfig(collision_rule="shared_lane")
     assert redrive(scenario, "L_4_0", applied, [last, [0.0] * 68]) == ("collided", None)
     longer = [*[1.0] * 3, *[-1.0] * 3, *[0.0] * 60]  # 0.9 m are enough
     assert redrive(scenario, "L_4_0", applied, [longer, [0.0] * 66]) == ("finished", "left")
@@ -164,7 +165,7 @@ def test_a_last_plan_goes_on_after_the_actions_that_were_driven():
 def test_it_stays_open_where_one_drivers_plan_is_not_known():
     """A fallback has no plan of its own."""
     applied = [[CRUISE] * 4, [CRUISE] * 4]
-    scenario = Scenario(collision_rule="shared_lane")
+    scenario = ScenarioConfig(collision_rule="shared_lane")
     known = [0.0] * 20
     assert redrive(scenario, "N_0_0", applied, [known, known]) == ("collided", None)
     assert redrive(scenario, "N_0_0", applied, [known, []]) == (UNDECIDED, None)
@@ -180,7 +181,7 @@ def test_an_open_trial_has_no_first_merger():
 
 def test_a_driver_that_decided_later_cruised_in_the_steps_before():
     """Full throttle from the right's first decision on, five steps late, comes too late to pass."""
-    scenario = Scenario(control_start="own_exit")
+    scenario = ScenarioConfig(control_start="own_exit")
     early = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 12], [[], []])
     late = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 8], [[], []])
     assert early == ("finished", "right")
@@ -225,7 +226,7 @@ def test_stored_plans_are_driven_again_under_each_rule(tmp_path):
 def test_stored_traces_are_judged_as_their_plans_driven_again(tmp_path, length_m):
     """Trials of any plans, of which many collide; also of longer vehicles."""
     rng = np.random.default_rng(7)
-    scenario = Scenario(vehicle_length_m=length_m)
+    scenario = ScenarioConfig(vehicle_length_m=length_m)
     drives = [
         Drive("o3", "baseline", str(rng.choice(list(CONDITIONS))), rep,
               *(tuple(rng.uniform(-0.3, 0.3, 12).tolist()) for _ in "lr"))
@@ -305,7 +306,7 @@ def test_human_traces_are_judged_as_they_are(humans):
 
 def test_the_table_says_how_long_the_vehicles_are_that_it_judges(tmp_path):
     drive = Drive("long", "baseline", "L_4_0", 1, (0.8, 0.8), (-0.8, -0.8))
-    db = write_study(tmp_path / "long.duckdb", [drive], Scenario(vehicle_length_m=8.0))
+    db = write_study(tmp_path / "long.duckdb", [drive], ScenarioConfig(vehicle_length_m=8.0))
     notes = robustness(Study(db)).notes
     assert "the vehicles are 8 m x 1.8 m" in notes
     assert not any("4.5" in note for note in notes)

@@ -4,7 +4,7 @@ from math import sqrt
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided, rectangles_overlap, squared_distance_m2
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.world import World
@@ -49,7 +49,7 @@ def test_rectangles_cannot_overlap_before_the_first_possible_contact():
 def test_every_rule_treats_left_and_right_alike():
     places = [85 + 1.7 * k for k in range(18)]
     for rule in RULES:
-        scenario = Scenario(collision_rule=rule)
+        scenario = ScenarioConfig(collision_rule=rule)
         for a in places:
             for b in places:
                 assert collided(scenario, a, b) == collided(scenario, b, a)
@@ -66,14 +66,14 @@ def test_the_vehicles_start_between_12_48_and_13_77_m_apart():
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("start", ["both_exits", "own_exit"])
 def test_no_condition_starts_in_a_collision(rule, start):
-    scenario = Scenario(collision_rule=rule, control_start=start)
+    scenario = ScenarioConfig(collision_rule=rule, control_start=start)
     assert all(World(scenario, condition).status is None for condition in CONDITIONS.values())
 
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_every_condition_ends_in_a_collision_at_constant_speed(rule, name):
-    world = World(Scenario(collision_rule=rule), CONDITIONS[name])
+    world = World(ScenarioConfig(collision_rule=rule), CONDITIONS[name])
     while world.status is None:
         world.advance({"left": 0.0, "right": 0.0})
     assert world.status == "collided"
@@ -84,7 +84,7 @@ def test_at_equal_speed_a_headway_of_4_6_m_passes_and_one_of_4_4_m_collides(foll
     def any_collision(headway_m):
         ways = [(50 + 0.01 * k, 50 + 0.01 * k + headway_m) for k in range(10_000)]
         pairs = ways if follower == "left" else [(right, left) for left, right in ways]
-        return any(collided(Scenario(), left, right) for left, right in pairs)
+        return any(collided(ScenarioConfig(), left, right) for left, right in pairs)
 
     assert not any_collision(4.6)
     assert any_collision(4.4)
@@ -93,8 +93,8 @@ def test_at_equal_speed_a_headway_of_4_6_m_passes_and_one_of_4_4_m_collides(foll
 def test_euclid2d_needs_less_than_a_vehicle_length_between_the_centres():
     """Level vehicles 18 m before the merge point are exactly 4.5 m apart, also in binary."""
     assert squared_distance_m2(82.0, 82.0) == LENGTH_M**2
-    assert not collided(Scenario(), 82.0, 82.0)
-    assert collided(Scenario(), 82.01, 82.01)
+    assert not collided(ScenarioConfig(), 82.0, 82.0)
+    assert collided(ScenarioConfig(), 82.01, 82.01)
 
 
 def test_rectangles_that_touch_do_not_collide():
@@ -103,7 +103,7 @@ def test_rectangles_that_touch_do_not_collide():
 
 
 def test_shared_lane_needs_one_vehicle_at_the_merge_point_and_less_than_a_length():
-    scenario = Scenario(collision_rule="shared_lane")
+    scenario = ScenarioConfig(collision_rule="shared_lane")
     assert not collided(scenario, 99.99, 99.99)
     assert collided(scenario, 100.0, 99.99)
     assert collided(scenario, 99.99, 100.0)
@@ -113,5 +113,5 @@ def test_shared_lane_needs_one_vehicle_at_the_merge_point_and_less_than_a_length
 
 @pytest.mark.parametrize("rule", RULES)
 def test_the_vehicle_length_is_the_scenarios(rule):
-    assert not collided(Scenario(collision_rule=rule), 110.0, 115.0)
-    assert collided(Scenario(collision_rule=rule, vehicle_length_m=6.0), 110.0, 115.0)
+    assert not collided(ScenarioConfig(collision_rule=rule), 110.0, 115.0)
+    assert collided(ScenarioConfig(collision_rule=rule, vehicle_length_m=6.0), 110.0, 115.0)

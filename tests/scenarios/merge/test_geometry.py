@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.results.database import SCHEMA
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
@@ -46,7 +46,7 @@ def test_the_track_in_sql_is_the_simulators(database):
 
 @pytest.mark.parametrize("spec", [{"source": "human"}, {"scenario": {}}])
 def test_a_size_that_a_spec_does_not_say_is_that_of_the_experiment(database, spec):
-    found, default = geometry(database, spec), Scenario()
+    found, default = geometry(database, spec), ScenarioConfig()
     assert found["length_m"] == default.vehicle_length_m
     assert found["width_m"] == default.vehicle_width_m
 
