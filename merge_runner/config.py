@@ -21,7 +21,9 @@ from pydantic import (
     ConfigDict,
     Field,
     JsonValue,
+    SerializerFunctionWrapHandler,
     ValidationError,
+    model_serializer,
     model_validator,
 )
 
@@ -33,6 +35,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
 LONGEST_URL, LONGEST_HOST = 2000, 253
 _LABEL = re.compile(r"[a-z0-9_-]{1,63}", re.I)
+USUAL_SCENARIO = "merge"
 MOST_STEPS = MOST_REPETITIONS = 100_000
 
 
@@ -64,6 +67,8 @@ class Frozen(BaseModel):
 class ScenarioConfig(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
+    ``name``: a registered scenario; where it is ``merge`` it is not written, as it was not before
+    there were others, so that the hashes of specs stay.
     ``collision_rule``: ``euclid2d`` (centres closer than a vehicle length), ``rectangle`` (the
     vehicles' oriented boxes overlap, as in the human experiment) or ``shared_lane``
     (|s_L - s_R| below a vehicle length once either has passed the merge point).
@@ -77,6 +82,7 @@ class ScenarioConfig(Frozen):
     once the ``own`` vehicle, or once ``both``, have passed the merge point.
     """
 
+    name: str = USUAL_SCENARIO
     horizon_s: Positive = 4.0
     step_s: Positive = 0.2
     prompt_rate_hz: Positive = 1.0
@@ -111,6 +117,13 @@ class ScenarioConfig(Frozen):
     def timeout_steps(self) -> int:
         """The number of steps after which a trial is over."""
         return round(self.timeout_s / self.step_s)
+
+    @model_serializer(mode="wrap")
+    def _without_usual_name(self, write: SerializerFunctionWrapHandler) -> dict[str, JsonValue]:
+        told: dict[str, JsonValue] = write(self)
+        if self.name == USUAL_SCENARIO:
+            del told["name"]
+        return told
 
     @model_validator(mode="after")
     def _whole_steps(self) -> ScenarioConfig:

@@ -17,15 +17,16 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
+from merge_runner.scenarios.base import World
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.world import World
+from merge_runner.scenarios.registry import SCENARIOS
 
 
 async def play_trial(
     spec: TrialSpec, scenario: ScenarioConfig, drivers: dict[Side, Driver]
 ) -> TrialRecord:
     """Play a trial to its end, or until a call fails."""
-    world = World(scenario, CONDITIONS[spec.condition])
+    world = SCENARIOS[scenario.name].world(scenario, CONDITIONS[spec.condition])
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}
     number = 0

@@ -15,7 +15,7 @@ from analysis.explorer.reading import PATIENCE_S, reading
 from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
-from merge_runner.results.database import SCHEMA, Instance, spill_folder
+from merge_runner.results.database import Instance, schema_sql, spill_folder
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer
 
@@ -398,7 +398,7 @@ class Catalogue:
         """Forget everything."""
         self._instance.drop()
         self._connection = self._instance.confined(self.db)
-        self._connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        self._connection.execute(schema_sql())
         self._connection.execute(LISTED + GROUPED)
         self._file, self._stamp = file, None
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 from merge_runner.config import ScenarioConfig
 from merge_runner.llm.keys import between_body_and_slot
 from merge_runner.records import SIDES
+from merge_runner.scenarios.merge.geometry import Track, track_of
 
 
 class _Facts(BaseModel):
@@ -99,6 +100,14 @@ class Spec:
             return ScenarioConfig.model_validate(
                 {name: fields[name] for name in ScenarioConfig.model_fields if name in fields}
             )
+        except ValidationError:
+            return None
+
+    @cached_property
+    def track(self) -> Track | None:
+        """The track, None where it cannot be read."""
+        try:
+            return track_of(self.content)
         except ValidationError:
             return None
 

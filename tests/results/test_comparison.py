@@ -7,7 +7,7 @@ import pytest
 
 from merge_runner.results.comparison import PLACES, stored_rows
 from merge_runner.config import ScenarioConfig
-from merge_runner.results.database import SCHEMA, in_memory
+from merge_runner.results.database import schema_sql, in_memory
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.llm.keys import make_request
@@ -55,7 +55,7 @@ RECORD = played()
 def stored():
     """A database with the trial, and another one beside it."""
     connection = in_memory({})
-    connection.execute(SCHEMA.read_text())
+    connection.execute(schema_sql())
     for table, rows in rows_of(RECORD).items():
         appender = connection.appender(table)
         appender.append_rows(rows)
@@ -77,7 +77,7 @@ def differing(connection, **how) -> list[str]:
 
 def columns():
     with in_memory({}) as connection:
-        connection.execute(SCHEMA.read_text())
+        connection.execute(schema_sql())
         return connection.execute(
             "SELECT table_name, column_name, data_type FROM duckdb_columns() "
             "WHERE table_name IN ('trials', 'states', 'decisions', 'calls') "

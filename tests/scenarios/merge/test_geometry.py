@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.results.database import SCHEMA
+from merge_runner.results.database import schema_sql
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
 from merge_runner.scenarios.merge.geometry import LATERAL, MERGE_POINT_M, TRACK_END_M
@@ -21,7 +21,7 @@ HAIR_M = 1e-6
 @pytest.fixture(scope="module")
 def database():
     with duckdb.connect() as connection:
-        connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        connection.execute(schema_sql())
         yield connection
 
 
