@@ -8,7 +8,7 @@ driven again, and the last ones go on as far as they reach; what is open then st
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, pairwise
 from math import ceil, hypot, isclose
 from pathlib import Path
@@ -19,10 +19,11 @@ import pandas as pd
 from analysis.data.load import SPECS, load_each
 from merge_runner.config import CollisionRule, ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided, rectangles_overlap
-from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.geometry import FORWARD, LATERAL, MERGE_POINT_M
+from merge_runner.scenarios.merge.conditions import Condition
+from merge_runner.scenarios.merge.geometry import TRACK, Track, track_of
 from merge_runner.scenarios.merge.vehicle import advance
 from merge_runner.scenarios.merge.world import World
+from merge_runner.text_safety import quoted
 
 # The readings of the paper's rule, looked for at every step of the simulation.
 RULES: tuple[CollisionRule, ...] = get_args(CollisionRule)
@@ -37,12 +38,13 @@ NEAR = """
 SELECT trial_id, spec_hash,
     list((step, time_s, left_m, left_mps, right_m, right_mps) ORDER BY step) AS near
 FROM (
-    SELECT *, left_m - {merge} AS left_past_m, right_m - {merge} AS right_past_m,
-        {lateral} * (least(left_past_m, 0) + least(right_past_m, 0)) AS across_m,
-        if(left_past_m < 0, {forward} * left_past_m, left_past_m)
-            - if(right_past_m < 0, {forward} * right_past_m, right_past_m) AS along_m,
-        {step_s} * (abs(left_mps - right_mps) + {lateral} * (left_mps + right_mps)) AS nearer_m
-    FROM vehicle_pairs
+    SELECT *, left_m - merge_m AS left_past_m, right_m - merge_m AS right_past_m,
+        sine * (least(left_past_m, 0) + least(right_past_m, 0)) AS across_m,
+        if(left_past_m < 0, cosine * left_past_m, left_past_m)
+            - if(right_past_m < 0, cosine * right_past_m, right_past_m) AS along_m,
+        {step_s} * (abs(left_mps - right_mps) + sine * (left_mps + right_mps)) AS nearer_m
+    FROM vehicle_pairs JOIN (VALUES {tracks}) AS tracks (spec_hash, merge_m, sine, cosine)
+        USING (spec_hash)
 ) WHERE across_m ** 2 + along_m ** 2 < ({reach_m} + nearer_m) ** 2 GROUP BY ALL
 """
 # Trials in which both drivers decided something; the others ended before that.
@@ -55,7 +57,20 @@ PLANS = (
     "SEMI JOIN (FROM trials WHERE status = 'collided') USING (trial_id, spec_hash) "
     "GROUP BY ALL ORDER BY ALL"
 )
+# The mean speed in m/s at the start of those trials, which their condition had.
+MEAN_SPEEDS = (
+    "SELECT trial_id, spec_hash, avg(velocity_mps) AS mean_mps FROM states "
+    "SEMI JOIN (FROM trials WHERE status = 'collided' AND source <> 'human') "
+    "USING (trial_id, spec_hash) WHERE step = 0 GROUP BY ALL"
+)
 Outcome = tuple[str, str | None]
+
+
+class Task(NamedTuple):
+    """What a trial is driven by and judged by."""
+
+    config: ScenarioConfig
+    track: Track
 
 
 class Sample(NamedTuple):
@@ -100,8 +115,10 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     """
     ended = trials[trials["status"] != "failed"]
     specs = load_each({"specs": SPECS}, db)["specs"]
-    scenarios = _scenarios(ended["spec_hash"].unique(), specs)
-    found = load_each({"plans": PLANS, "near": _near(scenarios.values()), "decided": DECIDED}, db)
+    tasks = _tasks(ended["spec_hash"].unique(), specs)
+    found = load_each(
+        {"plans": PLANS, "near": _near(tasks), "decided": DECIDED, "speeds": MEAN_SPEEDS}, db
+    )
     near = {
         (row.trial_id, row.spec_hash): [Sample(*sample) for sample in row.near]
         for row in found["near"].itertuples()
@@ -110,29 +127,31 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     plans: dict[tuple[str, str], dict[str, Any]] = {}
     for row in found["plans"].itertuples():
         plans.setdefault((row.trial_id, row.spec_hash), {})[row.side] = row
+    speeds = {(row.trial_id, row.spec_hash): row.mean_mps for row in found["speeds"].itertuples()}
     rows = []
-    columns = ["trial_id", "spec_hash", "source", "condition", "status", "merged_first"]
+    columns = ["trial_id", "spec_hash", "source", "status", "merged_first"]
+    columns += ["projected_headway_m", "relative_velocity_mps"]
     for trial in ended[columns].itertuples(index=False):
         key = (trial.trial_id, trial.spec_hash)
         known = trial.source == "human" or key in decided
         for reading in readings:
-            scenario = scenarios[trial.spec_hash, reading]
+            task = tasks[trial.spec_hash, reading]
             outcome: Outcome
             if reading == BOXES and trial.source == "human":
                 outcome = trial.status, trial.merged_first  # it is the rule of the experiment
             elif not known:
                 outcome = UNDECIDED, None
-            elif seen(scenario, near.get(key, ()), between=reading == BOXES):
+            elif seen(task, near.get(key, ()), between=reading == BOXES):
                 outcome = "collided", None
             elif trial.status != "collided":
                 outcome = trial.status, trial.merged_first
-            elif trial.source == "human":
+            elif key not in speeds:
                 outcome = UNDECIDED, None
             else:
                 sides = [plans[key][side] for side in ("left", "right")]
                 outcome = redrive(
-                    scenario,
-                    trial.condition,
+                    task,
+                    Condition(trial.projected_headway_m, trial.relative_velocity_mps, speeds[key]),
                     [side.applied for side in sides],
                     [side.last_plan for side in sides],
                     between=reading == BOXES,
@@ -141,32 +160,36 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     return pd.DataFrame(rows, columns=["trial_id", "spec_hash", "rule", "status", "merged_first"])
 
 
-def _near(scenarios: Iterable[ScenarioConfig]) -> str:
+def _near(tasks: Mapping[tuple[str, str], Task]) -> str:
     """The query of the samples at or next to which vehicles can collide."""
-    every = [ScenarioConfig(), *scenarios]
+    every = [ScenarioConfig(), *(task.config for task in tasks.values())]
+    tracks = {spec_hash: task.track for (spec_hash, _), task in tasks.items()} or {"": TRACK}
     step_s = max(one.step_s for one in every)
     # What accelerations against each other, and a resistance, add to the way within a step.
     added_m = 2 * (max(one.max_acceleration_mps2 for one in every) + 2) * step_s**2
     reach_m = max(hypot(one.vehicle_length_m, one.vehicle_width_m) for one in every)
     return NEAR.format(
-        merge=MERGE_POINT_M,
-        lateral=LATERAL,
-        forward=FORWARD,
+        tracks=", ".join(
+            f"({quoted(spec_hash)}, {t.merge_point_m!r}::DOUBLE, {t.branch_sine!r}::DOUBLE, "
+            f"{t.branch_cosine!r}::DOUBLE)"
+            for spec_hash, t in tracks.items()
+        ),
         step_s=step_s,
         reach_m=reach_m + added_m + 0.01,
     )
 
 
-def seen(scenario: ScenarioConfig, samples: Sequence[Sample], *, between: bool) -> bool:
+def seen(task: Task, samples: Sequence[Sample], *, between: bool) -> bool:
     """Whether a collision is seen at the scenario's steps, and ``between`` them at 20 Hz."""
+    config, track = task
     if any(
-        collided(scenario, sample.left_m, sample.right_m)
+        collided(config, track, sample.left_m, sample.right_m)
         for sample in samples
-        if _is_multiple(sample.time_s, scenario.step_s)
+        if _is_multiple(sample.time_s, config.step_s)
     ):
         return True
     return between and any(
-        rectangles_overlap(left_m, right_m, scenario.vehicle_length_m, scenario.vehicle_width_m)
+        rectangles_overlap(track, left_m, right_m, config.vehicle_length_m, config.vehicle_width_m)
         for before, now in pairwise(samples)
         if now.step == before.step + 1
         for left_m, right_m in _looks_between(before, now)
@@ -200,27 +223,26 @@ def _is_multiple(time_s: float, step_s: float) -> bool:
     return isclose(time_s / step_s, round(time_s / step_s), abs_tol=1e-6)
 
 
-def _scenarios(
-    spec_hashes: Iterable[str], specs: pd.DataFrame
-) -> dict[tuple[str, str], ScenarioConfig]:
-    """The scenario of each spec under each reading; that of humans is the default one."""
+def _tasks(spec_hashes: Iterable[str], specs: pd.DataFrame) -> dict[tuple[str, str], Task]:
+    """The task of each spec under each reading; that of humans is the default one."""
     texts = dict(zip(specs["spec_hash"], specs["spec"], strict=True))
-    found = {
-        spec_hash: json.loads(texts.get(spec_hash, "{}")).get("scenario", {})
-        for spec_hash in spec_hashes
-    }
+    found = {spec_hash: json.loads(texts.get(spec_hash, "{}")) for spec_hash in spec_hashes}
     return {
-        (spec_hash, reading): ScenarioConfig.model_validate(
-            scenario | {"collision_rule": "rectangle" if reading == BOXES else reading}
+        (spec_hash, reading): Task(
+            ScenarioConfig.model_validate(
+                spec.get("scenario", {})
+                | {"collision_rule": "rectangle" if reading == BOXES else reading}
+            ),
+            track_of(spec),
         )
-        for spec_hash, scenario in found.items()
+        for spec_hash, spec in found.items()
         for reading in READINGS
     }
 
 
 def redrive(
-    scenario: ScenarioConfig,
-    condition: str,
+    task: Task,
+    condition: Condition,
     applied: Sequence[Sequence[Sequence[float]]],
     last_plans: Sequence[Sequence[float]],
     *,
@@ -232,7 +254,7 @@ def redrive(
     ``applied`` holds, for left and right, the normalised actions of each decision; a vehicle that
     decided later than the other cruised before. ``last_plans`` are whole plans, empty if unknown.
     """
-    world = World(scenario, CONDITIONS[condition])
+    world = World(task.config, condition, task.track)
     actions = [[action for actions in side for action in actions] for side in applied]
     steps = max(map(len, actions))
     queues: list[list[float | None]] = []
@@ -243,7 +265,7 @@ def redrive(
         if world.status is not None:
             break
         world.advance({"left": left, "right": right})
-    if between and seen(scenario, _samples(world), between=True):
+    if between and seen(task, _samples(world), between=True):
         return "collided", None
     return world.status or UNDECIDED, world.merged_first() if world.status else None
 

@@ -23,7 +23,7 @@ from analysis.tables.formats import shown_value
 from analysis.tables.model import Table, from_text, options_text, to_text
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.results.database import read_database
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 if TYPE_CHECKING:
     from analysis.data.study import Group, Study
@@ -173,6 +173,7 @@ def human_panels(study: Study) -> dict[str, Any]:
     return {
         "measured": measured,
         "published": published,
+        "conditions": study.conditions,
         "notes": sample_notes(study, study.baselines),
         "caveat": outcomes_note(study.human) if study.human in study.groups else "",
         "groups": [
@@ -180,7 +181,7 @@ def human_panels(study: Study) -> dict[str, Any]:
                 "id": group.id,
                 "driver": group.label,
                 "scenario": specs.get(group.spec_hash, {}).get("scenario"),
-                "conditions": {name: _in_condition(group, name) for name in CONDITIONS},
+                "conditions": {name: _in_condition(group, name) for name in study.conditions},
             }
             for group in study.baselines
         ],
@@ -218,9 +219,10 @@ def _published_gaps() -> dict[str, float]:
     from analysis.stats.regressions import gap_design
 
     terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
-    headway = np.array([condition.projected_headway_m for condition in CONDITIONS.values()])
-    velocity = np.array([condition.relative_velocity_mps for condition in CONDITIONS.values()])
-    return dict(zip(CONDITIONS, map(float, gap_design(headway, velocity) @ terms), strict=True))
+    headway = np.array([one.projected_headway_m for one in HUMAN_CONDITIONS.values()])
+    velocity = np.array([one.relative_velocity_mps for one in HUMAN_CONDITIONS.values()])
+    gaps = gap_design(headway, velocity) @ terms
+    return dict(zip(HUMAN_CONDITIONS, map(float, gaps), strict=True))
 
 
 def main(db: Path) -> None:

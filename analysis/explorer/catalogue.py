@@ -38,7 +38,8 @@ LISTED = """
 CREATE SEQUENCE numbers;
 CREATE TABLE listed (
     number INTEGER DEFAULT nextval('numbers'), trial_id VARCHAR, spec_hash VARCHAR,
-    source VARCHAR, model VARCHAR, variant VARCHAR, condition VARCHAR, rep INTEGER, pair VARCHAR,
+    source VARCHAR, model VARCHAR, variant VARCHAR, condition VARCHAR,
+    projected_headway_m DOUBLE, relative_velocity_mps DOUBLE, rep INTEGER, pair VARCHAR,
     status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
     error VARCHAR, scripted BOOLEAN, stand_in VARCHAR,
     time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
@@ -121,7 +122,8 @@ LIST = """
 INSERT INTO listed BY NAME
 SELECT trials.trial_id, trials.spec_hash, source,
     if(source = 'human', 'human', driver) AS model,
-    variant, condition, rep, pair, status, merged_first, end_time_s, error, scripted,
+    variant, condition, projected_headway_m, relative_velocity_mps, rep, pair, status,
+    merged_first, end_time_s, error, scripted,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'

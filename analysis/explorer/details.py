@@ -14,6 +14,7 @@ from analysis.explorer.prompts import Part, parts_of
 from analysis.explorer.reading import reading
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES, Side
+from merge_runner.scenarios.merge.geometry import Track, track_of
 
 Row = dict[str, Any]
 OF_TRIAL = "trial_id = $trial AND spec_hash = $spec"
@@ -49,11 +50,12 @@ SELECT * FROM calls WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A trial's samples by side and its decisions without prompts; ``scenario`` is its task's."""
+    """A trial's samples by side and its decisions without prompts, and the task it is of."""
 
     trial_id: str
     spec_hash: str
     scenario: ScenarioConfig
+    track: Track
     states: dict[Side, Row]
     decisions: list[Row]
 
@@ -86,7 +88,7 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     told = json.loads(task["spec"] or "{}")
     scenario = scenario_of(task["source"], told.get("scenario"))
     ordered = {side: states[side] for side in SIDES if side in states}
-    trial = Trial(trial_id, spec_hash, scenario, ordered, decisions)
+    trial = Trial(trial_id, spec_hash, scenario, track_of(told), ordered, decisions)
     for row in decisions:
         if row["lost"]:
             row["time_s"] = trial.end_s

@@ -10,7 +10,9 @@ import duckdb
 
 from merge_runner.results.database import schema_sql
 
-_BEGINS = re.compile(r"CREATE (?:TABLE IF NOT EXISTS|(?:OR REPLACE )?VIEW(?: IF NOT EXISTS)?) (\w+)")
+_BEGINS = re.compile(
+    r"CREATE (?:TABLE IF NOT EXISTS|(?:OR REPLACE )?VIEW(?: IF NOT EXISTS)?) (\w+)"
+)
 _COLUMN = re.compile(r" {4}(\w+) [A-Z][^-]*(?:-- (.*))?")
 
 

@@ -16,7 +16,7 @@ from analysis.stats.group_scores import Score, score, unjudged
 from analysis.stats.indicators import ALPHA, INDICATORS, Verdict
 from analysis.stats.measures import BOXES, GAP, counts, estimate, known, published_human
 from analysis.stats.mixed import MIN_PAIRS
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",
@@ -71,17 +71,24 @@ def _concluded(study: Study) -> list[Group]:
 def _shown(study: Study, group: Group) -> list[str]:
     if not len(group.ended):
         return [f"{group.driver}: no trial ended ({group.left_out})."]
-    if not len(group.finished):
+    alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
+    own = len(group.ended) - len(alike.ended)
+    texts = _marks(study, group) if len(group.finished) else []
+    if own:
+        texts.append(
+            f"{group.driver}: {_trials(own)} of {len(group.ended)} "
+            f"{'is' if own == 1 else 'are'} of conditions that no human drove, and not compared "
+            "with humans in what follows."
+        )
+    if not len(alike.ended):
+        return texts
+    if not len(alike.finished):
         return [
-            f"{group.driver}: no trial finished ({group.left_out}).",
-            _collisions(study, group),
+            *texts,
+            f"{group.driver}: no trial finished ({alike.left_out}).",
+            _collisions(study, alike),
         ]
-    return [
-        *_marks(study, group),
-        _collisions(study, group),
-        _gap(study, group),
-        *unlike(study, group),
-    ]
+    return [*texts, _collisions(study, alike), _gap(study, alike), *unlike(study, alike)]
 
 
 def _marks(study: Study, group: Group) -> list[str]:
@@ -167,7 +174,8 @@ def _gap(study: Study, group: Group) -> str:
 
 def _human_gap(study: Study, group: Group) -> str:
     if not known(study.human, GAP):
-        return f"{published_human(GAP):.2f} m as published, over all {len(CONDITIONS)} conditions"
+        conditions = f"over all {len(HUMAN_CONDITIONS)} conditions"
+        return f"{published_human(GAP):.2f} m as published, {conditions}"
     human = estimate(_alike(study.human, group), GAP)
     if human.value is None:
         return "have none in the imported trials of these conditions"

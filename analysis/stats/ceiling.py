@@ -21,7 +21,7 @@ from scipy.special import expit
 from analysis.data.reference_data import HUMAN_GAP_SD_M, human_outcomes, published
 from analysis.stats.indicators import ALPHA, SLOPE_MARGIN_S, TESTED
 from analysis.stats.regressions import gap_design
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 Array = NDArray[np.float64]
 
@@ -31,9 +31,9 @@ WALD_STEPS = 35  # statsmodels' limit
 FIRTH_STEPS = 60
 HALVINGS = 8
 
-HEADWAYS = np.array([c.projected_headway_m for c in CONDITIONS.values()])
-VELOCITIES = np.array([c.relative_velocity_mps for c in CONDITIONS.values()])
-LOGIT_DESIGN = np.column_stack([np.ones(len(CONDITIONS)), HEADWAYS, VELOCITIES])
+HEADWAYS = np.array([c.projected_headway_m for c in HUMAN_CONDITIONS.values()])
+VELOCITIES = np.array([c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()])
+LOGIT_DESIGN = np.column_stack([np.ones(len(HUMAN_CONDITIONS)), HEADWAYS, VELOCITIES])
 GAP_DESIGN = gap_design(HEADWAYS, VELOCITIES)
 
 Passes = dict[str, NDArray[np.bool_]]
@@ -41,7 +41,7 @@ Passes = dict[str, NDArray[np.bool_]]
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Human trials by condition, in the order of CONDITIONS, one array each.
+    """Human trials by condition, in the order of HUMAN_CONDITIONS, one array each.
 
     ``left``: 1 or 0 for who merged first, NaN after a collision. ``gap_m``: NaN after a collision.
     Without traces the last is empty.
@@ -75,7 +75,7 @@ def imported_humans(trials: pd.DataFrame) -> Population:
 
 @cache
 def ceiling(humans: Population, sizes: tuple[int, ...]) -> Ceiling:
-    """The human ceiling for ``sizes`` trials per condition, in the order of CONDITIONS."""
+    """The human ceiling for ``sizes`` trials per condition, in the order of HUMAN_CONDITIONS."""
     draws = _Draws(humans, sizes)
     paper, robust = _wald(draws), _firth_tests(draws)
     paper_gap, robust_gap = _gap_tests(draws)
@@ -92,7 +92,7 @@ class _Draws:
 
     def __init__(self, humans: Population, sizes: Sequence[int]) -> None:
         rng = np.random.default_rng(SEED)
-        shape = (DATA_SETS, len(CONDITIONS))
+        shape = (DATA_SETS, len(HUMAN_CONDITIONS))
         self.n, self.left = np.zeros(shape), np.zeros(shape)
         self.gap, self.squared_gap = np.zeros(shape), np.zeros(shape)
         expected = GAP_DESIGN @ _published_gap()
@@ -270,4 +270,4 @@ def _left(trials: pd.DataFrame) -> pd.Series:
 
 
 def _by_condition(trials: pd.DataFrame, values: pd.Series) -> tuple[Array, ...]:
-    return tuple(values[trials["condition"] == name].to_numpy(float) for name in CONDITIONS)
+    return tuple(values[trials["condition"] == name].to_numpy(float) for name in HUMAN_CONDITIONS)

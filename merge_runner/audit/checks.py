@@ -1,9 +1,9 @@
 """What must hold of every trial, as queries for what does not: trial_id, side, decision, text.
 
 They read the tables of a database and the temporary ones that sweeps.py makes: ``audited`` (the
-trials), ``rules`` (numbers of a spec's scenario and track), ``drivers`` (per spec and side the endpoint and
-the body of an empty request, NULL for a program), ``entries`` (the models of the sweep) and
-``other_models`` (who answered in place of whom).
+trials), ``rules`` (numbers of a spec's scenario and track), ``drivers`` (per spec and side the
+endpoint and the body of an empty request, NULL for a program), ``entries`` (the models of the
+sweep) and ``other_models`` (who answered in place of whom).
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ WITH last_steps AS (
     LEFT JOIN last_steps USING (trial_id, spec_hash)
 )
 SELECT trial_id, side, decision, text FROM compared WHERE text IS NOT NULL
-"""  # noqa: S608 # constants
+"""  # constants
 
 # After an invalid reply the last valid plan goes on where it was left or, by the other rule, at
 # its first action; 0 where it is exhausted or there is none (drivers/llm_driver.py).

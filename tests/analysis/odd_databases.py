@@ -52,11 +52,11 @@ def partial_import(db: Path) -> None:
     files = {}
     for number in range(IMPORTED):
         experiment = (4, 5, 6, 8, 9)[number % 5]
-        condition = list(CONDITIONS.values())[number // 5 % len(CONDITIONS)]
+        played, condition = list(CONDITIONS.items())[number // 5 % len(CONDITIONS)]
         ahead = condition.projected_headway_m - condition.relative_velocity_mps
         yields = "right" if ahead > 0 or (ahead == 0 and number % 2) else "left"
         name = f"experiment_{experiment}/experiment_{experiment}_iter_{number + 1}.csv"
-        files[name] = drive(condition.name, yields=yields).csv()
+        files[name] = drive(played, yields=yields).csv()
     with open_files(write_folder(db.parent / "recordings", files)) as found:
         import_trials(sort_files(found).trials, Store(db))
 

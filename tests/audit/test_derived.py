@@ -11,7 +11,7 @@ import pytest
 
 from merge_runner.audit import NOT_DERIVED, audit_cache, audit_database, audit_recording
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.results.database import schema_sql, in_memory
+from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.recording import export_recording
 from tests.harness import PROJECT, as_a_model, watched
 

@@ -6,6 +6,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.server import serve
 from merge_runner.prompts.render import render_prompt
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 
@@ -28,5 +29,5 @@ async def emulator():
 def driving_prompt():
     """What the left driver is asked first in a symmetric trial."""
     scenario = ScenarioConfig()
-    seen = World(scenario, CONDITIONS["N_0_0"]).observe("left")
+    seen = World(scenario, CONDITIONS["N_0_0"], TRACK).observe("left")
     return render_prompt(seen, None, variant="baseline", scenario=scenario)

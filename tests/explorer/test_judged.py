@@ -80,10 +80,12 @@ def test_the_band_of_the_chart_holds_the_headways_that_collide(study_of, rule):
     places = zip(*(samples["position_m"] for samples in trial.states.values()), strict=True)
     for bound, (left, right) in zip(bounds, places, strict=True):
         mean = (left + right) / 2
-        assert collided(trial.scenario, left, right) == (abs(left - right) < (bound or 0))
+        assert collided(trial.scenario, trial.track, left, right) == (
+            abs(left - right) < (bound or 0)
+        )
         if rule != "shared_lane":
             assert bound is None or collided(
-                trial.scenario, mean + bound / 2 - 0.01, mean - bound / 2 + 0.01
+                trial.scenario, trial.track, mean + bound / 2 - 0.01, mean - bound / 2 + 0.01
             )
     assert max(filter(None, bounds)) == pytest.approx(6, abs=0.2)
 

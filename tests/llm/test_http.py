@@ -27,6 +27,7 @@ from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 SLOT = Slot("N_0_0", 1, "left", 0, 0)
@@ -408,7 +409,7 @@ def is_quick(plan):
 
 def driving_prompt():
     scenario = ScenarioConfig()
-    seen = World(scenario, CONDITIONS["L_4_8"]).observe("left")
+    seen = World(scenario, CONDITIONS["L_4_8"], TRACK).observe("left")
     return render_prompt(seen, None, variant="baseline", scenario=scenario)
 
 

@@ -17,6 +17,7 @@ from merge_runner.prompts.blocks import BLOCKS, VARIANTS, block_digests
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import SIDES, Observation
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "prompts"
@@ -109,7 +110,7 @@ def test_the_first_decision_is_told_that_it_has_no_previous_plan():
 
 def test_both_sides_of_the_symmetric_condition_get_the_identical_prompt():
     scenario = ScenarioConfig()
-    world = World(scenario, CONDITIONS["N_0_0"])
+    world = World(scenario, CONDITIONS["N_0_0"], TRACK)
     for action in (0.0, 0.3, -0.7):
         left, right = (
             render_prompt(world.observe(side), None, variant="baseline", scenario=scenario)

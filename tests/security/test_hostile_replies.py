@@ -20,6 +20,7 @@ from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 N = 20
@@ -66,7 +67,7 @@ def emulated():
     scenario = ScenarioConfig()
     for name, condition in CONDITIONS.items():
         for variant in ("baseline", "A1"):
-            seen = World(scenario, condition).observe("left")
+            seen = World(scenario, condition, TRACK).observe("left")
             prompt = render_prompt(seen, None, variant=variant, scenario=scenario)
             yield answer(prompt, Slot(name, 1, "left", 0, 0))
 

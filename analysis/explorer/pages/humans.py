@@ -14,7 +14,7 @@ from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import Site
 from analysis.tables.formats import notes_of, shown_value
 from analysis.tables.model import Table, from_text
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 HUMAN = "human"
 # Okabe and Ito's colours that show on white, each with a shape; humans are black circles.
@@ -119,11 +119,18 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         values = {
             "human": next((group for group in groups if group["id"] == HUMAN), None),
             "measured": content["measured"],
+            "conditions": {
+                name: views.condition_text(*of) for name, of in content["conditions"].items()
+            },
+            "own": [name for name in content["conditions"] if name not in HUMAN_CONDITIONS],
             "published": content["published"],
             "groups": groups,
             "rules": {group["id"]: rule_text(group) for group in groups},
             "marks": marks(groups),
-            "charts": [chart(kind, groups, content["published"]) for kind in KINDS],
+            "charts": [
+                chart(kind, groups, list(content["conditions"]), content["published"])
+                for kind in KINDS
+            ],
             "collisions": {name: collisions(groups, name) for name in COLLISIONS},
             "caveat": content["caveat"],
             "notes": content["notes"],
@@ -136,7 +143,6 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         "humans.html",
         here="humans",
         computed=found,
-        conditions={name: views.condition_text(name) for name in CONDITIONS},
         path=marker,
         value=value_text,
         **values,
@@ -207,6 +213,7 @@ def differences(contrasts: Table) -> list[dict[str, Any]]:
 def chart(
     kind: Kind,
     groups: Sequence[Mapping[str, Any]],
+    conditions: Sequence[str],
     published: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """One row of panels: where everything is drawn, in the units of the picture.
@@ -224,7 +231,7 @@ def chart(
     axis = Axis(*scale(kind, *reach(known, list(printed.values()))))
     panel = max(LEAST, STEP * (len(groups) + 1))
     panels: list[dict[str, Any]] = []
-    for i, name in enumerate(CONDITIONS):
+    for i, name in enumerate(conditions):
         x0 = LEFT + i * panel
         points = []
         for j, group in enumerate(groups):
@@ -237,7 +244,7 @@ def chart(
         panels.append({"name": name, "x": round(x0, 1), "points": points, "line": line})
     return {
         "kind": kind,
-        "width": round(LEFT + panel * len(CONDITIONS) + 4),
+        "width": round(LEFT + panel * len(conditions) + 4),
         "height": TOP + HEIGHT + FOOT,
         "top": TOP,
         "bottom": TOP + HEIGHT,
@@ -343,4 +350,6 @@ def _printed(kind: Kind, published: Mapping[str, Any] | None) -> dict[str, float
     value = (published or {}).get(kind.name)
     if value is None:
         return {}
-    return dict(value) if isinstance(value, Mapping) else dict.fromkeys(CONDITIONS, float(value))
+    return (
+        dict(value) if isinstance(value, Mapping) else dict.fromkeys(HUMAN_CONDITIONS, float(value))
+    )

@@ -27,7 +27,7 @@ class Condition:
     mean_speed_mps: float = MEAN_SPEED_MPS
 
     def __post_init__(self) -> None:
-        if not isfinite(self.projected_headway_m) or not all(0 < v for v in self.speeds_mps):
+        if not isfinite(self.projected_headway_m) or not all(v > 0 for v in self.speeds_mps):
             raise UsageError(f"{self} is no condition: both vehicles must drive forwards")
 
     @property

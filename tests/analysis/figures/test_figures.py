@@ -67,8 +67,8 @@ def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(
     assert set(points) == {
         (c.relative_velocity_mps, c.projected_headway_m) for c in CONDITIONS.values()
     }
-    for condition in CONDITIONS.values():
-        trials = group.finished[group.finished["condition"] == condition.name]
+    for name, condition in CONDITIONS.items():
+        trials = group.finished[group.finished["condition"] == name]
         found = points[condition.relative_velocity_mps, condition.projected_headway_m]
         assert found == proportion(int((trials["merged_first"] == "left").sum()), len(trials))
         (gap,) = [

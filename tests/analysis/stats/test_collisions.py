@@ -6,7 +6,7 @@ import duckdb
 import numpy as np
 import pytest
 
-from analysis.data.collision_rules import redrive
+from analysis.data.collision_rules import Task, redrive
 from analysis.data.load import load_trials
 from analysis.data.study import Study
 from analysis.explain import explain
@@ -14,6 +14,7 @@ from analysis.stats.measures import BOXES, COLLISIONS, MEASURES, counts
 from analysis.tables import make_tables
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from tests.analysis.studies import Drive, write_study, yielding
 
 pytestmark = pytest.mark.usefixtures("few_draws")
@@ -119,11 +120,12 @@ def test_longer_boxes_touch_where_shorter_ones_do_not(tmp_path):
 def test_what_is_seen_between_steps_is_what_a_finer_simulation_sees():
     """Four steps of 0.05 s with one action are one of 0.2 s; braking vehicles stop within one."""
     rng = np.random.default_rng(3)
-    coarse = ScenarioConfig(collision_rule="rectangle")
-    fine = coarse.model_copy(update={"step_s": 0.05, "timeout_steps": 4 * coarse.timeout_steps})
+    config = ScenarioConfig(collision_rule="rectangle")
+    finer_steps = {"step_s": 0.05, "timeout_steps": 4 * config.timeout_steps}
+    coarse, fine = Task(config, TRACK), Task(config.model_copy(update=finer_steps), TRACK)
     seen = 0
     for _ in range(300):
-        condition = str(rng.choice(list(CONDITIONS)))
+        condition = CONDITIONS[str(rng.choice(list(CONDITIONS)))]
         plans = rng.uniform(-1, 1, (2, 8)).round(1)
         sides = [[[action] * 5 for action in side] for side in plans]
         found = redrive(coarse, condition, sides, [[], []], between=True)

@@ -12,6 +12,7 @@ from analysis.data.load import load, load_trials
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from tests.analysis.studies import Drive, played, write_study
 
 SIZES = ((4.5, 1.8), (8.0, 2.5), (3.0, 1.2))
@@ -86,7 +87,9 @@ def rmse(trace, condition, until_s):
 
 
 def overlaps(scenario, left_m, right_m):
-    return rectangles_overlap(left_m, right_m, scenario.vehicle_length_m, scenario.vehicle_width_m)
+    return rectangles_overlap(
+        TRACK, left_m, right_m, scenario.vehicle_length_m, scenario.vehicle_width_m
+    )
 
 
 def edge(overlap, inside, outside):
