@@ -1,10 +1,14 @@
 """The scenario's numbers: what follows from them, and what is refused."""
 
+import hashlib
+
 import pytest
 from pydantic import ValidationError
 
 from merge_runner.config import ScenarioConfig, load_sweep
 from merge_runner.errors import UsageError
+from merge_runner.llm.keys import canonical_json
+from merge_runner.scenarios.registry import task_of
 
 
 def test_the_default_plan_has_20_actions_of_which_5_are_executed():
@@ -90,3 +94,11 @@ def test_an_unknown_key_in_a_sweep_file_is_named_with_the_valid_ones(tmp_path):
 def test_a_scenario_does_not_change():
     with pytest.raises(ValidationError):
         ScenarioConfig().step_s = 0.1
+
+
+def test_the_name_of_the_usual_scenario_is_not_written_so_that_spec_hashes_stay():
+    written = canonical_json(task_of(ScenarioConfig()))
+    assert hashlib.sha256(written.encode()).hexdigest() == (
+        "865c7980b733b5123b1dde61f3709f6d50229d6687c9c6b203edd89306972d30"
+    )
+    assert ScenarioConfig(name="another").model_dump()["name"] == "another"
