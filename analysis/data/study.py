@@ -164,9 +164,9 @@ class Study:
 
     @cached_property
     def conditions(self) -> dict[str, tuple[float, float]]:
-        """Projected headway in m and relative velocity in m/s of what humans drove, and of more.
+        """Name to projected headway in m and relative velocity in m/s: the humans', then others.
 
-        What more was played is told by the trials alone: whoever registered it may not be here.
+        The others are told by the stored trials, since whoever registered them may not be here.
         """
         played = {
             row.condition: (row.projected_headway_m, row.relative_velocity_mps)

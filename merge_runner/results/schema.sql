@@ -53,7 +53,7 @@ CREATE TABLE IF NOT EXISTS states (
     step INTEGER NOT NULL,
     time_s DOUBLE NOT NULL,           -- 0 where the drivers take control
     side VARCHAR NOT NULL,
-    position_m DOUBLE NOT NULL,       -- travelled along the own branch; the merge point is 100
+    position_m DOUBLE NOT NULL,       -- travelled along the own branch; see geometry
     velocity_mps DOUBLE NOT NULL,
     acceleration_mps2 DOUBLE NOT NULL -- realised over the step before this sample
 );

@@ -11,9 +11,18 @@ from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
 from merge_runner.scenarios.merge.geometry import TRACK
 
 
-@cache
 def measures_sql() -> str:
-    """Definitions that take the place of older ones; the last makes ``measures_version`` known."""
+    """Definitions that take the place of older ones, and leave word of which they are."""
+    return f"{_definitions()}\nCOMMENT ON VIEW trial_metrics IS '{measures_version()}';\n"
+
+
+def measures_version() -> str:
+    """A hash of the definitions: a database has it as the comment on ``trial_metrics``."""
+    return hashlib.sha256(_definitions().encode()).hexdigest()
+
+
+@cache
+def _definitions() -> str:
     numbers = {
         "merge_point_m": TRACK.merge_point_m,
         "track_end_m": TRACK.end_m,
@@ -24,14 +33,4 @@ def measures_sql() -> str:
     }
     macros = [f"CREATE OR REPLACE MACRO {name}() AS {n!r}::DOUBLE;" for name, n in numbers.items()]
     views = Path(__file__).with_name("measures.sql").read_text(encoding="utf-8")
-    text = "\n".join([*macros, "", views])
-    return f"{text}\nCOMMENT ON VIEW trial_metrics IS '{_digest(text)}';\n"
-
-
-def measures_version() -> str:
-    """What tells these definitions from others: the comment on the view ``trial_metrics``."""
-    return measures_sql().rpartition("IS '")[2].partition("'")[0]
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+    return "\n".join([*macros, "", views])

@@ -1,5 +1,5 @@
--- The measures of a trial: the one place where they are defined. What a spec does not tell (the
--- numbers in macros like merge_point_m()) is written down from the program's (measures.py).
+-- The measures of a trial. The numbers of the human experiment, for specs that tell no others, are
+-- macros such as merge_point_m(), which measures.py writes before this.
 
 -- One row a spec: its vehicles' size and its track, in a human recording those of the experiment,
 -- and where the vehicles' boxes overlap (collision.py). With half lengths l, half widths w and each branch at the angle phi
