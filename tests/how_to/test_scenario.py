@@ -51,7 +51,7 @@ async def test_a_scenario_from_outside_goes_through_every_command(merge_runner, 
     ):
         run = await merge_runner(*command)
         assert run.code == 0, run.err
-    assert "not derived anew in 4 trials" in run.out
+    assert "not derived anew in 2 trials" in run.out
     pages = "".join(page.read_text() for page in (tmp_path / "pages").glob("trials-*.html"))
     assert '"merge":120.0,"end":170.0' in pages
     db = tmp_path / "results/merge.duckdb"
