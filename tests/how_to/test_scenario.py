@@ -5,7 +5,9 @@ from __future__ import annotations
 import duckdb
 import pytest
 
+from analysis.explorer.details import read_trial
 from merge_runner.results.store import Store, query
+from merge_runner.scenarios.merge.geometry import Track
 from tests.harness import FAST, how_to, plugin
 
 FILE = """
@@ -52,9 +54,9 @@ async def test_a_scenario_from_outside_goes_through_every_command(merge_runner, 
         run = await merge_runner(*command)
         assert run.code == 0, run.err
     assert "not derived anew in 2 trials" in run.out
-    pages = "".join(page.read_text() for page in (tmp_path / "pages").glob("trials-*.html"))
-    assert '"merge":120.0,"end":170.0' in pages
     db = tmp_path / "results/merge.duckdb"
+    key = query(db, "SELECT trial_id, spec_hash FROM trials LIMIT 1")[1][0]
+    assert read_trial(db, *key).track == Track(merge_point_m=120.0, end_m=170.0)
     assert query(db, MEASURED)[1] == [
         (trial, pytest.approx(first_s)) for trial, first_s in query(db, FIRST)[1]
     ]
