@@ -20,7 +20,7 @@ from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.models import load_models
 from merge_runner.llm.shared_limits import BURST_S
 from merge_runner.records import SIDES, Attempt, ChatReply, Slot, TrialRecord, TrialSpec
-from merge_runner.results.database import SCHEMA
+from merge_runner.results.database import schema_sql
 from merge_runner.results.rows import rows_of
 from merge_runner.results.store import Store
 from merge_runner.run.plan import Choice, make_plan
@@ -93,7 +93,7 @@ def store(folder: Path) -> dict[str, float]:
     played = records(TRIALS)
     ours, bare = Store(folder / "ours.duckdb"), folder / "bare.duckdb"
     with duckdb.connect(bare) as connection:
-        connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        connection.execute(schema_sql())
     ours_s = bare_s = 0.0
     rows = 0
     for number in range(BATCHES):

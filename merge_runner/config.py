@@ -22,7 +22,9 @@ from pydantic import (
     ConfigDict,
     Field,
     JsonValue,
+    SerializerFunctionWrapHandler,
     ValidationError,
+    model_serializer,
     model_validator,
 )
 
@@ -36,6 +38,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
 LONGEST_URL, LONGEST_HOST = 2000, 253
 _LABEL = re.compile(r"[a-z0-9_-]{1,63}", re.I)
+USUAL_SCENARIO = "merge"
 MOST_STEPS = MOST_REPETITIONS = 100_000
 
 
@@ -73,9 +76,11 @@ def whole_steps(name: str, seconds: float, step_s: float) -> int:
     return round(steps)
 
 
-class Scenario(Frozen):
+class ScenarioConfig(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
+    ``name``: a registered scenario; where it is ``merge`` it is not written, as it was not before
+    there were others, so that the hashes of specs stay.
     ``collision_rule``: ``euclid2d`` (centres closer than a vehicle length), ``rectangle`` (the
     vehicles' oriented boxes overlap, as in the human experiment) or ``shared_lane``
     (|s_L - s_R| below a vehicle length once either has passed the merge point).
@@ -92,6 +97,7 @@ class Scenario(Frozen):
     ``prompt_rate_hz`` is a language model's, and that of a program without a rate of its own.
     """
 
+    name: str = USUAL_SCENARIO
     horizon_s: Positive = 4.0
     step_s: Positive = 0.2
     # Left out where it is not given, so that specs from before it keep their hashes.
@@ -139,8 +145,15 @@ class Scenario(Frozen):
         """The number of steps after which a trial is over."""
         return round(self.timeout_s / self.step_s)
 
+    @model_serializer(mode="wrap")
+    def _without_usual_name(self, write: SerializerFunctionWrapHandler) -> dict[str, JsonValue]:
+        told: dict[str, JsonValue] = write(self)
+        if self.name == USUAL_SCENARIO:
+            del told["name"]
+        return told
+
     @model_validator(mode="after")
-    def _whole_steps(self) -> Scenario:
+    def _whole_steps(self) -> ScenarioConfig:
         for name, seconds, step_s in (
             ("plan_step_s", self.action_s, self.step_s),
             ("horizon_s", self.horizon_s, self.action_s),
@@ -205,7 +218,7 @@ class SweepFile(Frozen):
     description: str = ""
     repetitions: dict[str, Annotated[Count, Field(le=MOST_REPETITIONS)]]
     conditions: tuple[str, ...] | None = None
-    scenario: Scenario = Scenario()
+    scenario: ScenarioConfig = ScenarioConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -512,7 +525,7 @@ def _auth_headers(scheme: str, key: str | None) -> dict[str, str]:
     return {"authorization": f"Bearer {key}"} if scheme == "bearer" else {scheme: key}
 
 
-NESTED: dict[str, type[BaseModel]] = {"scenario": Scenario, "price": Price}
+NESTED: dict[str, type[BaseModel]] = {"scenario": ScenarioConfig, "price": Price}
 
 
 def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:

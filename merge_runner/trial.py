@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
 from merge_runner.errors import CallFailed
 from merge_runner.records import (
@@ -19,15 +19,16 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
+from merge_runner.scenarios.base import World
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.world import World
+from merge_runner.scenarios.registry import SCENARIOS
 
 
 async def play_trial(
-    spec: TrialSpec, scenario: Scenario, drivers: Mapping[Side, Driver]
+    spec: TrialSpec, scenario: ScenarioConfig, drivers: Mapping[Side, Driver]
 ) -> TrialRecord:
     """Play a trial to its end, or until a call fails."""
-    world = World(scenario, CONDITIONS[spec.condition])
+    world = SCENARIOS[scenario.name].world(scenario, CONDITIONS[spec.condition])
     seats = {side: _Seated(drivers[side]) for side in SIDES}
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}

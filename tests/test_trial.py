@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import model_pace, program_pace
 from merge_runner.drivers.registry import PROGRAMS
@@ -44,7 +44,7 @@ def spec_of(condition):
 
 async def play(left, right, condition="N_0_0", **scenario):
     """A trial; a driver with a ``rate_hz`` keeps it."""
-    drivers, task = {"left": left, "right": right}, Scenario(**scenario)
+    drivers, task = {"left": left, "right": right}, ScenarioConfig(**scenario)
     for side, driver in drivers.items():
         rate_hz = getattr(driver, "rate_hz", None)
         pace = program_pace(task, rate_hz) if rate_hz else model_pace(task)
@@ -53,7 +53,7 @@ async def play(left, right, condition="N_0_0", **scenario):
 
 
 async def play_constant(condition="N_0_0", **scenario):
-    task, spec = Scenario(**scenario), spec_of(condition)
+    task, spec = ScenarioConfig(**scenario), spec_of(condition)
     drivers = {side: PROGRAMS["constant"].make(task, spec, side) for side in SIDES}
     return await play_trial(spec, task, drivers)
 
@@ -324,10 +324,10 @@ async def test_a_failed_call_has_the_number_of_its_own_driver(failing):
 
 def test_a_seed_is_that_of_the_slot_and_of_no_driver():
     spec = spec_of("N_0_0")
-    seed = take_seat(Scenario(), spec, "left", model_pace(Scenario())).seed
+    seed = take_seat(ScenarioConfig(), spec, "left", model_pace(ScenarioConfig())).seed
     assert seed == 4387192367012543550
     others = [
-        take_seat(Scenario(), other, side, model_pace(Scenario())).seed
+        take_seat(ScenarioConfig(), other, side, model_pace(ScenarioConfig())).seed
         for other, side in (
             (spec, "right"),
             (replace(spec, condition="L_4_0"), "left"),
@@ -337,7 +337,7 @@ def test_a_seed_is_that_of_the_slot_and_of_no_driver():
     ]
     assert len({seed, *others}) == 5
     renamed = replace(spec, model_left="another", variant="A1", order=7)
-    assert take_seat(Scenario(), renamed, "left", model_pace(Scenario())).seed == seed
+    assert take_seat(ScenarioConfig(), renamed, "left", model_pace(ScenarioConfig())).seed == seed
 
 
 async def test_an_action_that_cannot_be_driven_is_refused():

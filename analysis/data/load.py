@@ -106,7 +106,7 @@ def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """One row a trial: condition, outcome and metrics in SI units (see merge_runner/schema.sql)."""
+    """One row a trial: condition, outcome and metrics in SI units (see docs/tables.md)."""
     return load(TRIALS, db)
 
 

@@ -15,7 +15,7 @@ import pandas as pd
 from analysis.data.load import ANSWERED, load_each, rows
 from analysis.data.study import Group, Study, of_group
 from merge_runner.audit.replies import answers_alike
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.results.database import read_database
 from merge_runner.served_model import ALIASES, others_among
@@ -219,7 +219,7 @@ def _other_model(study: Study, answered: pd.DataFrame) -> list[bool]:
 
 def _switched(spec: str) -> str:
     """The settings of a spec's driving task that differ from the defaults."""
-    defaults, scenario = Scenario().model_dump(), json.loads(spec).get("scenario", {})
+    defaults, scenario = ScenarioConfig().model_dump(), json.loads(spec).get("scenario", {})
     return ", ".join(f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v)
 
 

@@ -31,7 +31,7 @@ from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.records import SIDES, Side
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.text_safety import quoted
 
 HUMAN = "human"
@@ -117,9 +117,9 @@ class Group:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many outcomes there are in each condition, in the order of CONDITIONS."""
+        """How many outcomes there are in each condition of humans, in their order."""
         counts = self.ended_outcomes["condition"].value_counts()
-        return tuple(int(counts.get(name, 0)) for name in CONDITIONS)
+        return tuple(int(counts.get(name, 0)) for name in HUMAN_CONDITIONS)
 
     @cached_property
     def left_out(self) -> str:
@@ -162,13 +162,32 @@ class Study:
     @property
     def calibrated(self) -> bool:
         """Whether there are human traces enough of every condition to compare others with."""
-        counts = self.human.ended["condition"].value_counts().reindex(CONDITIONS, fill_value=0)
+        found = self.human.ended["condition"].value_counts()
+        counts = found.reindex(HUMAN_CONDITIONS, fill_value=0)
         return self.human.measured and bool(counts.min() >= ENOUGH_PER_CONDITION)
 
     @property
     def complete(self) -> bool:
         """Whether the human traces are all there, so that whole trials can be drawn from them."""
         return self.imported is not None and self.imported.complete
+
+    @cached_property
+    def conditions(self) -> dict[str, tuple[float, float]]:
+        """Name to projected headway in m and relative velocity in m/s: the humans', then others.
+
+        The others are told by the stored trials, since whoever registered them may not be here.
+        """
+        played = {
+            row.condition: (row.projected_headway_m, row.relative_velocity_mps)
+            for group in self.models
+            for row in group.trials.drop_duplicates("condition").itertuples()
+        }
+        own = {name: at for name, at in played.items() if name not in HUMAN_CONDITIONS}
+        humans = {
+            name: (condition.projected_headway_m, condition.relative_velocity_mps)
+            for name, condition in HUMAN_CONDITIONS.items()
+        }
+        return humans | dict(sorted(own.items(), key=lambda one: (one[1], one[0])))
 
     @property
     def baselines(self) -> list[Group]:

@@ -24,7 +24,7 @@ from analysis.tables.formats import shown_value
 from analysis.tables.model import Table, from_text, options_text, to_text
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.results.database import read_database
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 if TYPE_CHECKING:
     from analysis.data.study import Group, Study
@@ -167,6 +167,7 @@ def human_panels(study: Study) -> dict[str, Any]:
         "measured": study.human.measured,
         "outcomes_from": citation("human_outcomes"),
         "published": {metric.name: _published(metric) for metric in unknown} if there else {},
+        "conditions": study.conditions,
         "notes": sample_notes(study, study.baselines),
         "caveat": outcomes_note(study.human) if there else "",
         "groups": [
@@ -174,7 +175,7 @@ def human_panels(study: Study) -> dict[str, Any]:
                 "id": group.id,
                 "driver": group.label,
                 "scenario": specs.get(group.spec_hash, {}).get("scenario"),
-                "conditions": {name: _in_condition(group, name) for name in CONDITIONS},
+                "conditions": {name: _in_condition(group, name) for name in study.conditions},
             }
             for group in study.baselines
         ],
@@ -203,7 +204,7 @@ def _published(metric: Metric) -> dict[str, Any]:
     found = human_reference(metric)
     if found is None:
         return {"text": no_human_value(metric)}
-    values, what = dict.fromkeys(CONDITIONS, found.value), "value over all conditions"
+    values, what = dict.fromkeys(HUMAN_CONDITIONS, found.value), "value over all conditions"
     source = found.source
     if metric is GAP:
         values, what, source = _published_gaps(), "regression", citation("paper_gap")
@@ -219,9 +220,10 @@ def _published_gaps() -> dict[str, float]:
     from analysis.stats.regressions import gap_design
 
     terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
-    headway = np.array([condition.projected_headway_m for condition in CONDITIONS.values()])
-    velocity = np.array([condition.relative_velocity_mps for condition in CONDITIONS.values()])
-    return dict(zip(CONDITIONS, map(float, gap_design(headway, velocity) @ terms), strict=True))
+    headway = np.array([one.projected_headway_m for one in HUMAN_CONDITIONS.values()])
+    velocity = np.array([one.relative_velocity_mps for one in HUMAN_CONDITIONS.values()])
+    gaps = gap_design(headway, velocity) @ terms
+    return dict(zip(HUMAN_CONDITIONS, map(float, gaps), strict=True))
 
 
 def main(db: Path) -> None:

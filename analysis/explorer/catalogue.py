@@ -15,7 +15,7 @@ from analysis.explorer.reading import PATIENCE_S, reading, records
 from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
-from merge_runner.results.database import SCHEMA, Instance, spill_folder
+from merge_runner.results.database import Instance, schema_sql, spill_folder
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer
 
@@ -39,7 +39,8 @@ CREATE SEQUENCE numbers;
 CREATE TABLE listed (
     number INTEGER DEFAULT nextval('numbers'), trial_id VARCHAR, spec_hash VARCHAR,
     source VARCHAR, model_left VARCHAR, model_right VARCHAR, model VARCHAR, variant VARCHAR,
-    condition VARCHAR, rep INTEGER, pair VARCHAR,
+    condition VARCHAR, projected_headway_m DOUBLE, relative_velocity_mps DOUBLE, rep INTEGER,
+    pair VARCHAR,
     status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
     error VARCHAR, scripted BOOLEAN, stand_in VARCHAR,
     time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
@@ -122,7 +123,8 @@ LIST = """
 INSERT INTO listed BY NAME
 SELECT trials.trial_id, trials.spec_hash, source, model_left, model_right,
     if(source = 'human', 'human', driver) AS model,
-    variant, condition, rep, pair, status, merged_first, end_time_s, error, scripted,
+    variant, condition, projected_headway_m, relative_velocity_mps, rep, pair, status,
+    merged_first, end_time_s, error, scripted,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'
@@ -399,7 +401,7 @@ class Catalogue:
         """Forget everything."""
         self._instance.drop()
         self._connection = self._instance.confined(self.db)
-        self._connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        self._connection.execute(schema_sql())
         self._connection.execute(LISTED + GROUPED)
         self._file, self._stamp = file, None
 

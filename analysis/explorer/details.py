@@ -10,9 +10,10 @@ from typing import Any
 
 from analysis.explorer.prompts import Part, parts_of
 from analysis.explorer.reading import Row, reading, records
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
+from merge_runner.scenarios.merge.geometry import Track, track_of
 
 OF_TRIAL = "trial_id = $trial AND spec_hash = $spec"
 STATES = f"""
@@ -47,14 +48,15 @@ SELECT * FROM calls WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A trial's samples by side and its decisions without prompts; ``scenario`` is its task's.
+    """A trial's samples by side and its decisions without prompts, and the task it is of.
 
     ``paces`` say when each driver decided.
     """
 
     trial_id: str
     spec_hash: str
-    scenario: Scenario
+    scenario: ScenarioConfig
+    track: Track
     paces: dict[Side, Pace]
     states: dict[Side, Row]
     decisions: list[Row]
@@ -93,7 +95,7 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     scenario = scenario_of(task["source"], told.get("scenario"))
     ordered = {side: states[side] for side in SIDES if side in states}
     paces = {side: pace_of(scenario, told.get(side, {})) for side in SIDES}
-    trial = Trial(trial_id, spec_hash, scenario, paces, ordered, decisions)
+    trial = Trial(trial_id, spec_hash, scenario, track_of(told), paces, ordered, decisions)
     for row in decisions:
         if row["lost"]:
             row["time_s"] = trial.end_s
@@ -101,10 +103,10 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     return trial
 
 
-def scenario_of(source: str, told: Mapping[str, Any] | None) -> Scenario:
+def scenario_of(source: str, told: Mapping[str, Any] | None) -> ScenarioConfig:
     """The task of a trial, as its spec tells it, or as it usually is."""
     usual = HUMAN_TASK if source == "human" else {}
-    return Scenario.model_validate(usual if told is None else told)
+    return ScenarioConfig.model_validate(usual if told is None else told)
 
 
 def read_decisions(

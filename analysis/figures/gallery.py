@@ -32,13 +32,13 @@ from analysis.figures.drawing import (
     wrapped,
 )
 from analysis.figures.panels import (
-    VELOCITIES_MPS,
     Point,
     deviations,
     gaps,
     left_first,
     left_traces,
     published_gap_line,
+    velocities_mps,
 )
 from analysis.figures.styles import HUMAN_STYLE, ORANGE, SKY_BLUE, Style, driver_style
 from analysis.figures.variant_figure import figure_2_variants
@@ -70,12 +70,13 @@ def figure_2(study: Study) -> Figure:
     parts: Any = figure.subfigures(2, 1, height_ratios=(2, 3))
     traces, curves = parts
     _traces(traces.subplots(2, max(len(groups), 1), sharex=True, sharey=True, squeeze=False), study)
-    axes = curves.subplots(3, 3, sharex=True, sharey="row")
-    _curves(axes[0], groups, left_first, "C", "P(left merges first)")
-    _curves(axes[1], groups, gaps, "D", "gap at merge (m)")
-    _curves(axes[2], groups, deviations, "E", "RMSE of speed (m/s)")
+    velocities = velocities_mps(study)
+    axes = curves.subplots(3, len(velocities), sharex=True, sharey="row")
+    _curves(axes[0], groups, left_first, velocities, "C", "P(left merges first)")
+    _curves(axes[1], groups, gaps, velocities, "D", "gap at merge (m)")
+    _curves(axes[2], groups, deviations, velocities, "E", "RMSE of speed (m/s)")
     axes[0, 0].set_ylim(-0.05, 1.05)
-    for column, velocity in enumerate(VELOCITIES_MPS):
+    for column, velocity in enumerate(velocities):
         axes[0, column].set_title(f"Δv = {velocity_text(velocity)}")
         axes[2, column].set_xlabel("projected headway (m)")
         if study.human in groups and not study.human.measured:
@@ -265,12 +266,13 @@ def _curves(
     axes: NDArray[np.object_],
     groups: list[Group],
     points: Callable[[Group, float], list[Point]],
+    velocities: list[float],
     panel: str,
     label: str,
 ) -> None:
     axes[0].set_ylabel(label)
     _panel(axes[0], panel)
-    for axis, velocity in zip(axes, VELOCITIES_MPS, strict=True):
+    for axis, velocity in zip(axes, velocities, strict=True):
         for index, group in enumerate(groups):
             found = points(group, velocity)
             # Side by side, so that intervals do not hide each other.

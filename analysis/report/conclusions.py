@@ -23,7 +23,7 @@ from analysis.stats.measures import (
     no_human_value,
 )
 from analysis.stats.mixed import MIN_PAIRS
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",
@@ -78,16 +78,28 @@ def _concluded(study: Study) -> list[Group]:
 def _shown(study: Study, group: Group) -> list[str]:
     if not len(group.ended):
         return [f"{group.driver}: no trial ended ({group.left_out})."]
-    if not len(group.finished):
+    alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
+    own = len(group.ended) - len(alike.ended)
+    texts = _marks(study, group) if len(group.finished) else []
+    if own:
+        texts.append(
+            f"{group.driver}: {_trials(own)} of {len(group.ended)} "
+            f"{'is' if own == 1 else 'are'} of conditions that no human drove, and not compared "
+            "with humans in what follows."
+        )
+    if not len(alike.ended):
+        return texts
+    if not len(alike.finished):
         return [
-            f"{group.driver}: no trial finished ({group.left_out}).",
-            _collisions(study, group),
+            *texts,
+            f"{group.driver}: no trial finished ({alike.left_out}).",
+            _collisions(study, alike),
         ]
     return [
-        *_marks(study, group),
-        _collisions(study, group),
-        *(_told(study, group, metric) for metric in shown_in("conclusions")),
-        *unlike(study, group),
+        *texts,
+        _collisions(study, alike),
+        *(_told(study, alike, metric) for metric in shown_in("conclusions")),
+        *unlike(study, alike),
     ]
 
 
@@ -183,7 +195,7 @@ def _of_humans(study: Study, group: Group, metric: Metric) -> str:
         if found is None:
             return no_human_value(metric)
         value = _number(metric, found.value)
-        return f"humans {value} as published, over all {len(CONDITIONS)} conditions"
+        return f"humans {value} as published, over all {len(HUMAN_CONDITIONS)} conditions"
     human = estimate(_alike(study.human, group), metric)
     if human.value is None:
         return "humans have none in the imported trials of these conditions"

@@ -22,7 +22,7 @@ from scipy.special import expit
 from analysis.data.reference_data import HUMAN_GAP_SD_M, human_outcomes, published
 from analysis.stats.indicators import PAPER, ROBUST, Criterion
 from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, gap_design
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 Array = NDArray[np.float64]
 
@@ -32,9 +32,9 @@ WALD_STEPS = 35  # statsmodels' limit
 FIRTH_STEPS = 60
 HALVINGS = 8
 
-HEADWAYS = np.array([c.projected_headway_m for c in CONDITIONS.values()])
-VELOCITIES = np.array([c.relative_velocity_mps for c in CONDITIONS.values()])
-LOGIT_DESIGN = np.column_stack([np.ones(len(CONDITIONS)), HEADWAYS, VELOCITIES])
+HEADWAYS = np.array([c.projected_headway_m for c in HUMAN_CONDITIONS.values()])
+VELOCITIES = np.array([c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()])
+LOGIT_DESIGN = np.column_stack([np.ones(len(HUMAN_CONDITIONS)), HEADWAYS, VELOCITIES])
 GAP_DESIGN = gap_design(HEADWAYS, VELOCITIES)
 
 # The degrees of freedom of tests that are no t tests.
@@ -45,7 +45,7 @@ Passes = dict[str, NDArray[np.bool_]]
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Human trials by condition, in the order of CONDITIONS, one array each.
+    """Human trials by condition, in the order of HUMAN_CONDITIONS, one array each.
 
     ``left``: 1 or 0 for who merged first, NaN after a collision. ``gap_m``: NaN after a collision.
     Without traces the last is empty.
@@ -79,7 +79,7 @@ def imported_humans(trials: pd.DataFrame) -> Population:
 
 @cache
 def ceiling(humans: Population, sizes: tuple[int, ...]) -> Ceiling:
-    """The human ceiling for ``sizes`` trials per condition, in the order of CONDITIONS."""
+    """The human ceiling for ``sizes`` trials per condition, in the order of HUMAN_CONDITIONS."""
     draws = drawn(humans, sizes)
     ols, hc3 = gap_fits(draws)
     return Ceiling(
@@ -142,7 +142,7 @@ class Draws:
 def drawn(humans: Population, sizes: Sequence[int]) -> Draws:
     """DATA_SETS human data sets of ``sizes`` trials, with replacement; some of them collide."""
     rng = np.random.default_rng(SEED)
-    n, left, gap, squared_gap = np.zeros((4, DATA_SETS, len(CONDITIONS)))
+    n, left, gap, squared_gap = np.zeros((4, DATA_SETS, len(HUMAN_CONDITIONS)))
     expected = GAP_DESIGN @ _published_gap()
     for i, size in enumerate(sizes):
         if size == 0 or len(humans.left[i]) == 0:
@@ -318,4 +318,4 @@ def _left(trials: pd.DataFrame) -> pd.Series:
 
 
 def _by_condition(trials: pd.DataFrame, values: pd.Series) -> tuple[Array, ...]:
-    return tuple(values[trials["condition"] == name].to_numpy(float) for name in CONDITIONS)
+    return tuple(values[trials["condition"] == name].to_numpy(float) for name in HUMAN_CONDITIONS)

@@ -8,7 +8,8 @@ from analysis.metrics import shown_in
 from analysis.stats.measures import values
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner.text_safety import quoted
 
 QUARTILES = {"crt_q1_s": 0.25, "crt_median_s": 0.5, "crt_q3_s": 0.75}
 
@@ -31,7 +32,12 @@ def conflict_resolution(study: Study) -> Table:
                 )
             ),
         ),
-        [_resolution(group, name) for name in CONDITIONS for group in study.baselines],
+        [
+            _resolution(group, name)
+            for name in study.conditions
+            for group in study.baselines
+            if group.setting or name in HUMAN_CONDITIONS
+        ],
         (
             "from the start of control until no vehicle, at its present speed, would meet the "
             "other at the first possible contact, the merge point or the end of the track",
@@ -68,7 +74,7 @@ def criticality(study: Study) -> Table:
 def _resolution(group: Group, condition: str) -> Row:
     key: dict[str, Value] = {"condition": condition, "driver": group.label}
     row = f"{group.id}/{condition}"
-    where = f"condition = '{condition}' AND conflict_resolution_s IS NOT NULL"
+    where = f"condition = {quoted(condition)} AND conflict_resolution_s IS NOT NULL"
     if not group.measured:
         printed = published("human_outcomes").set_index("condition").loc[condition]
         cells = {name: float(printed[name]) for name in QUARTILES}

@@ -19,7 +19,7 @@ import duckdb
 from merge_runner.audit.answers import COLUMNS, Answer, answers_another, read_answer
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Finding
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver, MakeDriver, Seat, take_seat
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.pace import Pace
@@ -53,6 +53,7 @@ from merge_runner.results.comparison import (
 )
 from merge_runner.results.rows import decision_rows, state_rows, trial_row
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.registry import SCENARIOS
 from merge_runner.trial import play_trial
 
 TOLERANCE = 1e-9
@@ -75,6 +76,7 @@ ASKED = "sha256(request::VARCHAR) AS asked"
 # What a reader is told could not be derived.
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
+NOT_INSTALLED = "anything, since their condition or their scenario is not installed"
 OTHER_PROGRAM = "the decisions of a program that is not as it was"
 
 
@@ -106,7 +108,7 @@ class _Trial:
 
     key: TrialKey
     row: dict[str, Any]
-    scenario: Scenario
+    scenario: ScenarioConfig
     attempts: list[Answer]
     plans: dict[tuple[str, int], Decision]
     scripted: bool
@@ -230,13 +232,18 @@ def _trials(
     for key in tables["trials"].rows:
         spec = specs.get(key[1])
         (row,) = tables["trials"].named(key)
-        if spec is None or spec.scenario is None or row["condition"] not in CONDITIONS:
+        if spec is None or spec.scenario is None:
+            continue
+        scenario = SCENARIOS.get(spec.scenario.name)
+        if scenario is None or row["condition"] not in CONDITIONS:
+            found.left_out[NOT_INSTALLED] += 1
             continue
         paces = {side: pace for side in SIDES if (pace := spec.pace(side)) is not None}
         if len(paces) < len(SIDES):
             continue
         known = all(side in wires for side in SIDES if spec.asks(side))
-        if spec.content.get("spec_version") != SPEC_VERSION or not known:
+        same_rules = spec.content.get("spec_version") == SPEC_VERSION
+        if not (same_rules and known and spec.track == scenario.track):
             found.left_out[OTHER_RULES] += 1
             continue
         calls, decisions = tables["calls"].named(key), tables["decisions"].named(key)

@@ -10,11 +10,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.errors import UsageError
 from merge_runner.llm.keys import between_body_and_slot
 from merge_runner.records import SIDES
+from merge_runner.scenarios.merge.geometry import Track, track_of
 
 
 class _Facts(BaseModel):
@@ -92,15 +93,23 @@ class Spec:
         return content if isinstance(content, dict) else {}
 
     @cached_property
-    def scenario(self) -> Scenario | None:
+    def scenario(self) -> ScenarioConfig | None:
         """The scenario, None where it cannot be read; what it lacks has its default."""
         fields = self.content.get("scenario")
         if not isinstance(fields, dict):
             return None
         try:
-            return Scenario.model_validate(
-                {name: fields[name] for name in Scenario.model_fields if name in fields}
+            return ScenarioConfig.model_validate(
+                {name: fields[name] for name in ScenarioConfig.model_fields if name in fields}
             )
+        except ValidationError:
+            return None
+
+    @cached_property
+    def track(self) -> Track | None:
+        """The track, None where it cannot be read."""
+        try:
+            return track_of(self.content)
         except ValidationError:
             return None
 

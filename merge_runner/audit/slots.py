@@ -145,7 +145,7 @@ def _spec_problems(row: Row, config: SweepConfig, specs: Mapping[str, Spec]) -> 
         return
     if spec_hash(spec.text) != row.spec_hash:
         yield f"the spec stored as {row.spec_hash} has the hash {spec_hash(spec.text)}"
-    if spec.scenario is None:
+    if spec.scenario is None or spec.track is None:
         yield f"the scenario of the spec {row.spec_hash} cannot be read: its trials are not checked"
     elif None in map(spec.pace, SIDES):
         yield f"the rates of the spec {row.spec_hash} cannot be read: its decisions are not checked"

@@ -34,7 +34,8 @@ from merge_runner.text_safety import first_line
 
 TABLES = """
 CREATE OR REPLACE TEMP TABLE rules (spec_hash VARCHAR, timeout_steps INTEGER, restarts BOOLEAN,
-    reach_m DOUBLE);
+    reach_m DOUBLE, tunnel_exit_m DOUBLE, merge_point_m DOUBLE, end_m DOUBLE, branch_sine DOUBLE,
+    branch_cosine DOUBLE);
 CREATE OR REPLACE TEMP TABLE paces (spec_hash VARCHAR, side VARCHAR, interval_steps INTEGER,
     executed INTEGER, plan_actions INTEGER);
 CREATE OR REPLACE TEMP TABLE drivers (spec_hash VARCHAR, side VARCHAR, endpoint VARCHAR,
@@ -240,9 +241,14 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
                 scenario.timeout_steps,
                 scenario.fallback == "restart",
                 reach_m(scenario),
+                track.tunnel_exit_m,
+                track.merge_point_m,
+                track.end_m,
+                track.branch_sine,
+                track.branch_cosine,
             )
             for spec in specs.values()
-            if (scenario := spec.scenario) is not None
+            if (scenario := spec.scenario) is not None and (track := spec.track) is not None
         ),
     )
     _fill(

@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass
 from typing import Protocol
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace
 from merge_runner.errors import UsageError
 from merge_runner.records import Decision, Observation, Side, TrialSpec
@@ -19,7 +19,7 @@ class Seat:
     ``seed`` is a whole number below 2**64 from which it draws whatever it leaves to chance.
     """
 
-    scenario: Scenario
+    scenario: ScenarioConfig
     side: Side
     pace: Pace
     seed: int
@@ -48,12 +48,12 @@ class Driver(Protocol):
 class MakeDriver(Protocol):
     """Whatever makes the driver of a side of a trial: a program, or a language model."""
 
-    def make(self, scenario: Scenario, spec: TrialSpec, side: Side) -> Driver:
+    def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """A driver that has not decided yet."""
         ...
 
 
-def take_seat(scenario: Scenario, spec: TrialSpec, side: Side, pace: Pace) -> Seat:
+def take_seat(scenario: ScenarioConfig, spec: TrialSpec, side: Side, pace: Pace) -> Seat:
     """The seat of a side of a trial.
 
     Its seed is the first eight bytes of the SHA-256 of condition, repetition, side and sample set:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import model_pace
 from merge_runner.prompts.parse import ParsedReply, parse_reply
@@ -24,7 +24,7 @@ class LanguageModel:
 
     ask: AskFor
 
-    def make(self, scenario: Scenario, spec: TrialSpec, side: Side) -> LlmDriver:
+    def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> LlmDriver:
         """See MakeDriver."""
 
         async def ask(prompt: str, number: int) -> ChatReply:

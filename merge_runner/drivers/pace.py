@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from merge_runner.config import Scenario, whole_steps
+from merge_runner.config import ScenarioConfig, whole_steps
 from merge_runner.errors import UsageError
 
 
@@ -28,12 +28,12 @@ class Pace:
         return self.action_steps * self.executed_actions
 
 
-def model_pace(scenario: Scenario) -> Pace:
+def model_pace(scenario: ScenarioConfig) -> Pace:
     """That of a language model: its prompt rate, and the steps of its plan."""
     return Pace(scenario.action_steps, scenario.executed_actions, scenario.plan_actions)
 
 
-def program_pace(scenario: Scenario, rate_hz: float | None) -> Pace:
+def program_pace(scenario: ScenarioConfig, rate_hz: float | None) -> Pace:
     """That of a program with a rate of its own, or at the prompt rate; it acts in every step.
 
     Raises ValueError where the world's step is too long for the rate.
@@ -44,7 +44,7 @@ def program_pace(scenario: Scenario, rate_hz: float | None) -> Pace:
     return Pace(1, executed, max(horizon, executed))
 
 
-def pace_of(scenario: Scenario, driver: Mapping[str, Any]) -> Pace:
+def pace_of(scenario: ScenarioConfig, driver: Mapping[str, Any]) -> Pace:
     """The pace of what a spec says of a driver; raises UsageError."""
     if "endpoint" in driver:
         return model_pace(scenario)

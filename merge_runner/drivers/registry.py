@@ -12,7 +12,7 @@ from importlib.util import find_spec, resolve_name
 from pkgutil import iter_modules
 
 from merge_runner import drivers
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver, Seat, take_seat
 from merge_runner.drivers.pace import program_pace
 from merge_runner.errors import UsageError
@@ -40,7 +40,7 @@ class Program:
         """See ``source_digest``."""
         return source_digest(self.driver)
 
-    def make(self, scenario: Scenario, spec: TrialSpec, side: Side) -> Driver:
+    def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """See MakeDriver."""
         pace = program_pace(scenario, self.rate_hz)
         return self.driver(take_seat(scenario, spec, side, pace))

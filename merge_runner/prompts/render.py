@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from functools import cache
 from statistics import fmean
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import Fields, blocks_of
 from merge_runner.records import Observation, Road
 
@@ -16,7 +16,7 @@ def render_prompt(
     remaining_plan: Sequence[float] | None,
     *,
     variant: str,
-    scenario: Scenario,
+    scenario: ScenarioConfig,
 ) -> str:
     """The prompt of a variant.
 
@@ -35,7 +35,7 @@ def _template(variant: str, road: Road) -> str:
 
 
 def _fields(
-    observation: Observation, remaining_plan: Sequence[float] | None, scenario: Scenario
+    observation: Observation, remaining_plan: Sequence[float] | None, scenario: ScenarioConfig
 ) -> Fields:
     distance = observation.distance_to_merge_m
     every = scenario.action_steps

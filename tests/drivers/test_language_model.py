@@ -2,7 +2,7 @@
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.drivers.pace import model_pace
@@ -43,7 +43,7 @@ async def decide(*replies, seen=SEEN, variant="baseline", **scenario):
         reply = replies[number]
         return chat_reply(reply) if isinstance(reply, str) else reply
 
-    scenario = Scenario(**scenario)
+    scenario = ScenarioConfig(**scenario)
     driver = LlmDriver(ask, variant, Seat(scenario, "left", model_pace(scenario), 0))
     decisions = [await driver.decide(seen, number) for number in range(len(replies))]
     assert [prompt for prompt, _ in asked] == [decision.prompt for decision in decisions]

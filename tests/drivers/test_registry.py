@@ -2,7 +2,7 @@
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.records import SIDES, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -15,7 +15,7 @@ RULES = ("euclid2d", "rectangle", "shared_lane")
 
 async def play(condition, driver, **scenario):
     """A trial with the same kind of driver on both sides."""
-    scenario = Scenario(**scenario)
+    scenario = ScenarioConfig(**scenario)
     spec = TrialSpec(
         trial_id="test",
         spec_hash="test",

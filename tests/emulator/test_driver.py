@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.emulator.chance import draw, draw_between, draw_index
 from merge_runner.emulator.driver import answer
@@ -17,21 +17,22 @@ from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import SIDES, ChatReply, Slot, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.trial import play_trial
 
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 SAMPLE_SETS = range(6)
 REPETITIONS = range(1, 11)
 
 
 def first_prompt(condition, side, variant="baseline"):
-    seen = World(SCENARIO, CONDITIONS[condition]).observe(side)
+    seen = World(SCENARIO, CONDITIONS[condition], TRACK).observe(side)
     return render_prompt(seen, None, variant=variant, scenario=SCENARIO)
 
 
 def straight_prompt(variant="baseline", previous=None, **changes):
-    seen = World(SCENARIO, CONDITIONS["L_4_0"]).observe("right")
+    seen = World(SCENARIO, CONDITIONS["L_4_0"], TRACK).observe("right")
     seen = replace(seen, road="straight", distance_to_merge_m=None, **changes)
     return render_prompt(seen, previous, variant=variant, scenario=SCENARIO)
 

@@ -18,7 +18,7 @@ from analysis.figures.styles import HUMAN_STYLE, MARKERS, driver_style
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
 from analysis.tables.notes import sample_notes
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.recordings import drive, write_folder
@@ -36,7 +36,9 @@ KILLED = [
 @pytest.fixture
 def db(tmp_path):
     return write_study(
-        tmp_path / "t.duckdb", [*yielding("o3", reps=5), *KILLED], Scenario(vehicle_length_m=4)
+        tmp_path / "t.duckdb",
+        [*yielding("o3", reps=5), *KILLED],
+        ScenarioConfig(vehicle_length_m=4),
     )
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.records import TrialRecord, TrialSpec
@@ -23,7 +23,7 @@ from merge_runner.run.flusher import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 SWEEP = SweepRow("s1", "baseline", datetime(2026, 1, 1), "{}", None, None, "{}")  # noqa: DTZ001
 LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True); input()"
 

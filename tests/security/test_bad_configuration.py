@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from analysis.commands import main
-from merge_runner.config import PROVIDERS, ModelEntry, Scenario, SweepFile
+from merge_runner.config import PROVIDERS, ModelEntry, ScenarioConfig, SweepFile
 from merge_runner.emulator.faults import FAULTS, FaultPlan
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -150,7 +150,7 @@ def test_a_registry_that_is_wrong(program, tmp_path, content, says):
         (sweep(repetitions="{ baseline = 100001 }"), "less than or equal to 100000"),
         (
             scenario("horizn_s = 5"),
-            f"'scenario.horizn_s'; valid: {', '.join(Scenario.model_fields)}",
+            f"'scenario.horizn_s'; valid: {', '.join(ScenarioConfig.model_fields)}",
         ),
         (scenario("horizon_s = nan"), "scenario.horizon_s: Input should be a finite number"),
         (scenario("horizon_s = inf"), "scenario.horizon_s: Input should be a finite number"),

@@ -16,7 +16,7 @@ from analysis.figures.styles import HUMAN_STYLE, Style, driver_style
 from analysis.metrics import Metric, intervals_of, shown_in
 from analysis.tables.formats import notes_of, shown_value
 from analysis.tables.model import Table, from_text
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 HUMAN = "human"
 SHAPE_WORDS = {"down": "triangle that points down"}
@@ -96,11 +96,18 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
             "human": next((group for group in groups if group["id"] == HUMAN), None),
             "measured": content["measured"],
             "outcomes_from": content["outcomes_from"],
+            "conditions": {
+                name: views.condition_text(*of) for name, of in content["conditions"].items()
+            },
+            "own": [name for name in content["conditions"] if name not in HUMAN_CONDITIONS],
             "published": [one["text"] for one in content["published"].values()],
             "groups": groups,
             "rules": {group["id"]: rule_text(group) for group in groups},
             "marks": marks(groups),
-            "charts": [chart(kind, groups, content["published"]) for kind in kinds()],
+            "charts": [
+                chart(kind, groups, list(content["conditions"]), content["published"])
+                for kind in kinds()
+            ],
             "collisions": {
                 kind.name: collisions(groups, kind.name) for kind in kinds() if kind.denominators
             },
@@ -115,7 +122,6 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         "humans.html",
         here="humans",
         computed=found,
-        conditions={name: views.condition_text(name) for name in CONDITIONS},
         in_table={metric.name for metric in shown_in("tables")},
         path=marker,
         value=value_text,
@@ -185,6 +191,7 @@ def differences(contrasts: Table) -> list[dict[str, Any]]:
 def chart(
     kind: Kind,
     groups: Sequence[Mapping[str, Any]],
+    conditions: Sequence[str],
     published: Mapping[str, Any],
 ) -> dict[str, Any]:
     """One row of panels: where everything is drawn, in the units of the picture.
@@ -202,7 +209,7 @@ def chart(
     axis = Axis(*scale(kind, *reach(known, list(printed.values()))))
     panel = max(LEAST, STEP * (len(groups) + 1))
     panels: list[dict[str, Any]] = []
-    for i, name in enumerate(CONDITIONS):
+    for i, name in enumerate(conditions):
         x0 = LEFT + i * panel
         points = []
         for j, group in enumerate(groups):
@@ -215,7 +222,7 @@ def chart(
         panels.append({"name": name, "x": round(x0, 1), "points": points, "line": line})
     return {
         "kind": kind,
-        "width": round(LEFT + panel * len(CONDITIONS) + 4),
+        "width": round(LEFT + panel * len(conditions) + 4),
         "height": TOP + HEIGHT + FOOT,
         "top": TOP,
         "bottom": TOP + HEIGHT,

@@ -52,7 +52,7 @@ def shown(row: Row, trial: Trial) -> dict[str, Any]:
         "outcome": views.outcome_text(row, trial.scenario),
         "facts": views.facts(row),
         "judged": views.judged_text(trial.scenario),
-        "view_box": views.view_box(),
+        "view_box": views.view_box(trial.track),
         "data": embedded(views.replay_data(row, trial)) if trial.states else None,
         "lines": views.summary(row, trial),
         "samples": views.sample_table(trial),
