@@ -13,11 +13,13 @@ from merge_runner.config import (
 )
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
+from merge_runner.registry import load_plugins
 from merge_runner.text_safety import one_line
 
 
 def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
     """The entries by name, of which each names a format and a provider; raises UsageError."""
+    load_plugins()  # here, since what fails in one is no fault of this file
     path = path or find_experiments() / "models.toml"
     entries = {}
     for name, table in read_toml(path).items():

@@ -119,7 +119,7 @@ def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
     huge = killed["conditions"]["L_4_0"]["gap_m"]
     assert huge["low"] < -30
     assert huge["high"] > 50
-    drawn = chart(gap, content["groups"], content["published"])
+    drawn = chart(gap, content["groups"], list(content["conditions"]), content["published"])
     ticks = [float(text) for _, text in drawn["ticks"]]
     assert ticks[0] >= -10
     assert ticks[-1] <= 30
@@ -132,7 +132,7 @@ def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
     )
     assert [shape for shape, _ in point["arrows"]] == ["down", "triangle"]
     assert drawn["top"] <= point["ends"][1] <= point["y"] <= point["ends"][0] <= drawn["bottom"]
-    assert chart(rmse, content["groups"], content["published"])["ticks"][0][1] == "0"
+    assert chart(rmse, content["groups"], [], content["published"])["ticks"][0][1] == "0"
     text = ask()
     assert len(re.findall(r'class="cut"', text)) >= 2
     assert "An arrow at the edge: an interval goes on beyond the axis. killed in" in text

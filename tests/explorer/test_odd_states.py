@@ -75,7 +75,9 @@ def test_odd_rows_cost_no_other_row_its_page(db):
         "DELETE FROM states WHERE side = 'right' AND trial_id LIKE '%N_0_0/rep01'",
     )
     site = Site(db)
-    assert "no condition of the experiment" in ask(site, "/trials/o4/baseline/L_4_0/rep01").text
+    text = ask(site, "/trials/o4/baseline/L_4_0/rep01").text
+    assert "X_1_1" in text
+    assert "the left vehicle would be 4 m ahead" in text
     assert ask(site, "/trials?condition=N_0_0").text.count('<th scope="row">') == 4
     assert ask(site, TRIAL).status_code == 200
 

@@ -215,7 +215,7 @@ def test_a_variant_of_a_block_that_there_is_not_is_refused(monkeypatch):
 def test_in_a_finer_world_the_histories_are_those_of_the_plans_steps(history_start):
     coarse = ScenarioConfig(history_start=history_start)
     fine = coarse.model_copy(update={"step_s": 0.05, "plan_step_s": 0.2})
-    worlds = [World(scenario, CONDITIONS["L_4_0"]) for scenario in (coarse, fine)]
+    worlds = [World(scenario, CONDITIONS["L_4_0"], TRACK) for scenario in (coarse, fine)]
     for number in range(4):
         prompts = [
             render_prompt(world.observe("right"), [0.5], variant="baseline", scenario=scenario)

@@ -87,7 +87,7 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
     # Before and after an import of humans it is another page, and not an older one.
     (humans,) = site.catalogue.ask("SELECT count(*) AS n FROM listed WHERE source = 'human'")
     found = computed(site, ("humans", str(humans["n"])), asked, patient=patient)
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = {"own": []}
     if found.result is not None:
         content = found.result.content
         groups = content["groups"]

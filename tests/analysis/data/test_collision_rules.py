@@ -189,8 +189,8 @@ def test_an_open_trial_has_no_first_merger():
 def test_a_driver_that_decided_later_cruised_in_the_steps_before():
     """Full throttle from the right's first decision on, five steps late, comes too late to pass."""
     scenario = ScenarioConfig(control_start="own_exit")
-    early = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 12], [[], []])
-    late = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 8], [[], []], begins=(0, 20))
+    early = redriven(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 12], [[], []])
+    late = redriven(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 8], [[], []], begins=(0, 20))
     assert early == ("finished", "right")
     assert late == ("collided", None)
     drawn_out = redriven(

@@ -91,7 +91,10 @@ def test_what_was_sent_is_named_and_a_default_only_where_nothing_was(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1))
 
     def sent(**body):
-        driver = {"endpoint": "openai", "body": {"model": "o3", "messages": [], **body}}
+        driver = {
+            "endpoint": "openai",
+            "body": {"model": "o3", "messages": [{"content": ""}], **body},
+        }
         spec = json.dumps({"left": driver, "right": driver})
         return texts(changed(db, f"UPDATE specs SET spec = '{spec}'"))[1]
 
