@@ -10,7 +10,9 @@ from tests.harness import PROJECT
 
 def test_every_promise_has_its_test():
     text = (PROJECT / "docs/explanation/reliability.md").read_text()
-    others = [(PROJECT / page).read_text() for page in ("docs/explanation/scaling.md", "SECURITY.md")]
+    others = [
+        (PROJECT / page).read_text() for page in ("docs/explanation/scaling.md", "SECURITY.md")
+    ]
     named = set(re.findall(r"`(test_\w+)`", "".join([text, *others])))
     defined = Counter(
         name
