@@ -43,6 +43,9 @@ INSTALLED = (
 # ask no question and start no event loop. All else runs in a shell.
 HERE = ("audit", "digest", "explain", "human", "recording", "tables")
 SERVES = re.compile(r" emulate |make view$| view$| view --(port|bind)")
+NEEDS_MAKE = pytest.mark.skipif(
+    not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv"
+)
 LINKED = (
     ".venv",
     "Makefile",
@@ -55,34 +58,45 @@ LINKED = (
 )
 
 
+def lines_of(block: str) -> list[str]:
+    """The commands of an sh block that do something, comments cut off."""
+    lines = [line.split("  #")[0].strip() for line in block.splitlines()]
+    return [line for line in lines if line and not line.startswith(("#", "export "))]
+
+
 def commands(page: Path) -> list[str]:
-    """The commands of a page's sh blocks, comments cut off."""
+    """The commands of a page."""
     blocks = re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
-    lines = [line.split("  #")[0].strip() for block in blocks for line in block.splitlines()]
-    return [line for line in lines if line and not line.startswith("#")]
+    return [line for block in blocks for line in lines_of(block)]
 
 
 @pytest.fixture
-def folder(tmp_path):
-    """A checkout with the project's environment and short sweeps."""
+def checkout(tmp_path):
+    """The project as it is checked out, with its environment and without results."""
     for name in LINKED:
         (tmp_path / name).symlink_to(PROJECT / name)
     shutil.copytree(PROJECT / "experiments", tmp_path / "experiments")
-    for sweep in (tmp_path / "experiments").glob("*.toml"):
+    shutil.copytree(PROJECT / "cache/recordings", tmp_path / "cache/recordings")
+    return tmp_path
+
+
+@pytest.fixture
+def folder(checkout):
+    """A checkout with short sweeps, and recordings of humans."""
+    for sweep in (checkout / "experiments").glob("*.toml"):
         # One repetition each; and no account's limits, which would make the sweeps take minutes.
         change = (r"^[rt]pm = .*$", "") if sweep.stem == "models" else (r" = \d+$", " = 1")
         text = re.sub(*change, sweep.read_text(), flags=re.MULTILINE)
         few = 'conditions = ["L_4_0", "N_0_0"]\n' if sweep.stem == "ablations" else ""
         sweep.write_text(few + text)
-    shutil.copytree(PROJECT / "cache/recordings", tmp_path / "cache/recordings")
     write_folder(
-        tmp_path / "recordings",
+        checkout / "recordings",
         {
             f"data/experiments/experiment_4/experiment_4_iter_{i}.csv": drive(name).csv()
             for i, name in enumerate(CONDITIONS, 1)
         },
     )
-    return tmp_path
+    return checkout
 
 
 async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
@@ -129,7 +143,7 @@ def here(folder, monkeypatch, capfd):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv")
+@NEEDS_MAKE
 async def test_every_command_of_the_docs_does_what_it_says(folder, here):
     """What stands on the pages twice is run once, where the later pages need nothing of it."""
     done: list[str] = []
@@ -137,7 +151,7 @@ async def test_every_command_of_the_docs_does_what_it_says(folder, here):
         account = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
         for page in PAGES:
             for command in commands(page):
-                if command in {"make test", *done} or command.startswith("export "):
+                if command in {"make test", *done}:
                     continue
                 words = shlex.split(command)
                 if words[0] == "merge-runner" and words[1] in HERE:
@@ -151,6 +165,29 @@ async def test_every_command_of_the_docs_does_what_it_says(folder, here):
     assert len(done) >= 14
 
 
+def unspaced(text: str) -> str:
+    """A text whose columns may be padded to other widths."""
+    return "\n".join(" ".join(line.split()) for line in text.splitlines())
+
+
+@pytest.mark.slow
+@NEEDS_MAKE
+async def test_the_tutorial_shows_what_its_commands_say(checkout):
+    said = ""
+    blocks = re.findall(r"^```(sh|text)\n(.*?)^```", TUTORIAL.read_text(), re.MULTILINE | re.DOTALL)
+    for kind, block in blocks:
+        if kind == "text":
+            for line in unspaced(block).splitlines():
+                assert line in unspaced(said)
+            said = ""
+            continue
+        for command in lines_of(block):
+            code, out = await shell(command, checkout)
+            assert code == 0, f"{command}\n{out}"
+            said += out
+    assert (checkout / "results/figures/figure2.pdf").exists()
+
+
 def test_commands_that_run_in_the_tests_own_process_are_ours_and_start_no_event_loop():
     group = typer.main.get_command(app)
     for name in HERE:
@@ -159,7 +196,7 @@ def test_commands_that_run_in_the_tests_own_process_are_ours_and_start_no_event_
             assert "asyncio" not in inspect.getsource(inspect.unwrap(part.callback))
 
 
-@pytest.mark.skipif(not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv")
+@NEEDS_MAKE
 def test_make_test_runs_the_tests():
     run = subprocess.run(
         ["make", "--dry-run", "test"], cwd=PROJECT, capture_output=True, text=True, check=True
