@@ -214,6 +214,26 @@ def test_every_command_and_every_make_target_is_in_the_docs():
         assert f"make {target}" in text, target
 
 
+def test_the_reference_of_commands_has_every_command_and_every_option_and_no_other():
+    text = (DOCS / "reference/commands.md").read_text()
+    options = {"--debug", "--help"}
+    for name, command in typer.main.get_command(app).commands.items():
+        for part, inner in getattr(command, "commands", {"": command}).items():
+            assert re.search(rf"^\| `{f'{name} {part}'.strip()}[` ]", text, re.MULTILINE), (
+                name,
+                part,
+            )
+            shown = (p for p in inner.params if not getattr(p, "hidden", False))
+                options |= {option for p in shown for option in p.opts if option[:2] == "--"}
+    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)) == options
+
+
+def test_every_how_to_is_in_the_list_of_them():
+    listed = (DOCS / "how-to/README.md").read_text()
+    for page in sorted((DOCS / "how-to").glob("*.md")):
+        assert f"{page.stem}.md" in listed or page.stem == "README"
+
+
 def test_the_readings_of_the_docs_are_those_of_the_report():
     text = (PROJECT / "docs/explanation/reproduction.md").read_text(encoding="utf-8")
     shown = [line for line in text.splitlines() if line.startswith("| ")][1:]
@@ -221,10 +241,19 @@ def test_the_readings_of_the_docs_are_those_of_the_report():
     assert shown == ["| " + " | ".join(c.replace("|", r"\|") for c in r) + " |" for r in readings]
 
 
+def anchors(page: Path) -> set[str]:
+    """What a link into a page can name: its headings, as GitHub spells them."""
+    headings = re.findall(r"^#+ (.*)", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h).strip().lower().replace(" ", "-") for h in headings}
+
+
 def test_links_of_the_docs_lead_somewhere():
-    for page in PAGES:
-        for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text()):
-            assert (page.parent / target).exists(), f"{page.name}: {target}"
+    for page in LINKING:
+        for target in re.findall(r"\]\((?!http)([^)]+)", page.read_text()):
+            path, _, heading = target.partition("#")
+            to = page.parent / path if path else page
+            assert to.exists(), f"{page}: {target}"
+            assert not heading or heading in anchors(to), f"{page}: {target}"
 
 
 def test_the_project_names_no_path_and_no_index_of_its_maker():
