@@ -219,12 +219,10 @@ def test_the_reference_of_commands_has_every_command_and_every_option_and_no_oth
     options = {"--debug", "--help"}
     for name, command in typer.main.get_command(app).commands.items():
         for part, inner in getattr(command, "commands", {"": command}).items():
-            assert re.search(rf"^\| `{f'{name} {part}'.strip()}[` ]", text, re.MULTILINE), (
-                name,
-                part,
-            )
+            words = f"{name} {part}".strip()
+            assert re.search(rf"^\| `{words}[` ]", text, re.MULTILINE), words
             shown = (p for p in inner.params if not getattr(p, "hidden", False))
-                options |= {option for p in shown for option in p.opts if option[:2] == "--"}
+            options |= {option for p in shown for option in p.opts if option[:2] == "--"}
     assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)) == options
 
 
