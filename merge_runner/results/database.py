@@ -95,15 +95,16 @@ class Instance:
         """
         if not self._confine:
             return self.cursor()
-        if self._confined is None or self._confined[0] != path:
+        whole = path.absolute()  # the same name means another file in another folder
+        if self._confined is None or self._confined[0] != whole:
             made = in_memory(self._settings)
             own = ", ".join(
-                quoted(f"{each}{log}") for each in (path.absolute(), path.resolve()) for log in LOGS
+                quoted(f"{each}{log}") for each in (whole, path.resolve()) for log in LOGS
             )
             also = ", ".join(map(quoted, self._also))
             made.execute(f"SET allowed_directories = [{also}]")
             made.execute(f"SET allowed_paths = [{own}]; SET enable_external_access = false")
-            self._confined = path, made
+            self._confined = whole, made
         return self._confined[1].cursor()
 
     def name(self) -> str:

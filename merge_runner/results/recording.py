@@ -25,13 +25,13 @@ from typing import Any
 import duckdb
 from pydantic import TypeAdapter
 
-from merge_runner.results.database import Settings, in_memory
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, Entry, ResponseCache
 from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
 from merge_runner.llm.verify import DAMAGED, check_attempts, check_body
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
+from merge_runner.results.database import Settings, in_memory
 from merge_runner.text_safety import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 2"

@@ -16,6 +16,8 @@ from typing import Any
 
 import duckdb
 
+from merge_runner.errors import StoreError, UsageError
+from merge_runner.records import TrialRecord
 from merge_runner.results.comparison import PLACES, TrialKey, stored_rows
 from merge_runner.results.database import (
     PATIENCE_S,
@@ -33,11 +35,9 @@ from merge_runner.results.database import (
     streamed,
     unreadable_is_usage,
 )
-from merge_runner.errors import StoreError, UsageError
-from merge_runner.signals import at_signals
-from merge_runner.records import TrialRecord
 from merge_runner.results.rows import Row, rows_of, state_rows, trial_row
 from merge_runner.served_model import other_models, sql_of
+from merge_runner.signals import at_signals
 from merge_runner.text_safety import first_line
 
 # What a run has of its own: whether it made an attempt itself, and when the attempt was made.

@@ -1,5 +1,6 @@
 import asyncio
 import contextlib
+import gc
 import json
 import os
 import shutil
@@ -483,6 +484,7 @@ def model_folder(tmp_path_factory):
     ledger = Ledger(cache, "s")
     asyncio.run(ledger.reserve("0" * 64, [], 3.0, None))
     cache.close()
+    gc.collect()  # the connections of other threads, or their files go while they are copied
     return folder
 
 

@@ -5,13 +5,13 @@ import json
 
 import pytest
 
-from merge_runner.results.comparison import PLACES, stored_rows
 from merge_runner.config import Scenario
-from merge_runner.results.database import SCHEMA, in_memory
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.llm.keys import make_request
 from merge_runner.records import Attempt, ChatReply, Slot, TrialRecord, TrialSpec, Usage
+from merge_runner.results.comparison import PLACES, stored_rows
+from merge_runner.results.database import SCHEMA, in_memory
 from merge_runner.results.rows import rows_of
 from merge_runner.results.store import OF_A_RUN
 from merge_runner.trial import play_trial

@@ -5,9 +5,9 @@ import shutil
 import subprocess
 
 import pytest
-from tests.harness import RECORDING
 
 from merge_runner.results import signing
+from tests.harness import RECORDING
 
 pytestmark = pytest.mark.skipif(shutil.which("ssh-keygen") is None, reason="no ssh-keygen")
 

@@ -8,19 +8,20 @@ import subprocess
 import sys
 from dataclasses import replace
 from datetime import datetime
+from pathlib import Path
 
 import duckdb
 import pytest
 
-from merge_runner.run import flusher
 from merge_runner.config import Scenario
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.drivers.projected_order import ProjectedOrderDriver
 from merge_runner.errors import StoreError, UsageError
-from merge_runner.run.flusher import Flusher
 from merge_runner.records import TrialRecord, TrialSpec
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.results.store import Store, SweepRow, query, results_digest, sweep_facts
+from merge_runner.run import flusher
+from merge_runner.run.flusher import Flusher
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
 SCENARIO = Scenario()
@@ -168,6 +169,16 @@ def test_the_metrics_are_those_computed_by_hand(store, path):
     finished, collided = rows(path, f"select {columns} from trial_metrics order by trial_id")
     assert finished == pytest.approx(tuple(expected.values()))
     assert collided[:3] == (None, None, None), "a collided trial has no gap and no deviation"
+
+
+def test_a_name_means_another_file_in_another_folder(tmp_path, monkeypatch):
+    digests = []
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        Store(Path("merge.duckdb")).begin_sweep(SWEEP, {"h": "{}"}, [])
+        digests.append(results_digest(Path("merge.duckdb")))
+    assert digests[0] == digests[1]
 
 
 def test_a_query_changes_nothing_and_reads_no_file(store, path, tmp_path):

@@ -31,7 +31,7 @@ REFUSALS = {
 PLAN = ", ".join(["0.05"] * N)
 # Where code that is evaluated would leave a trace of itself.
 EXECUTED: list[str] = []
-TRAP = "__import__('test_hostile_replies').EXECUTED.append('reply')"
+TRAP = f"__import__('sys').modules[{__name__!r}].EXECUTED.append('reply')"
 
 
 class Watch:

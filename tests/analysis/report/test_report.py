@@ -52,7 +52,7 @@ def one_figure():
     """Drawing takes most of a report's time, and other tests look at the figures."""
     name = "ablation-matrix"
     with pytest.MonkeyPatch.context() as patch:
-        for place in ("report", "figures"):
+        for place in ("report.writer", "figures.gallery"):
             patch.setattr(f"analysis.{place}.FIGURES", {name: FIGURES[name]})
         yield
 
