@@ -72,7 +72,7 @@ class Config(BaseModel):
 
     @property
     def driver(self) -> str:
-        """Who drives, and where he is asked."""
+        """The drivers with their endpoints."""
         left, _, right = self.model.partition("+")
         return pair_name((left, right or left), self.endpoints)
 

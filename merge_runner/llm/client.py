@@ -152,7 +152,7 @@ class LlmClient:
         return driver_name(self.name, self.endpoint)
 
     def _recorded(self, request: ChatRequest) -> Entry | None:
-        """The recorded call; a damaged one is none, unless nothing can be asked anew."""
+        """The recorded call, None for a damaged one; in a replay that raises CallFailed."""
         try:
             return self.cache.get(request.key)
         except RecordingError as exc:
@@ -453,7 +453,7 @@ class LlmClient:
             return f"the endpoint does not accept the key; {set_key(self.name, self.entry)}"
         if verdict.outcome == "bad_certificate":
             return (
-                "the endpoint's certificate is not to be trusted, and nothing was sent; check the "
+                "the endpoint's certificate cannot be trusted, and nothing was sent; check the "
                 "base URL, or set SSL_CERT_FILE to the certificates of who signed it"
             )
         shutdown = self.entry.shutdown

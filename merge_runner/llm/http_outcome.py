@@ -141,7 +141,7 @@ def _json(body: str) -> object:
 
 def _judge_success(raw: RawReply, payload: object, wire: WireFormat) -> Verdict:
     if not isinstance(payload, dict):
-        return Verdict("retry", "bad_body", Reading("error"), "the body is no JSON object")
+        return Verdict("retry", "bad_body", Reading("error"), "the body is not a JSON object")
     reading = wire.read(payload)
     if reading.outcome == "empty" and not is_answer(payload, wire.members):
         return Verdict("retry", "bad_body", reading, "the body has nothing of an answer")

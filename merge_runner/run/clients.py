@@ -48,7 +48,7 @@ class Terms:
 
 @dataclass(frozen=True, slots=True)
 class Addressed:
-    """Whom a sweep asks: the identities of its endpoints, and the variables of their base URLs.
+    """The endpoints of a sweep: their identities, and the variables of their base URLs.
 
     ``known`` are the models whose endpoint has ever answered in its format, ``passed`` those where
     it has done so in this run. ``strict`` stops at an answer of another model.

@@ -91,7 +91,7 @@ class Plan:
         return any(entry.provider == "emulator" for entry in self.entries.values())
 
     def driver(self, endpoints: Mapping[str, str]) -> str:
-        """Who drives, and where he is asked; see ``pair_name``."""
+        """The drivers with their endpoints; see ``pair_name``."""
         return pair_name(self.sides.values(), endpoints)
 
     def specs(self, endpoints: Mapping[str, str]) -> dict[str, str]:
