@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -10,6 +11,7 @@ import duckdb
 
 from analysis.data.reference_data import citation
 from analysis.data.study import Group, Study, of_group
+from analysis.metrics import JUDGED, METRICS
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.errors import UsageError
@@ -111,8 +113,10 @@ def _published(group: Group, row: Row, column: Column | None) -> Source | None:
 
 def query_of(group: Group, predicate: str) -> str:
     """The query that lists the trials of a group which a value rests on, with their measures."""
-    for column in ("collided", "collided_boxes"):
-        predicate = predicate.replace(f"{column} IS NOT NULL", _decided(group, column))
+    for metric in METRICS.values():
+        judged = metric.value in JUDGED
+        told = _decided(group, metric.column) if judged else metric.counts_in_database
+        predicate = re.sub(rf"\b{metric.counts}", told.replace("\\", r"\\"), predicate)
     variant = f" AND variant = '{group.setting}'" if group.setting else ""
     narrowed = f" AND {group.narrowed}" if group.narrowed else ""
     return (

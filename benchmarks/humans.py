@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from merge_runner.records import SIDES
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from tests.analysis.recordings import drive, write_zip
 
 PAIRS, RUNS = 9, 10
@@ -15,14 +15,14 @@ PAIRS, RUNS = 9, 10
 def write_archive(path: Path) -> None:
     """9 pairs of humans, 10 runs of 11 conditions each."""
     recorded = [
-        drive(condition, yields=yields).csv() for condition in CONDITIONS for yields in SIDES
+        drive(condition, yields=yields).csv() for condition in HUMAN_CONDITIONS for yields in SIDES
     ]
     write_zip(
         path,
         {
             f"data/experiment_{pair}_iter_{number}.csv": recorded[number % len(recorded)]
             for pair in range(1, PAIRS + 1)
-            for number in range(RUNS * len(CONDITIONS))
+            for number in range(RUNS * len(HUMAN_CONDITIONS))
         },
     )
 

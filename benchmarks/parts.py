@@ -13,14 +13,14 @@ from pathlib import Path
 
 import duckdb
 
-from merge_runner.config import load_models
-from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.models import load_models
 from merge_runner.llm.shared_limits import BURST_S
-from merge_runner.records import SIDES, Attempt, ChatReply, Side, Slot, TrialRecord, TrialSpec
-from merge_runner.results.database import SCHEMA
+from merge_runner.records import SIDES, Attempt, ChatReply, Slot, TrialRecord, TrialSpec
+from merge_runner.results.database import schema_sql
 from merge_runner.results.rows import rows_of
 from merge_runner.results.store import Store
 from merge_runner.run.plan import Choice, make_plan
@@ -63,28 +63,25 @@ def records(count: int) -> list[TrialRecord]:
     text = f"Y\n{'I keep my distance. ' * 80}\n```python\n{[-0.4] * 20}\n```"
     payload = {"id": "ID", "choices": [{"message": {"content": text}, "finish_reason": "stop"}]}
 
-    def driver(spec: TrialSpec, side: Side) -> LlmDriver:
-        async def ask(prompt: str, number: int) -> ChatReply:
-            slot = Slot(spec.condition, spec.repetition, side, number, 0)
-            wire = FORMATS[entry.format].request(entry, prompt)
-            request = make_request(
-                provider=entry.provider,
-                endpoint="benchmark",
-                model=entry.id,
-                path=wire.path,
-                headers=wire.headers,
-                body=wire.body,
-                slot=slot,
-            )
-            attempt = Attempt(1, "ok", http_status=200, reply=json.dumps(payload))
-            return ChatReply(text, "ok", request, (attempt,), 0)
-
-        return LlmDriver(ask, "baseline", plan.scenario)
+    async def ask(prompt: str, slot: Slot, _: TrialSpec) -> ChatReply:
+        wire = FORMATS[entry.format].request(entry, prompt)
+        request = make_request(
+            provider=entry.provider,
+            endpoint="benchmark",
+            model=entry.id,
+            path=wire.path,
+            headers=wire.headers,
+            body=wire.body,
+            slot=slot,
+        )
+        attempt = Attempt(1, "ok", http_status=200, reply=json.dumps(payload))
+        return ChatReply(text, "ok", request, (attempt,), 0)
 
     async def play() -> list[TrialRecord]:
+        task, model = plan.scenario, LanguageModel(ask)
         specs = list(plan.trial_specs({"emulator": "benchmark"}))
         return [
-            await play_trial(spec, plan.scenario, {side: driver(spec, side) for side in SIDES})
+            await play_trial(spec, task, {side: model.make(task, spec, side) for side in SIDES})
             for spec in specs[:count]
         ]
 
@@ -96,7 +93,7 @@ def store(folder: Path) -> dict[str, float]:
     played = records(TRIALS)
     ours, bare = Store(folder / "ours.duckdb"), folder / "bare.duckdb"
     with duckdb.connect(bare) as connection:
-        connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        connection.execute(schema_sql())
     ours_s = bare_s = 0.0
     rows = 0
     for number in range(BATCHES):

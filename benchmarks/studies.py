@@ -19,7 +19,7 @@ import numpy as np
 
 from analysis.data.reference_data import PAIRS
 from analysis.human.record import SPEC, SPEC_HASH
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import (
     SIDES,
     Attempt,
@@ -36,16 +36,17 @@ from merge_runner.records import (
     Usage,
 )
 from merge_runner.results.store import Store, SweepRow
-from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 SEED = 1
 BATCH = 500
 MODELS = (*(("o3", v) for v in ("baseline", *(f"A{i}" for i in range(1, 8)))), ("o1", "baseline"))
 GROUPS = len(MODELS) + 1
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 # Humans are recorded at 20 Hz.
-HUMAN_SCENARIO = Scenario(step_s=0.05)
+HUMAN_SCENARIO = ScenarioConfig(step_s=0.05)
 PROMPT = "You drive a car towards a merge point and see another one. " * 30
 HORIZON, HELD = 20, 5
 STARTED = datetime(2026, 11, 21, tzinfo=UTC).replace(tzinfo=None)
@@ -59,7 +60,7 @@ def main() -> None:
     parser.add_argument("--copies", type=int, default=1, help="have every trial so many times")
     arguments = parser.parse_args()
     if arguments.trials is not None:
-        if arguments.trials % (GROUPS * len(CONDITIONS)) or arguments.study.exists():
+        if arguments.trials % (GROUPS * len(HUMAN_CONDITIONS)) or arguments.study.exists():
             parser.error("--trials is a multiple of 110, and STUDY a new file")
         write_study(arguments.study, arguments.trials)
     copy_trials(arguments.study, arguments.copies)
@@ -84,7 +85,7 @@ def copy_trials(path: Path, copies: int) -> None:
 
 def write_study(path: Path, trials: int) -> None:
     """Write so many trials, the same number in every group and condition."""
-    reps = trials // (GROUPS * len(CONDITIONS))
+    reps = trials // (GROUPS * len(HUMAN_CONDITIONS))
     store = Store(path)
     scenario = {"scenario": SCENARIO.model_dump()}
     specs = {
@@ -95,18 +96,14 @@ def write_study(path: Path, trials: int) -> None:
     store.begin_sweep(SweepRow("sweep-1", "made", STARTED, config, None, None, "{}"), specs, [])
     rng = np.random.default_rng(SEED)
     played = (
-        _played(rng, driver, variant, condition, rep)
+        _played(rng, driver, variant, name, rep)
         for rep in range(1, reps + 1)
         for driver, variant in MODELS
-        for condition in CONDITIONS.values()
+        for name in HUMAN_CONDITIONS
     )
     while batch := list(islice(played, BATCH)):
         store.write("sweep-1", batch, patience_s=5)
-    driven = (
-        _human(rng, condition, rep)
-        for rep in range(1, reps + 1)
-        for condition in CONDITIONS.values()
-    )
+    driven = (_human(rng, name, rep) for rep in range(1, reps + 1) for name in HUMAN_CONDITIONS)
     while batch := list(islice(driven, BATCH)):
         store.add_recorded(batch, {SPEC_HASH: SPEC})
 
@@ -137,14 +134,15 @@ def _actions(
 
 
 def _played(
-    rng: np.random.Generator, driver: str, variant: str, condition: Condition, rep: int
+    rng: np.random.Generator, driver: str, variant: str, name: str, rep: int
 ) -> TrialRecord:
     """One trial of a model; now and then a call fails, is retried, or gives no plan."""
-    world = World(SCENARIO, condition)
+    condition = HUMAN_CONDITIONS[name]
+    world = World(SCENARIO, condition, TRACK)
     actions = _actions(rng, condition, 0.02 * MODELS.index((driver, variant)))
     spec = TrialSpec(
-        f"{driver}/{variant}/{condition.name}/rep{rep:02d}",
-        *(f"{driver}-{variant}", "llm", driver, driver, variant, condition.name, rep, 0, 0),
+        f"{driver}/{variant}/{name}/rep{rep:02d}",
+        *(f"{driver}-{variant}", "llm", driver, driver, variant, name, rep, 0, 0),
     )
     decisions: list[DecisionRow] = []
     lost: list[FailedCall] = []
@@ -163,7 +161,7 @@ def _played(
                 plan[:HELD],
                 "M" if plan[0] > 0 else "Y",
                 f"I am at step {start}.",
-                prompt=f"{PROMPT}Step {start}, rep {rep}, {side}, {condition.name}.",
+                prompt=f"{PROMPT}Step {start}, rep {rep}, {side}, {name}.",
                 reply=_reply(spec, side, start // HELD, outcomes),
             )
             if fate < 0.003:
@@ -206,16 +204,17 @@ def _reply(spec: TrialSpec, side: Side, number: int, outcomes: tuple[str, ...]) 
     return ChatReply("", outcomes[-1], request, attempts, earlier=0)
 
 
-def _human(rng: np.random.Generator, condition: Condition, rep: int) -> TrialRecord:
+def _human(rng: np.random.Generator, name: str, rep: int) -> TrialRecord:
     """One trial of a pair, at 20 Hz and without decisions."""
-    world = World(HUMAN_SCENARIO, condition)
+    condition = HUMAN_CONDITIONS[name]
+    world = World(HUMAN_SCENARIO, condition, TRACK)
     actions = _actions(rng, condition, 0.05)
     pair = list(PAIRS.values())[rep % len(PAIRS)]
     while world.status is None:
         world.advance({side: actions[side][world.step // 4] for side in SIDES})
     spec = TrialSpec(
-        f"human/{pair}/{condition.name}/iter{rep:03d}",
-        *(SPEC_HASH, "human", "human", "human", None, condition.name, rep, 0, 0),
+        f"human/{pair}/{name}/iter{rep:03d}",
+        *(SPEC_HASH, "human", "human", "human", None, name, rep, 0, 0),
         pair=pair,
     )
     states: tuple[StateRow, ...] = world.states()

@@ -347,8 +347,10 @@ def _agree(what: str, *, yes: bool) -> None:
 
 @app.command()
 def models() -> None:
-    """List the registry: provider, id, key, price, known shutdown date."""
-    from merge_runner.config import Price, key_status, load_models
+    """List who can drive: the models with provider, id, key and price, and the programs."""
+    from merge_runner.config import Price, key_status
+    from merge_runner.drivers.registry import PROGRAMS
+    from merge_runner.llm.models import load_models
     from merge_runner.llm.prices import pricing
     from merge_runner.records import Usage
     from merge_runner.results.query_output import write_table
@@ -375,6 +377,9 @@ def models() -> None:
                 entry.note,
             )
         )
+    for name, program in PROGRAMS.items():
+        rate = f" ({program.rate_hz:g} times a second)" if program.rate_hz is not None else ""
+        rows.append((name, "program", "", "not needed", "0", "0", "", "", program.meaning + rate))
     headings = ["name", "provider", "id", "key", "USD/M in", "USD/M out", "prices", "shutdown"]
     write_table([*headings, "note"], rows, sys.stdout)
 

@@ -6,6 +6,7 @@ import ipaddress
 import json
 import os
 import re
+import tempfile
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -21,18 +22,23 @@ from pydantic import (
     ConfigDict,
     Field,
     JsonValue,
+    SerializerFunctionWrapHandler,
     ValidationError,
+    model_serializer,
     model_validator,
 )
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
+from merge_runner.records import Side
+from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
 LONGEST_URL, LONGEST_HOST = 2000, 253
 _LABEL = re.compile(r"[a-z0-9_-]{1,63}", re.I)
+USUAL_SCENARIO = "merge"
 MOST_STEPS = MOST_REPETITIONS = 100_000
 
 
@@ -49,7 +55,6 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(gt=0, strict=True)]
 Json = Annotated[JsonValue, AfterValidator(_finite)]
-Format = Literal["openai-chat", "openai-responses", "gemini", "anthropic"]
 CollisionRule = Literal["euclid2d", "rectangle", "shared_lane"]
 Resistance = Literal["none", "human"]
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -61,9 +66,21 @@ class Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Scenario(Frozen):
+def whole_steps(name: str, seconds: float, step_s: float) -> int:
+    """How many steps a time takes; raises ValueError where that is no whole number from 1."""
+    steps = seconds / step_s
+    if steps > MOST_STEPS:
+        raise ValueError(f"{name} = {seconds:g} s is more than {MOST_STEPS} steps")
+    if abs(steps - round(steps)) > 1e-9 or round(steps) < 1:
+        raise ValueError(f"{name} = {seconds:g} s is no whole number of {step_s} s")
+    return round(steps)
+
+
+class ScenarioConfig(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
+    ``name``: a registered scenario; where it is ``merge`` it is not written, as it was not before
+    there were others, so that the hashes of specs stay.
     ``collision_rule``: ``euclid2d`` (centres closer than a vehicle length), ``rectangle`` (the
     vehicles' oriented boxes overlap, as in the human experiment) or ``shared_lane``
     (|s_L - s_R| below a vehicle length once either has passed the merge point).
@@ -75,10 +92,16 @@ class Scenario(Frozen):
     ``empty``. ``fallback``: after an invalid reply the last valid plan ``continue``s where it
     was left, or ``restart``s at its first action. ``straight_after``: the prompt says "straight"
     once the ``own`` vehicle, or once ``both``, have passed the merge point.
+    ``step_s`` is the world's step. ``plan_step_s`` is how long an action of a language model's plan
+    lasts and how far apart the samples of its histories are, ``step_s`` where it is not given.
+    ``prompt_rate_hz`` is a language model's, and that of a program without a rate of its own.
     """
 
+    name: str = USUAL_SCENARIO
     horizon_s: Positive = 4.0
     step_s: Positive = 0.2
+    # Left out where it is not given, so that specs from before it keep their hashes.
+    plan_step_s: Positive | None = Field(default=None, exclude_if=lambda value: value is None)
     prompt_rate_hz: Positive = 1.0
     memory_s: Positive = 2.0
     max_acceleration_mps2: Positive = 2.5
@@ -93,18 +116,28 @@ class Scenario(Frozen):
     straight_after: Literal["own", "both"] = "own"
 
     @cached_property
+    def action_s(self) -> float:
+        """How long an action of a language model's plan lasts."""
+        return self.step_s if self.plan_step_s is None else self.plan_step_s
+
+    @cached_property
+    def action_steps(self) -> int:
+        """How many steps of the world an action of a language model's plan lasts."""
+        return round(self.action_s / self.step_s)
+
+    @cached_property
     def plan_actions(self) -> int:
-        """N, the number of actions of a plan."""
-        return round(self.horizon_s / self.step_s)
+        """N, the number of actions of a language model's plan."""
+        return round(self.horizon_s / self.action_s)
 
     @cached_property
     def executed_actions(self) -> int:
         """How many actions of a plan are driven before the next prompt."""
-        return round(1 / (self.prompt_rate_hz * self.step_s))
+        return round(1 / (self.prompt_rate_hz * self.action_s))
 
     @cached_property
     def memory_samples(self) -> int:
-        """The number of samples in each history."""
+        """The number of the world's samples in each history."""
         return round(self.memory_s / self.step_s)
 
     @cached_property
@@ -112,19 +145,23 @@ class Scenario(Frozen):
         """The number of steps after which a trial is over."""
         return round(self.timeout_s / self.step_s)
 
+    @model_serializer(mode="wrap")
+    def _without_usual_name(self, write: SerializerFunctionWrapHandler) -> dict[str, JsonValue]:
+        told: dict[str, JsonValue] = write(self)
+        if self.name == USUAL_SCENARIO:
+            del told["name"]
+        return told
+
     @model_validator(mode="after")
-    def _whole_steps(self) -> Scenario:
-        for name, seconds in (
-            ("horizon_s", self.horizon_s),
-            ("memory_s", self.memory_s),
-            ("timeout_s", self.timeout_s),
-            ("1 / prompt_rate_hz", 1 / self.prompt_rate_hz),
+    def _whole_steps(self) -> ScenarioConfig:
+        for name, seconds, step_s in (
+            ("plan_step_s", self.action_s, self.step_s),
+            ("horizon_s", self.horizon_s, self.action_s),
+            ("memory_s", self.memory_s, self.action_s),
+            ("timeout_s", self.timeout_s, self.step_s),
+            ("1 / prompt_rate_hz", 1 / self.prompt_rate_hz, self.action_s),
         ):
-            steps = seconds / self.step_s
-            if steps > MOST_STEPS:
-                raise ValueError(f"{name} = {seconds:g} s is more than {MOST_STEPS} steps")
-            if abs(steps - round(steps)) > 1e-9 or round(steps) < 1:
-                raise ValueError(f"{name} = {seconds:g} s is no whole number of {self.step_s} s")
+            whole_steps(name, seconds, step_s)
         if self.executed_actions > self.plan_actions:
             raise ValueError("the horizon is shorter than the time between two prompts")
         return self
@@ -142,17 +179,17 @@ class Price(Frozen):
 class ModelEntry(Frozen):
     """One model of ``experiments/models.toml``.
 
-    ``id`` is what is sent; a served model that is neither it nor one of ``aliases`` is reported
-    as a mismatch. ``parameters`` go into the request as they are; what is not listed is not
-    sent, so that the provider's default applies; ``applied_defaults`` puts on record which.
-    ``price`` is ``free``, ``genai-prices`` (the
-    table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
-    minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of
-    ``--dry-run`` alone. A reply longer than ``max_reply_mb`` (unpacked) is refused.
+    ``provider`` is one of PROVIDERS, ``format`` one of the wire formats (llm/formats). ``id`` is
+    what is sent; a served model that is neither it nor one of ``aliases`` is reported as a
+    mismatch. ``parameters`` go into the request as they are; what is not listed is not sent, so
+    that the provider's default applies; ``applied_defaults`` puts on record which. ``price`` is
+    ``free``, ``genai-prices`` (the table of that package) or explicit figures. ``rpm`` and ``tpm``
+    are requests and tokens a minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the
+    estimate of ``--dry-run`` alone. A reply longer than ``max_reply_mb`` (unpacked) is refused.
     """
 
     provider: str
-    format: Format
+    format: str
     id: str
     aliases: tuple[str, ...] = ()
     parameters: dict[str, Json] = {}
@@ -181,41 +218,71 @@ class SweepFile(Frozen):
     description: str = ""
     repetitions: dict[str, Annotated[Count, Field(le=MOST_REPETITIONS)]]
     conditions: tuple[str, ...] | None = None
-    scenario: Scenario = Scenario()
+    scenario: ScenarioConfig = ScenarioConfig()
 
 
 @dataclass(frozen=True, slots=True)
 class Provider:
-    """Where a provider is reached and which variables configure it."""
+    """Where a provider is reached, which variables configure it, and how it takes a key.
+
+    ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are those that the
+    provider documents for all of its errors, so that what lacks one may be a gateway's.
+    """
 
     base_url: str
     base_url_env: str | None = None
     key_envs: tuple[str, ...] = ()
-    auth: Literal["bearer", "api-key", "x-goog-api-key", "x-api-key"] = "bearer"
+    auth: str = "bearer"
     key_needed: bool = True
+    error_members: frozenset[str] = frozenset()
 
 
-PROVIDERS: dict[str, Provider] = {
-    "openai": Provider("https://api.openai.com/v1", "OPENAI_BASE_URL", ("OPENAI_API_KEY",)),
-    # The official SDK prefers GOOGLE_API_KEY where both are set.
-    "gemini": Provider(
+PROVIDERS: Registry[Provider] = Registry("provider")
+PROVIDERS.register(
+    "openai",
+    Provider(
+        "https://api.openai.com/v1",
+        "OPENAI_BASE_URL",
+        ("OPENAI_API_KEY",),
+        error_members=frozenset({"message", "type", "code"}),
+    ),
+)
+PROVIDERS.register(
+    "gemini",
+    Provider(
         "https://generativelanguage.googleapis.com",
         "GOOGLE_GEMINI_BASE_URL",
+        # The official SDK prefers GOOGLE_API_KEY where both are set.
         ("GOOGLE_API_KEY", "GEMINI_API_KEY"),
         auth="x-goog-api-key",
+        error_members=frozenset({"message", "code", "status"}),
     ),
-    "anthropic": Provider(
+)
+PROVIDERS.register(
+    "anthropic",
+    Provider(
         "https://api.anthropic.com",
         "ANTHROPIC_BASE_URL",
         ("ANTHROPIC_API_KEY",),
         auth="x-api-key",
+        error_members=frozenset({"message", "type"}),
     ),
-    "openrouter": Provider("https://openrouter.ai/api/v1", None, ("OPENROUTER_API_KEY",)),
-    "local": Provider(
-        "http://localhost:8000/v1", "LOCAL_BASE_URL", ("LOCAL_API_KEY",), key_needed=False
+)
+PROVIDERS.register(
+    "openrouter",
+    Provider(
+        "https://openrouter.ai/api/v1",
+        key_envs=("OPENROUTER_API_KEY",),
+        error_members=frozenset({"message", "code"}),
     ),
-    "emulator": Provider("http://127.0.0.1/v1", "EMULATOR_BASE_URL", key_needed=False),
-}
+)
+PROVIDERS.register(
+    "local",
+    Provider("http://localhost:8000/v1", "LOCAL_BASE_URL", ("LOCAL_API_KEY",), key_needed=False),
+)
+PROVIDERS.register(
+    "emulator", Provider("http://127.0.0.1/v1", "EMULATOR_BASE_URL", key_needed=False)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +311,7 @@ def resolve_endpoint(
     Raises UsageError where a key is needed and none is set.
     """
     env = os.environ if environment is None else environment
-    provider = _provider(name, entry)
+    provider = PROVIDERS.require(entry.provider)
     key_envs = (entry.key_env,) if entry.key_env else provider.key_envs
     key = next((env[variable] for variable in key_envs if env.get(variable)), None)
     if key is None and provider.key_needed:
@@ -259,18 +326,16 @@ def resolve_endpoint(
         )
     return Endpoint(
         provider=entry.provider,
-        identity=endpoint_identity(name, entry, env),
+        identity=endpoint_identity(entry, env),
         base_url=_base_url(entry, provider, env),
         auth_headers=_auth_headers(entry.auth or provider.auth, key),
     )
 
 
-def endpoint_identity(
-    name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None
-) -> str:
+def endpoint_identity(entry: ModelEntry, environment: Mapping[str, str] | None = None) -> str:
     """What stands for the endpoint in cache keys; see Endpoint."""
     env = os.environ if environment is None else environment
-    provider = _provider(name, entry)
+    provider = PROVIDERS.require(entry.provider)
     base_url = _base_url(entry, provider, env)
     if entry.provider == "emulator":
         return "emulator"
@@ -286,6 +351,12 @@ def driver_name(model: str, endpoint: str | None) -> str:
     return f"{model} at {host[1]}" if host else model
 
 
+def both_sides(model: str) -> dict[Side, str]:
+    """Who drives on each side, by what ``--model`` says: one name, or two that + joins."""
+    left, _, right = model.partition("+")
+    return {"left": left, "right": right or left}
+
+
 def pair_name(sides: Iterable[str], endpoints: Mapping[str, str]) -> str:
     """Who drives left and right, as the view ``trial_drivers`` names it but for the sample set."""
     left, right = (driver_name(model, endpoints.get(model)) for model in sides)
@@ -296,7 +367,7 @@ def key_status(
     name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None
 ) -> Literal["set", "missing", "not needed"]:
     """Whether the environment holds the key that a live run of the model needs."""
-    if not _provider(name, entry).key_needed:
+    if not PROVIDERS.require(entry.provider).key_needed:
         return "not needed"
     try:
         resolve_endpoint(name, entry, environment)
@@ -378,6 +449,16 @@ def _check_proxy(variable: str, value: str) -> None:
         raise UsageError(f"{variable} is no URL of a proxy: set it to http://HOST:PORT or unset it")
 
 
+def runtime_folder(environment: Mapping[str, str] | None = None) -> Path:
+    """Where a user's processes share what a session needs: XDG_RUNTIME_DIR, else among temporaries.
+
+    Nothing there outlives the machine's next start.
+    """
+    env = os.environ if environment is None else environment
+    named = Path(env.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
+    return named if named.is_dir() else Path(tempfile.gettempdir())
+
+
 def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | None:
     """The URL of an emulator that already runs (EMULATOR_BASE_URL), or None."""
     env = os.environ if environment is None else environment
@@ -386,28 +467,13 @@ def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | 
 
 def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
     """The variables of this environment that say where the entries' providers are reached."""
-    variables = {_provider(name, entry).base_url_env for name, entry in entries.items()}
+    variables = {PROVIDERS.require(entry.provider).base_url_env for entry in entries.values()}
     return {v: os.environ[v] for v in variables if v is not None and os.environ.get(v)}
 
 
 def with_base_urls(urls: Mapping[str, str]) -> dict[str, str]:
     """The environment of this process, with the base URLs that another process has found."""
     return {**os.environ, **urls}
-
-
-def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
-    """The registry, name to entry; raises UsageError."""
-    path = path or find_experiments() / "models.toml"
-    entries = {
-        name: _validate(ModelEntry, table, f"{path}: [{name}]")
-        for name, table in read_toml(path).items()
-    }
-    for name, entry in entries.items():
-        try:
-            endpoint_identity(name, entry, {})
-        except UsageError as exc:
-            raise UsageError(one_line(f"{path}: [{name}]: {exc}")) from exc
-    return entries
 
 
 def load_sweep(name: str) -> tuple[str, SweepFile]:
@@ -419,7 +485,7 @@ def load_sweep(name: str) -> tuple[str, SweepFile]:
         known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "models")
         if name not in known:
             raise UsageError(f"there is no sweep {name!r}; valid: {', '.join(known)}, or a path")
-    return path.stem, _validate(SweepFile, read_toml(path), str(path))
+    return path.stem, validated(SweepFile, read_toml(path), str(path))
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -434,18 +500,18 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path} is no TOML file: {exc}") from exc
 
 
+def validated(model: type[ModelT], value: object, where: str) -> ModelT:
+    """A value as a configuration object; raises UsageError, which says ``where`` it stands."""
+    try:
+        return model.model_validate(value)
+    except ValidationError as exc:
+        raise UsageError(one_line(f"{where}: {'; '.join(_explain(exc, model))}")) from exc
+
+
 def find_experiments() -> Path:
     """The experiments folder: of the working directory, else of the project."""
     here = Path("experiments")
     return here if here.is_dir() else PROJECT / "experiments"
-
-
-def _provider(name: str, entry: ModelEntry) -> Provider:
-    if entry.provider not in PROVIDERS:
-        raise UsageError(
-            f"model {name}: unknown provider {entry.provider!r}; valid: {', '.join(PROVIDERS)}"
-        )
-    return PROVIDERS[entry.provider]
 
 
 def _base_url(entry: ModelEntry, provider: Provider, env: Mapping[str, str]) -> str:
@@ -459,14 +525,7 @@ def _auth_headers(scheme: str, key: str | None) -> dict[str, str]:
     return {"authorization": f"Bearer {key}"} if scheme == "bearer" else {scheme: key}
 
 
-def _validate(model: type[ModelT], value: object, where: str) -> ModelT:
-    try:
-        return model.model_validate(value)
-    except ValidationError as exc:
-        raise UsageError(one_line(f"{where}: {'; '.join(_explain(exc, model))}")) from exc
-
-
-NESTED: dict[str, type[BaseModel]] = {"scenario": Scenario, "price": Price}
+NESTED: dict[str, type[BaseModel]] = {"scenario": ScenarioConfig, "price": Price}
 
 
 def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:

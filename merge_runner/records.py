@@ -13,6 +13,8 @@ Status = Literal["finished", "collided", "timeout", "failed"]
 # A prompt variant and a condition.
 Cell = tuple[str, str]
 
+# The outcomes of an attempt that are answers.
+ANSWERS = ("ok", "refusal", "truncated", "empty")
 SIDES: tuple[Side, Side] = ("left", "right")
 
 # Tell the slot and the attempt to our own emulator, and to nobody else.
@@ -101,6 +103,11 @@ class Attempt:
     error: str | None = None
     cost_usd: float | None = None
     scripted: bool = False
+
+    @property
+    def answered(self) -> bool:
+        """Whether a body of status 200 was read as an answer, which is a JSON object."""
+        return self.http_status == 200 and self.outcome in ANSWERS
 
 
 @dataclass(frozen=True, slots=True)

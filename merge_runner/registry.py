@@ -10,9 +10,12 @@ imported before the first look into any table; what it registers is then as good
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from merge_runner.errors import UsageError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 GROUP = "merge_runner"
 T = TypeVar("T")
@@ -59,14 +62,19 @@ class Registry(Mapping[str, T]):
 _loaded: set[str] = set()
 
 
+def plugins() -> list[EntryPoint]:
+    """What installed packages name, in the order in which it is imported."""
+    from importlib.metadata import entry_points
+
+    return sorted(entry_points(group=GROUP), key=lambda point: (point.value, point.name))
+
+
 def load_plugins() -> None:
     """Import what installed packages register, once; raises UsageError where that fails."""
     if GROUP in _loaded:
         return
-    from importlib.metadata import entry_points
-
     _loaded.add(GROUP)  # before, since a plug-in may look into a table while it is imported
-    for point in sorted(entry_points(group=GROUP), key=lambda point: (point.value, point.name)):
+    for point in plugins():
         try:
             point.load()
         except (ImportError, AttributeError, SyntaxError) as exc:

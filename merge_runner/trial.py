@@ -1,10 +1,12 @@
-"""One trial: both drivers observe the same frozen state, decide together, and are driven."""
+"""One trial: whoever is due observes the same frozen state and decides, and both are driven."""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
 from merge_runner.errors import CallFailed
 from merge_runner.records import (
@@ -17,29 +19,29 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
+from merge_runner.scenarios.base import World
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.world import World
+from merge_runner.scenarios.registry import SCENARIOS
 
 
 async def play_trial(
-    spec: TrialSpec, scenario: Scenario, drivers: dict[Side, Driver]
+    spec: TrialSpec, scenario: ScenarioConfig, drivers: Mapping[Side, Driver]
 ) -> TrialRecord:
     """Play a trial to its end, or until a call fails."""
-    world = World(scenario, CONDITIONS[spec.condition])
+    world = SCENARIOS[scenario.name].world(scenario, CONDITIONS[spec.condition])
+    seats = {side: _Seated(drivers[side]) for side in SIDES}
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}
-    number = 0
-    while world.status is None and not failures:
-        asked = [side for side in SIDES if world.in_control(side)]
-        answers = await _decide(world, {side: drivers[side] for side in asked}, number)
+    while world.status is None:
+        answers = await _decide(world, seats)
         failures = {s: a for s, a in answers.items() if isinstance(a, CallFailed)}
-        decided = {s: a for s, a in answers.items() if isinstance(a, Decision)}
-        decisions += [
-            DecisionRow(number, world.time_s, side, decision) for side, decision in decided.items()
-        ]
-        if not failures:
-            _drive(world, decided, scenario.executed_actions)
-        number += 1
+        for side, answer in answers.items():
+            if isinstance(answer, Decision):
+                number = seats[side].take(answer, world.step)
+                decisions.append(DecisionRow(number, world.time_s, side, answer))
+        if failures:
+            break
+        world.advance({side: seats[side].action(world.step) for side in SIDES})
     return TrialRecord(
         spec=spec,
         status=world.status or "failed",
@@ -49,33 +51,58 @@ async def play_trial(
         states=world.states(),
         decisions=tuple(decisions),
         failed_calls=tuple(
-            FailedCall(number - 1, side, exc.request, exc.attempts, exc.earlier)
+            FailedCall(seats[side].number(world.step), side, exc.request, exc.attempts, exc.earlier)
             for side, exc in failures.items()
         ),
     )
 
 
-async def _decide(
-    world: World, drivers: dict[Side, Driver], number: int
-) -> dict[Side, Decision | CallFailed]:
-    """Ask all drivers at once; where one call fails, the other's answer is still awaited."""
+@dataclass(slots=True)
+class _Seated:
+    """A driver in its trial: what it decided last, and at which step of the world."""
 
-    async def answer(driver: Driver, observation: Observation) -> Decision | CallFailed:
+    driver: Driver
+    decision: Decision | None = None
+    decided_at: int = 0
+
+    def is_due(self, step: int) -> bool:
+        """Whether it decides at a step: its instants count from the start of the trial."""
+        return step % self.driver.seat.pace.interval_steps == 0
+
+    def number(self, step: int) -> int:
+        """The number of its decision at a step, or of the last one before."""
+        return step // self.driver.seat.pace.interval_steps
+
+    def take(self, decision: Decision, step: int) -> int:
+        """Drive by a decision from now on; returns its number."""
+        self.decision, self.decided_at = decision, step
+        return self.number(step)
+
+    def action(self, step: int) -> float | None:
+        """What is driven in a step; None: nothing is decided yet, and the vehicle cruises."""
+        if self.decision is None:
+            return None
+        driven = (step - self.decided_at) // self.driver.seat.pace.action_steps
+        return self.decision.applied[driven]
+
+
+async def _decide(world: World, seats: Mapping[Side, _Seated]) -> dict[Side, Decision | CallFailed]:
+    """Ask at once all who are due; where one call fails, the other's answer is still awaited."""
+
+    async def answer(seated: _Seated, observation: Observation) -> Decision | CallFailed:
         try:
-            return await driver.decide(observation, number)
+            return await seated.driver.decide(observation, seated.number(world.step))
         except CallFailed as failure:
             return failure
 
+    asked = {
+        side: seated
+        for side, seated in seats.items()
+        if seated.is_due(world.step) and world.in_control(side)
+    }
+    if not asked:
+        return {}
     answers = await asyncio.gather(
-        *(answer(driver, world.observe(side)) for side, driver in drivers.items())
+        *(answer(seated, world.observe(side)) for side, seated in asked.items())
     )
-    return dict(zip(drivers, answers, strict=True))
-
-
-def _drive(world: World, decided: dict[Side, Decision], actions: int) -> None:
-    for index in range(actions):
-        world.advance(
-            {side: decided[side].applied[index] if side in decided else None for side in SIDES}
-        )
-        if world.status is not None:
-            return
+    return dict(zip(asked, answers, strict=True))

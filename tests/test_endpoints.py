@@ -9,7 +9,6 @@ from merge_runner.config import (
     Price,
     endpoint_identity,
     key_status,
-    load_models,
     load_sweep,
     normalised_url,
     resolve_endpoint,
@@ -17,6 +16,7 @@ from merge_runner.config import (
 )
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.models import load_models
 
 REGISTRY = PROJECT / "experiments/models.toml"
 KEYS = {f"{name}_API_KEY": "k" for name in ("OPENAI", "GEMINI", "ANTHROPIC", "OPENROUTER")}
@@ -56,7 +56,7 @@ def entry(provider="openai", **changes):
 )
 def test_the_identity_of_an_endpoint(provider, base_url, env, identity):
     model = entry(provider, base_url=base_url)
-    assert endpoint_identity("m", model, env) == identity
+    assert endpoint_identity(model, env) == identity
     assert resolve_endpoint("m", model, {**KEYS, **env}).identity == identity
 
 
@@ -195,7 +195,7 @@ def test_a_missing_key_is_an_error_that_names_its_variable(model, env, named):
 
 
 def test_the_identity_needs_no_key():
-    assert endpoint_identity("m", entry("openai"), {}) == "openai"
+    assert endpoint_identity(entry("openai"), {}) == "openai"
 
 
 def test_a_key_is_not_shown():

@@ -1,22 +1,39 @@
 """The scenario's numbers: what follows from them, and what is refused."""
 
+import hashlib
+
 import pytest
 from pydantic import ValidationError
 
-from merge_runner.config import Scenario, load_sweep
+from merge_runner.config import ScenarioConfig, load_sweep
 from merge_runner.errors import UsageError
+from merge_runner.llm.keys import canonical_json
+from merge_runner.scenarios.registry import task_of
 
 
 def test_the_default_plan_has_20_actions_of_which_5_are_executed():
-    scenario = Scenario()
+    scenario = ScenarioConfig()
     assert (scenario.plan_actions, scenario.executed_actions) == (20, 5)
     assert (scenario.memory_samples, scenario.timeout_steps) == (10, 150)
 
 
 def test_the_counts_follow_from_the_times():
-    scenario = Scenario(horizon_s=3, step_s=0.1, prompt_rate_hz=2, memory_s=1.5, timeout_s=12)
+    scenario = ScenarioConfig(horizon_s=3, step_s=0.1, prompt_rate_hz=2, memory_s=1.5, timeout_s=12)
     assert (scenario.plan_actions, scenario.executed_actions) == (30, 5)
     assert (scenario.memory_samples, scenario.timeout_steps) == (15, 120)
+
+
+def test_a_plan_may_have_steps_of_its_own():
+    scenario = ScenarioConfig(step_s=0.05, plan_step_s=0.2)
+    assert (scenario.plan_actions, scenario.executed_actions, scenario.action_steps) == (20, 5, 4)
+    assert (scenario.memory_samples, scenario.timeout_steps) == (40, 600)
+    with pytest.raises(ValidationError, match=r"plan_step_s = 0\.3 s is no whole number"):
+        ScenarioConfig(plan_step_s=0.3)
+
+
+def test_a_knob_that_is_not_turned_stands_in_no_spec():
+    assert "plan_step_s" not in ScenarioConfig().model_dump()
+    assert ScenarioConfig(plan_step_s=1.0).model_dump()["plan_step_s"] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -33,27 +50,28 @@ def test_the_counts_follow_from_the_times():
 )
 def test_a_time_that_is_no_whole_number_of_steps_is_refused(field, seconds):
     with pytest.raises(ValidationError, match="no whole number"):
-        Scenario(**{field: seconds})
+        ScenarioConfig(**{field: seconds})
 
 
 def test_a_time_is_whole_also_where_binary_fractions_are_not():
     """0.6 / 0.2 is 2.9999999999999996 in binary."""
-    assert Scenario(memory_s=0.6).memory_samples == 3
+    assert ScenarioConfig(memory_s=0.6).memory_samples == 3
 
 
 def test_a_plan_must_last_until_the_next_prompt():
-    assert Scenario(horizon_s=1).plan_actions == 5
+    assert ScenarioConfig(horizon_s=1).plan_actions == 5
     with pytest.raises(ValidationError, match="horizon"):
-        Scenario(horizon_s=0.8)
+        ScenarioConfig(horizon_s=0.8)
 
 
 @pytest.mark.parametrize("value", [0, -1, float("nan"), float("inf")])
 @pytest.mark.parametrize(
-    "field", [name for name, info in Scenario.model_fields.items() if info.annotation is float]
+    "field",
+    [name for name, info in ScenarioConfig.model_fields.items() if info.annotation is float],
 )
 def test_every_quantity_is_positive_and_finite(field, value):
     with pytest.raises(ValidationError):
-        Scenario(**{field: value})
+        ScenarioConfig(**{field: value})
 
 
 @pytest.mark.parametrize(
@@ -69,12 +87,12 @@ def test_every_quantity_is_positive_and_finite(field, value):
 )
 def test_a_switch_takes_only_its_named_settings(field):
     with pytest.raises(ValidationError):
-        Scenario(**{field: "sometimes"})
+        ScenarioConfig(**{field: "sometimes"})
 
 
 def test_an_unknown_key_is_refused():
     with pytest.raises(ValidationError, match="horizon"):
-        Scenario(horizon=4)
+        ScenarioConfig(horizon=4)
 
 
 def test_an_unknown_key_in_a_sweep_file_is_named_with_the_valid_ones(tmp_path):
@@ -83,9 +101,17 @@ def test_an_unknown_key_in_a_sweep_file_is_named_with_the_valid_ones(tmp_path):
     with pytest.raises(UsageError) as caught:
         load_sweep(str(file))
     assert "'scenario.horizon'" in str(caught.value)
-    assert all(field in str(caught.value) for field in Scenario.model_fields)
+    assert all(field in str(caught.value) for field in ScenarioConfig.model_fields)
 
 
 def test_a_scenario_does_not_change():
     with pytest.raises(ValidationError):
-        Scenario().step_s = 0.1
+        ScenarioConfig().step_s = 0.1
+
+
+def test_the_name_of_the_usual_scenario_is_not_written_so_that_spec_hashes_stay():
+    written = canonical_json(task_of(ScenarioConfig()))
+    assert hashlib.sha256(written.encode()).hexdigest() == (
+        "865c7980b733b5123b1dde61f3709f6d50229d6687c9c6b203edd89306972d30"
+    )
+    assert ScenarioConfig(name="another").model_dump()["name"] == "another"

@@ -1,17 +1,18 @@
 """The loop of a trial: observe, decide together, drive, and keep what there is when it ends."""
 
 import asyncio
+from dataclasses import replace
 
 import pytest
 
-from merge_runner.config import Scenario
-from merge_runner.drivers.base import held
-from merge_runner.drivers.constant import ConstantDriver
-from merge_runner.errors import CallFailed
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.base import Seat, take_seat
+from merge_runner.drivers.pace import model_pace, program_pace
+from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.errors import CallFailed, UsageError
 from merge_runner.records import SIDES, Attempt, ChatRequest, Decision, Slot, TrialSpec
 from merge_runner.trial import play_trial
 
-PLAN_ACTIONS = 20
 EXECUTED = 5
 ATTEMPTS = (Attempt(1, "http_500"), Attempt(2, "timeout"))
 REQUEST = ChatRequest(
@@ -42,8 +43,19 @@ def spec_of(condition):
 
 
 async def play(left, right, condition="N_0_0", **scenario):
-    drivers = {"left": left, "right": right}
-    return await play_trial(spec_of(condition), Scenario(**scenario), drivers)
+    """A trial; a driver with a ``rate_hz`` keeps it."""
+    drivers, task = {"left": left, "right": right}, ScenarioConfig(**scenario)
+    for side, driver in drivers.items():
+        rate_hz = getattr(driver, "rate_hz", None)
+        pace = program_pace(task, rate_hz) if rate_hz else model_pace(task)
+        driver.seat = Seat(task, side, pace, 0)
+    return await play_trial(spec_of(condition), task, drivers)
+
+
+async def play_constant(condition="N_0_0", **scenario):
+    task, spec = ScenarioConfig(**scenario), spec_of(condition)
+    drivers = {side: PROGRAMS["constant"].make(task, spec, side) for side in SIDES}
+    return await play_trial(spec, task, drivers)
 
 
 class Holding:
@@ -56,7 +68,7 @@ class Holding:
     async def decide(self, observation, number):
         assert number not in self.seen
         self.seen[number] = observation
-        return held(self.action, PLAN_ACTIONS, EXECUTED)
+        return self.seat.held(self.action)
 
 
 class Meeting(Holding):
@@ -137,9 +149,7 @@ async def test_decisions_are_made_once_a_second_from_time_0_on():
 
 
 async def test_the_prompt_rate_decides_when_the_drivers_are_asked():
-    scenario = Scenario(prompt_rate_hz=2.5)
-    drivers = {side: ConstantDriver(scenario) for side in SIDES}
-    trial = await play_trial(spec_of("N_0_0"), scenario, drivers)
+    trial = await play_constant(prompt_rate_hz=2.5)
     times = [row.time_s for row in trial.decisions if row.side == "left"]
     assert times[:4] == [0.0, 0.4, 0.8, 1.2]
 
@@ -158,8 +168,7 @@ async def test_the_actions_of_a_decision_are_driven_in_their_order():
 
 
 async def test_a_trial_ends_within_a_second_when_the_cars_collide():
-    scenario = Scenario()
-    trial = await play(ConstantDriver(scenario), ConstantDriver(scenario))
+    trial = await play_constant()
     # Level cars at 10 m/s are closer than 4.5 m from 82 m on: after 3.2 s, at 3.4 s in steps.
     assert (trial.status, trial.end_time_s, trial.merged_first) == ("collided", 3.4, None)
     assert trial.states[-1].step == 17
@@ -237,3 +246,100 @@ async def test_under_both_exits_both_are_asked_from_the_beginning():
     await play(left, right, "L_4_-8")
     assert list(left.seen) == list(right.seen)
     assert 0 in right.seen
+
+
+class Fast(Holding):
+    """Decides twenty times a second."""
+
+    rate_hz = 20
+
+
+class Brisk(Holding):
+    """Decides five times a second."""
+
+    rate_hz = 5
+
+
+FINE = {"step_s": 0.05, "plan_step_s": 0.2}
+
+
+def decided(trial, side):
+    return [row for row in trial.decisions if row.side == side]
+
+
+async def test_each_driver_decides_at_its_own_rate_and_counts_its_own_decisions():
+    trial = await play(Fast(-0.1), Brisk(-0.3), **FINE)
+    left, right = decided(trial, "left"), decided(trial, "right")
+    assert [row.number for row in left] == list(range(len(left)))
+    assert [row.time_s for row in left] == pytest.approx([0.05 * n for n in range(len(left))])
+    assert [row.time_s for row in right] == pytest.approx([0.2 * n for n in range(len(right))])
+    assert len(left) > 3 * len(right) > 100
+    assert {len(row.decision.applied) for row in left} == {1}
+    assert {len(row.decision.applied) for row in right} == {4}
+
+
+async def test_a_plan_in_steps_of_its_own_drives_the_same_way_in_a_finer_world():
+    actions = (0.1, -0.2, 0.3, -0.4, 0.5)
+
+    class Wavering(Holding):
+        async def decide(self, observation, number):
+            return Decision(plan=actions * 4, applied=actions)
+
+    coarse = await play(Wavering(0), Holding(-1.0))
+    fine = await play(Wavering(0), Fast(-1.0), **FINE)
+    for side in SIDES:
+        one, other = (
+            {
+                row.time_s: (row.position_m, row.velocity_mps)
+                for row in trial.states
+                if row.side == side
+            }
+            for trial in (coarse, fine)
+        )
+        shared = sorted(one.keys() & other.keys())
+        assert len(shared) > 40
+        assert [other[t] for t in shared] == [pytest.approx(one[t]) for t in shared]
+
+
+async def test_a_slow_driver_is_not_asked_while_a_fast_one_is():
+    slow, fast = Holding(-0.2), Fast(-0.1)
+    trial = await play(slow, fast, **FINE)
+    assert list(slow.seen) == list(range(len(slow.seen)))
+    assert [row.time_s for row in decided(trial, "left")] == [float(n) for n in slow.seen]
+    assert len(fast.seen) > 15 * len(slow.seen)
+
+
+@pytest.mark.parametrize("failing", SIDES)
+async def test_a_failed_call_has_the_number_of_its_own_driver(failing):
+    drivers = {side: Fast(-0.1) for side in SIDES}
+    drivers[failing] = Failing(-0.1, at=2)
+    (other,) = set(SIDES) - {failing}
+    trial = await play(**drivers, **FINE)
+    (call,) = trial.failed_calls
+    assert (call.number, call.side, trial.end_time_s) == (2, failing, 2.0)
+    # Who was due at that instant too has decided, and it is not driven.
+    assert decided(trial, other)[-1].number == 40
+    assert [row.number for row in decided(trial, failing)] == [0, 1]
+
+
+def test_a_seed_is_that_of_the_slot_and_of_no_driver():
+    spec = spec_of("N_0_0")
+    seed = take_seat(ScenarioConfig(), spec, "left", model_pace(ScenarioConfig())).seed
+    assert seed == 4387192367012543550
+    others = [
+        take_seat(ScenarioConfig(), other, side, model_pace(ScenarioConfig())).seed
+        for other, side in (
+            (spec, "right"),
+            (replace(spec, condition="L_4_0"), "left"),
+            (replace(spec, repetition=2), "left"),
+            (replace(spec, sample_set=1), "left"),
+        )
+    ]
+    assert len({seed, *others}) == 5
+    renamed = replace(spec, model_left="another", variant="A1", order=7)
+    assert take_seat(ScenarioConfig(), renamed, "left", model_pace(ScenarioConfig())).seed == seed
+
+
+async def test_an_action_that_cannot_be_driven_is_refused():
+    with pytest.raises(UsageError, match=r"^the left driver decided 1\.5: -1 to 1 can be driven$"):
+        await play(Holding(1.5), Holding(0.0))

@@ -16,11 +16,11 @@ from merge_runner.config import driver_name
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.keys import make_request
 from merge_runner.records import SCRIPTED_FIELD, Attempt, Slot, is_scripted
-from merge_runner.results.database import SCHEMA, in_memory
+from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.recording import export_recording, read_recording
 from tests.harness import FAST, PROJECT, as_a_model, watched
 
-MACRO = re.search(r"CREATE MACRO[^;]*driver_name[^;]*;", SCHEMA.read_text())[0]
+MACRO = re.search(r"CREATE MACRO[^;]*driver_name[^;]*;", schema_sql())[0]
 SMALL = ("--reps", 1, "--conditions", "L_4_0", "--json")
 # The registry's entries by the variables that lead to them; all four formats are among them.
 POINTED = {

@@ -8,7 +8,7 @@ driven again, and the last ones go on as far as they reach; what is open then st
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, pairwise
 from math import ceil, hypot, isclose
 from pathlib import Path
@@ -17,12 +17,15 @@ from typing import Any, NamedTuple, get_args
 import pandas as pd
 
 from analysis.data.load import SPECS, load_each
-from merge_runner.config import CollisionRule, Scenario
+from merge_runner.config import CollisionRule, ScenarioConfig
+from merge_runner.drivers.pace import pace_of
+from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.collision import collided, rectangles_overlap
-from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.geometry import FORWARD, LATERAL, MERGE_POINT_M
+from merge_runner.scenarios.merge.conditions import Condition
+from merge_runner.scenarios.merge.geometry import TRACK, Track, track_of
 from merge_runner.scenarios.merge.vehicle import advance
 from merge_runner.scenarios.merge.world import World
+from merge_runner.text_safety import quoted
 
 # The readings of the paper's rule, looked for at every step of the simulation.
 RULES: tuple[CollisionRule, ...] = get_args(CollisionRule)
@@ -37,12 +40,13 @@ NEAR = """
 SELECT trial_id, spec_hash,
     list((step, time_s, left_m, left_mps, right_m, right_mps) ORDER BY step) AS near
 FROM (
-    SELECT *, left_m - {merge} AS left_past_m, right_m - {merge} AS right_past_m,
-        {lateral} * (least(left_past_m, 0) + least(right_past_m, 0)) AS across_m,
-        if(left_past_m < 0, {forward} * left_past_m, left_past_m)
-            - if(right_past_m < 0, {forward} * right_past_m, right_past_m) AS along_m,
-        {step_s} * (abs(left_mps - right_mps) + {lateral} * (left_mps + right_mps)) AS nearer_m
-    FROM vehicle_pairs
+    SELECT *, left_m - merge_m AS left_past_m, right_m - merge_m AS right_past_m,
+        sine * (least(left_past_m, 0) + least(right_past_m, 0)) AS across_m,
+        if(left_past_m < 0, cosine * left_past_m, left_past_m)
+            - if(right_past_m < 0, cosine * right_past_m, right_past_m) AS along_m,
+        {step_s} * (abs(left_mps - right_mps) + sine * (left_mps + right_mps)) AS nearer_m
+    FROM vehicle_pairs JOIN (VALUES {tracks}) AS tracks (spec_hash, merge_m, sine, cosine)
+        USING (spec_hash)
 ) WHERE across_m ** 2 + along_m ** 2 < ({reach_m} + nearer_m) ** 2 GROUP BY ALL
 """
 # Trials in which both drivers decided something; the others ended before that.
@@ -51,11 +55,25 @@ SELECT trial_id, spec_hash FROM decisions GROUP BY ALL HAVING count(DISTINCT sid
 """
 PLANS = (
     "SELECT trial_id, spec_hash, side, list(applied ORDER BY decision) AS applied, "
+    "min(time_s) AS since_s, "
     "arg_max(coalesce(plan, []), decision) AS last_plan FROM decisions "
     "SEMI JOIN (FROM trials WHERE status = 'collided') USING (trial_id, spec_hash) "
     "GROUP BY ALL ORDER BY ALL"
 )
+# The mean speed in m/s at the start of those trials, which their condition had.
+MEAN_SPEEDS = (
+    "SELECT trial_id, spec_hash, avg(velocity_mps) AS mean_mps FROM states "
+    "SEMI JOIN (FROM trials WHERE status = 'collided' AND source <> 'human') "
+    "USING (trial_id, spec_hash) WHERE step = 0 GROUP BY ALL"
+)
 Outcome = tuple[str, str | None]
+
+
+class Task(NamedTuple):
+    """What a trial is driven by and judged by."""
+
+    config: ScenarioConfig
+    track: Track
 
 
 class Sample(NamedTuple):
@@ -100,8 +118,12 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     """
     ended = trials[trials["status"] != "failed"]
     specs = load_each({"specs": SPECS}, db)["specs"]
-    scenarios = _scenarios(ended["spec_hash"].unique(), specs)
-    found = load_each({"plans": PLANS, "near": _near(scenarios.values()), "decided": DECIDED}, db)
+    texts = dict(zip(specs["spec_hash"], specs["spec"], strict=True))
+    told = {name: json.loads(texts.get(name, "{}")) for name in ended["spec_hash"].unique()}
+    tasks = _tasks(told)
+    found = load_each(
+        {"plans": PLANS, "near": _near(tasks), "decided": DECIDED, "speeds": MEAN_SPEEDS}, db
+    )
     near = {
         (row.trial_id, row.spec_hash): [Sample(*sample) for sample in row.near]
         for row in found["near"].itertuples()
@@ -110,63 +132,77 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     plans: dict[tuple[str, str], dict[str, Any]] = {}
     for row in found["plans"].itertuples():
         plans.setdefault((row.trial_id, row.spec_hash), {})[row.side] = row
+    speeds = {(row.trial_id, row.spec_hash): row.mean_mps for row in found["speeds"].itertuples()}
     rows = []
-    columns = ["trial_id", "spec_hash", "source", "condition", "status", "merged_first"]
+    columns = ["trial_id", "spec_hash", "source", "status", "merged_first"]
+    columns += ["projected_headway_m", "relative_velocity_mps"]
     for trial in ended[columns].itertuples(index=False):
         key = (trial.trial_id, trial.spec_hash)
         known = trial.source == "human" or key in decided
         for reading in readings:
-            scenario = scenarios[trial.spec_hash, reading]
+            task = tasks[trial.spec_hash, reading]
             outcome: Outcome
             if reading == BOXES and trial.source == "human":
                 outcome = trial.status, trial.merged_first  # it is the rule of the experiment
             elif not known:
                 outcome = UNDECIDED, None
-            elif seen(scenario, near.get(key, ()), between=reading == BOXES):
+            elif seen(task, near.get(key, ()), between=reading == BOXES):
                 outcome = "collided", None
             elif trial.status != "collided":
                 outcome = trial.status, trial.merged_first
-            elif trial.source == "human":
+            elif key not in speeds:
                 outcome = UNDECIDED, None
             else:
-                sides = [plans[key][side] for side in ("left", "right")]
+                sides = [plans[key][side] for side in SIDES]
+                lasting = [
+                    pace_of(task.config, told[trial.spec_hash].get(side, {})).action_steps
+                    for side in SIDES
+                ]
                 outcome = redrive(
-                    scenario,
-                    trial.condition,
-                    [side.applied for side in sides],
-                    [side.last_plan for side in sides],
+                    task,
+                    Condition(trial.projected_headway_m, trial.relative_velocity_mps, speeds[key]),
+                    [
+                        [_in_steps(actions, n) for actions in side.applied]
+                        for side, n in zip(sides, lasting, strict=True)
+                    ],
+                    [_in_steps(side.last_plan, n) for side, n in zip(sides, lasting, strict=True)],
+                    begins=[round(side.since_s / task.config.step_s) for side in sides],
                     between=reading == BOXES,
                 )
             rows.append((*key, reading, *outcome))
     return pd.DataFrame(rows, columns=["trial_id", "spec_hash", "rule", "status", "merged_first"])
 
 
-def _near(scenarios: Iterable[Scenario]) -> str:
+def _near(tasks: Mapping[tuple[str, str], Task]) -> str:
     """The query of the samples at or next to which vehicles can collide."""
-    every = [Scenario(), *scenarios]
+    every = [ScenarioConfig(), *(task.config for task in tasks.values())]
+    tracks = {spec_hash: task.track for (spec_hash, _), task in tasks.items()} or {"": TRACK}
     step_s = max(one.step_s for one in every)
     # What accelerations against each other, and a resistance, add to the way within a step.
     added_m = 2 * (max(one.max_acceleration_mps2 for one in every) + 2) * step_s**2
     reach_m = max(hypot(one.vehicle_length_m, one.vehicle_width_m) for one in every)
     return NEAR.format(
-        merge=MERGE_POINT_M,
-        lateral=LATERAL,
-        forward=FORWARD,
+        tracks=", ".join(
+            f"({quoted(spec_hash)}, {t.merge_point_m!r}::DOUBLE, {t.branch_sine!r}::DOUBLE, "
+            f"{t.branch_cosine!r}::DOUBLE)"
+            for spec_hash, t in tracks.items()
+        ),
         step_s=step_s,
         reach_m=reach_m + added_m + 0.01,
     )
 
 
-def seen(scenario: Scenario, samples: Sequence[Sample], *, between: bool) -> bool:
+def seen(task: Task, samples: Sequence[Sample], *, between: bool) -> bool:
     """Whether a collision is seen at the scenario's steps, and ``between`` them at 20 Hz."""
+    config, track = task
     if any(
-        collided(scenario, sample.left_m, sample.right_m)
+        collided(config, track, sample.left_m, sample.right_m)
         for sample in samples
-        if _is_multiple(sample.time_s, scenario.step_s)
+        if _is_multiple(sample.time_s, config.step_s)
     ):
         return True
     return between and any(
-        rectangles_overlap(left_m, right_m, scenario.vehicle_length_m, scenario.vehicle_width_m)
+        rectangles_overlap(track, left_m, right_m, config.vehicle_length_m, config.vehicle_width_m)
         for before, now in pairwise(samples)
         if now.step == before.step + 1
         for left_m, right_m in _looks_between(before, now)
@@ -200,48 +236,52 @@ def _is_multiple(time_s: float, step_s: float) -> bool:
     return isclose(time_s / step_s, round(time_s / step_s), abs_tol=1e-6)
 
 
-def _scenarios(spec_hashes: Iterable[str], specs: pd.DataFrame) -> dict[tuple[str, str], Scenario]:
-    """The scenario of each spec under each reading; that of humans is the default one."""
-    texts = dict(zip(specs["spec_hash"], specs["spec"], strict=True))
-    found = {
-        spec_hash: json.loads(texts.get(spec_hash, "{}")).get("scenario", {})
-        for spec_hash in spec_hashes
-    }
+def _tasks(told: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], Task]:
+    """The task of each spec under each reading; that of humans is the default one."""
     return {
-        (spec_hash, reading): Scenario.model_validate(
-            scenario | {"collision_rule": "rectangle" if reading == BOXES else reading}
+        (spec_hash, reading): Task(
+            ScenarioConfig.model_validate(
+                spec.get("scenario", {})
+                | {"collision_rule": "rectangle" if reading == BOXES else reading}
+            ),
+            track_of(spec),
         )
-        for spec_hash, scenario in found.items()
+        for spec_hash, spec in told.items()
         for reading in READINGS
     }
 
 
+def _in_steps(actions: Iterable[float], lasting: int) -> list[float]:
+    """Actions that each last so many steps of the world, step by step."""
+    return [action for action in actions for _ in range(lasting)]
+
+
 def redrive(
-    scenario: Scenario,
-    condition: str,
+    task: Task,
+    condition: Condition,
     applied: Sequence[Sequence[Sequence[float]]],
     last_plans: Sequence[Sequence[float]],
     *,
+    begins: Sequence[int] = (0, 0),
     between: bool = False,
 ) -> Outcome:
     """Drive a trial's plans again: (status, merged_first).
 
     ``between``: collisions are looked for at 20 Hz between the steps too.
-    ``applied`` holds, for left and right, the normalised actions of each decision; a vehicle that
-    decided later than the other cruised before. ``last_plans`` are whole plans, empty if unknown.
+    ``applied`` holds, for left and right, the normalised actions of each decision, one a step of
+    the world; until the step at which it ``begins`` a vehicle cruises. ``last_plans`` are whole
+    plans, empty if unknown.
     """
-    world = World(scenario, CONDITIONS[condition])
-    actions = [[action for actions in side for action in actions] for side in applied]
-    steps = max(map(len, actions))
+    world = World(task.config, condition, task.track)
     queues: list[list[float | None]] = []
-    for side, last, own in zip(applied, last_plans, actions, strict=True):
+    for begin, side, last in zip(begins, applied, last_plans, strict=True):
         rest = last[len(side[-1]) :] if side else []
-        queues.append([*[None] * (steps - len(own)), *own, *rest])
+        queues.append([*[None] * begin, *(action for own in side for action in own), *rest])
     for left, right in zip(*queues, strict=False):
         if world.status is not None:
             break
         world.advance({"left": left, "right": right})
-    if between and seen(scenario, _samples(world), between=True):
+    if between and seen(task, _samples(world), between=True):
         return "collided", None
     return world.status or UNDECIDED, world.merged_first() if world.status else None
 

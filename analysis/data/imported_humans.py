@@ -10,7 +10,7 @@ import pandas as pd
 
 from analysis.data.load import load
 from analysis.data.reference_data import HUMAN_TRIALS, PAIRS, published
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 OUTCOMES = ["left_first", "right_first", "collided"]
 COUNTS = ["trials", *OUTCOMES]
@@ -99,7 +99,7 @@ def by_condition(trials: pd.DataFrame) -> pd.DataFrame:
     Those have the suffix ``_published``.
     """
     own = trials[trials["pair"].isin(PAIRS.values())]
-    found = _counted(own).groupby(own["condition"]).sum().reindex(CONDITIONS, fill_value=0)
+    found = _counted(own).groupby(own["condition"]).sum().reindex(HUMAN_CONDITIONS, fill_value=0)
     known = published("human_outcomes").set_index("condition")[OUTCOMES]
     return found.join(known.assign(trials=known.sum(axis=1)), suffixes=("", "_published"))
 

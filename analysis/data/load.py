@@ -1,4 +1,7 @@
-"""Results as data frames; all SQL that reads for the analysis."""
+"""Results as data frames: how they are read, and the frames of a study, which anybody may use.
+
+A query that a single table, page or statistic needs stands beside it.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +80,10 @@ SELECT one.spec_hash, base.spec_hash AS baseline, calls, count(*) AS shared
 FROM used AS one JOIN used AS base USING (call_key) JOIN totals ON totals.spec_hash = one.spec_hash
 WHERE one.variant <> 'baseline' AND base.variant = 'baseline' GROUP BY ALL ORDER BY ALL
 """
-
+# One row a trial and window: RMSE of the speeds from the initial ones, and joint.
+DEVIATIONS = "SELECT * FROM speed_deviations ORDER BY ALL"
+# Fates of the attempts that were answered, also without a plan.
+ANSWERED = ("driven", "fallback")
 # One row a trial and kind of attempt; a retried attempt has no share in the answer's failure.
 ATTEMPTS = """
 SELECT trial_id, spec_hash, fate, outcome, if(fate = 'retried', NULL, failure) AS failure,
@@ -91,8 +97,6 @@ FROM decisions GROUP BY ALL ORDER BY ALL
 """
 
 SPECS = "SELECT spec_hash, spec FROM specs"
-# The size of a spec's vehicles in words.
-SIZES = "SELECT spec_hash, format('{:g} m x {:g} m', length_m, width_m) AS size FROM geometry"
 
 
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
@@ -102,7 +106,7 @@ def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """One row a trial: condition, outcome and metrics in SI units (see merge_runner/schema.sql)."""
+    """One row a trial: condition, outcome and metrics in SI units (see docs/tables.md)."""
     return load(TRIALS, db)
 
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.data.load import load_each, rows
+from analysis.data.load import ANSWERED, load_each, rows
 from analysis.data.study import Group, Study, of_group
 from merge_runner.audit.replies import answers_alike
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.results.database import read_database
 from merge_runner.served_model import ALIASES, others_among
@@ -55,14 +55,14 @@ FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spe
 WHERE source <> 'human' ORDER BY ALL
 """
 # Answers by each model that answered.
-SERVED = """
+SERVED = f"""
 SELECT model_requested, model_served,
     count(DISTINCT (trial_id, spec_hash, side, decision)) AS answers,
     list_sort(list(DISTINCT sweep_id) FILTER (sweep_id IS NOT NULL)) AS sweeps
 FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
-WHERE fate IN ('driven', 'fallback') AND model_served IS NOT NULL
+WHERE fate IN {ANSWERED} AND model_served IS NOT NULL
 GROUP BY ALL ORDER BY ALL
-"""
+"""  # noqa: S608 # constants
 SWEEP_COSTS = """
 SELECT sweep_id, name, sweep_costs.* EXCLUDE (sweep_id)
 FROM sweeps JOIN sweep_costs USING (sweep_id) ORDER BY started_at, sweep_id
@@ -89,8 +89,6 @@ DRIVERS = """
 SELECT DISTINCT driver FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE source = 'llm' AND NOT scripted ORDER BY ALL
 """
-# What of a request's body is no parameter.
-NO_PARAMETERS = frozenset({"messages", "input", "contents", "model"})
 # Failures with an own column of the tables; the others are malformed answers.
 ANSWERS = ("refusal", "truncated", "empty")
 
@@ -198,7 +196,7 @@ def tally(study: Study, group: Group) -> Tally:
     attempts = of_group(study.calls.attempts, group, group.trials)
     decisions = of_group(study.calls.decisions, group, group.trials)
     by_fate = Counter(attempts.groupby("fate")["attempts"].sum().to_dict())
-    answered = attempts[attempts["fate"].isin(("driven", "fallback"))]
+    answered = attempts[attempts["fate"].isin(ANSWERED)]
     return Tally(
         trials=len(group.trials),
         failed=len(group.trials) - len(group.ended),
@@ -221,7 +219,7 @@ def _other_model(study: Study, answered: pd.DataFrame) -> list[bool]:
 
 def _switched(spec: str) -> str:
     """The settings of a spec's driving task that differ from the defaults."""
-    defaults, scenario = Scenario().model_dump(), json.loads(spec).get("scenario", {})
+    defaults, scenario = ScenarioConfig().model_dump(), json.loads(spec).get("scenario", {})
     return ", ".join(f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v)
 
 
@@ -237,11 +235,14 @@ def _alike(db: Path) -> dict[str, int]:
 def _sent(spec: Mapping[str, Any]) -> dict[str, dict[str, object]]:
     """The parameters of the model on each side of a spec, by the last part of their names.
 
-    A program on a side has none, and is left out.
+    A program on a side has none, and is left out. A spec is made with an empty prompt, by which
+    that is known in any format.
     """
     bodies = {side: spec[side]["body"] for side in SIDES if "body" in spec.get(side, {})}
     return {
-        side: dict(_leaves({k: v for k, v in body.items() if k not in NO_PARAMETERS}))
+        side: dict(
+            _leaves({k: v for k, v in body.items() if k != "model" and '""' not in json.dumps(v)})
+        )
         for side, body in bodies.items()
     }
 

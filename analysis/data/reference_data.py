@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 DATA = Path(__file__).parent
 # Standard deviation in m of the human gaps about their regression: what the four standard errors of
@@ -43,7 +43,7 @@ def human_outcomes() -> pd.DataFrame:
     """
     rows = []
     for counts in published("human_outcomes").itertuples():
-        condition = CONDITIONS[counts.condition]
+        condition = HUMAN_CONDITIONS[counts.condition]
         outcomes = (
             [("finished", "left")] * counts.left_first
             + [("finished", "right")] * counts.right_first
@@ -51,7 +51,7 @@ def human_outcomes() -> pd.DataFrame:
         )
         rows += [
             (
-                condition.name,
+                counts.condition,
                 condition.projected_headway_m,
                 condition.relative_velocity_mps,
                 *outcome,

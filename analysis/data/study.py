@@ -15,28 +15,30 @@ from analysis.data.collision_rules import judged
 from analysis.data.imported_humans import Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
+    DEVIATIONS,
     LEFT_SPEEDS,
     PLANS,
     SHARED,
     SPECS,
     SPEEDS,
     TRACES,
-    TRIALS,
     Calls,
     load_calls,
     load_each,
 )
-from analysis.data.reference_data import human_outcomes
+from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
 from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
-from merge_runner.records import SIDES
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.records import SIDES, Side
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.text_safety import quoted
 
 HUMAN = "human"
 # What tells groups apart, and is no measure.
-COLUMNS_OF_GROUPS = ["driver", "task", "trace", "left_scripted", "right_scripted"]
+COLUMNS_OF_GROUPS = [
+    "driver", "task", "mark", "apart", "trace", "left_scripted", "right_scripted",
+]  # fmt: skip
 BASELINE = "baseline"
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
@@ -48,12 +50,15 @@ class Group:
 
     ``trials`` are rows of ``load_trials``; for humans before an import only the outcomes that are
     published, and ``measured`` is False. ``setting`` is the prompt variant, empty for humans.
-    ``label`` is how tables name the driver, ``model`` the name that was asked for, and ``posing``
-    what is said of a scripted stand-in. Of a driver without chance, whose repetitions are the same
-    trial again, only the first are ``trials``, and ``repeated`` counts the others; ``equal`` counts
-    such trials of a driver that samples. ``narrowed`` is what tells the trials in SQL from others
-    of their spec and variant, empty where there are none. ``published_outcomes`` stand in the place
-    of the trials' outcomes where these are a part of the published ones.
+    ``driver`` is its ``name`` with the ``mark`` that tells it from itself under other settings, and
+    with ``[scripted]`` where a stand-in answered only some of its trials. ``label`` is how tables
+    name the driver, ``models`` are the names that were asked for, left and right, an equal one
+    once, and ``posing`` is what is said of a scripted stand-in. Of a driver without chance, whose
+    repetitions are the same trial again, only the first are ``trials``, and ``repeated`` counts the
+    others; ``equal`` counts such trials of a driver that samples. ``narrowed`` is what tells the
+    trials in SQL from others of their spec and variant, empty where there are none.
+    ``published_outcomes`` stand in the place of the trials' outcomes where these are a part of the
+    published ones.
     """
 
     driver: str
@@ -61,7 +66,9 @@ class Group:
     spec_hash: str | None
     trials: pd.DataFrame
     label: str
-    model: str
+    models: tuple[str, ...]
+    name: str
+    mark: str = ""
     measured: bool = True
     posing: str = ""
     repeated: int = 0
@@ -110,9 +117,9 @@ class Group:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many outcomes there are in each condition, in the order of CONDITIONS."""
+        """How many outcomes there are in each condition of humans, in their order."""
         counts = self.ended_outcomes["condition"].value_counts()
-        return tuple(int(counts.get(name, 0)) for name in CONDITIONS)
+        return tuple(int(counts.get(name, 0)) for name in HUMAN_CONDITIONS)
 
     @cached_property
     def left_out(self) -> str:
@@ -133,8 +140,10 @@ class Study:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
         self.db = Path(db)
         self.chosen = models
-        found = load_each({"trials": TRIALS, "specs": SPECS, "traces": TRACES}, self.db)
-        trials = found["trials"].merge(found["traces"], on=["trial_id", "spec_hash"], how="left")
+        found = load_each({"specs": SPECS, "traces": TRACES}, self.db)
+        trials = trials_with_metrics(self.db).merge(
+            found["traces"], on=["trial_id", "spec_hash"], how="left"
+        )
         trials = judged(self.db, trials)
         recorded = trials["source"] == HUMAN
         self.imported = imported(trials[recorded]) if recorded.any() else None
@@ -153,13 +162,32 @@ class Study:
     @property
     def calibrated(self) -> bool:
         """Whether there are human traces enough of every condition to compare others with."""
-        counts = self.human.ended["condition"].value_counts().reindex(CONDITIONS, fill_value=0)
+        found = self.human.ended["condition"].value_counts()
+        counts = found.reindex(HUMAN_CONDITIONS, fill_value=0)
         return self.human.measured and bool(counts.min() >= ENOUGH_PER_CONDITION)
 
     @property
     def complete(self) -> bool:
         """Whether the human traces are all there, so that whole trials can be drawn from them."""
         return self.imported is not None and self.imported.complete
+
+    @cached_property
+    def conditions(self) -> dict[str, tuple[float, float]]:
+        """Name to projected headway in m and relative velocity in m/s: the humans', then others.
+
+        The others are told by the stored trials, since whoever registered them may not be here.
+        """
+        played = {
+            row.condition: (row.projected_headway_m, row.relative_velocity_mps)
+            for group in self.models
+            for row in group.trials.drop_duplicates("condition").itertuples()
+        }
+        own = {name: at for name, at in played.items() if name not in HUMAN_CONDITIONS}
+        humans = {
+            name: (condition.projected_headway_m, condition.relative_velocity_mps)
+            for name, condition in HUMAN_CONDITIONS.items()
+        }
+        return humans | dict(sorted(own.items(), key=lambda one: (one[1], one[0])))
 
     @property
     def baselines(self) -> list[Group]:
@@ -179,7 +207,7 @@ class Study:
     @cached_property
     def deviations(self) -> pd.DataFrame:
         """One row a trial and window: RMSE of the speeds from the initial ones, and joint."""
-        return self._read("SELECT * FROM speed_deviations ORDER BY ALL")
+        return self._read(DEVIATIONS)
 
     @cached_property
     def plans(self) -> pd.DataFrame:
@@ -218,16 +246,20 @@ def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
         str(trials["spec_hash"].iloc[0]),
         trials,
         label=known.label,
-        model=HUMAN,
+        models=(HUMAN,),
+        name=HUMAN,
         narrowed=f"pair IN ({pairs})" if known.left_out else "",
-        published_outcomes=None if known.complete else human_outcomes(),
+        published_outcomes=None if known.complete else outcomes_with_metrics(),
     )
 
 
 @cache
 def _published_group() -> Group:
     """One object for all studies: what is computed from it is computed once."""
-    return Group(HUMAN, "", None, human_outcomes(), label=HUMAN, model=HUMAN, measured=False)
+    return Group(
+        HUMAN, "", None, outcomes_with_metrics(), label=HUMAN, models=(HUMAN,), name=HUMAN,
+        measured=False,
+    )  # fmt: skip
 
 
 def _tasks(specs: pd.DataFrame) -> dict[str, str]:
@@ -252,14 +284,11 @@ def _model_groups(trials: pd.DataFrame, tasks: dict[str, str]) -> list[Group]:
         return []
     task = trials["spec_hash"].map(lambda spec_hash: tasks.get(spec_hash, spec_hash[:8]))
     keyed = trials.assign(task=task)
-    keyed["driver"] += _marks(keyed, ["driver"], "task")
-    keyed["driver"] += _marks(keyed, ["driver", "variant"], "spec_hash")
-    both = keyed.groupby("driver")["scripted"].transform("nunique") > 1
-    keyed.loc[both & keyed["scripted"], "driver"] += " [scripted]"
-    groups = [
-        _model_group(driver, variant, spec_hash, rows, both[rows.index].any())
-        for (driver, variant, spec_hash), rows in keyed.groupby(["driver", "variant", "spec_hash"])
-    ]
+    keyed["mark"] = _marks(keyed, ["driver"], "task")
+    keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "spec_hash")
+    keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
+    keys = ["driver", "mark", "apart", "scripted", "variant", "spec_hash"]
+    groups = [_model_group(rows) for _, rows in keyed.groupby(keys)]
     return sorted(
         groups,
         key=lambda group: (
@@ -271,25 +300,28 @@ def _model_groups(trials: pd.DataFrame, tasks: dict[str, str]) -> list[Group]:
     )
 
 
-def _model_group(
-    driver: str, variant: str, spec_hash: str, rows: pd.DataFrame, told_apart: bool
-) -> Group:
-    model = str(rows["trial_id"].iloc[0]).split("/", maxsplit=1)[0]
-    scripted = bool(rows["scripted"].any())
+def _model_group(rows: pd.DataFrame) -> Group:
+    """The group of these trials, which have equal keys."""
+    first = rows.iloc[0]
+    scripted = bool(first["scripted"])
+    models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
-    posing = stand_in(model, sides or SIDES) if scripted else ""
+    posing = stand_in(models, sides or SIDES) if scripted else ""
+    driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
     distinct = _distinct(rows)
-    narrowed = [f"scripted = {str(scripted).lower()}"] if told_apart else []
+    narrowed = [f"scripted = {str(scripted).lower()}"] if first["apart"] else []
     if len(distinct) < len(rows):
         names = ", ".join(quoted(trial_id) for trial_id in distinct["trial_id"])
         narrowed.append(f"trials.trial_id IN ({names})")
     return Group(
         driver,
-        variant,
-        spec_hash,
+        first["variant"],
+        first["spec_hash"],
         distinct.drop(columns=COLUMNS_OF_GROUPS),
         label=f"{driver} ({posing})" if scripted else driver,
-        model=model,
+        models=tuple(dict.fromkeys(models.values())),
+        name=first["driver"],
+        mark=first["mark"],
         posing=posing,
         repeated=len(rows) - len(distinct),
         equal=len(_again(distinct)),

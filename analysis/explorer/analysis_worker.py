@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.data.derived_cache import finished, keep_finished
+from analysis.metrics import GAP, Metric, shown_in
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Table, from_text, options_text, to_text
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.results.database import read_database
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 if TYPE_CHECKING:
     from analysis.data.study import Group, Study
@@ -150,37 +151,31 @@ class Numbers:
 def human_panels(study: Study) -> dict[str, Any]:
     """The humans and the baseline of every driver, measured in each condition.
 
-    Rates in percent, gaps in m, RMSE in m/s. Before an import the humans have outcomes alone;
-    ``published`` holds what the paper prints of the rest: the gap by its regression in m, and the
-    RMSE over all conditions in m/s.
+    Values are in the units of the metrics. Before an import the humans have outcomes alone;
+    ``published`` holds what is published of the rest, by the metric's name: ``values`` by
+    condition, as far as there are such, and a ``text`` that says what they are.
     """
     from analysis.data.load import SPECS, load
     from analysis.data.reference_data import citation
-    from analysis.stats.measures import RMSE, outcomes_note, published_human
+    from analysis.stats.measures import known, outcomes_note
     from analysis.tables.notes import sample_notes
 
-    measured = study.human.measured
     specs = {row.spec_hash: json.loads(row.spec) for row in load(SPECS, study.db).itertuples()}
-    published = None
-    if study.human in study.groups and not measured:
-        published = {
-            "gap_m": _published_gaps(),
-            "rmse_mps": published_human(RMSE),
-            "outcomes_from": citation("human_outcomes"),
-            "gaps_from": citation("paper_gap"),
-            "rmse_from": citation("paper_ablation_quantitative"),
-        }
+    there = study.human in study.groups
+    unknown = [metric for metric in shown_in("humans") if not known(study.human, metric)]
     return {
-        "measured": measured,
-        "published": published,
+        "measured": study.human.measured,
+        "outcomes_from": citation("human_outcomes"),
+        "published": {metric.name: _published(metric) for metric in unknown} if there else {},
+        "conditions": study.conditions,
         "notes": sample_notes(study, study.baselines),
-        "caveat": outcomes_note(study.human) if study.human in study.groups else "",
+        "caveat": outcomes_note(study.human) if there else "",
         "groups": [
             {
                 "id": group.id,
                 "driver": group.label,
                 "scenario": specs.get(group.spec_hash, {}).get("scenario"),
-                "conditions": {name: _in_condition(group, name) for name in CONDITIONS},
+                "conditions": {name: _in_condition(group, name) for name in study.conditions},
             }
             for group in study.baselines
         ],
@@ -189,25 +184,32 @@ def human_panels(study: Study) -> dict[str, Any]:
 
 def _in_condition(group: Group, condition: str) -> dict[str, Any]:
     """The trials of a group in one condition: counts, and estimates with 95 % intervals."""
-    from analysis.stats.measures import (
-        BOXES,
-        COLLISIONS,
-        GAP,
-        LEFT_FIRST,
-        RMSE,
-        counts,
-        estimate,
-        known,
-    )
+    from analysis.stats.measures import counts, estimate, known
 
     part = group.part(lambda trials: trials["condition"] == condition)
     found: dict[str, Any] = {"all": len(part.outcomes), "ended": len(part.ended_outcomes)}
-    for measure in (LEFT_FIRST, GAP, RMSE, BOXES, COLLISIONS):
-        if known(group, measure):
-            found[measure.name] = asdict(estimate(part, measure))
-            if measure.rate:
-                found[measure.name]["k"] = counts(part, measure)[0]
+    for metric in shown_in("humans"):
+        if known(group, metric):
+            found[metric.name] = asdict(estimate(part, metric))
+            if metric.rate:
+                found[metric.name]["k"] = counts(part, metric)[0]
     return found
+
+
+def _published(metric: Metric) -> dict[str, Any]:
+    """The human values of a metric in each condition, as far as they are published."""
+    from analysis.data.reference_data import citation
+    from analysis.stats.measures import human_reference, no_human_value
+
+    found = human_reference(metric)
+    if found is None:
+        return {"text": no_human_value(metric)}
+    values, what = dict.fromkeys(HUMAN_CONDITIONS, found.value), "value over all conditions"
+    source = found.source
+    if metric is GAP:
+        values, what, source = _published_gaps(), "regression", citation("paper_gap")
+    text = f"{metric.heading}: the black dashes are the published {what} ({source})"
+    return {"values": values, "text": text}
 
 
 def _published_gaps() -> dict[str, float]:
@@ -218,9 +220,10 @@ def _published_gaps() -> dict[str, float]:
     from analysis.stats.regressions import gap_design
 
     terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
-    headway = np.array([condition.projected_headway_m for condition in CONDITIONS.values()])
-    velocity = np.array([condition.relative_velocity_mps for condition in CONDITIONS.values()])
-    return dict(zip(CONDITIONS, map(float, gap_design(headway, velocity) @ terms), strict=True))
+    headway = np.array([one.projected_headway_m for one in HUMAN_CONDITIONS.values()])
+    velocity = np.array([one.relative_velocity_mps for one in HUMAN_CONDITIONS.values()])
+    gaps = gap_design(headway, velocity) @ terms
+    return dict(zip(HUMAN_CONDITIONS, map(float, gaps), strict=True))
 
 
 def main(db: Path) -> None:

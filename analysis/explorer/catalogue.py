@@ -11,11 +11,11 @@ from typing import Any
 import duckdb
 
 from analysis.explorer.query_worker import csv_cell
-from analysis.explorer.reading import PATIENCE_S, reading
+from analysis.explorer.reading import PATIENCE_S, reading, records
 from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
-from merge_runner.results.database import SCHEMA, Instance, spill_folder
+from merge_runner.results.database import Instance, schema_sql, spill_folder
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer
 
@@ -38,7 +38,9 @@ LISTED = """
 CREATE SEQUENCE numbers;
 CREATE TABLE listed (
     number INTEGER DEFAULT nextval('numbers'), trial_id VARCHAR, spec_hash VARCHAR,
-    source VARCHAR, model VARCHAR, variant VARCHAR, condition VARCHAR, rep INTEGER, pair VARCHAR,
+    source VARCHAR, model_left VARCHAR, model_right VARCHAR, model VARCHAR, variant VARCHAR,
+    condition VARCHAR, projected_headway_m DOUBLE, relative_velocity_mps DOUBLE, rep INTEGER,
+    pair VARCHAR,
     status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
     error VARCHAR, scripted BOOLEAN, stand_in VARCHAR,
     time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
@@ -119,9 +121,10 @@ INSERT INTO memory.flaws
 # A sparkline has about 24 points, and its words the slowest and the fastest of all.
 LIST = """
 INSERT INTO listed BY NAME
-SELECT trials.trial_id, trials.spec_hash, source,
+SELECT trials.trial_id, trials.spec_hash, source, model_left, model_right,
     if(source = 'human', 'human', driver) AS model,
-    variant, condition, rep, pair, status, merged_first, end_time_s, error, scripted,
+    variant, condition, projected_headway_m, relative_velocity_mps, rep, pair, status,
+    merged_first, end_time_s, error, scripted,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'
@@ -153,11 +156,11 @@ TRUNCATE trials; TRUNCATE states; TRUNCATE decided; TRUNCATE paid;
 """
 # Trials of stand-ins that are not said to be: by the model asked for, and the sides it answered on.
 UNNAMED = """
-SELECT split_part(trial_id, '/', 1) AS asked, sides, list(number)
+SELECT model_left, model_right, sides, list(number)
 FROM listed LEFT JOIN (
     SELECT trial_id, spec_hash, list_sort(list(side)) AS sides FROM posed GROUP BY ALL
 ) USING (trial_id, spec_hash)
-WHERE scripted AND stand_in IS NULL GROUP BY asked, sides
+WHERE scripted AND stand_in IS NULL GROUP BY ALL
 """
 FACETS = ("sweep", "model", "variant", "condition", "outcome", "validity", "cause")
 # Facets of which a trial may have several: their tables.
@@ -172,7 +175,7 @@ SORTS = {
     "cost": "cost_usd",
 }
 SPEEDS = "left_mps, right_mps, left_range_mps, right_range_mps"
-EXPORTED = f"* EXCLUDE (number, {SPEEDS})"
+EXPORTED = f"* EXCLUDE (number, model_left, model_right, {SPEEDS})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -398,7 +401,7 @@ class Catalogue:
         """Forget everything."""
         self._instance.drop()
         self._connection = self._instance.confined(self.db)
-        self._connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        self._connection.execute(schema_sql())
         self._connection.execute(LISTED + GROUPED)
         self._file, self._stamp = file, None
 
@@ -416,10 +419,10 @@ class Catalogue:
         """Say of each trial that a stand-in drove for whom it stood."""
         assert self._connection is not None
         unnamed = self._connection.execute(UNNAMED).fetchall()
-        for model, sides, numbers in unnamed:
+        for left, right, sides, numbers in unnamed:
             self._connection.execute(
                 "UPDATE listed SET stand_in = ? WHERE number IN (SELECT unnest(?))",
-                [stand_in(model, sides or SIDES), numbers],
+                [stand_in({"left": left, "right": right}, sides or SIDES), numbers],
             )
 
     def _note_others(self) -> None:
@@ -444,9 +447,7 @@ class Catalogue:
     def _records(self, sql: str, values: list[Any]) -> list[dict[str, Any]]:
         assert self._connection is not None, "it was never refreshed"
         with self._lock:
-            found = self._connection.execute(sql, values)
-            names = [column[0] for column in found.description]
-            return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
+            return records(self._connection, sql, values)
 
 
 def order_by(sort: str) -> str:

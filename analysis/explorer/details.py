@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import duckdb
-
 from analysis.explorer.prompts import Part, parts_of
-from analysis.explorer.reading import reading
-from merge_runner.config import Scenario
+from analysis.explorer.reading import Row, reading, records
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
+from merge_runner.scenarios.merge.geometry import Track, track_of
 
-Row = dict[str, Any]
 OF_TRIAL = "trial_id = $trial AND spec_hash = $spec"
 STATES = f"""
 SELECT side, list(time_s ORDER BY step) AS time_s, list(position_m ORDER BY step) AS position_m,
@@ -49,11 +48,16 @@ SELECT * FROM calls WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A trial's samples by side and its decisions without prompts; ``scenario`` is its task's."""
+    """A trial's samples by side and its decisions without prompts, and the task it is of.
+
+    ``paces`` say when each driver decided.
+    """
 
     trial_id: str
     spec_hash: str
-    scenario: Scenario
+    scenario: ScenarioConfig
+    track: Track
+    paces: dict[Side, Pace]
     states: dict[Side, Row]
     decisions: list[Row]
 
@@ -61,6 +65,10 @@ class Trial:
     def end_s(self) -> float:
         """The time of the last sample."""
         return max((samples["time_s"][-1] for samples in self.states.values()), default=0.0)
+
+    def interval_s(self, side: Side) -> float:
+        """How long a decision of a side is driven."""
+        return self.paces[side].interval_steps * self.scenario.step_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +88,14 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     """Read a trial that is known to be there."""
     key = {"trial": trial_id, "spec": spec_hash}
     with reading(db) as connection:
-        states = {row.pop("side"): row for row in _records(connection, STATES, key)}
-        decisions = _records(connection, DECISIONS, key)
-        (task,) = _records(connection, TASK, key)
+        states = {row.pop("side"): row for row in records(connection, STATES, key)}
+        decisions = records(connection, DECISIONS, key)
+        (task,) = records(connection, TASK, key)
     told = json.loads(task["spec"] or "{}")
     scenario = scenario_of(task["source"], told.get("scenario"))
     ordered = {side: states[side] for side in SIDES if side in states}
-    trial = Trial(trial_id, spec_hash, scenario, ordered, decisions)
+    paces = {side: pace_of(scenario, told.get(side, {})) for side in SIDES}
+    trial = Trial(trial_id, spec_hash, scenario, track_of(told), paces, ordered, decisions)
     for row in decisions:
         if row["lost"]:
             row["time_s"] = trial.end_s
@@ -94,10 +103,10 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     return trial
 
 
-def scenario_of(source: str, told: Mapping[str, Any] | None) -> Scenario:
+def scenario_of(source: str, told: Mapping[str, Any] | None) -> ScenarioConfig:
     """The task of a trial, as its spec tells it, or as it usually is."""
     usual = HUMAN_TASK if source == "human" else {}
-    return Scenario.model_validate(usual if told is None else told)
+    return ScenarioConfig.model_validate(usual if told is None else told)
 
 
 def read_decisions(
@@ -109,8 +118,8 @@ def read_decisions(
     """
     key = {"trial": trial_id, "spec": spec_hash, "side": side, "number": number}
     with reading(db) as connection:
-        rows = _records(connection, DECIDED, key)
-        calls = _records(connection, ATTEMPTS, key)
+        rows = records(connection, DECIDED, key)
+        calls = records(connection, ATTEMPTS, key)
     decided = {(row["side"], row["decision"]): row for row in rows}
     attempts: dict[tuple[str, int], list[Row]] = {}
     for call in calls:
@@ -132,11 +141,3 @@ def _decision(
     before = decided.get((side, number - 1))
     parts = parts_of(row["prompt"] or "", before["prompt"] if before else None)
     return Decision({**row, "lost": False}, before, parts, attempts)
-
-
-def _records(
-    connection: duckdb.DuckDBPyConnection, sql: str, values: Mapping[str, object]
-) -> list[Row]:
-    found = connection.execute(sql, dict(values))
-    names = [column[0] for column in found.description]
-    return [dict(zip(names, row, strict=True)) for row in found.fetchall()]

@@ -20,13 +20,14 @@ from typing import Any
 from markupsafe import Markup
 
 from analysis.explorer.catalogue import FACETS, SEVERAL, Filter
-from analysis.explorer.details import Row, read_decisions, read_trial
+from analysis.explorer.details import read_decisions, read_trial
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
 from analysis.explorer.pages.tables import table_page, tables_page
 from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
+from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import list_sweeps
 from analysis.explorer.urls import EXPORTED, StaticLinks, bundle_name

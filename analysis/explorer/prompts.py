@@ -42,24 +42,34 @@ def parts_of(prompt: str, before: str | None) -> list[Part]:
 
 
 def _blocks(prompt: str) -> list[tuple[str, str]]:
-    """Name and text of each block; paragraphs that begin no block belong to the one before."""
+    """Name and text of each block; what belongs to none that is known here has no name."""
     found: list[tuple[str, str]] = []
+    paragraphs_to_come = 0
     for paragraph in prompt.rstrip("\n").split("\n\n"):
-        name = _name(paragraph)
-        if name is None and found:
+        begun = _begun(paragraph)
+        if begun is not None:
+            name, paragraphs_to_come = begun
+            found.append((name, paragraph))
+        elif found and (paragraphs_to_come > 0 or not found[-1][0]):
+            paragraphs_to_come -= 1
             found[-1] = (found[-1][0], f"{found[-1][1]}\n\n{paragraph}")
         else:
-            found.append((name or "", paragraph))
+            found.append(("", paragraph))
     return found
 
 
-def _name(paragraph: str) -> str | None:
-    """The block whose template begins like this paragraph, up to the first value in it."""
-    for block in BLOCKS:
-        for template in (block.merge, block.straight):
-            if template is not None and paragraph.startswith(template.partition("{")[0]):
-                return block.name
-    return None
+def _begun(paragraph: str) -> tuple[str, int] | None:
+    """The block that begins like this paragraph, up to its first value, and how many follow."""
+    beginnings = [
+        (beginning, name, template.count("\n\n"))
+        for name, block in BLOCKS.items()
+        for template in (block.merge, block.straight)
+        if template is not None
+        and (beginning := template.partition("{")[0].partition("\n\n")[0])
+        and paragraph.startswith(beginning)
+    ]
+    # One may begin with another one's words.
+    return max(beginnings)[1:] if beginnings else None
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:

@@ -7,9 +7,10 @@ then write while another thread still reads.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import duckdb
 
@@ -22,6 +23,9 @@ ALONE = threading.RLock()
 
 # A sweep that stores its trials holds the file for less; a page has no time for others.
 PATIENCE_S = 2.0
+
+
+Row = dict[str, Any]
 
 
 @contextmanager
@@ -37,3 +41,12 @@ def reading(
             yield connection
     except duckdb.Error as exc:
         raise UsageError(f"{db} cannot be read: {first_line(exc)}") from exc
+
+
+def records(
+    connection: duckdb.DuckDBPyConnection, sql: str, values: Mapping[str, object] | Sequence[object]
+) -> list[Row]:
+    """The rows of a query, by the names of their columns."""
+    found = connection.execute(sql, values)
+    names = [column[0] for column in found.description]
+    return [dict(zip(names, row, strict=True)) for row in found.fetchall()]

@@ -1,4 +1,4 @@
-"""Tables and views with their columns, as schema.sql defines and explains them."""
+"""Tables and views with their columns, as their definitions explain them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from functools import cache
 
 import duckdb
 
-from merge_runner.results.database import SCHEMA
+from merge_runner.results.database import schema_sql
 
-_BEGINS = re.compile(r"CREATE (?:TABLE|VIEW) IF NOT EXISTS (\w+)")
+_BEGINS = re.compile(
+    r"CREATE (?:TABLE IF NOT EXISTS|(?:OR REPLACE )?VIEW(?: IF NOT EXISTS)?) (\w+)"
+)
 _COLUMN = re.compile(r" {4}(\w+) [A-Z][^-]*(?:-- (.*))?")
 
 
@@ -36,7 +38,7 @@ class Table:
 @cache
 def tables() -> list[Table]:
     """Tables, then views, in the order of their definitions."""
-    definitions = SCHEMA.read_text(encoding="utf-8")
+    definitions = schema_sql()
     said = _comments(definitions)
     with duckdb.connect() as connection:
         connection.execute(definitions)
@@ -60,7 +62,7 @@ def tables() -> list[Table]:
 
 def units() -> str:
     """What holds for all columns: the definitions' first line."""
-    return SCHEMA.read_text(encoding="utf-8").partition("\n")[0].removeprefix("-- ")
+    return schema_sql().partition("\n")[0].removeprefix("-- ")
 
 
 def _comments(definitions: str) -> dict[str, dict[str, str]]:

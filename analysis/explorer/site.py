@@ -15,6 +15,8 @@ from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.display_text import visible
 from analysis.explorer.query_process import Sandbox
 from analysis.explorer.urls import Links
+from analysis.explorer.views import clock
+from analysis.metrics import METRICS
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
 
@@ -65,6 +67,7 @@ class Site:
         )
         self._environment.globals.update(
             at=self.at,
+            metrics=METRICS,
             pages={name: page for name, page in PAGES.items() if self.at.to(page)},
             share=self.share,
             program=self.program,
@@ -72,6 +75,7 @@ class Site:
             static=self.static,
             study=self.db.name if self.static else str(self.db),
             visible=visible,
+            clock=clock,
             **self.shared,
         )
 

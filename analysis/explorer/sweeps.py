@@ -6,17 +6,16 @@ import shlex
 from collections import Counter
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from analysis.explorer.catalogue import Catalogue
+from analysis.explorer.reading import Row
 from merge_runner.audit.expected import ModelFacts
-from merge_runner.config import pair_name
+from merge_runner.config import both_sides, pair_name
 from merge_runner.drivers.registry import stand_in
 from merge_runner.results.progress_file import Standing, read_standing
 
-Row = dict[str, Any]
 OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, exit_code, config::VARCHAR AS config,
@@ -73,12 +72,11 @@ class Config(BaseModel):
     @property
     def driver(self) -> str:
         """The drivers with their endpoints."""
-        left, _, right = self.model.partition("+")
-        return pair_name((left, right or left), self.endpoints)
+        return pair_name(both_sides(self.model).values(), self.endpoints)
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ListedSweep:
     """One sweep of the list. ``standing`` is what its process says, None where no file does."""
 
     row: Row
@@ -101,7 +99,7 @@ class Entry:
             part = f", in {scripted} of {trials} trials" if scripted < trials else ""
             return f"{self.row['stand_ins']}{part}"
         asked = {model.provider for model in self.config.models.values()}
-        return stand_in(self.config.model) if "emulator" in asked and not trials else ""
+        return stand_in(both_sides(self.config.model)) if "emulator" in asked and not trials else ""
 
     @property
     def state(self) -> str:
@@ -153,7 +151,7 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class VariantCondition:
     """Trials of one variant and condition; ``running`` is None where nobody knows.
 
     ``decisions`` and ``invalid`` are those of stored trials.
@@ -183,7 +181,7 @@ class Rate:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Assessment:
     """The answer in one sentence; ``command`` goes on, unless a ``later`` sweep already did."""
 
     kind: str
@@ -196,16 +194,16 @@ class Verdict:
 class Sweep:
     """One sweep with all that its page shows."""
 
-    entry: Entry
-    verdict: Verdict
-    cells: dict[tuple[str, str], Cell]
+    entry: ListedSweep
+    assessment: Assessment
+    cells: dict[tuple[str, str], VariantCondition]
     rates: list[Rate]
     mismatches: dict[str, int]
     causes: list[Row]
     unpriced: int
 
 
-def list_sweeps(catalogue: Catalogue) -> list[Entry]:
+def list_sweeps(catalogue: Catalogue) -> list[ListedSweep]:
     """All sweeps, the newest first. Raises what ``Catalogue.refresh`` does."""
     before = {
         row["sweep_id"]: read_standing(catalogue.db, row["sweep_id"])
@@ -214,7 +212,9 @@ def list_sweeps(catalogue: Catalogue) -> list[Entry]:
     }
     catalogue.refresh()
     return [
-        Entry(row, config_of(row["config"]), _newest(catalogue, row, before.get(row["sweep_id"])))
+        ListedSweep(
+            row, config_of(row["config"]), _newest(catalogue, row, before.get(row["sweep_id"]))
+        )
         for row in catalogue.ask(SWEEPS)
     ]
 
@@ -239,13 +239,13 @@ def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> 
     if place is None:
         return None
     row = rows[place]
-    entry = Entry(row, config_of(row["config"]), _newest(catalogue, row, standing))
+    entry = ListedSweep(row, config_of(row["config"]), _newest(catalogue, row, standing))
     stored = catalogue.ask(CELLS, sweep_id)
     tried = catalogue.ask(TRIED, sweep_id)
     mismatches = mismatches_of(tried)
     return Sweep(
         entry=entry,
-        verdict=verdict_of(entry, _later(entry, rows[:place]), sum(mismatches.values())),
+        assessment=assessment_of(entry, _later(entry, rows[:place]), sum(mismatches.values())),
         cells=cells_of(entry, stored),
         rates=rates_of(stored, tried, mismatches, sweep_id),
         mismatches=mismatches,
@@ -262,7 +262,7 @@ def config_of(text: str) -> Config:
         return Config()
 
 
-def cells_of(entry: Entry, stored: list[Row]) -> dict[tuple[str, str], Cell]:
+def cells_of(entry: ListedSweep, stored: list[Row]) -> dict[tuple[str, str], VariantCondition]:
     """Every cell that was planned, and any other that holds a trial."""
     planned = {
         (variant, condition): repetitions
@@ -274,7 +274,7 @@ def cells_of(entry: Entry, stored: list[Row]) -> dict[tuple[str, str], Cell]:
     cells = {}
     for key in planned | found:
         row, now = found.get(key, {}), told.get(key)
-        cells[key] = Cell(
+        cells[key] = VariantCondition(
             variant=key[0],
             condition=key[1],
             planned=planned.get(key, 0),
@@ -334,16 +334,16 @@ def mismatches_of(tried: list[Row]) -> dict[str, int]:
     return dict(others)
 
 
-def verdict_of(entry: Entry, later: str, mismatches: int) -> Verdict:
+def assessment_of(entry: ListedSweep, later: str, mismatches: int) -> Assessment:
     """Say whether it is finished, and can be trusted."""
     counted = f"{entry.ended} of {entry.planned or '?'} trials"
     failures = f", {entry.failed} failed" if entry.failed else ""
     if entry.state == "checking":
-        return Verdict("running", f"Nearly done: {counted} ended{failures}; the audit runs.")
+        return Assessment("running", f"Nearly done: {counted} ended{failures}; the audit runs.")
     if entry.live:
         left_s = entry.live.left_s
         left = f", about {duration(left_s)} left" if left_s is not None else ""
-        return Verdict("running", f"Running: {counted} ended{failures}{left}.")
+        return Assessment("running", f"Running: {counted} ended{failures}{left}.")
     if entry.state == "finished":
         return _finished(entry, mismatches)
     complete = entry.ended == entry.planned
@@ -365,8 +365,8 @@ def verdict_of(entry: Entry, later: str, mismatches: int) -> Verdict:
     else:
         text = f"Stopped by an error that it printed: {counted} have an outcome."
     if complete or later or code == 4:
-        return Verdict("stopped", text, later=later)
-    return Verdict("stopped", text, command=_again(entry))
+        return Assessment("stopped", text, later=later)
+    return Assessment("stopped", text, command=_again(entry))
 
 
 def duration(seconds: float) -> str:
@@ -378,27 +378,27 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-def _finished(entry: Entry, mismatches: int) -> Verdict:
+def _finished(entry: ListedSweep, mismatches: int) -> Assessment:
     if entry.planned and entry.ended < entry.planned:
-        return Verdict(
+        return Assessment(
             "stopped",
             f"It had finished, but the database holds only {entry.ended} of its {entry.planned} "
             "trials.",
         )
     text = f"Finished: all {entry.ended} trials ended, and the audit found nothing"
     if mismatches:
-        return Verdict("doubtful", f"{text}; but another model gave {mismatches} answers.")
-    return Verdict("finished", f"{text}.")
+        return Assessment("doubtful", f"{text}; but another model gave {mismatches} answers.")
+    return Assessment("finished", f"{text}.")
 
 
-def _again(entry: Entry) -> str:
+def _again(entry: ListedSweep) -> str:
     words = ["merge-runner", "sweep", entry.row["name"], "--model", entry.config.model or "?"]
     if entry.config.sample_set:
         words += ["--sample-set", str(entry.config.sample_set)]
     return shlex.join(words)
 
 
-def _later(entry: Entry, newer: list[Row]) -> str:
+def _later(entry: ListedSweep, newer: list[Row]) -> str:
     """The newest sweep that went on with the same trials."""
     for row in newer:
         config = config_of(row["config"])

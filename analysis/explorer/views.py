@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import ceil, floor
 from typing import Any
 
-from analysis.explorer.details import Decision, Row, Trial
+from analysis.explorer.details import Decision, Trial
 from analysis.explorer.display_text import visible
-from merge_runner.config import Scenario
-from merge_runner.prompts.blocks import VARIANTS
+from analysis.explorer.reading import Row
+from merge_runner.config import ScenarioConfig
+from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
 from merge_runner.records import SIDES
-from merge_runner.scenarios.merge import geometry as track
 from merge_runner.scenarios.merge.collision import collided
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import Track
 
 BISECTIONS = 14
 # What a picture shows of the plane around the track, in m.
 BEFORE_M, BEYOND_M, BESIDE_M = 3.0, 5.8, 4.5
-# What each part of a prompt is for.
-BLOCK_MEANINGS = {
-    "C0": "situation",
-    "C1": "history",
-    "C2": "previous plan",
-    "C3.safety": "avoid a collision",
-    "C3.human": "drive like a human",
-    "C3.distance": "keep a distance",
-    "C3.reassess": "reassess",
-    "C4": "tactical decision",
-    "C5": "output format",
-}
+UNKNOWN = "no meaning is known here"
 
 
 Scale = tuple[int, int]
@@ -70,12 +59,8 @@ def _spark_points(speeds: Sequence[float], scale: Scale) -> str:
     )
 
 
-def condition_text(name: str) -> str:
-    """A condition in words."""
-    condition = CONDITIONS.get(name)
-    if condition is None:
-        return "no condition of the experiment"
-    headway, velocity = condition.projected_headway_m, condition.relative_velocity_mps
+def condition_text(headway: float, velocity: float) -> str:
+    """A condition in words, of its projected headway in m and its relative velocity in m/s."""
     if headway == 0:
         ahead = "both would reach the merge point together"
     else:
@@ -91,11 +76,34 @@ def prompt_text(variant: str | None) -> str:
     """A prompt variant in words."""
     if variant is None:
         return ""
-    without = sorted(VARIANTS.get(variant, ()))
-    return "the whole prompt" if not without else f"the prompt without {', '.join(without)}"
+    known = VARIANTS.get(variant)
+    if known is None:
+        return f"a prompt of which {UNKNOWN}"
+    changes = changes_text(known, str)
+    return f"the prompt {changes}" if changes else "the whole prompt"
 
 
-def outcome_text(row: Row, scenario: Scenario) -> str:
+def changes_text(variant: Variant, shown: Callable[[str], str]) -> str:
+    """What a variant's prompt leaves out and adds, each block as it is to be shown."""
+    return " and ".join(
+        f"{word} {', '.join(shown(name) for name in sorted(names))}"
+        for word, names in (("without", variant.removes), ("with", variant.adds))
+        if names
+    )
+
+
+def block_meaning(name: str) -> str:
+    """What a block of a prompt is for."""
+    block = BLOCKS.get(name)
+    return UNKNOWN if block is None else block.meaning
+
+
+def clock(time_s: float) -> str:
+    """A time in seconds, to a tenth or, where that is not exact, a hundredth."""
+    return f"{time_s:.1f}" if abs(time_s - round(time_s, 1)) < 1e-6 else f"{time_s:.2f}"
+
+
+def outcome_text(row: Row, scenario: ScenarioConfig) -> str:
     """How a trial ended, in a sentence."""
     end = f"{row['end_time_s']:.1f} s"
     if row["status"] == "collided":
@@ -113,7 +121,7 @@ def outcome_text(row: Row, scenario: Scenario) -> str:
     return f"The {other} vehicle yielded: the {first} one reached the merge point first{when}{gap}."
 
 
-def collision_text(scenario: Scenario) -> str:
+def collision_text(scenario: ScenarioConfig) -> str:
     """What the scenario takes for a collision."""
     length = f"{scenario.vehicle_length_m:g} m"
     return {
@@ -123,7 +131,7 @@ def collision_text(scenario: Scenario) -> str:
     }[scenario.collision_rule]
 
 
-def judged_text(scenario: Scenario) -> str:
+def judged_text(scenario: ScenarioConfig) -> str:
     """What the picture draws of the rule by which the scenario judges a collision."""
     length = f"{scenario.vehicle_length_m:g} m"
     return {
@@ -136,16 +144,16 @@ def judged_text(scenario: Scenario) -> str:
     }[scenario.collision_rule]
 
 
-def view_box() -> str:
+def view_box(track: Track) -> str:
     """The part of the plane that a picture of the track shows: x, y, width, height in m."""
-    half = track.START_DISTANCE_M / 2 + BESIDE_M
-    width = track.MERGE_Y_M + track.TRACK_END_M - track.MERGE_POINT_M + BEFORE_M + BEYOND_M
+    half = track.start_distance_m / 2 + BESIDE_M
+    width = track.end_y_m + BEFORE_M + BEYOND_M
     return f"{-BEFORE_M:g} {-half:g} {width:.1f} {2 * half:g}"
 
 
 def facts(row: Row) -> list[str]:
     """What a trial was about and what was measured, in short sentences."""
-    text = condition_text(row["condition"])
+    text = condition_text(row["projected_headway_m"], row["relative_velocity_mps"])
     found = [f"{row['condition']}: {text}."]
     if row["variant"] is not None:
         found.append(f"{row['variant']}: {prompt_text(row['variant'])}.")
@@ -203,7 +211,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
         "label": label(row),
         "status": row["status"],
         "end": trial.end_s,
-        "every": 1 / trial.scenario.prompt_rate_hz,
+        "every": {side: trial.interval_s(side) for side in SIDES},
         "sides": {
             side: {
                 "t": _rounded(samples["time_s"], 3),
@@ -227,11 +235,11 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
             for d in trial.decisions
         ],
         "track": {
-            "tunnel": track.TUNNEL_EXIT_M,
-            "merge": track.MERGE_POINT_M,
-            "end": track.TRACK_END_M,
-            "lateral": track.LATERAL,
-            "forward": track.FORWARD,
+            "tunnel": trial.track.tunnel_exit_m,
+            "merge": trial.track.merge_point_m,
+            "end": trial.track.end_m,
+            "lateral": trial.track.branch_sine,
+            "forward": trial.track.branch_cosine,
             "length": trial.scenario.vehicle_length_m,
             "width": trial.scenario.vehicle_width_m,
             "rule": trial.scenario.collision_rule,
@@ -272,26 +280,26 @@ def collision_bounds(trial: Trial) -> list[float | None]:
     if left is None or right is None:
         return []
     return [
-        _bound(trial.scenario, a, b)
+        _bound(trial.scenario, trial.track, a, b)
         for a, b in zip(left["position_m"], right["position_m"], strict=False)
     ]
 
 
-def _bound(scenario: Scenario, left_m: float, right_m: float) -> float | None:
+def _bound(scenario: ScenarioConfig, track: Track, left_m: float, right_m: float) -> float | None:
     """At the vehicles' mean position, or on the shared lane once one of them is there.
 
     By bisection: the further apart two vehicles are along the road, the less they overlap.
     """
     if scenario.collision_rule == "shared_lane":
-        shared = max(left_m, right_m) >= track.MERGE_POINT_M
+        shared = max(left_m, right_m) >= track.merge_point_m
         return scenario.vehicle_length_m if shared else None
     mean_m = (left_m + right_m) / 2
-    if not collided(scenario, mean_m, mean_m):
+    if not collided(scenario, track, mean_m, mean_m):
         return None
     low, high = 0.0, 2 * (scenario.vehicle_length_m + scenario.vehicle_width_m)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        if collided(scenario, mean_m + middle / 2, mean_m - middle / 2):
+        if collided(scenario, track, mean_m + middle / 2, mean_m - middle / 2):
             low = middle
         else:
             high = middle
@@ -308,6 +316,7 @@ def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
     None where there is no plan.
     """
     row, before, scenario = decision.row, decision.before, trial.scenario
+    pace = trial.paces[row["side"]]
     if row["lost"]:
         return None
     applied = (row["applied"] or []) if row["time_s"] < trial.end_s else []
@@ -318,9 +327,9 @@ def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
         "plan": row["plan"] or [],
         "before": old,
         "applied": applied,
-        "step_s": scenario.step_s,
+        "step_s": pace.action_steps * scenario.step_s,
         "most_mps2": scenario.max_acceleration_mps2,
-        "steps": scenario.plan_actions,
+        "steps": pace.plan_actions,
     }
 
 
@@ -334,15 +343,15 @@ def step_points(values: Sequence[float], width: float, height: float, steps: int
 
 
 def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:
-    """Both vehicles where a decision was made and a second later, or at the end."""
+    """Both vehicles where a decision was made and where the next one was, or at the end."""
     if decision.row["lost"]:
         return []
     start = decision.row["time_s"]
-    second = 1 / trial.scenario.prompt_rate_hz
+    until = start + trial.interval_s(decision.row["side"])
     found = []
     for side, samples in trial.states.items():
         times = samples["time_s"]
-        inside = [i for i, t in enumerate(times) if start - 1e-9 <= t <= start + second + 1e-9]
+        inside = [i for i, t in enumerate(times) if start - 1e-9 <= t <= until + 1e-9]
         if len(inside) > 1:
             first, last = inside[0], inside[-1]
             found.append(
@@ -353,7 +362,7 @@ def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:
                     "from_mps": samples["velocity_mps"][first],
                     "to_mps": samples["velocity_mps"][last],
                     "moved_m": samples["position_m"][last] - samples["position_m"][first],
-                    "to_merge_m": track.MERGE_POINT_M - samples["position_m"][last],
+                    "to_merge_m": trial.track.merge_point_m - samples["position_m"][last],
                 }
             )
     return sorted(found, key=lambda vehicle: not vehicle["own"])

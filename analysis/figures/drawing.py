@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from analysis.data.reference_data import HUMAN_TRIALS
 from analysis.data.study import Group, Study
 from analysis.figures.panels import Point
+from analysis.figures.styles import Style
 
 # IEEE transactions: one column and the whole page, in inches.
 COLUMN_IN, PAGE_IN = 3.5, 7.16
@@ -26,7 +27,7 @@ def named(group: Group) -> str:
     """A group as figures name it: ``o3/A2``, and a stand-in as what it is."""
     if not group.setting:
         return group.label
-    return group.id + group.label.removeprefix(group.driver)
+    return f"{group.id} ({group.posing})" if group.scripted else group.id
 
 
 def wrapped(text: str, width_in: float) -> str:
@@ -68,13 +69,20 @@ def say(axis: Axes, text: str, height: float = 0.9) -> None:
     )  # fmt: skip
 
 
-def draw_points(axis: Axes, found: list[Point], shift_m: float, colour: str, marker: str) -> None:
+def key(style: Style, label: str) -> Line2D:
+    """A line of a legend."""
+    return Line2D(
+        [], [], color=style.colour, marker=style.marker, ms=3, lw=0.8, mfc="white", label=label
+    )
+
+
+def draw_points(axis: Axes, found: list[Point], shift_m: float, style: Style) -> None:
     """Estimates by projected headway with their intervals, drawn ``shift_m`` beside it."""
     x = np.array([p.headway_m for p in found]) + shift_m
     y = np.array([p.estimate.value for p in found], dtype=float)
     low = np.array([p.estimate.low for p in found], dtype=float)
     high = np.array([p.estimate.high for p in found], dtype=float)
     axis.errorbar(
-        x, y, yerr=np.nan_to_num(np.vstack([y - low, high - y])), color=colour,
-        marker=marker, ms=3, lw=0.8, elinewidth=0.7, capsize=1.5, mfc="white", mew=0.8,
+        x, y, yerr=np.nan_to_num(np.vstack([y - low, high - y])), color=style.colour,
+        marker=style.marker, ms=3, lw=0.8, elinewidth=0.7, capsize=1.5, mfc="white", mew=0.8,
     )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator
 from functools import cache
+from math import ceil
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from analysis.data.study import Group, Study
@@ -23,6 +23,7 @@ from analysis.figures.drawing import (
     MISSING,
     PAGE_IN,
     draw_points,
+    key,
     line_count,
     named,
     remarks,
@@ -31,32 +32,24 @@ from analysis.figures.drawing import (
     wrapped,
 )
 from analysis.figures.panels import (
-    VELOCITIES_MPS,
     Point,
     deviations,
     gaps,
     left_first,
     left_traces,
     published_gap_line,
+    velocities_mps,
 )
+from analysis.figures.styles import HUMAN_STYLE, ORANGE, SKY_BLUE, Style, driver_style
 from analysis.figures.variant_figure import figure_2_variants
+from analysis.metrics import Metric, shown_in
 from analysis.stats.group_scores import score
 from analysis.stats.indicators import INDICATORS
-from analysis.stats.measures import GAP, RMSE, known, published_human
+from analysis.stats.measures import human_reference, known, values
 from merge_runner.errors import UsageError
 
-# Okabe and Ito's palette, safe for the colour-blind; each driver has a marker as well.
-HUMAN_STYLE = ("#000000", "o")
-STYLES = (
-    ("#0072B2", "s"),
-    ("#D55E00", "^"),
-    ("#009E73", "D"),
-    ("#CC79A7", "v"),
-    ("#56B4E9", "P"),
-    ("#E69F00", "X"),
-)
 LEGEND_COLUMNS = 4
-PASSED, FAILED, UNKNOWN = "#56B4E9", "#E69F00", "#DDDDDD"
+PASSED, FAILED, UNKNOWN = SKY_BLUE, ORANGE, "#dddddd"
 # The same input gives the same file.
 SETTINGS: Any = {
     "font.size": 7,
@@ -77,12 +70,13 @@ def figure_2(study: Study) -> Figure:
     parts: Any = figure.subfigures(2, 1, height_ratios=(2, 3))
     traces, curves = parts
     _traces(traces.subplots(2, max(len(groups), 1), sharex=True, sharey=True, squeeze=False), study)
-    axes = curves.subplots(3, 3, sharex=True, sharey="row")
-    _curves(axes[0], groups, left_first, "C", "P(left merges first)")
-    _curves(axes[1], groups, gaps, "D", "gap at merge (m)")
-    _curves(axes[2], groups, deviations, "E", "RMSE of speed (m/s)")
+    velocities = velocities_mps(study)
+    axes = curves.subplots(3, len(velocities), sharex=True, sharey="row")
+    _curves(axes[0], groups, left_first, velocities, "C", "P(left merges first)")
+    _curves(axes[1], groups, gaps, velocities, "D", "gap at merge (m)")
+    _curves(axes[2], groups, deviations, velocities, "E", "RMSE of speed (m/s)")
     axes[0, 0].set_ylim(-0.05, 1.05)
-    for column, velocity in enumerate(VELOCITIES_MPS):
+    for column, velocity in enumerate(velocities):
         axes[0, column].set_title(f"Δv = {velocity_text(velocity)}")
         axes[2, column].set_xlabel("projected headway (m)")
         if study.human in groups and not study.human.measured:
@@ -121,37 +115,56 @@ def ablation_matrix(study: Study) -> Figure:
 
 
 def distributions(study: Study) -> Figure:
-    """Gaps and speed deviations of finished trials: median, quartiles, and every trial."""
-    groups = study.groups
+    """Each metric that is no rate, of every group: median, quartiles, and every trial."""
+    groups, metrics = study.groups, _distributed()
     names = [wrapped(named(group), PAGE_IN / 4) for group in groups]
     row_in = max(0.28, LINE_IN * line_count(names) + 0.04)
-    figure = Figure(figsize=(PAGE_IN, 0.8 + row_in * len(groups)), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, measure in zip(axes, (GAP, RMSE), strict=True):
+    lines = ceil(len(metrics) / 2)
+    size = (PAGE_IN, lines * (0.8 + row_in * len(groups)))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(lines, 2, sharey=True, squeeze=False)
+    for axis, metric in zip(axes.flat, metrics, strict=False):
         for row, group in enumerate(groups):
-            colour, _ = _style(study, group)
-            if not known(group, measure):
-                axis.plot(published_human(measure), row, "D", color=colour, ms=4)
-                axis.annotate(
-                    "published mean", (published_human(measure), row), (6, -2),
-                    textcoords="offset points", fontsize=6,
-                )  # fmt: skip
-                continue
-            values = group.finished[measure.column].dropna().to_numpy(float)
-            if not len(values):
-                axis.annotate("no finished trial", (0.02, row), xycoords=("axes fraction", "data"))
-                continue
-            # Spread by rank, not by chance: the same trials give the same picture.
-            spread = row + 0.36 * (np.arange(len(values)) % 7 / 6 - 0.5)
-            axis.plot(values, spread, ".", color=colour, ms=1.5, alpha=0.4, rasterized=True)
-            axis.boxplot(
-                values, positions=[row], orientation="horizontal", widths=0.6, showfliers=False,
-                medianprops={"color": colour, "lw": 1.4}, manage_ticks=False,
-            )  # fmt: skip
-        axis.set_xlabel(measure.heading)
-    axes[0].set_yticks(range(len(groups)), names)
-    axes[0].set_ylim(len(groups) - 0.5, -0.5)
+            _distribution(axis, row, group, metric, _style(study.baselines, group).colour)
+        axis.set_xlabel(metric.heading)
+    for axis in axes.flat[len(metrics) :]:
+        axis.set_visible(False)
+    axes[0, 0].set_yticks(range(len(groups)), names)
+    axes[0, 0].set_ylim(len(groups) - 0.5, -0.5)
     return figure
+
+
+def _distributed() -> list[Metric]:
+    """Those with values to spread; a rate has two."""
+    return [metric for metric in shown_in("distributions") if not metric.rate]
+
+
+def _distribution(axis: Axes, row: int, group: Group, metric: Metric, colour: str) -> None:
+    if not known(group, metric):
+        _reference(axis, row, metric, colour)
+        return
+    found = values(group, metric).to_numpy(float)
+    if not len(found):
+        axis.annotate("no finished trial", (0.02, row), xycoords=("axes fraction", "data"))
+        return
+    # Spread by rank, not by chance: the same trials give the same picture.
+    spread = row + 0.36 * (np.arange(len(found)) % 7 / 6 - 0.5)
+    axis.plot(found, spread, ".", color=colour, ms=1.5, alpha=0.4, rasterized=True)
+    axis.boxplot(
+        found, positions=[row], orientation="horizontal", widths=0.6, showfliers=False,
+        medianprops={"color": colour, "lw": 1.4}, manage_ticks=False,
+    )  # fmt: skip
+
+
+def _reference(axis: Axes, row: int, metric: Metric, colour: str) -> None:
+    """The published value of humans without traces, or that there is none."""
+    found = human_reference(metric)
+    if found is None:
+        axis.annotate("no published value", (0.02, row), xycoords=("axes fraction", "data"))
+        return
+    axis.plot(found.value, row, "D", color=colour, ms=4)
+    text = f"published {metric.estimator}"
+    axis.annotate(text, (found.value, row), (6, -2), textcoords="offset points", fontsize=6)
 
 
 METADATA: dict[str, dict[str, None]] = {
@@ -184,7 +197,7 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
     ),
     "distributions": (
         distributions,
-        "Gap at the merge point and RMSE of the speed of all finished trials: medians, quartiles, "
+        "Every metric that is not a share, of all trials that count in it: medians, quartiles, "
         "whiskers to 1.5 times the quartiles' distance, and every trial.",
     ),
 }
@@ -227,7 +240,7 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
         for row, (first, panel) in enumerate((("left", "A"), ("right", "B"))):
             axis: Axes = axes[row, column]
             found = left_traces(study, group, first)
-            colour, _ = _style(study, group)
+            colour = _style(study.baselines, group).colour
             alpha = min(0.4, max(0.06, 25 / max(len(found), 1)))  # many lines must not be one blot
             lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
             lines.set(capstyle="projecting", joinstyle="round")
@@ -253,43 +266,37 @@ def _curves(
     axes: NDArray[np.object_],
     groups: list[Group],
     points: Callable[[Group, float], list[Point]],
+    velocities: list[float],
     panel: str,
     label: str,
 ) -> None:
     axes[0].set_ylabel(label)
     _panel(axes[0], panel)
-    for axis, velocity in zip(axes, VELOCITIES_MPS, strict=True):
+    for axis, velocity in zip(axes, velocities, strict=True):
         for index, group in enumerate(groups):
             found = points(group, velocity)
             # Side by side, so that intervals do not hide each other.
             shift = 0.16 * (index - (len(groups) - 1) / 2)
-            draw_points(axis, found, shift, *_group_style(groups, group))
+            draw_points(axis, found, shift, _style(groups, group))
         axis.set_xticks([-4, -2, 0, 2, 4])
 
 
 def _legend(figure: SubFigure, study: Study, groups: list[Group]) -> None:
     handles = []
     for group in groups:
-        colour, marker = _group_style(groups, group)
         label = wrapped(group.label, PAGE_IN / LEGEND_COLUMNS - 0.4)
-        handles.append(
-            Line2D([], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white", label=label)
-        )
+        handles.append(key(_style(groups, group), label))
     handles += remarks(study, "black")
     figure.legend(handles=handles, loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False)
 
 
-def _style(study: Study, group: Group) -> tuple[str, str]:
-    return _group_style(study.baselines, group)
-
-
-def _group_style(groups: list[Group], group: Group) -> tuple[str, str]:
-    """Colour and marker of a driver, the same for all its variants."""
+def _style(groups: list[Group], group: Group) -> Style:
+    """The style of a driver, the same for all its variants."""
     if not group.setting:
         return HUMAN_STYLE
     drivers = list(dict.fromkeys(g.driver for g in groups if g.setting))
     index = drivers.index(group.driver) if group.driver in drivers else len(drivers)
-    return STYLES[index % len(STYLES)]
+    return driver_style(index)
 
 
 def _mark(passed: bool | None) -> str:

@@ -13,10 +13,10 @@ from analysis.data.reference_data import published
 from analysis.data.study import Group, Study, of_group
 from analysis.stats.intervals import Estimate, mean, proportion
 from analysis.stats.regressions import gap_design
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 Array = NDArray[np.float64]
-VELOCITIES_MPS = (-0.8, 0.0, 0.8)
+HUMAN_VELOCITIES_MPS = sorted({c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()})
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +25,11 @@ class Point:
 
     headway_m: float
     estimate: Estimate
+
+
+def velocities_mps(study: Study) -> list[float]:
+    """The relative velocities that there are panels for."""
+    return sorted({*HUMAN_VELOCITIES_MPS, *(velocity for _, velocity in study.conditions.values())})
 
 
 def left_first(group: Group, velocity_mps: float) -> list[Point]:
@@ -79,8 +84,6 @@ def left_traces(study: Study, group: Group, first: str) -> list[Array]:
 def _conditions(every: pd.DataFrame, velocity_mps: float) -> Iterator[tuple[float, pd.DataFrame]]:
     """The finished trials of each condition with this relative velocity, by headway."""
     finished = every[every["status"] == "finished"]
-    chosen = [c for c in CONDITIONS.values() if c.relative_velocity_mps == velocity_mps]
-    for condition in sorted(chosen, key=lambda c: c.projected_headway_m):
-        trials = finished[finished["condition"] == condition.name]
-        if len(trials):
-            yield condition.projected_headway_m, trials
+    chosen = finished[finished["relative_velocity_mps"] == velocity_mps]
+    for (headway_m, _), trials in chosen.groupby(["projected_headway_m", "condition"]):
+        yield headway_m, trials

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from analysis.data.study import Group, Study
@@ -17,6 +17,7 @@ from analysis.figures.drawing import (
     MISSING,
     PAGE_IN,
     draw_points,
+    key,
     line_count,
     remarks,
     say,
@@ -24,24 +25,35 @@ from analysis.figures.drawing import (
     wrapped,
 )
 from analysis.figures.panels import (
-    VELOCITIES_MPS,
+    HUMAN_VELOCITIES_MPS,
     Point,
     deviations,
     gaps,
     left_first,
     left_traces,
     published_gap_line,
+    velocities_mps,
+)
+from analysis.figures.styles import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY_BLUE,
+    VERMILION,
+    Style,
 )
 from analysis.stats.intervals import Estimate
 from analysis.tables.formats import VARIANTS
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 # Laid out by hand: many rows of equal panels need no solver. In inches.
 LABEL_IN, ROW_IN = 1.15, 0.62
 LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = LABEL_IN + 0.35, 0.08, 0.4, 0.62
 BETWEEN_ROWS_IN, BETWEEN_COLUMNS_IN = 0.16, 0.3
-# Of Okabe and Ito's palette, with a marker each, in the order of VELOCITIES_MPS.
-STYLES = (("#0072B2", "v"), ("#009E73", "o"), ("#D55E00", "^"))
+# Those of the humans' relative velocities in their order, and what is left for others.
+STYLES = (Style(BLUE, "down"), Style(GREEN, "circle"), Style(VERMILION, "triangle"))
+OTHER_STYLES = (Style(PURPLE, "square"), Style(SKY_BLUE, "diamond"), Style(ORANGE, "plus"))
+Styles = dict[float, Style]
 HEADINGS = (
     "left first:\nv left (m/s)",
     "left second:\nv left (m/s)",
@@ -57,6 +69,7 @@ PANELS = (left_first, gaps, deviations)
 def figure_2_variants(study: Study) -> Figure:
     """Left speeds (A, B), who was first (C), gap (D) and speed deviation (E) of every group."""
     groups = study.groups
+    styles = _styles(study)
     names = [_name(group) for group in groups]
     figure, axes = _panels(len(groups), max(ROW_IN, LINE_IN * line_count(names) + 0.06))
     for row, group, name in zip(axes, groups, names, strict=True):
@@ -65,15 +78,22 @@ def figure_2_variants(study: Study) -> Figure:
             textcoords="offset points", va="center",
         )  # fmt: skip
         for axis, first in zip(row[:2], ("left", "right"), strict=True):
-            _traces(axis, study, group, first)
+            _traces(axis, study, group, first, styles)
         for axis, points in zip(row[2:], PANELS, strict=True):
-            _points(axis, group, points)
+            _points(axis, group, points, styles)
         if not group.measured:
             _published(row[3])
-    _scales(axes, groups)
+    _scales(axes, groups, study)
     _headings(axes)
-    _legend(figure, study)
+    _legend(figure, study, styles)
     return figure
+
+
+def _styles(study: Study) -> Styles:
+    """Colour and marker of each relative velocity in m/s."""
+    humans = dict(zip(HUMAN_VELOCITIES_MPS, STYLES, strict=True))
+    others = [velocity for velocity in velocities_mps(study) if velocity not in humans]
+    return dict(sorted({**humans, **dict(zip(others, cycle(OTHER_STYLES), strict=False))}.items()))
 
 
 def _panels(rows: int, row_in: float) -> tuple[Figure, NDArray[np.object_]]:
@@ -106,13 +126,13 @@ def _name(group: Group) -> str:
     return f"{driver}\n{wrapped(VARIANTS.get(group.setting, group.setting), LABEL_IN)}"
 
 
-def _traces(axis: Axes, study: Study, group: Group, first: str) -> None:
+def _traces(axis: Axes, study: Study, group: Group, first: str, styles: Styles) -> None:
     """The left speeds of those trials in which this side merged first."""
-    parts = [left_traces(study, _part(group, velocity), first) for velocity in VELOCITIES_MPS]
+    parts = [left_traces(study, _part(group, velocity), first) for velocity in styles]
     count = sum(map(len, parts))
     alpha = min(0.4, max(0.06, 25 / max(count, 1)))  # many lines must not be one blot
-    for found, (colour, _) in zip(parts, STYLES, strict=True):
-        lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
+    for found, style in zip(parts, styles.values(), strict=True):
+        lines = LineCollection(found, color=style.colour, lw=0.4, alpha=alpha, rasterized=True)
         lines.set(capstyle="projecting", joinstyle="round")
         axis.add_collection(lines)
     axis.autoscale_view()
@@ -125,15 +145,16 @@ def _traces(axis: Axes, study: Study, group: Group, first: str) -> None:
 
 
 def _part(group: Group, velocity_mps: float) -> Group:
-    names = [c.name for c in CONDITIONS.values() if c.relative_velocity_mps == velocity_mps]
-    return group.part(lambda trials: trials["condition"].isin(names))
+    return group.part(lambda trials: trials["relative_velocity_mps"] == velocity_mps)
 
 
-def _points(axis: Axes, group: Group, points: Callable[[Group, float], list[Point]]) -> None:
-    """Estimates of the three relative velocities, side by side."""
-    found = [points(group, velocity) for velocity in VELOCITIES_MPS]
-    for index, (part, style) in enumerate(zip(found, STYLES, strict=True)):
-        draw_points(axis, part, 0.3 * (index - 1), *style)
+def _points(
+    axis: Axes, group: Group, points: Callable[[Group, float], list[Point]], styles: Styles
+) -> None:
+    """Estimates of the relative velocities, side by side."""
+    found = [points(group, velocity) for velocity in styles]
+    for index, (part, style) in enumerate(zip(found, styles.values(), strict=True)):
+        draw_points(axis, part, 0.3 * (index - (len(styles) - 1) / 2), style)
     if group.measured and not any(found):
         say(axis, "no such trial")
     elif points is deviations and not group.measured:
@@ -142,11 +163,11 @@ def _points(axis: Axes, group: Group, points: Callable[[Group, float], list[Poin
 
 def _published(axis: Axes) -> None:
     """The humans' gaps as the paper's regression has them."""
-    for velocity, (colour, _) in zip(VELOCITIES_MPS, STYLES, strict=True):
-        axis.plot(*published_gap_line(velocity), color=colour, ls="--", lw=0.8)
+    for velocity, style in zip(HUMAN_VELOCITIES_MPS, STYLES, strict=True):
+        axis.plot(*published_gap_line(velocity), color=style.colour, ls="--", lw=0.8)
 
 
-def _scales(axes: NDArray[np.object_], groups: list[Group]) -> None:
+def _scales(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None:
     """One scale a quantity; a few very wide intervals must not press all others flat."""
     speeds = [limit for axis in axes[0, :2] for limit in axis.get_ylim()]
     for axis in axes[0, :2]:
@@ -154,14 +175,15 @@ def _scales(axes: NDArray[np.object_], groups: list[Group]) -> None:
     axes[0, 2].set_ylim(-0.08, 1.08)
     axes[0, 2].set_yticks([0, 0.5, 1])
     published = not all(group.measured for group in groups)
-    lines = [float(y) for v in VELOCITIES_MPS for y in published_gap_line(v)[1] if published]
+    lines = [float(y) for v in HUMAN_VELOCITIES_MPS for y in published_gap_line(v)[1] if published]
     for axis, points in zip(axes[0, 3:], PANELS[1:], strict=True):
-        found = [p.estimate for g in groups for v in VELOCITIES_MPS for p in points(g, v)]
+        found = [p.estimate for g in groups for v in velocities_mps(study) for p in points(g, v)]
         if found:
             axis.set_ylim(*_limits(found, lines if points is gaps else []))
+    farthest_m = max(abs(headway_m) for headway_m, _ in study.conditions.values())
     for axis in axes[0, 2:]:
-        axis.set_xlim(-5, 5)
-        axis.set_xticks([-4, 0, 4])
+        axis.set_xlim(-farthest_m - 1, farthest_m + 1)
+        axis.set_xticks([-farthest_m, 0, farthest_m])
 
 
 def _limits(found: list[Estimate], lines: list[float]) -> tuple[float, float]:
@@ -183,13 +205,7 @@ def _headings(axes: NDArray[np.object_]) -> None:
         axis.set_xlabel(label)
 
 
-def _legend(figure: Figure, study: Study) -> None:
-    handles = [
-        Line2D(
-            [], [], color=colour, marker=marker, ms=3, lw=0.8, mfc="white",
-            label=f"Δv = {velocity_text(velocity)}",
-        )
-        for velocity, (colour, marker) in zip(VELOCITIES_MPS, STYLES, strict=True)
-    ]  # fmt: skip
+def _legend(figure: Figure, study: Study, styles: Styles) -> None:
+    handles = [key(style, f"Δv = {velocity_text(velocity)}") for velocity, style in styles.items()]
     handles += remarks(study, "#555555")
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False)

@@ -9,8 +9,8 @@ from analysis.human.archive import Unreadable
 from analysis.human.trace import Trace
 from merge_runner.llm.keys import canonical_json, spec_hash
 from merge_runner.records import SIDES, Side, StateRow, Status, TrialRecord, TrialSpec
-from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
-from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
+from merge_runner.scenarios.merge.geometry import TRACK
 
 STATUSES: dict[str, Status] = {
     "Finished": "finished",
@@ -30,11 +30,11 @@ SPEC = canonical_json(
         "doi": HUMAN_DOI,
         "condition": "the one whose start is at most "
         f"{START_TOLERANCE_M} m and {START_TOLERANCE_MPS} m/s from the first sample",
-        "time_s": f"from the first sample with both vehicles beyond {TUNNEL_EXIT_M:g} m",
+        "time_s": f"from the first sample with both vehicles beyond {TRACK.tunnel_exit_m:g} m",
         "position_m": "travelled_distance",
         "velocity_mps": "velocities",
         "acceleration_mps2": "difference of velocities over the step before",
-        "merged_first": f"at {MERGE_POINT_M:g} m, interpolated within the step",
+        "merged_first": f"at {TRACK.merge_point_m:g} m, interpolated within the step",
     }
 )
 SPEC_HASH = spec_hash(SPEC)
@@ -75,13 +75,13 @@ def _status(trace: Trace) -> Status:
     if status is None:
         raise Unreadable(f"end_state is {trace.end_state!r}; known: {', '.join(STATUSES)}")
     farthest = max(trace.positions_m[side][-1] for side in SIDES)
-    if status == "finished" and farthest < TRACK_END_M - END_TOLERANCE_M:
+    if status == "finished" and farthest < TRACK.end_m - END_TOLERANCE_M:
         raise Unreadable(f"it is Finished, but ends with no vehicle beyond {farthest:.1f} m")
     return status
 
 
 def _condition(trace: Trace) -> str:
-    for name, condition in CONDITIONS.items():
+    for name, condition in HUMAN_CONDITIONS.items():
         if _starts_like(condition, trace):
             return name
     starts = (
@@ -96,7 +96,7 @@ def _starts_like(condition: Condition, trace: Trace) -> bool:
         abs(trace.positions_m[side][0] - start_m) <= START_TOLERANCE_M
         and abs(trace.velocities_mps[side][0] - speed_mps) <= START_TOLERANCE_MPS
         for side, start_m, speed_mps in zip(
-            SIDES, condition.starts_m, condition.speeds_mps, strict=True
+            SIDES, condition.starts_m(TRACK), condition.speeds_mps, strict=True
         )
     )
 
@@ -104,9 +104,9 @@ def _starts_like(condition: Condition, trace: Trace) -> bool:
 def _control_start(trace: Trace) -> int:
     """The first sample with both vehicles out of their tunnels: time 0."""
     for sample, positions in enumerate(zip(*trace.positions_m.values(), strict=True)):
-        if min(positions) > TUNNEL_EXIT_M:
+        if min(positions) > TRACK.tunnel_exit_m:
             return sample
-    raise Unreadable(f"its vehicles are never both beyond the tunnels ({TUNNEL_EXIT_M:g} m)")
+    raise Unreadable(f"its vehicles are never both beyond the tunnels ({TRACK.tunnel_exit_m:g} m)")
 
 
 def _merged_first(trace: Trace) -> Side | None:
@@ -120,8 +120,8 @@ def _merged_first(trace: Trace) -> Side | None:
 def _arrival(positions_m: list[float]) -> float | None:
     """When a vehicle reaches the merge point, in steps from the first sample; None: never."""
     for step, (before, now) in enumerate(pairwise(positions_m)):
-        if before < MERGE_POINT_M <= now:
-            return step + (MERGE_POINT_M - before) / (now - before)
+        if before < TRACK.merge_point_m <= now:
+            return step + (TRACK.merge_point_m - before) / (now - before)
     return None
 
 

@@ -10,19 +10,17 @@ from typing import Any
 from scipy import stats
 
 from analysis.data.study import BASELINE, Group, Study
+from analysis.metrics import Metric, compared
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import POWER
-from analysis.stats.measures import MEASURES, Measure, counts
+from analysis.stats.measures import counts
 from analysis.stats.variants import variants
 from analysis.tables import finished_tables
 from analysis.tables.model import Row
+from analysis.tables.notes import listed
 
-NAMES = {
-    "collided_percent": ("collisions by the scenario's rule", "points"),
-    "collided_boxes_percent": ("collisions of boxes", "points"),
-    "gap_m": ("the gap", "m"),
-    "rmse_mps": ("the RMSE of the speed", "m/s"),
-    "joint_percent": ("joint contributions", "points"),
+# Coefficients of the regressions, as a sentence names them, and their units.
+SLOPES = {
     "projected_headway": ("the effect of headway on who merges first", "logits per m"),
     "relative_velocity": ("the effect of relative velocity on who merges first", "logits per m/s"),
     "abs_projected_headway": ("the effect of |headway| on the gap", "m per m"),
@@ -54,9 +52,18 @@ class Change:
     @property
     def text(self) -> str:
         """``the gap by -2.40 m (95 % CI -3.23 to -1.57)``."""
-        name, unit = NAMES[self.what]
+        name, unit = _names()[self.what]
         interval = f" (95 % CI {self.ci[0]:+.2f} to {self.ci[1]:+.2f})" if self.ci else ""
         return f"{name} by {self.difference:+.2f} {unit}{interval}"
+
+
+def _names() -> dict[str, tuple[str, str]]:
+    """What may differ, as a sentence names it, and the unit of a difference."""
+    metrics = {
+        metric.name: (metric.in_sentences, "points" if metric.rate else metric.unit)
+        for metric in compared()
+    }
+    return metrics | SLOPES
 
 
 def ablation_sentences(study: Study) -> list[str]:
@@ -95,12 +102,12 @@ def _of_driver(
 
 
 def _changes(group: Group, baseline: Group, rows: dict[str, Row]) -> Iterator[Change]:
-    for measure in MEASURES:
-        row = rows.get(f"{group.id}/{BASELINE}/{measure.name}")
+    for metric in compared():
+        row = rows.get(f"{group.id}/{BASELINE}/{metric.name}")
         if row is not None:
-            possible = smallest_p(group, baseline, measure) < ALPHA
-            yield _change(group, measure.name, row, "ci", possible=possible)
-    for slope in (name for name in NAMES if name not in {one.name for one in MEASURES}):
+            possible = smallest_p(group, baseline, metric) < ALPHA
+            yield _change(group, metric.name, row, "ci", possible=possible)
+    for slope in SLOPES:
         row = rows[f"{group.id}/{slope}"]
         if "difference" in row.values:
             yield _change(group, slope, row, "difference_ci", possible=True)
@@ -119,17 +126,17 @@ def _change(group: Group, what: str, row: Row, interval: str, *, possible: bool)
     )
 
 
-def smallest_p(group: Group, baseline: Group, measure: Measure) -> float:
+def smallest_p(group: Group, baseline: Group, metric: Metric) -> float:
     """The smallest p that a test of so many trials gives, whatever comes out.
 
     Fisher's of two rates of 0 and 1; that of the permutation test, where of all ways to shuffle
     within the conditions one is the most extreme, or two that mirror each other.
     """
-    if measure.rate:
-        n, m = (counts(one, measure)[1] for one in (group, baseline))
+    if metric.rate:
+        n, m = (counts(one, metric)[1] for one in (group, baseline))
         return float(stats.fisher_exact([[n, 0], [0, m]]).pvalue)
     first, second = (
-        one.finished.dropna(subset=[measure.column])["condition"].value_counts()
+        one.trials.dropna(subset=[metric.column])["condition"].value_counts()
         for one in (group, baseline)
     )
     shared = [
@@ -153,7 +160,7 @@ def _not_shown(label: str, changes: list[Change]) -> Iterator[str]:
         return
     sizes = [
         f"{_span(found)} {unit} in {name}"
-        for what, (name, unit) in NAMES.items()
+        for what, (name, unit) in _names().items()
         for found in [
             [c.detectable for c in changes if c.what == what and c.detectable is not None]
         ]
@@ -180,7 +187,7 @@ def _not_compared(label: str, groups: list[Group], changes: list[Change]) -> Ite
     there = {(one.setting, one.what) for one in changes}
     lacking = [
         (group.setting, what)
-        for what in NAMES
+        for what in _names()
         for group in groups
         if (group.setting, what) not in there
     ]
@@ -198,7 +205,7 @@ def _which(changes: list[Change]) -> str:
 def _grouped(found: list[tuple[str, str]]) -> str:
     """Measures and slopes with their variants; those of the same variants together."""
     alike: dict[str, list[str]] = {}
-    for what, (name, _) in NAMES.items():
+    for what, (name, _) in _names().items():
         settings = ", ".join(setting for setting, other in found if other == what)
         if settings:
             alike.setdefault(settings, []).append(name)
@@ -208,8 +215,3 @@ def _grouped(found: list[tuple[str, str]]) -> str:
 def _span(values: list[float]) -> str:
     low, high = (f"{value:.2f}" for value in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
-
-
-def listed(items: list[str]) -> str:
-    """``a, b and c``."""
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

@@ -8,15 +8,22 @@ from __future__ import annotations
 from analysis.data.provenance import Provenance
 from analysis.data.reference_data import HUMAN_TRIALS, PAIRS
 from analysis.data.study import Group, Study
+from analysis.metrics import BOXES, Metric, shown_in
 from analysis.report.ablated import ablation_sentences
 from analysis.report.alarms import mismatch
 from analysis.report.unlike import unlike
 from analysis.stats.contrasts import contrast_rates
 from analysis.stats.group_scores import Score, score, unjudged
 from analysis.stats.indicators import ALPHA, INDICATORS, Verdict
-from analysis.stats.measures import BOXES, GAP, counts, estimate, known, published_human
+from analysis.stats.measures import (
+    counts,
+    estimate,
+    human_reference,
+    known,
+    no_human_value,
+)
 from analysis.stats.mixed import MIN_PAIRS
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",
@@ -71,16 +78,28 @@ def _concluded(study: Study) -> list[Group]:
 def _shown(study: Study, group: Group) -> list[str]:
     if not len(group.ended):
         return [f"{group.driver}: no trial ended ({group.left_out})."]
-    if not len(group.finished):
+    alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
+    own = len(group.ended) - len(alike.ended)
+    texts = _marks(study, group) if len(group.finished) else []
+    if own:
+        texts.append(
+            f"{group.driver}: {_trials(own)} of {len(group.ended)} "
+            f"{'is' if own == 1 else 'are'} of conditions that no human drove, and not compared "
+            "with humans in what follows."
+        )
+    if not len(alike.ended):
+        return texts
+    if not len(alike.finished):
         return [
-            f"{group.driver}: no trial finished ({group.left_out}).",
-            _collisions(study, group),
+            *texts,
+            f"{group.driver}: no trial finished ({alike.left_out}).",
+            _collisions(study, alike),
         ]
     return [
-        *_marks(study, group),
-        _collisions(study, group),
-        _gap(study, group),
-        *unlike(study, group),
+        *texts,
+        _collisions(study, alike),
+        *(_told(study, alike, metric) for metric in shown_in("conclusions")),
+        *unlike(study, alike),
     ]
 
 
@@ -154,24 +173,42 @@ def _collisions(study: Study, group: Group) -> str:
     )
 
 
-def _gap(study: Study, group: Group) -> str:
-    found = estimate(group, GAP)
+def _told(study: Study, group: Group, metric: Metric) -> str:
+    """What a driver comes to by a metric, and the humans."""
+    found, subject = estimate(group, metric), metric.in_sentences
     if found.value is None:
-        return f"{group.driver} has no gap at the merge point."
-    interval = "" if found.low is None else f" (95 % CI {found.low:.2f} to {found.high:.2f})"
-    return (
-        f"{group.driver} leaves {found.value:.2f} m on average of {_trials(found.n)}{interval}; "
-        f"humans {_human_gap(study, group)}."
+        return f"{group.driver}: no trial has {subject}."
+    told = metric.told.format(
+        value=_number(metric, found.value),
+        subject=subject,
+        estimator=metric.estimator,
+        trials=_trials(found.n),
     )
+    low_high = found.bounds()
+    interval = f" (95 % CI {' to '.join(_digits(metric, x) for x in low_high)})" if low_high else ""
+    return f"{group.driver} {told}{interval}; {_of_humans(study, group, metric)}."
 
 
-def _human_gap(study: Study, group: Group) -> str:
-    if not known(study.human, GAP):
-        return f"{published_human(GAP):.2f} m as published, over all {len(CONDITIONS)} conditions"
-    human = estimate(_alike(study.human, group), GAP)
+def _of_humans(study: Study, group: Group, metric: Metric) -> str:
+    if not known(study.human, metric):
+        found = human_reference(metric)
+        if found is None:
+            return no_human_value(metric)
+        value = _number(metric, found.value)
+        return f"humans {value} as published, over all {len(HUMAN_CONDITIONS)} conditions"
+    human = estimate(_alike(study.human, group), metric)
     if human.value is None:
-        return "have none in the imported trials of these conditions"
-    return f"{human.value:.2f} m in {human.n} imported trials of the same {_conditions(group)}"
+        return "humans have none in the imported trials of these conditions"
+    value, conditions = _number(metric, human.value), _conditions(group)
+    return f"humans {value} in {human.n} imported trials of the same {conditions}"
+
+
+def _number(metric: Metric, value: float) -> str:
+    return f"{_digits(metric, value)} {metric.unit}"
+
+
+def _digits(metric: Metric, value: float) -> str:
+    return f"{value:.{metric.decimals}f}"
 
 
 def _alike(human: Group, group: Group) -> Group:

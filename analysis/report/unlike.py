@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from analysis.data.study import Group, Study
-from analysis.report.ablated import NAMES, listed
+from analysis.report.ablated import SLOPES
 from analysis.stats.contrasts import corrected
 from analysis.stats.indicators import ALPHA
-from analysis.stats.intervals import POWER
-from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Difference, differences
+from analysis.stats.intervals import POWER, Difference
+from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, differences
+from analysis.tables.notes import listed
 
 LEVELS = {
     WHO_FIRST: ("who merges first where nobody is ahead or faster", "logits"),
@@ -20,37 +21,37 @@ LEVELS = {
 def unlike(study: Study, group: Group) -> Iterator[str]:
     """What one model of a driver and the humans shows of their difference."""
     found = differences(study.human, group)
-    tested = [one for one in found if one.p is not None]
+    tested = [(one, one.found) for one in found if one.found is not None]
     for problem in dict.fromkeys(one.problem for one in found if one.problem):
         yield f"{group.driver}: a difference from the humans cannot be tested: {problem}."
-    for remark in dict.fromkeys(one.remark for one in tested if NARROW in one.remark):
+    for remark in dict.fromkeys(one.remark for one, _ in tested if NARROW in one.remark):
         yield f"{group.driver} beside the humans: {remark}."
-    holm, _ = corrected([one.p for one in tested if one.p is not None]) if tested else ((), ())
-    shown = [one for one, p in zip(tested, holm, strict=True) if p < ALPHA]
+    holm, _ = corrected([difference.p for _, difference in tested]) if tested else ((), ())
+    shown = [pair for pair, p in zip(tested, holm, strict=True) if p < ALPHA]
     if shown:
         yield (
             f"{group.driver} differs from the humans, in one model of both and after Holm's "
-            f"correction for {len(tested)} tests, in {listed([_size(one) for one in shown])}."
+            f"correction for {len(tested)} tests, in {listed([_size(*pair) for pair in shown])}."
         )
-    others = [one for one in tested if one not in shown]
+    others = [pair for pair in tested if pair not in shown]
     if others:
         yield (
             f"{group.driver}: no difference from the humans is shown in "
-            f"{listed([_name(one)[0] for one in others])}. That does not show that there is none: "
-            f"the smallest that one such test, not yet corrected, finds with a chance of "
-            f"{100 * POWER:.0f} % is {listed([_smallest(one) for one in others])}."
+            f"{listed([_name(one)[0] for one, _ in others])}. That does not show that there is "
+            f"none: the smallest that one such test, not yet corrected, finds with a chance of "
+            f"{100 * POWER:.0f} % is {listed([_smallest(*pair) for pair in others])}."
         )
 
 
-def _name(one: Difference) -> tuple[str, str]:
-    return LEVELS[one.outcome] if one.term == "intercept" else NAMES[one.term]
+def _name(one: Interaction) -> tuple[str, str]:
+    return LEVELS[one.outcome] if one.term == "intercept" else SLOPES[one.term]
 
 
-def _size(one: Difference) -> str:
+def _size(one: Interaction, found: Difference) -> str:
     name, unit = _name(one)
-    return f"{name} by {one.b:+.2f} {unit} (95 % CI {one.low:+.2f} to {one.high:+.2f})"
+    return f"{name} by {found.value:+.2f} {unit} (95 % CI {found.low:+.2f} to {found.high:+.2f})"
 
 
-def _smallest(one: Difference) -> str:
+def _smallest(one: Interaction, found: Difference) -> str:
     name, unit = _name(one)
-    return f"{one.detectable:.2f} {unit} in {name}"
+    return f"{found.detectable:.2f} {unit} in {name}"

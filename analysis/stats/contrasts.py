@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -10,29 +9,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
-from analysis.stats.intervals import LEVEL, POWER, detectable
+from analysis.stats.intervals import LEVEL, POWER, Difference, detectable, interval
 
 SEED = 260409609
 PERMUTATIONS = 9999
 DRAWN_AT_ONCE = 2**15  # they stay in the processor
 
 
-@dataclass(frozen=True, slots=True)
-class Contrast:
-    """A difference (first minus second) with its 95 % interval and a two-sided p-value.
-
-    ``detectable`` is the smallest difference, in either direction, that is found at p < .05 with a
-    power of 0.8; None where none is.
-    """
-
-    difference: float
-    low: float | None
-    high: float | None
-    p: float
-    detectable: float | None
-
-
-def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Contrast:
+def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Difference:
     """Two rates, (successes, n) each: Fisher's exact test, Newcombe's score interval (1998)."""
     from statsmodels.stats.proportion import confint_proportions_2indep
 
@@ -40,7 +24,7 @@ def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Contrast:
     low, high = confint_proportions_2indep(a, n, b, m, method="newcomb", alpha=1 - LEVEL)
     p = stats.fisher_exact([[a, n - a], [b, m - b]]).pvalue
     found = detectable_rate(n, m, b / m)
-    return Contrast(a / n - b / m, float(low), float(high), float(p), found)
+    return Difference(a / n - b / m, float(low), float(high), float(p), found)
 
 
 def detectable_rate(n: int, m: int, rate: float) -> float | None:
@@ -80,7 +64,7 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
     return found
 
 
-def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Contrast | None:
+def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Difference | None:
     """Two means, compared within conditions: permutation test, least-squares interval.
 
     The difference is that of a linear model with a level for each condition, so that another mix of
@@ -92,6 +76,8 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> C
     by_condition = both.groupby("condition")
     value = (both[measure].astype(float) - by_condition[measure].transform("mean")).to_numpy(float)
     group = (both["_first"] - by_condition["_first"].transform("mean")).to_numpy(float)
+    # Of what is left of both within conditions, the slope is that of the whole model (Frisch and
+    # Waugh 1933; Lovell 1963).
     weight = float((group**2).sum())
     if weight < 1e-12:
         return None
@@ -101,12 +87,12 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> C
     if freedom > 0:
         variance = float(((value - difference * group) ** 2).sum()) / freedom
         se = float(np.sqrt(variance / weight))
-        half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * se
-        low, high, found = difference - half, difference + half, detectable(se, freedom)
+        low, high = interval(difference, se, freedom)
+        found = detectable(se, freedom)
     chosen = both["_first"].to_numpy(float) == 1
     sizes = by_condition.size().to_numpy()
     p = _permutation_p(value, chosen, sizes, weight, difference)
-    return Contrast(difference, low, high, p, found)
+    return Difference(difference, low, high, p, found)
 
 
 def _permutation_p(
@@ -127,6 +113,7 @@ def _permutation_p(
         for start, end in zip(ends - sizes, ends, strict=True)
     ]
     extreme = int((np.abs(np.sum(parts, axis=0) / weight) >= abs(observed) - 1e-12).sum())
+    # The trials as they are count as a shuffle, so that p is never 0 (Phipson and Smyth 2010).
     return (extreme + 1) / (PERMUTATIONS + 1)
 
 
@@ -152,7 +139,8 @@ def shuffled_sums(
 def corrected(p: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A family's p-values by Holm (1979) and by Benjamini and Hochberg (1995).
 
-    Not by statsmodels, which collects garbage at every call: that takes longer than the tests.
+    Not by statsmodels' multipletests, which collects garbage at every call: 0.1 s each, and there
+    is a family for every measure of every driver. A test holds both against each other.
     """
     found = np.asarray(p, dtype=float)
     order = np.argsort(found, kind="stable")

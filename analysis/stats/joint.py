@@ -3,7 +3,7 @@
 Who merged first is left ~ (h + dv) x source (logit), the gap is ~ (|h| + |dv| + h*dv) x source
 (least squares); source is 1 for the driver and 0 for the humans. Since it stands in every term, the
 likelihood, and Firth's penalty, fall apart into one factor of the humans and one of the driver: an
-interaction is the driver's coefficient minus the humans', and its variance the sum of both.
+interaction is the driver's coefficient minus the humans' (see ``regressions.difference``).
 
 The driver's trials are independent: Fisher's information in the logit, HC3 errors for the gap. The
 humans' come from pairs who differ: a jackknife over the pairs (CV3 of MacKinnon, Nielsen and Webb
@@ -14,27 +14,27 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from math import hypot, inf, isinf, sqrt
+from math import sqrt
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import stats
 
 from analysis.data.reference_data import citation, published
 from analysis.data.study import Group
 from analysis.stats.group_scores import fits
-from analysis.stats.intervals import LEVEL, detectable
+from analysis.stats.intervals import LEVEL, Difference
 from analysis.stats.mixed import MIN_PAIRS
 from analysis.stats.regressions import (
     GAP_TERMS,
     MAX_ITERATIONS,
     WHO_FIRST_TERMS,
     Regression,
-    Term,
+    difference,
     gap_ols,
+    wald_term,
     who_first_data,
     who_first_logit,
 )
@@ -46,34 +46,27 @@ NO_PAIRS = f"which pair drove is not published: {NARROW}"
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
-    """A driver's coefficient minus the humans', of ``outcome`` and ``term``; ``intercept``: source.
+class Interaction:
+    """How far a term of ``outcome`` differs between a driver and the humans.
 
-    ``driver`` and ``human`` are the two coefficients, ``n`` and ``n_human`` their trials. ``low``
-    and ``high`` bound the difference ``b`` at 95 %, ``p`` is two-sided, ``freedom`` that of its t
-    test, None where it is normal. ``detectable`` is the smallest difference that is found with a
-    power of 0.8. ``problem`` says why there is none of these; ``remark`` what to know of them.
+    That of ``intercept`` is the source itself. ``driver`` and ``human`` are the two coefficients,
+    ``n`` and ``n_human`` their trials, and ``found`` the driver's minus the humans'. ``problem``
+    says why there is none of these; ``remark`` what to know of them.
     """
 
     outcome: str
     term: str
     n: int
     n_human: int
-    method: str = ""
     driver: float | None = None
     human: float | None = None
-    b: float | None = None
-    low: float | None = None
-    high: float | None = None
-    p: float | None = None
-    freedom: float | None = None
-    detectable: float | None = None
+    found: Difference | None = None
     problem: str = ""
     remark: str = ""
 
 
 @cache
-def differences(human: Group, group: Group) -> tuple[Difference, ...]:
+def differences(human: Group, group: Group) -> tuple[Interaction, ...]:
     """How a driver differs from the humans: in who merged first, then in the gap, by term."""
     return (*_of_who_first(human, group), *_of_gap(human, group))
 
@@ -94,33 +87,29 @@ def by_pairs(
     lacking = [f"without {pair}: {part.problem}" for pair, part in parts.items() if part.problem]
     if whole.problem or lacking:
         return Regression(whole.n, {}, whole.problem or lacking[0])
+    # CV3: the squares of what each pair moves an estimate by, about the whole fit and not the mean.
     freedom = len(pairs) - 1
     terms = {}
     for name, term in whole.terms.items():
         moved = sum((part.terms[name].b - term.b) ** 2 for part in parts.values())
-        terms[name] = _tested(term.b, sqrt(moved * freedom / len(pairs)), freedom)
+        terms[name] = wald_term(term.b, sqrt(moved * freedom / len(pairs)), freedom)
     remark = f"errors by jackknife over {len(pairs)} pairs"
     return Regression(whole.n, terms, freedom=freedom, remark=remark)
 
 
-def _tested(b: float, se: float, freedom: float) -> Term:
-    statistic = b / se if se else inf
-    return Term(b, se, statistic, float(2 * stats.t.sf(abs(statistic), freedom)))
-
-
-def _of_who_first(human: Group, group: Group) -> list[Difference]:
+def _of_who_first(human: Group, group: Group) -> list[Interaction]:
     mine, theirs = fits(group), _human_who_first(human)
     if mine.logit.terms and theirs.terms:
-        return [_subtracted(WHO_FIRST, term, mine.logit, theirs, "ML") for term in WHO_FIRST_TERMS]
+        return [_interaction(WHO_FIRST, term, mine.logit, theirs, "ML") for term in WHO_FIRST_TERMS]
     return _by_firth(human, group, theirs)
 
 
-def _of_gap(human: Group, group: Group) -> list[Difference]:
+def _of_gap(human: Group, group: Group) -> list[Interaction]:
     mine, theirs = fits(group).hc3, _human_gap(human)
     if mine.terms and theirs.terms:
-        return [_subtracted(GAP, term, mine, theirs, "least squares") for term in GAP_TERMS]
+        return [_interaction(GAP, term, mine, theirs, "least squares") for term in GAP_TERMS]
     problem = mine.problem or f"humans: {theirs.problem}"
-    return [Difference(GAP, term, mine.n, theirs.n, problem=problem) for term in GAP_TERMS]
+    return [Interaction(GAP, term, mine.n, theirs.n, problem=problem) for term in GAP_TERMS]
 
 
 @cache
@@ -143,49 +132,34 @@ def _human_gap(human: Group) -> Regression:
     n = int(rows["n"].iloc[0])
     freedom = n - len(GAP_TERMS)
     terms = {
-        name: _tested(float(rows["b"][name]), float(rows["se"][name]), freedom)
+        name: wald_term(float(rows["b"][name]), float(rows["se"][name]), freedom)
         for name in GAP_TERMS
     }
     remark = f"humans as published ({citation('paper_gap')}); {NO_PAIRS}"
     return Regression(n, terms, freedom=freedom, remark=remark)
 
 
-def _subtracted(
+def _interaction(
     outcome: str, term: str, driver: Regression, human: Regression, method: str
-) -> Difference:
+) -> Interaction:
     """The interaction of a term with the source."""
-    mine, theirs = driver.terms[term], human.terms[term]
-    b, se = mine.b - theirs.b, hypot(mine.se, theirs.se)
-    if se == 0:
+    found = difference(driver, human, term, method)
+    if found is None:
         problem = "neither the driver nor the humans vary: there is nothing to test"
-        return Difference(outcome, term, driver.n, human.n, problem=problem)
-    freedom = _satterthwaite((mine.se, driver.freedom), (theirs.se, human.freedom))
-    half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * se
-    return Difference(
+        return Interaction(outcome, term, driver.n, human.n, problem=problem)
+    return Interaction(
         outcome,
         term,
         driver.n,
         human.n,
-        method,
-        mine.b,
-        theirs.b,
-        b,
-        b - half,
-        b + half,
-        _tested(b, se, freedom).p,
-        None if isinf(freedom) else freedom,
-        detectable(se, freedom),
+        driver.terms[term].b,
+        human.terms[term].b,
+        found,
         remark=human.remark,
     )
 
 
-def _satterthwaite(*parts: tuple[float, int | None]) -> float:
-    """Degrees of freedom of a sum of variances; those of a part are infinite where it has none."""
-    spread = sum(se**4 / freedom for se, freedom in parts if freedom)
-    return sum(se**2 for se, _ in parts) ** 2 / spread if spread else inf
-
-
-def _by_firth(human: Group, group: Group, theirs: Regression) -> list[Difference]:
+def _by_firth(human: Group, group: Group, theirs: Regression) -> list[Interaction]:
     """The joint logit by Firth's penalised likelihood, where maximum likelihood has no estimate.
 
     Tests and intervals are those of the penalised likelihood (Heinze and Schemper 2002), which
@@ -198,30 +172,23 @@ def _by_firth(human: Group, group: Group, theirs: Regression) -> list[Difference
         problem = "" if found is not None else "Firth's penalised joint fit does not converge"
     if problem or found is None:
         return [
-            Difference(WHO_FIRST, term, mine.n, humans.n, problem=problem)
+            Interaction(WHO_FIRST, term, mine.n, humans.n, problem=problem)
             for term in WHO_FIRST_TERMS
         ]
-    p, bounds = found
     remark = theirs.remark if theirs.terms and NARROW in theirs.remark else f"Firth's fit: {NARROW}"
     return [
-        Difference(
-            WHO_FIRST,
-            term,
-            mine.n,
-            humans.n,
-            "Firth",
-            mine.terms[term].b,
-            humans.terms[term].b,
-            mine.terms[term].b - humans.terms[term].b,
-            float(bounds[i, 0]),
-            float(bounds[i, 1]),
-            float(p[i]),
-            None,
-            detectable(hypot(mine.terms[term].se, humans.terms[term].se), inf),
-            remark=remark,
-        )
-        for i, term in enumerate(WHO_FIRST_TERMS)
+        _by_likelihood(_interaction(WHO_FIRST, term, mine, humans, "Firth"), p, bounds, remark)
+        for term, p, bounds in zip(WHO_FIRST_TERMS, *found, strict=True)
     ]
+
+
+def _by_likelihood(
+    one: Interaction, p: float, bounds: NDArray[np.float64], remark: str
+) -> Interaction:
+    """The same interaction by another test and interval; what is detectable stays Wald's."""
+    assert one.found is not None, "Firth's estimates always have errors"
+    low, high = map(float, bounds)
+    return replace(one, found=replace(one.found, low=low, high=high, p=float(p)), remark=remark)
 
 
 def _penalised(

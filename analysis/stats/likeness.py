@@ -10,14 +10,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from math import hypot
 
+import numpy as np
 import pandas as pd
-from scipy import stats
+from numpy.typing import NDArray
 
 from analysis.data.study import ENOUGH_PER_CONDITION, Group, Study, of_group
+from analysis.stats import intervals
 from analysis.stats.indicators import Verdict
-from analysis.stats.intervals import LEVEL, Estimate, mean
+from analysis.stats.intervals import Estimate, finite, mean, standard_error
+
+Array = NDArray[np.float64]
 
 # Half a standard deviation is a medium effect (Cohen 1988): the distributions overlap by 80 %.
 MARGIN_SD = 0.5
@@ -53,36 +56,28 @@ def compared(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
     usual = human.groupby("condition")["gain"].mean()
     human = human.assign(apart=human["gain"] - human["condition"].map(usual))
     spread = float((human["apart"] ** 2).sum() / max(len(human) - len(usual), 1)) ** 0.5
-    apart = driver["gain"] - driver["condition"].map(usual)
-    return _scaled(mean(apart.to_numpy(float)), mean(_independent(human, "apart")), spread)
+    apart = (driver["gain"] - driver["condition"].map(usual)).to_numpy(float)
+    return _in_spreads(finite(apart), finite(_independent(human, "apart")), spread)
 
 
-def _scaled(driver: Estimate, pairs: Estimate, spread: float) -> Estimate:
-    """``driver`` in units of ``spread``, with the uncertainty of both means (Welch 1947)."""
-    if not spread or driver.value is None:
-        return Estimate(None, None, None, driver.n)
-    value = driver.value / spread
-    if driver.low is None or pairs.low is None:
-        return Estimate(value, None, None, driver.n)
-    errors = [(_error(part), part.n - 1) for part in (driver, pairs)]
-    error = hypot(*(one for one, _ in errors))
-    if not error:
-        return Estimate(value, value, value, driver.n)
-    freedom = error**4 / sum(one**4 / n for one, n in errors)
-    half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * error / spread
-    return Estimate(value, value - half, value + half, driver.n)
+def _in_spreads(driver: Array, pairs: Array, spread: float) -> Estimate:
+    """The mean of ``driver`` in units of ``spread``, with the uncertainty of both means."""
+    n = len(driver)
+    if not spread or not n:
+        return Estimate(None, None, None, n)
+    value = float(driver.mean()) / spread
+    if min(n, len(pairs)) < 2:
+        return Estimate(value, None, None, n)
+    errors = ((standard_error(part) / spread, len(part) - 1) for part in (driver, pairs))
+    found = intervals.difference(value, *errors)
+    low, high = (found and found.bounds()) or (value, value)
+    return Estimate(value, low, high, n)
 
 
-def _error(found: Estimate) -> float:
-    """The standard error that an interval of ``mean`` came from."""
-    assert found.value is not None
-    assert found.high is not None
-    return (found.high - found.value) / float(stats.t.ppf((1 + LEVEL) / 2, found.n - 1))
-
-
-def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
+def _independent(trials: pd.DataFrame, column: str) -> Array:
     """Values that do not hang together: of trials, or the means of human pairs."""
-    return trials.groupby(trials["pair"].fillna(trials["trial_id"]))[column].mean()
+    units = trials.groupby(trials["pair"].fillna(trials["trial_id"]))
+    return np.asarray(units[column].mean(), dtype=float)
 
 
 def likeness(study: Study, group: Group) -> Verdict:

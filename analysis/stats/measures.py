@@ -1,136 +1,104 @@
-"""The quantitative measures of a group of trials, with their intervals."""
+"""What a group of trials comes to by a metric, and what is known of the humans."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import numpy as np
+import pandas as pd
+from scipy import stats
 
-from analysis.data.reference_data import published
+from analysis.data.reference_data import citation, human_outcomes, published
 from analysis.data.study import Group
-from analysis.stats.intervals import Estimate, mean, proportion
+from analysis.metrics import BOXES, HumanReference, Metric
+from analysis.stats.intervals import LEVEL, Estimate, mean, proportion
+
+PAPER = "paper_ablation_quantitative"
 
 
-@dataclass(frozen=True, slots=True)
-class Measure:
-    """A measure of Table VII.
-
-    ``column`` is that of a group's trials. ``counts`` is the predicate of the trials that it rests
-    on. Rates are printed in percent.
-    """
-
-    name: str
-    heading: str
-    meaning: str
-    column: str
-    rate: bool
-    counts: str
+def values(group: Group, metric: Metric) -> pd.Series:
+    """The values of the trials that count. Everything that counts trials counts these."""
+    trials = group.outcomes if metric.humans_from == "outcomes" else group.trials
+    return trials[metric.column].dropna()
 
 
-COLLISIONS = Measure(
-    "collided_percent",
-    "coll. (%)",
-    "share of ended trials with a collision by the rule of their scenario, looked for at its steps "
-    "(the paper's: centres closer than a vehicle length, every 0.2 s)",
-    "collided",
-    True,
-    "collided IS NOT NULL",
-)
-BOXES = Measure(
-    "collided_boxes_percent",
-    "coll. boxes (%)",
-    "share of ended trials with a collision by the rule of the human experiment: boxes that "
-    "overlap, looked for at 20 Hz",
-    "collided_boxes",
-    True,
-    "collided_boxes IS NOT NULL",
-)
-GAP = Measure(
-    "gap_m",
-    "gap (m)",
-    "net gap when the first vehicle reaches the merge point",
-    "gap_m",
-    False,
-    "gap_m IS NOT NULL",
-)
-RMSE = Measure(
-    "rmse_mps",
-    "RMSE (m/s)",
-    "RMSE of the speed from the initial speed, mean of both vehicles, to the first merge",
-    "rmse_mps",
-    False,
-    "rmse_mps IS NOT NULL",
-)
-JOINT = Measure(
-    "joint_percent",
-    "joint (%)",
-    "share of finished trials with an RMSE of at least 0.5 m/s on both sides",
-    "joint",
-    True,
-    "joint IS NOT NULL",
-)
-LEFT_FIRST = Measure(
-    "left_first_percent",
-    "left first (%)",
-    "share of finished trials with a first merger in which it is the left vehicle",
-    "merged_first",
-    True,
-    "status = 'finished' AND merged_first IS NOT NULL",
-)
-MEASURES = (COLLISIONS, BOXES, GAP, RMSE, JOINT)
-# What the published counts tell of the humans.
-OUTCOMES = (BOXES, LEFT_FIRST)
-RULES_NOTE = (
-    f"{COLLISIONS.heading}: by the rule of the trials' scenario, in the paper centres closer than "
-    f"a vehicle length at a step of 0.2 s; {BOXES.heading}: by the rule of the human experiment, "
-    "boxes that overlap, looked for at 20 Hz, the one by which drivers are compared with humans"
-)
-
-
-def counts(group: Group, measure: Measure) -> tuple[int, int]:
+def counts(group: Group, metric: Metric) -> tuple[int, int]:
     """Successes and n of a rate."""
-    if measure is LEFT_FIRST:
-        finished = group.outcomes[group.outcomes["status"] == "finished"]
-        first = finished["merged_first"].dropna()
-        return int((first == "left").sum()), len(first)
-    trials = {COLLISIONS: group.trials, BOXES: group.outcomes}.get(measure, group.finished)
-    known = trials[measure.column].dropna()
-    return int(known.astype(bool).sum()), len(known)
+    found = values(group, metric)
+    return int(found.astype(bool).sum()), len(found)
 
 
-def undecided(group: Group, measure: Measure) -> str:
-    """How many trials are left out of a collision rate, since their traces leave it open."""
-    if measure not in (COLLISIONS, BOXES) or not known(group, measure):
-        return ""
-    ended = group.ended if measure is COLLISIONS else group.ended_outcomes
-    left_open = len(ended) - counts(group, measure)[1]
-    if not left_open:
-        return ""
-    return f"{measure.heading}: {left_open} of {len(ended)} trials end undecided and are left out"
-
-
-def estimate(group: Group, measure: Measure) -> Estimate:
-    """The measure of a group with its 95 % interval, rates in percent."""
-    if not measure.rate:
-        return mean(group.finished[measure.column].to_numpy(float))
-    found = proportion(*counts(group, measure))
+def estimate(group: Group, metric: Metric) -> Estimate:
+    """The metric of a group with its 95 % interval, rates in percent."""
+    match metric.estimator:
+        case "mean":
+            return mean(values(group, metric).to_numpy(float))
+        case "median":
+            return median(values(group, metric).to_numpy(float))
+    found = proportion(*counts(group, metric))
     if found.value is None or found.low is None or found.high is None:
         return found
     return Estimate(100 * found.value, 100 * found.low, 100 * found.high, found.n)
 
 
-def published_human(measure: Measure) -> float:
-    """The human value that the paper prints; of collisions it is that of boxes."""
-    row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
-    return float(row[COLLISIONS.name if measure is BOXES else measure.name])
+def median(sample: np.ndarray) -> Estimate:
+    """A median with its interval of order statistics, which no distribution is assumed for.
+
+    Of ``n`` sorted values the k-th and the (n + 1 - k)-th enclose it where as many as k - 1 heads
+    in n throws of a coin have a chance of at most 2.5 % (David and Nagaraja, Order Statistics,
+    section 7.1); with fewer than six values no such pair does.
+    """
+    n = len(sample)
+    if not n:
+        return Estimate(None, None, None, 0)
+    value = float(np.median(sample))
+    k = int(stats.binom.ppf((1 - LEVEL) / 2, n, 0.5))
+    if not k:
+        return Estimate(value, None, None, n)
+    ordered = np.sort(sample)
+    return Estimate(value, float(ordered[k - 1]), float(ordered[n - k]), n)
 
 
-def known(group: Group, measure: Measure) -> bool:
-    """Whether a group's trials hold this measure.
+def undecided(group: Group, metric: Metric) -> str:
+    """How many trials are left out of a collision rate, since their traces leave it open."""
+    if not (metric.rate and metric.trials == "ended" and known(group, metric)):
+        return ""
+    ended = group.ended_outcomes if metric.humans_from == "outcomes" else group.ended
+    left_open = len(ended) - len(values(group, metric))
+    if not left_open:
+        return ""
+    return f"{metric.heading}: {left_open} of {len(ended)} trials end undecided and are left out"
+
+
+def known(group: Group, metric: Metric) -> bool:
+    """Whether a group's trials hold this metric.
 
     Before an import humans have outcomes alone, and until it is complete no collisions but these.
     """
-    if measure in OUTCOMES:
-        return True
-    return group.measured and not (measure is COLLISIONS and group.published_outcomes is not None)
+    if metric.humans_from == "all recordings":
+        return group.measured and group.published_outcomes is None
+    return group.measured or metric.humans_from == "outcomes"
+
+
+def human_reference(metric: Metric) -> HumanReference | None:
+    """What is published of the humans: in the paper, or as the metric says."""
+    if not metric.paper_of_humans:
+        return metric.human
+    row = published(PAPER).query("driver == 'human'").iloc[0]
+    trials = human_outcomes()
+    if metric.trials == "finished":
+        trials = trials[trials["status"] == "finished"]
+    return HumanReference(float(row[metric.paper_of_humans]), citation(PAPER), n=len(trials))
+
+
+def estimate_or_reference(group: Group, metric: Metric) -> Estimate | HumanReference | None:
+    """What a group comes to; of humans without traces what is published, None where nothing is."""
+    return estimate(group, metric) if known(group, metric) else human_reference(metric)
+
+
+def no_human_value(metric: Metric) -> str:
+    """Why the humans have no value of a metric before their recordings are imported."""
+    if metric.humans_from == "all recordings":
+        return f"{metric.heading}: published human collisions are boxes that overlap"
+    return f"{metric.heading}: no human value is published, and no human traces are imported"
 
 
 def outcomes_note(group: Group) -> str:

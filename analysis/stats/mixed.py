@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import optimize
 from scipy.special import expit, logsumexp
 
 from analysis.stats.regressions import (
@@ -18,6 +18,7 @@ from analysis.stats.regressions import (
     Term,
     gap_data,
     unfit_for_logit,
+    wald_term,
     who_first_data,
 )
 
@@ -78,6 +79,7 @@ def who_first_mixed(trials: pd.DataFrame) -> Regression:
 
     start = np.array([0.0, 0.5, -0.5, np.log(0.5)])
     found = optimize.minimize(loss, start, method="BFGS", options={"gtol": 1e-5})
+    # Where pairs do not differ the likelihood is flat in their variance, and the Hessian singular.
     covariance = np.linalg.pinv(_hessian(loss, found.x))
     variances = np.diag(covariance)[:3]
     if np.abs(found.jac).max() > 1e-2 or not (variances > 0).all():
@@ -87,7 +89,7 @@ def who_first_mixed(trials: pd.DataFrame) -> Regression:
 
 def _wald(names: tuple[str, ...], estimates: Array, errors: Array) -> dict[str, Term]:
     return {
-        name: Term(float(b), float(se), float(b / se), float(2 * stats.norm.sf(abs(b / se))))
+        name: wald_term(float(b), float(se))
         for name, b, se in zip(names, estimates, errors, strict=True)
     }
 
@@ -100,6 +102,7 @@ def _cells(design: Array, left: Array) -> tuple[Array, Array, Array]:
 
 def _marginal(parameters: Array, design: Array, trials: Array, left: Array) -> float:
     """The log-likelihood of one pair's trials, its intercept integrated out."""
+    # The fourth parameter is the logarithm of the standard deviation, which so cannot be negative.
     fixed, sd = design @ parameters[:3], float(np.exp(parameters[3]))
 
     def joint(effect: Array) -> Array:
@@ -108,6 +111,7 @@ def _marginal(parameters: Array, design: Array, trials: Array, left: Array) -> f
         fit = (left[:, None] * linear - trials[:, None] * np.logaddexp(0, linear)).sum(axis=0)
         return np.asarray(fit - effect**2 / (2 * sd**2) - np.log(sd * np.sqrt(2 * np.pi)))
 
+    # Newton: the joint density is log-concave, so that it has a single mode.
     mode = 0.0
     for _ in range(50):
         p = expit(fixed + mode)
@@ -116,6 +120,8 @@ def _marginal(parameters: Array, design: Array, trials: Array, left: Array) -> f
         mode += slope / curvature
         if abs(slope / curvature) < 1e-10:
             break
+    # The rule integrates f(x) exp(-x^2): the exponential that it supplies is taken out again, and
+    # the scale is that of the change of variables (Pinheiro and Bates 1995).
     nodes, weights = _nodes()
     scale = np.sqrt(2 / curvature)
     return float(

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from math import inf
 from typing import Protocol
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import expit
+
+from analysis.stats import intervals
 
 Array = NDArray[np.float64]
 
@@ -53,15 +56,35 @@ class Term:
 class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms, and is else empty.
 
-    ``freedom`` is the residual degrees of freedom of a linear fit; ``remark`` is what to know of a
-    fit that has terms.
+    ``freedom`` is the residual degrees of freedom of a linear fit, infinite where tests are normal;
+    ``remark`` is what to know of a fit that has terms.
     """
 
     n: int
     terms: dict[str, Term]
     problem: str = ""
-    freedom: int | None = None
+    freedom: float = inf
     remark: str = ""
+
+
+def wald_term(b: float, se: float, freedom: float = inf) -> Term:
+    """A coefficient by Wald's test; one without an error is sure."""
+    statistic = b / se if se else inf
+    return Term(b, se, statistic, intervals.two_sided_p(statistic, freedom))
+
+
+def difference(
+    first: Regression, second: Regression, term: str, by: str
+) -> intervals.Difference | None:
+    """The difference of a coefficient between fits to two groups that are independent.
+
+    A model of both in which every term may differ between them falls apart into a fit of each: the
+    interaction is the difference of the coefficients, and its variance the sum of theirs. None
+    where neither fit leaves an error.
+    """
+    one, other = first.terms[term], second.terms[term]
+    errors = (one.se, first.freedom), (other.se, second.freedom)
+    return intervals.difference(one.b - other.b, *errors, by=by)
 
 
 def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:

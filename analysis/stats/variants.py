@@ -1,52 +1,31 @@
-"""Coefficients of a prompt variant against those of its driver's baseline.
-
-A model of both groups in which every term may differ between them falls apart into a fit of each:
-the interaction is the difference of the two coefficients, and its squared error the sum of theirs.
-"""
+"""Coefficients of a prompt variant against those of its driver's baseline."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from math import hypot, inf
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
 from scipy.linalg import LinAlgError
 
 from analysis.data.study import BASELINE, Group, Study
 from analysis.stats.contrasts import corrected
 from analysis.stats.group_scores import fits
-from analysis.stats.intervals import LEVEL, detectable
+from analysis.stats.intervals import Difference
 from analysis.stats.regressions import (
     MAX_ITERATIONS,
     WHO_FIRST_TERMS,
     Array,
     Regression,
+    difference,
     who_first_data,
 )
 
 if TYPE_CHECKING:
     from firthmodels import FirthLogisticRegression
-
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """A difference (first minus second) with its 95 % interval and a two-sided p-value.
-
-    ``detectable`` is the smallest true difference that a study of this size shows with a
-    probability of POWER by one test at 5 %. ``by`` names the fits.
-    """
-
-    value: float
-    low: float
-    high: float
-    p: float
-    detectable: float
-    by: str
 
 
 Differences = Callable[[Group, Group], Mapping[str, Difference]]
@@ -85,36 +64,6 @@ def corrected_differences(
             family.items(), *corrected([one.p for one in family.values()]), strict=True
         )
     }
-
-
-def interval(b: float, se: float, freedom: int | None) -> tuple[float, float]:
-    """The 95 % interval of a coefficient: Student's t, or normal where ``freedom`` is None."""
-    half = _quantile((1 + LEVEL) / 2, freedom) * se
-    return b - half, b + half
-
-
-def difference(first: Regression, second: Regression, term: str, by: str) -> Difference | None:
-    """The difference of a coefficient between two fits to groups that are independent.
-
-    Linear fits are compared by Welch's t test (1947), which holds its 5 % also where the groups
-    differ in size and in variance; others by z. None where neither fit leaves an error.
-    """
-    one, other = first.terms[term], second.terms[term]
-    se = hypot(one.se, other.se)
-    if se == 0:
-        return None
-    freedom = None
-    if first.freedom is not None and second.freedom is not None:
-        freedom = se**4 / (one.se**4 / first.freedom + other.se**4 / second.freedom)
-    value, half = one.b - other.b, se * _quantile((1 + LEVEL) / 2, freedom)
-    return Difference(
-        value,
-        value - half,
-        value + half,
-        2 * _above(abs(value) / se, freedom),
-        detectable(se, inf if freedom is None else freedom),
-        by,
-    )
 
 
 @cache
@@ -180,7 +129,7 @@ def _penalised(group: Group, baseline: Group, term: str, found: Difference) -> D
     p = float(fit.lrt(features=index).lrt_pvalues_[index])
     if not np.isfinite(p):
         return found
-    return Difference(found.value, *bounds, p, found.detectable, "Firth")
+    return replace(found, low=bounds[0], high=bounds[1], p=p, by="Firth")
 
 
 def _firth(design: Array, left: Array) -> FirthLogisticRegression:
@@ -198,11 +147,3 @@ def _profile(fit: FirthLogisticRegression, index: int) -> tuple[float, float] | 
         except LinAlgError:
             return None
     return (float(bounds[0]), float(bounds[1])) if np.isfinite(bounds).all() else None
-
-
-def _quantile(share: float, freedom: float | None) -> float:
-    return float(stats.norm.ppf(share) if freedom is None else stats.t.ppf(share, freedom))
-
-
-def _above(statistic: float, freedom: float | None) -> float:
-    return float(stats.norm.sf(statistic) if freedom is None else stats.t.sf(statistic, freedom))

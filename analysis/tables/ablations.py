@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from analysis.data.reference_data import citation
 from analysis.data.study import Group, Study
+from analysis.metrics import RULES_NOTE, HumanReference, Metric, intervals_of, shown_in
 from analysis.stats.group_scores import score
 from analysis.stats.indicators import INDICATORS
 from analysis.stats.measures import (
-    BOXES,
-    COLLISIONS,
-    MEASURES,
-    RULES_NOTE,
-    estimate,
-    known,
+    estimate_or_reference,
+    no_human_value,
     outcomes_note,
-    published_human,
     undecided,
 )
 from analysis.tables.indicators import (
-    BOXES_ALONE,
     RULES,
-    SOURCE,
     percent,
     score_note,
     score_text,
@@ -28,7 +21,7 @@ from analysis.tables.indicators import (
     verdict_values,
 )
 from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
+from analysis.tables.notes import ceiling_notes, intermittency_notes, listed, sample_notes
 
 # Columns that rest on who merged first.
 OF_OUTCOMES = tuple(
@@ -92,34 +85,36 @@ def ablation_qualitative(study: Study) -> Table:
 
 def ablation_quantitative(study: Study) -> Table:
     """Table VII: collisions, gap, RMSE and joint rate of every driver and prompt variant."""
-    columns = [*_key_columns()]
-    for measure in MEASURES:
-        columns += [
-            Column(
-                measure.name,
-                measure.heading,
-                "percent" if measure.rate else "number",
-                2,
-                measure.meaning,
-                measure.counts,
-            ),
-            Column(
-                f"{measure.name}_ci", "95 % CI", "interval", 2, "", measure.counts, optional=True
-            ),
-        ]
+    metrics = shown_in("tables")
     return Table(
         "ablation-quantitative",
         "Quantitative measures across prompt ablations",
-        columns,
+        [*_key_columns(), *(column for metric in metrics for column in _metric_columns(metric))],
         [_quantitative_row(group) for group in study.groups],
         (
-            "collisions over all ended trials; gap, RMSE and joint rate over finished ones; "
-            "intervals: Wilson for rates, Student's t for means",
+            f"{_denominators(metrics)}; intervals: {intervals_of(metrics)}",
             RULES_NOTE,
             *sample_notes(study, study.groups),
         ),
         "Table VII",
     )
+
+
+def _metric_columns(metric: Metric) -> tuple[Column, Column]:
+    counts, digits = metric.counts, metric.decimals
+    return (
+        Column(metric.name, metric.heading, metric.kind, digits, metric.meaning, counts),
+        Column(f"{metric.name}_ci", "95 % CI", "interval", digits, "", counts, optional=True),
+    )
+
+
+def _denominators(metrics: list[Metric]) -> str:
+    """Which trials the metrics are of: ``collisions over all ended trials; gap over finished``."""
+    ended, finished = (
+        listed(list(dict.fromkeys(one.in_lists for one in metrics if one.trials == trials)))
+        for trials in ("ended", "finished")
+    )
+    return f"{ended} over all ended trials; {finished} over finished ones"
 
 
 def _key_columns() -> tuple[Column, ...]:
@@ -158,34 +153,44 @@ def _qualitative_row(study: Study, group: Group) -> Row:
 
 
 def _quantitative_row(group: Group) -> Row:
-    values, missing, shipped = _keys(group), [], []
-    remarks = [outcomes_note(group), *(undecided(group, measure) for measure in MEASURES)]
-    for measure in MEASURES:
-        if measure is COLLISIONS and not known(group, measure):
-            remarks.append(BOXES_ALONE)
+    metrics = shown_in("tables")
+    values, missing, absent = _keys(group), [], []
+    shipped: dict[str, list[Metric]] = {}
+    for metric in metrics:
+        found = estimate_or_reference(group, metric)
+        if found is None:
+            absent.append(no_human_value(metric))
             continue
-        if not known(group, measure):
-            values[measure.name] = published_human(measure)
-            shipped.append(measure.name)
-            continue
-        found = estimate(group, measure)
-        values[measure.name] = found.value
-        if found.low is not None and found.high is not None:
-            values[f"{measure.name}_ci"] = (found.low, found.high)
-        if found.value is None:
-            missing.append(measure.heading)
+        values[metric.name] = found.value
+        if (interval := found.bounds()) is not None:
+            values[f"{metric.name}_ci"] = interval
+        if isinstance(found, HumanReference):
+            shipped.setdefault(found.source, []).append(metric)
+        elif found.value is None:
+            missing.append(metric.heading)
+    remarks = [outcomes_note(group), *(undecided(group, metric) for metric in metrics), *absent]
     if missing:
         remarks.append(f"no trial with {', '.join(missing)}")
-    if shipped:
-        remarks.append(
-            "gap, RMSE and joint rate are published values, no human traces are imported "
-            f"({citation(SOURCE)})"
-        )
+    remarks += [_shipped_note(found, source) for source, found in shipped.items()]
     return Row(
         group.id,
         (group.id,),
         values,
         "; ".join(filter(None, remarks)),
-        printed=tuple(shipped),
-        published=("n", BOXES.name, f"{BOXES.name}_ci"),
+        printed=tuple(metric.name for found in shipped.values() for metric in found),
+        published=(
+            "n",
+            *(
+                name
+                for metric in metrics
+                if metric.humans_from == "outcomes"
+                for name in (metric.name, f"{metric.name}_ci")
+            ),
+        ),
     )
+
+
+def _shipped_note(metrics: list[Metric], source: str) -> str:
+    names = listed([metric.in_lists for metric in metrics])
+    what = "is a published value" if len(metrics) == 1 else "are published values"
+    return f"{names} {what}, no human traces are imported ({source})"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -11,6 +10,7 @@ import pandas as pd
 
 from analysis.data.reference_data import citation, published
 from analysis.data.study import HUMAN, Group
+from analysis.metrics import shown_in
 from analysis.stats.indicators import INDICATORS
 from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.drivers.registry import EMULATOR
@@ -19,37 +19,26 @@ from merge_runner.errors import UsageError
 PAPER = "paper"
 # Whom the paper has rows of, and what may follow the name of a driver that is one of them.
 DRIVERS = ("human", "o3", "gemini-2.5-pro")
-MARKS = re.compile(r"(/set\d+)?( \[[^]]+\])*")
-# Table to its published file, and our columns to the file's.
-FILES: dict[str, tuple[str, dict[str, str]]] = {
-    "who-first": ("paper_who_first", {c: c for c in ("n", "b", "se", "z", "p")}),
-    "gap": ("paper_gap", {c: c for c in ("n", "b", "se", "t", "p")}),
-    "ablation-qualitative": (
-        "paper_ablation_qualitative",
-        {**{f"i{i}_paper": f"i{i}" for i in range(1, 6)}, "score_paper": "score"},
-    ),
-    "ablation-quantitative": (
-        "paper_ablation_quantitative",
-        {
-            "collided_boxes_percent": "collided_percent",
-            **{c: c for c in ("collided_percent", "gap_m", "rmse_mps", "joint_percent")},
-        },
-    ),
+METRICS_FILE = "paper_ablation_quantitative"
+INDICATORS_FILE = "paper_ablation_qualitative"
+# Table to its published file.
+FILES = {
+    "who-first": "paper_who_first",
+    "gap": "paper_gap",
+    "ablation-qualitative": INDICATORS_FILE,
+    "ablation-quantitative": METRICS_FILE,
+}
+# Our columns to those of the file, where they are not the metrics'.
+COLUMNS = {
+    "who-first": {c: c for c in ("n", "b", "se", "z", "p")},
+    "gap": {c: c for c in ("n", "b", "se", "t", "p")},
+    "ablation-qualitative": {
+        **{f"i{i}_paper": f"i{i}" for i in range(1, 6)},
+        "score_paper": "score",
+    },
 }
 # Rows of Table V are columns of the files of Tables VI and VII.
-INDICATOR_ROWS = {
-    **{f"I{i}": ("paper_ablation_qualitative", f"i{i}", PAPER) for i in range(1, 6)},
-    "score": ("paper_ablation_qualitative", "score", PAPER),
-    **{
-        name: ("paper_ablation_quantitative", name, "value")
-        for name in ("collided_percent", "gap_m", "rmse_mps", "joint_percent")
-    },
-    "collided_boxes_percent": ("paper_ablation_quantitative", "collided_percent", "value"),
-}
-# Rows of Table V that rest on who merged first, or on collisions.
-OF_OUTCOMES = {"I1", "I2", "collided_percent", "collided_boxes_percent"}
-# The rule by which the paper does not count collisions: the other's of humans, and of models.
-NOT_PRINTED = {True: "collided_percent", False: "collided_boxes_percent"}
+INDICATOR_ROWS = {**{f"I{i}": f"i{i}" for i in range(1, 6)}, "score": "score"}
 
 
 def placed(table: Table, groups: Iterable[Group]) -> Table:
@@ -64,12 +53,14 @@ def placed(table: Table, groups: Iterable[Group]) -> Table:
 
 
 def _placed(table: Table, row: Row, group: Group) -> Row:
-    own = MARKS.fullmatch(group.driver.removeprefix(group.model)) and not group.scripted
-    posing = group.scripted and group.model != EMULATOR
+    (asked, *others) = group.models
+    sample_set = "" if group.name == asked else f"/set{group.trials['sample_set'].iloc[0]}"
+    own = not others and group.name == asked + sample_set and not group.scripted
+    posing = group.scripted and group.models != (EMULATOR,)
     return replace(
         row,
-        beside=group.model if own and group.model in DRIVERS else "",
-        stand_in_for=group.model if posing else "",
+        beside=asked if own and asked in DRIVERS else "",
+        stand_in_for=group.models if posing else (),
         printed=_printed(table, row, group),
     )
 
@@ -82,8 +73,12 @@ def _printed(table: Table, row: Row, group: Group) -> tuple[str, ...]:
     if group.published_outcomes is None:
         return row.printed
     item = row.id.rpartition("/")[2]
-    outcomes = table.name == "who-first" or item in OF_OUTCOMES
-    return every if outcomes else ("collided_boxes_percent",)
+    metrics = {metric.name: metric.humans_from for metric in shown_in("tables")}
+    # Collisions by the drivers' rule are unknown until all is imported, as are the outcomes.
+    of_outcomes = item in {"I1", "I2"} or metrics.get(item, "recordings") != "recordings"
+    if table.name == "who-first" or of_outcomes:
+        return every
+    return tuple(name for name, source in metrics.items() if source == "outcomes")
 
 
 def against(table: Table, reference: str, driver: str | None = None) -> Table:
@@ -99,10 +94,10 @@ def against(table: Table, reference: str, driver: str | None = None) -> Table:
         raise UsageError(f"--as {driver}: the paper has {', '.join(DRIVERS)}")
     if table.name == "indicators":
         columns, rows = _indicators(table, driver)
-        files = ["paper_ablation_qualitative", "paper_ablation_quantitative"]
+        files = [INDICATORS_FILE, METRICS_FILE]
     elif table.name in FILES:
         columns, rows = _beside(table, driver)
-        files = [FILES[table.name][0]]
+        files = [FILES[table.name]]
     else:
         return replace(table, notes=(*table.notes, "the paper has no such table"))
     cited = [f"paper: {citation(name)}" for name in files]
@@ -119,7 +114,7 @@ def _placements(table: Table, driver: str | None) -> list[str]:
         (row.values["driver"], name)
         for row in table.rows
         for name in names
-        if name in row.stand_in_for.split("+")
+        if name in row.stand_in_for
     ]
     return [
         *([] if driver is None else [f"every driver stands beside the paper's {driver}"]),
@@ -136,20 +131,20 @@ def in_paper(table: Table) -> bool:
 
 
 def _beside(table: Table, named: str | None) -> tuple[list[Column], list[Row]]:
-    name, pairs = FILES[table.name]
+    of_humans, of_drivers = _theirs(table.name, HUMAN), _theirs(table.name, "")
     columns: list[Column] = []
     for column in table.columns:
         columns.append(column)
-        if column.name in pairs:
+        if column.name in of_humans | of_drivers:
             columns += _columns(column)
     rows = []
     for row in table.rows:
         driver, setting, term = _key(row, named)
-        printed = _row(published(name), driver, setting, term)
+        printed = _row(published(FILES[table.name]), driver, setting, term)
         values = dict(row.values)
+        pairs = of_humans if driver == HUMAN else of_drivers
         for ours, theirs in pairs.items():
-            if ours != NOT_PRINTED[driver == "human"]:
-                values |= _compared(row, ours, printed, theirs)
+            values |= _compared(row, ours, printed, theirs)
         rows.append(replace(row, values=values))
     return columns, rows
 
@@ -163,13 +158,29 @@ def _indicators(table: Table, named: str | None) -> tuple[list[Column], list[Row
     rows = []
     for row in table.rows:
         driver, setting, item = _key(row, named)
-        file, theirs, ours = INDICATOR_ROWS[item]
-        printed = _row(published(file), driver, setting, "")
         values = dict(row.values)
-        if item != NOT_PRINTED[driver == "human"]:
-            values |= _compared(row, ours, printed, theirs)
+        if item in INDICATOR_ROWS:
+            printed = _row(published(INDICATORS_FILE), driver, setting, "")
+            values |= _compared(row, PAPER, printed, INDICATOR_ROWS[item])
+        elif theirs := _metric_columns(driver).get(item):
+            printed = _row(published(METRICS_FILE), driver, setting, "")
+            values |= _compared(row, "value", printed, theirs)
         rows.append(replace(row, values=values))
     return columns, rows
+
+
+def _theirs(table: str, driver: str) -> dict[str, str]:
+    """Our columns to those that the paper's row of a driver fills."""
+    return COLUMNS.get(table) or _metric_columns(driver)
+
+
+def _metric_columns(driver: str) -> dict[str, str]:
+    """The metrics to the columns of the file; the paper has another collision rule for humans."""
+    columns = {
+        one.name: one.paper_of_humans if driver == HUMAN else one.paper_of_drivers
+        for one in shown_in("tables")
+    }
+    return {name: column for name, column in columns.items() if column}
 
 
 def _key(row: Row, named: str | None) -> tuple[str, str, str]:
@@ -178,7 +189,7 @@ def _key(row: Row, named: str | None) -> tuple[str, str, str]:
     item = row.id.removeprefix(group).lstrip("/")
     driver = row.beside
     if named is not None and driver != HUMAN:
-        driver = "" if named in row.stand_in_for.split("+") else named
+        driver = "" if named in row.stand_in_for else named
     # The humans had no prompt: whatever a driver's was, they stand beside it.
     return driver, "" if driver == HUMAN else group.rpartition("/")[2], item
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from analysis.data.load import ANSWERED
 from analysis.data.provenance import ANSWERS, Tally, tally
 from analysis.data.study import Group, Study
 from analysis.tables.model import Column, Row, Table, Value
@@ -63,7 +64,7 @@ def _columns(study: Study, reasons: tuple[str, ...]) -> list[Column]:
         *_rated(
             "invalid",
             "answers without a valid plan, for any reason",
-            _with("fate IN ('driven', 'fallback') AND failure IS NOT NULL"),
+            _with(f"fate IN {ANSWERED} AND failure IS NOT NULL"),
         ),
         *_rated("fallback", "decisions driven from an older plan, or from none", FALLBACK),
         _count("unknown", "attempts of unknown fate", _with("outcome = 'unknown'")),
@@ -92,11 +93,11 @@ def _with(what: str) -> str:
 
 
 def _failed(reason: str) -> str:
-    return _with(f"fate IN ('driven', 'fallback') AND failure = {quoted(reason)}")
+    return _with(f"fate IN {ANSWERED} AND failure = {quoted(reason)}")
 
 
 def _other_model(study: Study) -> str:
-    return _with(f"fate IN ('driven', 'fallback') AND {sql_of(sorted(study.calls.others))}")
+    return _with(f"fate IN {ANSWERED} AND {sql_of(sorted(study.calls.others))}")
 
 
 def _row(group: Group, found: Tally, reasons: tuple[str, ...]) -> Row:

@@ -5,34 +5,30 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from analysis.data.study import BASELINE, Group, Study
-from analysis.stats.contrasts import Contrast, contrast_means, contrast_rates, corrected
+from analysis.metrics import RULES_NOTE, Metric, compared
+from analysis.stats.contrasts import contrast_means, contrast_rates, corrected
+from analysis.stats.intervals import Difference
 from analysis.stats.measures import (
-    BOXES,
-    JOINT,
-    MEASURES,
-    RULES_NOTE,
-    Measure,
     counts,
-    estimate,
+    human_reference,
     known,
     outcomes_note,
-    published_human,
     undecided,
+    values,
 )
 from analysis.tables.model import Column, Row, Table
-from analysis.tables.notes import sample_notes
+from analysis.tables.notes import listed, sample_notes
 
 # Of a row: those that the outcomes of humans are in.
 COLUMNS = ("difference", "ci", "p", "p_holm", "p_bh", "n", "n_reference")
-JOINT_NOTE = "human joint rate: 510 of 962 trials, from the 53.0 % that the paper prints"
 
 
 def contrasts(study: Study) -> Table:
     """Every variant against its driver's baseline, and every baseline against the humans."""
     rows: list[Row] = []
     for driver in dict.fromkeys(group.driver for group in study.models):
-        for measure in MEASURES:
-            rows += _family(study, driver, measure)
+        for metric in compared():
+            rows += _family(study, driver, metric)
     rows += _against_humans(study)
     return Table(
         "contrasts",
@@ -68,11 +64,7 @@ def contrasts(study: Study) -> Table:
             "being the observed one, in the direction in which less is enough; means: (t.975 + "
             "t.8) times the standard error of the linear model",
             RULES_NOTE,
-            *(
-                []
-                if study.human.measured
-                else ["gap and RMSE against humans need the recordings: merge-runner human import"]
-            ),
+            *_recordings_note(study),
             *shared_notes(study),
             *sample_notes(study, study.groups),
             *([] if rows else ["there is no pair of groups to compare"]),
@@ -80,14 +72,14 @@ def contrasts(study: Study) -> Table:
     )
 
 
-def _family(study: Study, driver: str, measure: Measure) -> list[Row]:
+def _family(study: Study, driver: str, metric: Metric) -> list[Row]:
     """One measure of a driver's variants against its baseline."""
     groups = [group for group in study.models if group.driver == driver]
     baseline = next((group for group in groups if group.setting == BASELINE), None)
     if baseline is None:
         return []
     pairs = [(group, baseline) for group in groups if group.setting != BASELINE]
-    return _corrected(pairs, measure, "baseline")
+    return _corrected(pairs, metric, "baseline")
 
 
 def _against_humans(study: Study) -> Iterator[Row]:
@@ -95,95 +87,106 @@ def _against_humans(study: Study) -> Iterator[Row]:
     if study.human not in study.groups:
         return
     pairs = [(group, study.human) for group in study.models if group.setting == BASELINE]
-    for measure in MEASURES:
-        if known(study.human, measure) or measure is JOINT:
-            yield from _corrected(pairs, measure, "human")
+    for metric in compared():
+        if known(study.human, metric) or _published_rate(metric) is not None:
+            yield from _corrected(pairs, metric, "human")
 
 
-def _corrected(pairs: list[tuple[Group, Group]], measure: Measure, reference: str) -> list[Row]:
+def _recordings_note(study: Study) -> list[str]:
+    """Which means cannot be compared with the humans before these are imported."""
+    means = [one.in_lists for one in compared() if not (one.rate or known(study.human, one))]
+    need = "needs" if len(means) == 1 else "need"
+    command = "merge-runner human import"
+    return [f"{listed(means)} against humans {need} the recordings: {command}"] if means else []
+
+
+def _corrected(pairs: list[tuple[Group, Group]], metric: Metric, reference: str) -> list[Row]:
     """A family of contrasts; groups without the measure are left out of it."""
     found = [
         (group, other, contrast)
         for group, other in pairs
-        if (contrast := _contrast(group, other, measure)) is not None
+        if (contrast := _contrast(group, other, metric)) is not None
     ]
     if not found:
         return []
     holm, bh = corrected([contrast.p for _, _, contrast in found])
     return [
         Row(
-            f"{group.id}/{reference}/{measure.name}",
+            f"{group.id}/{reference}/{metric.name}",
             (group.id, other.id),
             {
                 "driver": group.label,
                 "setting": group.setting,
                 "reference": reference,
-                "measure": measure.heading,
-                "difference": contrast.difference * (100 if measure.rate else 1),
-                "ci": _scaled(contrast, measure),
+                "measure": metric.heading,
+                "difference": contrast.value * (100 if metric.rate else 1),
+                "ci": contrast.bounds(100 if metric.rate else 1),
                 "p": contrast.p,
                 "p_holm": float(holm[i]),
                 "p_bh": float(bh[i]),
-                "detectable": _percent(contrast.detectable, measure),
-                "n": _n(group, measure),
-                "n_reference": _n(other, measure),
+                "detectable": _percent(contrast.detectable, metric),
+                "n": _n(group, metric),
+                "n_reference": _n(other, metric),
             },
-            "; ".join(filter(None, (_note(group, other, measure), _powerless(contrast, measure)))),
-            counts=measure.counts,
-            published=COLUMNS if measure is BOXES else (),
+            "; ".join(filter(None, (_note(group, other, metric), _powerless(contrast, metric)))),
+            counts=metric.counts,
+            published=COLUMNS if metric.humans_from == "outcomes" else (),
         )
         for i, (group, other, contrast) in enumerate(found)
     ]
 
 
-def _note(group: Group, other: Group, measure: Measure) -> str:
-    named = {group.id: undecided(group, measure), other.id: undecided(other, measure)}
+def _note(group: Group, other: Group, metric: Metric) -> str:
+    named = {group.id: undecided(group, metric), other.id: undecided(other, metric)}
     remarks = [f"{name}, {remark}" for name, remark in named.items() if remark]
-    if not known(other, measure):
-        remarks.append(JOINT_NOTE)
+    if not known(other, metric):
+        remarks.append(_published_note(metric))
     return "; ".join(filter(None, [*remarks, outcomes_note(other)]))
 
 
-def _contrast(group: Group, other: Group, measure: Measure) -> Contrast | None:
-    if measure.rate:
-        first, second = counts(group, measure), _rate(other, measure)
+def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
+    if metric.rate:
+        first, second = counts(group, metric), _rate(other, metric)
         return contrast_rates(first, second) if first[1] and second[1] else None
-    return contrast_means(group.finished, other.finished, measure.column)
+    return contrast_means(group.trials, other.trials, metric.column)
 
 
-def _rate(group: Group, measure: Measure) -> tuple[int, int]:
-    """Successes and n; the humans' joint rate before an import is the published 53.0 % of 962."""
-    if known(group, measure):
-        return counts(group, measure)
-    finished = len(group.finished)
-    return round(finished * published_human(measure) / 100), finished
+def _rate(group: Group, metric: Metric) -> tuple[int, int]:
+    """Successes and n; of humans without traces those that the published rate comes to."""
+    if known(group, metric):
+        return counts(group, metric)
+    return _published_rate(metric) or (0, 0)
 
 
-def _n(group: Group, measure: Measure) -> int:
-    if measure.rate:
-        return _rate(group, measure)[1]
-    return estimate(group, measure).n
+def _published_rate(metric: Metric) -> tuple[int, int] | None:
+    """Successes and n of the humans, from a published rate of so many trials."""
+    found = human_reference(metric)
+    if not metric.rate or found is None or found.n is None:
+        return None
+    return round(found.n * found.value / 100), found.n
 
 
-def _joint_note(other: Group, measure: Measure) -> str:
-    return "" if known(other, measure) else JOINT_NOTE
+def _published_note(metric: Metric) -> str:
+    found, rate = human_reference(metric), _published_rate(metric)
+    assert found is not None
+    assert rate is not None
+    printed = "that the paper prints" if metric.paper_of_humans else f"of {found.source}"
+    k, n = rate
+    return f"human {metric.in_lists}: {k} of {n} trials, from the {found.value:.1f} % {printed}"
 
 
-def _powerless(contrast: Contrast, measure: Measure) -> str:
+def _n(group: Group, metric: Metric) -> int:
+    return _rate(group, metric)[1] if metric.rate else len(values(group, metric))
+
+
+def _powerless(contrast: Difference, metric: Metric) -> str:
     if contrast.detectable is not None:
         return ""
-    return f"{measure.heading}: so few trials can show no difference, however large"
+    return f"{metric.heading}: so few trials can show no difference, however large"
 
 
-def _percent(value: float | None, measure: Measure) -> float | None:
-    return 100 * value if value is not None and measure.rate else value
-
-
-def _scaled(contrast: Contrast, measure: Measure) -> tuple[float, float] | None:
-    if contrast.low is None or contrast.high is None:
-        return None
-    factor = 100 if measure.rate else 1
-    return factor * contrast.low, factor * contrast.high
+def _percent(value: float | None, metric: Metric) -> float | None:
+    return 100 * value if value is not None and metric.rate else value
 
 
 def shared_notes(study: Study) -> list[str]:

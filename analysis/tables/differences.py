@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from math import isinf
+
 from analysis.data.study import Group, Study
-from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Difference, pairs_known
+from analysis.stats.intervals import Difference
+from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, pairs_known
 from analysis.stats.joint import differences as tested
 from analysis.stats.mixed import MIN_PAIRS
-from analysis.tables.model import Column, Row, Table
+from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
 from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
 
@@ -88,9 +91,8 @@ def differences(study: Study) -> Table:
     )
 
 
-def _row(human: Group, group: Group, found: Difference) -> Row:
+def _row(human: Group, group: Group, found: Interaction) -> Row:
     of_traces = pairs_known(human, found.outcome) >= MIN_PAIRS
-    ci = None if found.low is None or found.high is None else (found.low, found.high)
     said = found.problem or found.remark
     return Row(
         f"{group.id}/{found.outcome}/{found.term}",
@@ -103,12 +105,7 @@ def _row(human: Group, group: Group, found: Difference) -> Row:
             "n_human": found.n_human,
             "b_driver": found.driver,
             "b_human": found.human,
-            "difference": found.b,
-            "ci": ci,
-            "p": found.p,
-            "freedom": found.freedom,
-            "detectable": found.detectable,
-            "method": found.method or None,
+            **_tested(found.found),
         },
         f"{found.outcome}: {said}" if said else "",
         counts=COUNTS[found.outcome],
@@ -116,3 +113,16 @@ def _row(human: Group, group: Group, found: Difference) -> Row:
         published=() if of_traces else OF_HUMANS,
         cited="" if of_traces else FILES[found.outcome],
     )
+
+
+def _tested(found: Difference | None) -> dict[str, Value]:
+    if found is None:
+        return {}
+    return {
+        "difference": found.value,
+        "ci": found.bounds(),
+        "p": found.p,
+        "freedom": None if isinf(found.freedom) else found.freedom,
+        "detectable": found.detectable,
+        "method": found.by,
+    }

@@ -3,27 +3,16 @@
 from __future__ import annotations
 
 from analysis.data.study import Group, Study, of_group
+from analysis.metrics import GAP, LEFT_FIRST, RULES_NOTE, Metric, intervals_of, shown_in
 from analysis.stats.group_scores import Fits, fits
 from analysis.stats.indicators import INDICATORS, TESTED, Verdict, paper_verdicts, robust_verdicts
 from analysis.stats.intervals import Estimate
-from analysis.stats.measures import (
-    BOXES,
-    COLLISIONS,
-    GAP,
-    JOINT,
-    LEFT_FIRST,
-    RMSE,
-    RULES_NOTE,
-    Measure,
-    estimate,
-    undecided,
-)
+from analysis.stats.measures import estimate, undecided, values
 from analysis.tables.attempts import FALLBACK
 from analysis.tables.indicators import RULES
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
 
-COMPARED = (COLLISIONS, BOXES, LEFT_FIRST, GAP, RMSE, JOINT)
 # What an indicator's regression is fitted to.
 FITTED = {"I1": LEFT_FIRST, "I2": LEFT_FIRST, "I3": GAP, "I4": GAP}
 # The two sides: name, suffix of the columns, predicate of the trials.
@@ -53,7 +42,7 @@ def fallbacks(study: Study) -> Table:
         rows,
         (
             "all: every trial; without: those in which every decision was driven from its own "
-            "answer. Intervals: Wilson for rates, Student's t for means. Where the two are far "
+            f"answer. Intervals: {intervals_of(shown_in('fallbacks'))}. Where the two are far "
             "apart, failed answers bias the result",
             RULES_NOTE,
             RULES,
@@ -95,7 +84,7 @@ def _rows(study: Study, group: Group) -> list[Row]:
     kept = without_fallbacks(study, group)
     why = _why(group, kept)
     return [
-        *(_measure_row(group, kept, measure, why) for measure in COMPARED),
+        *(_metric_row(group, kept, metric, why) for metric in shown_in("fallbacks")),
         *(_verdict_row(group, kept, name, why) for name in TESTED),
     ]
 
@@ -121,28 +110,28 @@ def _why(group: Group, kept: Group) -> str:
     return ""
 
 
-def _measure_row(group: Group, kept: Group, measure: Measure, why: str) -> Row:
-    found, without = estimate(group, measure), estimate(kept, measure)
-    values: dict[str, Value] = {
-        **_keys(group, measure.heading),
+def _metric_row(group: Group, kept: Group, metric: Metric, why: str) -> Row:
+    found, without = estimate(group, metric), estimate(kept, metric)
+    cells: dict[str, Value] = {
+        **_keys(group, metric.heading),
         **_estimated(found, "all", ""),
         **_estimated(without, "without", "_without"),
     }
     if found.value is not None and without.value is not None:
-        values["difference"] = without.value - found.value
+        cells["difference"] = without.value - found.value
     missing = found.value is None or (without.value is None and not why)
-    nothing = f"{measure.heading}: no trial with this measure" if missing else ""
+    nothing = f"{metric.heading}: no trial with this measure" if missing else ""
     return Row(
-        f"{group.id}/{measure.name}",
+        f"{group.id}/{metric.name}",
         (group.id,),
-        values,
-        "; ".join(filter(None, (why, nothing, undecided(group, measure)))),
-        measure.counts,
+        cells,
+        "; ".join(filter(None, (why, nothing, undecided(group, metric)))),
+        metric.counts,
     )
 
 
 def _estimated(found: Estimate, name: str, suffix: str) -> dict[str, Value]:
-    interval = None if found.low is None or found.high is None else (found.low, found.high)
+    interval = found.bounds()
     return {f"n{suffix}": found.n, name: found.value, f"ci{suffix}": interval}
 
 
@@ -164,10 +153,10 @@ def _verdict_row(group: Group, kept: Group, name: str, why: str) -> Row:
         (group.id,),
         {
             **_keys(group, name),
-            "n": estimate(group, FITTED[name]).n,
+            "n": len(values(group, FITTED[name])),
             "paper": found[0].passed,
             "robust": found[1].passed,
-            "n_without": estimate(kept, FITTED[name]).n,
+            "n_without": len(values(kept, FITTED[name])),
             "paper_without": without[0].passed,
             "robust_without": without[1].passed,
             "differ": "≠" if changed else None,

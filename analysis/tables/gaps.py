@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from analysis.data.study import Group, Study
+from analysis.metrics import GAP
 from analysis.stats.intervals import mean
 from analysis.stats.regressions import Regression, gap_ols
 from analysis.tables.model import Column, Row, Table, Value
@@ -10,7 +11,7 @@ from analysis.tables.notes import sample_notes
 
 # Column of the trials to what is measured.
 DEFINITIONS = {
-    "gap_m": "interpolated, first vehicle at the merge point (ours)",
+    GAP.value: "interpolated, first vehicle at the merge point (ours)",
     "gap_first_sample_m": "first sample, first vehicle at the merge point",
     "gap_mean100_m": "first sample, mean position at the merge point",
 }
@@ -29,7 +30,7 @@ def gap_definitions(study: Study) -> Table:
             Column("setting", "setting"),
             Column("definition", "definition"),
             Column("n", "n", "count", 0, "finished trials with this gap"),
-            Column("gap_m", "gap (m)", "number", 2, "mean, net of the vehicle length"),
+            Column(GAP.name, GAP.heading, GAP.kind, 2, "mean, net of the vehicle length"),
             Column("gap_m_ci", "95 % CI", "interval", 2, "Student's t", optional=True),
             Column("headway_b", "b of |h|", "number", 2, "coefficient of |h| (I3)"),
             Column("headway_p", "p", "p", 3, "its t test"),
@@ -49,14 +50,13 @@ def gap_definitions(study: Study) -> Table:
 def _row(group: Group, column: str) -> Row:
     found = mean(group.finished[column].to_numpy(float))
     fit = gap_ols(group.trials, column)
-    interval = None if found.low is None or found.high is None else (found.low, found.high)
     values: dict[str, Value] = {
         "driver": group.label,
         "setting": group.setting,
         "definition": DEFINITIONS[column],
         "n": found.n,
-        "gap_m": found.value,
-        "gap_m_ci": interval,
+        GAP.name: found.value,
+        "gap_m_ci": found.bounds(),
         **_coefficients(fit),
     }
     return Row(f"{group.id}/{column}", (group.id,), values, fit.problem, f"{column} IS NOT NULL")

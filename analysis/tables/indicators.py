@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-from analysis.data.reference_data import citation
 from analysis.data.study import Group, Study
+from analysis.metrics import RULES_NOTE, HumanReference, Metric, shown_in
 from analysis.stats.group_scores import PAPER_RULE, ROBUST_RULE, Score, score, total, unjudged
 from analysis.stats.indicators import INDICATORS, Verdict
 from analysis.stats.likeness import gains
 from analysis.stats.measures import (
-    BOXES,
-    COLLISIONS,
-    MEASURES,
-    RULES_NOTE,
-    Measure,
-    estimate,
-    known,
+    estimate_or_reference,
+    no_human_value,
     outcomes_note,
-    published_human,
     undecided,
 )
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
 from analysis.tables.profiles import gain_values
 
-BOXES_ALONE = f"{COLLISIONS.heading}: published human collisions are boxes that overlap"
-SOURCE = "paper_ablation_quantitative"
 # The indicators that rest on who merged first, and all columns of their rows.
 OF_OUTCOMES = ("I1", "I2")
 EVERY = ("paper", "robust", "differ", "value", "interval", "n")
@@ -40,8 +32,8 @@ def indicators(study: Study) -> Table:
     for name in INDICATORS:
         rows += [_verdict_row(study, group, name) for group in study.baselines]
     rows += [_total_row(study, group) for group in study.baselines]
-    for measure in MEASURES:
-        rows += [_measure_row(group, measure) for group in study.baselines]
+    for metric in shown_in("tables"):
+        rows += [_metric_row(group, metric) for group in study.baselines]
     return Table(
         "indicators",
         "Qualitative and quantitative indicators of behaviour during merging conflicts",
@@ -188,33 +180,28 @@ def _total_row(study: Study, group: Group) -> Row:
     )
 
 
-def _measure_row(group: Group, measure: Measure) -> Row:
-    key: dict[str, Value] = {"indicator": measure.heading, "driver": group.label}
-    row = f"{group.id}/{measure.name}"
-    if measure is COLLISIONS and not known(group, measure):
-        return Row(row, (group.id,), key, BOXES_ALONE)
-    if not known(group, measure):
-        source = f"published value, no human traces are imported ({citation(SOURCE)})"
-        values = {**key, "value": published_human(measure)}
+def _metric_row(group: Group, metric: Metric) -> Row:
+    key: dict[str, Value] = {"indicator": metric.heading, "driver": group.label}
+    row = f"{group.id}/{metric.name}"
+    found = estimate_or_reference(group, metric)
+    if found is None:
+        return Row(row, (group.id,), key, no_human_value(metric))
+    values: dict[str, Value] = {**key, "value": found.value, "interval": found.bounds()}
+    if isinstance(found, HumanReference):
+        source = f"published value, no human traces are imported ({found.source})"
         return Row(row, (group.id,), values, source, printed=("value",))
-    found = estimate(group, measure)
-    interval = None if found.low is None or found.high is None else (found.low, found.high)
+    remarks = (
+        "" if found.value is not None else f"{metric.heading}: no trial has it",
+        undecided(group, metric),
+        outcomes_note(group),
+    )
     return Row(
         row,
         (group.id,),
-        {**key, "value": found.value, "interval": interval, "n": found.n},
-        "; ".join(
-            filter(
-                None,
-                (
-                    "" if found.value is not None else f"{measure.heading}: no trial has it",
-                    undecided(group, measure),
-                    outcomes_note(group),
-                ),
-            )
-        ),
-        measure.counts,
-        published=EVERY if measure is BOXES else (),
+        {**values, "n": found.n},
+        "; ".join(filter(None, remarks)),
+        metric.counts,
+        published=EVERY if metric.humans_from == "outcomes" else (),
     )
 
 

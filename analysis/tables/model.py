@@ -41,8 +41,8 @@ class Row:
     ``counts`` is the SQL predicate of its trials, where it is not that of the columns; ``printed``
     names the columns whose values are the published ones, or rest on them, ``published`` those that
     the published human outcomes are in, where trials of humans are in others. ``beside`` is the
-    driver of the paper whose row it stands beside, if any, and ``stand_in_for`` the model in whose
-    name a scripted stand-in answered. ``reference`` is the group that it is compared with, in the
+    driver of the paper whose row it stands beside, if any, and ``stand_in_for`` the models in whose
+    names a scripted stand-in answered. ``reference`` is the group that it is compared with, in the
     columns that compare, and ``cited`` the shipped file that its ``published`` columns are made of.
     """
 
@@ -53,7 +53,7 @@ class Row:
     counts: str = ""
     printed: tuple[str, ...] = ()
     beside: str = ""
-    stand_in_for: str = ""
+    stand_in_for: tuple[str, ...] = ()
     reference: str = ""
     published: tuple[str, ...] = ()
     cited: str = ""
@@ -99,7 +99,7 @@ def from_text(text: str) -> Table:
         for name in intervals & row["values"].keys():
             if row["values"][name] is not None:
                 row["values"][name] = tuple(row["values"][name])
-        for name in ("groups", "printed", "published"):
+        for name in ("groups", "printed", "stand_in_for", "published"):
             row[name] = tuple(row[name])
     rows = [Row(**row) for row in content["rows"]]
     return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 
 from analysis.data.intermittency import STEADY_MPS
@@ -10,6 +10,12 @@ from analysis.data.reference_data import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
 from analysis.data.study import Group, Study
 from analysis.stats import ceiling
 from analysis.stats.likeness import MARGIN_SD
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+
+
+def listed(items: Sequence[str]) -> str:
+    """``a, b and c``."""
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
 def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) -> list[str]:
@@ -26,8 +32,23 @@ def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) 
     if study.empty:
         notes.append(f"{study.db} holds no trial of a model; `make sweep` plays some")
     if study.human in study.groups:
-        notes += _human_notes(study, pooled)
+        notes += [*_human_notes(study, pooled), *_own_notes(study, shown)]
     return [*notes, *(f"{group.id}: {repeated_note(group)}" for group in shown if group.repeated)]
+
+
+def _own_notes(study: Study, groups: list[Group]) -> list[str]:
+    """Which of these trials are of conditions that no human drove."""
+    notes = []
+    for group in groups:
+        mine = group.trials.loc[~group.trials["condition"].isin(HUMAN_CONDITIONS), "condition"]
+        if len(mine):
+            names = [name for name in study.conditions if name in set(mine)]
+            notes.append(
+                f"{group.id}: no human drove {', '.join(names)} ({len(mine)} trials): beside the "
+                "humans, rates and regressions rest on these too, differences of means and the "
+                "human ceiling on the other conditions alone"
+            )
+    return notes
 
 
 def repeated_note(group: Group) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from analysis.data.study import Group, Study, of_group
-from analysis.stats.intervals import Estimate
 from analysis.stats.likeness import NO_ACTION, difference, gains, mean_gain
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import intermittency_notes, sample_notes
@@ -74,7 +73,7 @@ def _row(study: Study, group: Group) -> Row:
         values["held_percent"] = float(100 * (judged > 0).mean())
     if study.calibrated and group is not study.human:
         found = difference(study, group)
-        values |= {"difference_sd": found.value, "difference_sd_ci": bounds(found)}
+        values |= {"difference_sd": found.value, "difference_sd_ci": found.bounds()}
     plans = of_group(study.plans, group, group.ended)[
         ["plans", "coarse_plans", "revised_plans", "total_revision", "large_revisions"]
     ].sum()
@@ -93,9 +92,4 @@ def gain_values(
     if not group.measured:
         return {}
     found = mean_gain(study, group)
-    return {value: found.value, interval: bounds(found)}
-
-
-def bounds(found: Estimate) -> tuple[float, float] | None:
-    """The interval of an estimate, where it has one."""
-    return None if found.low is None or found.high is None else (found.low, found.high)
+    return {value: found.value, interval: found.bounds()}

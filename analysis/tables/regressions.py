@@ -165,8 +165,8 @@ def _hc3(fit: Regression, term: str) -> dict[str, Value]:
     if found is None:
         return {}
     values: dict[str, Value] = {"hc3_se": found.se, "hc3_p": found.p}
-    if term == "abs_relative_velocity" and fit.freedom is not None:
-        values["equivalence_p"] = equivalence_p(found.b, found.se, fit.freedom)
+    if term == "abs_relative_velocity":
+        values["equivalence_p"] = float(equivalence_p(found.b, found.se, fit.freedom))
     return values
 
 

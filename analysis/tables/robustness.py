@@ -7,11 +7,14 @@ from collections.abc import Iterable, Iterator
 import pandas as pd
 
 from analysis.data.collision_rules import BOXES, READINGS, UNDECIDED, outcomes
-from analysis.data.load import SIZES, load_each
+from analysis.data.load import load_each
 from analysis.data.study import Group, Study, of_group
 from analysis.stats.intervals import proportion
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
+
+# The size of a spec's vehicles in words.
+SIZES = "SELECT spec_hash, format('{:g} m x {:g} m', length_m, width_m) AS size FROM geometry"
 
 
 def robustness(study: Study) -> Table:
@@ -85,10 +88,10 @@ def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
             ),
         }
         note = "no trial ended"
-        if share.value is not None and share.low is not None and share.high is not None:
+        if share.value is not None:
             values |= {
                 "collided_percent": 100 * share.value,
-                "collided_percent_ci": (100 * share.low, 100 * share.high),
+                "collided_percent_ci": share.bounds(100),
             }
             note = ""
         rows.append(Row(f"{group.id}/{rule}", (group.id,), values, note))

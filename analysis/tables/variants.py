@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from analysis.data.study import Group, Study
 from analysis.stats.group_scores import fits
-from analysis.stats.intervals import POWER
+from analysis.stats.intervals import POWER, interval
 from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
 from analysis.stats.variants import (
     Corrected,
@@ -15,7 +15,6 @@ from analysis.stats.variants import (
     corrected_differences,
     firth_intervals,
     gap_differences,
-    interval,
     variants,
     who_first_differences,
 )
@@ -207,7 +206,7 @@ def _with_difference(row: Row, baseline: Group | None, one: Corrected) -> Row:
         values={
             **row.values,
             "difference": found.value,
-            "difference_ci": (found.low, found.high),
+            "difference_ci": found.bounds(),
             "difference_p": found.p,
             "p_holm": one.holm,
             "p_bh": one.bh,

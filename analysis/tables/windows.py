@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from analysis.data.study import Group, Study, of_group
+from analysis.metrics import JOINT, RMSE, Metric
 from analysis.stats.intervals import mean, proportion
-from analysis.stats.measures import JOINT, RMSE, published_human
+from analysis.stats.measures import human_reference
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import sample_notes
 
@@ -19,9 +20,6 @@ WINDOWS = {
 def speed_windows(study: Study) -> Table:
     """One row a group and window; the right window gives the published human values."""
     measured = [group for group in study.groups if group.measured]
-    human = " and ".join(
-        f"{published_human(m):g} {'%' if m.rate else 'm/s'}" for m in (RMSE, JOINT)
-    )
     rows = [_row(study, group, window) for group in measured for window in WINDOWS]
     return Table(
         "speed-windows",
@@ -31,12 +29,15 @@ def speed_windows(study: Study) -> Table:
             Column("setting", "setting"),
             Column("window", "window"),
             Column("n", "n", "count", 0, "finished trials in which the window ends"),
-            Column("rmse_mps", "RMSE (m/s)", "number", 2, RMSE.meaning),
-            Column("joint_percent", "joint (%)", "percent", 2, JOINT.meaning),
+            *(
+                Column(one.name, one.heading, one.kind, one.decimals, one.meaning)
+                for one in (RMSE, JOINT)
+            ),
         ),
         rows,
         (
-            f"the paper prints {human} for humans; the window that gives both with the imported "
+            f"the paper prints {_printed(RMSE)} and {_printed(JOINT)} for humans; the window that "
+            "gives both with the imported "
             "recordings is the paper's. Models have no tunnel: their trials start at its exit",
             *([] if rows else ["there is no measured trial to show"]),
             *sample_notes(study, measured),
@@ -44,11 +45,18 @@ def speed_windows(study: Study) -> Table:
     )
 
 
+def _printed(metric: Metric) -> str:
+    human = human_reference(metric)
+    assert human is not None
+    return f"{human.value:g} {metric.unit}"
+
+
 def _row(study: Study, group: Group, window: str) -> Row:
     found = study.deviations[study.deviations["time_window"] == window]
     own = of_group(found, group, group.finished)
-    rmse = mean(own["rmse_mps"].to_numpy(float))
-    joint = proportion(int(own["joint"].sum()), len(own)).value
+    # The view of the windows has the same columns as that of the metrics.
+    rmse = mean(own[RMSE.value].to_numpy(float))
+    joint = proportion(int(own[JOINT.value].sum()), len(own)).value
     return Row(
         f"{group.id}/{window}",
         (group.id,),
@@ -57,8 +65,8 @@ def _row(study: Study, group: Group, window: str) -> Row:
             "setting": group.setting,
             "window": WINDOWS[window],
             "n": rmse.n,
-            "rmse_mps": rmse.value,
-            "joint_percent": None if joint is None else 100 * joint,
+            RMSE.name: rmse.value,
+            JOINT.name: None if joint is None else 100 * joint,
         },
         "" if rmse.n else "no finished trial",
     )

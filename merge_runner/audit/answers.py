@@ -9,10 +9,9 @@ from typing import Any
 
 from merge_runner.llm.formats.base import Reading, WireFormat
 from merge_runner.llm.http_outcome import RawReply, judge
-from merge_runner.records import ANSWERED_FIELD, says_scripted
+from merge_runner.records import ANSWERED_FIELD, ANSWERS, says_scripted
 from merge_runner.results.rows import Row
 
-ANSWERS = ("ok", "refusal", "truncated", "empty")
 # A row of ``calls`` as it is read here; ``READ`` of it is what its reply tells.
 PLACE = ("decision", "side", "attempt")
 READ = (
@@ -50,19 +49,18 @@ def read_answer(row: dict[str, Any], wire: WireFormat) -> Answer:
     An attempt that failed stays as it is, since its name rests on headers that are not stored;
     also of an answer the header alone may have said that a stand-in made it.
     """
-    body = _body(row["reply"])
-    payload = _json(body)
-    told = {"scripted": row["scripted"] or row["provider"] == "emulator" or says_scripted(body)}
-    if row["http_status"] == 200 and isinstance(payload, dict):
-        reading = wire.read(payload)
+    raw = RawReply(row["http_status"] or 0, {}, _body(row["reply"]))
+    told = {"scripted": row["scripted"] or row["provider"] == "emulator" or says_scripted(raw.body)}
+    if raw.status == 200 and isinstance(raw.payload, dict):
+        reading = wire.read(raw.payload)
         if reading.outcome != "error":
             wanted = {**_told(reading), **told, "outcome": reading.outcome, "error": None}
-            return Answer(row, wanted, reading.text, payload)
+            return Answer(row, wanted, reading.text, raw.payload)
     if row["outcome"] not in ANSWERS:
         return Answer(row, told, None)
-    verdict = judge(RawReply(row["http_status"] or 0, {}, body), wire)
-    wanted = {**_told(verdict.reading), **told, "outcome": verdict.outcome}
-    return Answer(row, {**wanted, "error": verdict.message}, "")
+    outcome = judge(raw, wire)
+    wanted = {**_told(outcome.reading), **told, "outcome": outcome.name}
+    return Answer(row, {**wanted, "error": outcome.message}, "")
 
 
 def answers_another(payload: object, body_sha256: str, slot: Mapping[str, Any]) -> bool:
@@ -89,12 +87,10 @@ def _told(reading: Reading) -> dict[str, Any]:
 
 def _body(reply: str | None) -> str:
     """The body as it came: what the table would not take as JSON lies there as a JSON string."""
-    value = _json(reply or "")
-    return value if isinstance(value, str) else reply or ""
-
-
-def _json(text: str) -> object:
+    if reply is None or not reply.startswith('"'):
+        return reply or ""
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        return None
+        body: str = json.loads(reply)
+    except ValueError:
+        return reply
+    return body

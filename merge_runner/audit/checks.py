@@ -1,18 +1,15 @@
 """What must hold of every trial, as queries for what does not: trial_id, side, decision, text.
 
 They read the tables of a database and the temporary ones that sweeps.py makes: ``audited`` (the
-trials), ``rules`` (numbers of a spec's scenario), ``drivers`` (per spec and side the endpoint and
-the body of an empty request, NULL for a program), ``entries`` (the models of the sweep) and
-``other_models`` (who answered in place of whom).
+trials), ``rules`` (numbers of a spec's scenario and track), ``paces`` (when the driver of a spec's
+side decides), ``drivers`` (per spec and side the endpoint and the body of an empty request, NULL
+for a program), ``entries`` (the models of the sweep) and ``other_models`` (who answered in place
+of whom).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
-
-IN_CONTROL_M = TUNNEL_EXIT_M - 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,71 +21,73 @@ class Check:
 
 
 # The numbers that a trial's rows repeat are those of its states.
-OUTCOMES = f"""
+OUTCOMES = """
 WITH driven AS (
     SELECT trial_id, spec_hash, max(step) AS last_step, count(*) AS samples,
         count(DISTINCT (step, side)) AS places, max(time_s) AS end_s, max(position_m) AS far_m,
-        min(step) FILTER (side = 'left' AND position_m >= {MERGE_POINT_M}) AS left_step,
-        min(step) FILTER (side = 'right' AND position_m >= {MERGE_POINT_M}) AS right_step
-    FROM states SEMI JOIN audited USING (trial_id, spec_hash) GROUP BY ALL
+        min(step) FILTER (side = 'left' AND position_m >= merge_point_m) AS left_step,
+        min(step) FILTER (side = 'right' AND position_m >= merge_point_m) AS right_step
+    FROM states SEMI JOIN audited USING (trial_id, spec_hash) JOIN rules USING (spec_hash)
+    GROUP BY ALL
 ), judged AS (
     SELECT trial_id, CASE
         WHEN samples IS NULL THEN 'it has no states'
         WHEN samples <> 2 * (last_step + 1) OR places <> samples
-            THEN format('it has {{}} states in {{}} steps of two vehicles', samples, last_step + 1)
+            THEN format('it has {} states in {} steps of two vehicles', samples, last_step + 1)
         WHEN abs(end_time_s - end_s) > 1e-6
-            THEN format('it ended after {{}} s, its states after {{}} s', end_time_s, end_s)
+            THEN format('it ended after {} s, its states after {} s', end_time_s, end_s)
         WHEN status = 'failed' AND error IS NULL THEN 'it failed and names no reason'
-        WHEN status = 'finished' AND far_m < {TRACK_END_M}
+        WHEN status = 'finished' AND far_m < end_m
             THEN 'it is finished, and nobody has reached the end of the track'
-        WHEN status IN ('timeout', 'failed') AND far_m >= {TRACK_END_M}
-            THEN format('it is {{}}, and a vehicle has reached the end of the track', status)
+        WHEN status IN ('timeout', 'failed') AND far_m >= end_m
+            THEN format('it is {}, and a vehicle has reached the end of the track', status)
         WHEN status = 'timeout' AND last_step <> timeout_steps
-            THEN format('its time was over after {{}} of {{}} steps', last_step, timeout_steps)
+            THEN format('its time was over after {} of {} steps', last_step, timeout_steps)
         WHEN status IN ('collided', 'failed') THEN
-            if(merged_first IS NULL, NULL, format('it is {{}}, and has a first merger', status))
+            if(merged_first IS NULL, NULL, format('it is {}, and has a first merger', status))
         WHEN left_step IS NULL AND right_step IS NULL THEN
             if(merged_first IS NULL, NULL, 'nobody merged, and it has a first merger')
         WHEN merged_first IS NULL THEN 'a vehicle merged, and it has no first merger'
         -- Within one step the exact instants decide, which are not compared here.
         WHEN left_step = right_step THEN NULL
         WHEN merged_first <> if(right_step IS NULL OR left_step < right_step, 'left', 'right')
-            THEN format('{{}} merged first by its row, and not by its states', merged_first)
+            THEN format('{} merged first by its row, and not by its states', merged_first)
         END AS text
     FROM audited JOIN rules USING (spec_hash) LEFT JOIN driven USING (trial_id, spec_hash)
 )
 SELECT trial_id, NULL AS side, NULL AS decision, text FROM judged WHERE text IS NOT NULL
-"""  # noqa: S608 # constants
+"""
 
 # Every driver in control decides once per interval until the trial ends. The last interval of a
 # failed trial was not driven: one side may have decided in it.
-NUMBERS = f"""
+NUMBERS = """
 WITH last_steps AS (
     SELECT trial_id, spec_hash, max(step) AS last_step FROM states
     SEMI JOIN audited USING (trial_id, spec_hash) GROUP BY ALL
 ), implied AS (
-    SELECT trial_id, spec_hash, side, step // executed AS decision, time_s AS due_s
-    FROM states JOIN last_steps USING (trial_id, spec_hash) JOIN rules USING (spec_hash)
-    WHERE step % executed = 0 AND step < last_step AND position_m > {IN_CONTROL_M}
+    SELECT trial_id, spec_hash, side, step // interval_steps AS decision, time_s AS due_s
+    FROM states JOIN last_steps USING (trial_id, spec_hash) JOIN paces USING (spec_hash, side)
+    JOIN rules USING (spec_hash)
+    WHERE step % interval_steps = 0 AND step < last_step AND position_m > tunnel_exit_m - 1e-9
 ), made AS (
     SELECT trial_id, spec_hash, side, decision, count(*) AS times, min(time_s) AS at_s
     FROM decisions SEMI JOIN audited USING (trial_id, spec_hash) GROUP BY ALL
 ), compared AS (
     SELECT trial_id, side, decision, CASE
         WHEN times IS NULL THEN 'it is missing: the driver was in control'
-        WHEN times > 1 THEN format('it is stored {{}} times', times)
-        WHEN due_s IS NULL AND NOT (status = 'failed' AND decision * executed = last_step)
+        WHEN times > 1 THEN format('it is stored {} times', times)
+        WHEN due_s IS NULL AND NOT (status = 'failed' AND decision * interval_steps = last_step)
             THEN 'nothing was to be decided: the trial was over, or the driver not in control'
         WHEN abs(at_s - due_s) > 1e-6
-            THEN format('it was due at {{}} s and made at {{}} s', due_s, at_s)
+            THEN format('it was due at {} s and made at {} s', due_s, at_s)
         END AS text
     FROM implied FULL JOIN made USING (trial_id, spec_hash, side, decision)
     JOIN audited USING (trial_id, spec_hash)
-    JOIN rules USING (spec_hash)
+    JOIN paces USING (spec_hash, side)
     LEFT JOIN last_steps USING (trial_id, spec_hash)
 )
 SELECT trial_id, side, decision, text FROM compared WHERE text IS NOT NULL
-"""  # noqa: S608 # constants
+"""  # constants
 
 # After an invalid reply the last valid plan goes on where it was left or, by the other rule, at
 # its first action; 0 where it is exhausted or there is none (drivers/llm_driver.py).
@@ -97,6 +96,7 @@ WITH numbered AS (
     SELECT *, row_number() OVER (
         PARTITION BY trial_id, spec_hash, side ORDER BY decision) AS place
     FROM decisions SEMI JOIN audited USING (trial_id, spec_hash) JOIN rules USING (spec_hash)
+    JOIN paces USING (spec_hash, side)
 ), older AS (
     SELECT *,
         last_value(if(valid, plan, NULL) IGNORE NULLS) OVER before AS older_plan,

@@ -10,7 +10,7 @@ import asyncio
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -19,9 +19,10 @@ import duckdb
 from merge_runner.audit.answers import COLUMNS, Answer, answers_another, read_answer
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Finding
-from merge_runner.config import Scenario
-from merge_runner.drivers.base import Driver
-from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.base import Driver, MakeDriver, Seat, take_seat
+from merge_runner.drivers.language_model import LanguageModel
+from merge_runner.drivers.pace import Pace
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed
 from merge_runner.llm.formats import FORMATS
@@ -52,6 +53,7 @@ from merge_runner.results.comparison import (
 )
 from merge_runner.results.rows import decision_rows, state_rows, trial_row
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.registry import SCENARIOS
 from merge_runner.trial import play_trial
 
 TOLERANCE = 1e-9
@@ -74,6 +76,7 @@ ASKED = "sha256(request::VARCHAR) AS asked"
 # What a reader is told could not be derived.
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
+NOT_INSTALLED = "anything, since their condition or their scenario is not installed"
 OTHER_PROGRAM = "the decisions of a program that is not as it was"
 
 
@@ -99,24 +102,31 @@ class _NotStored(Exception):  # what happened, and no error of the program
 class _Trial:
     """A trial as it is stored.
 
-    ``scripted`` says that the sweep asks the emulator. Not derived are its prompts unless
-    ``prompts``, and if ``as_stored`` a program's decisions.
+    ``scripted`` says that the sweep asks the emulator. Its prompts are not derived unless
+    ``prompts``.
     """
 
     key: TrialKey
     row: dict[str, Any]
-    scenario: Scenario
+    scenario: ScenarioConfig
     attempts: list[Answer]
     plans: dict[tuple[str, int], Decision]
     scripted: bool
     prompts: bool = True
-    as_stored: bool = False
     drivers: dict[Side, Driver] = field(default_factory=dict)
 
     async def played(self) -> TrialRecord | _NotStored:
         """The trial, driven anew."""
+        try:
+            return await play_trial(self.spec, self.scenario, self.drivers)
+        except _NotStored as exc:
+            return exc
+
+    @property
+    def spec(self) -> TrialSpec:
+        """The trial as it was to be played."""
         row = self.row
-        spec = TrialSpec(
+        return TrialSpec(
             *self.key,
             source=row["source"],
             model_left=row["model_left"],
@@ -128,10 +138,6 @@ class _Trial:
             order=0,
             scripted=self.scripted or any(a.wanted["scripted"] for a in self.attempts),
         )
-        try:
-            return await play_trial(spec, self.scenario, self.drivers)
-        except _NotStored as exc:
-            return exc
 
     def slot(self, row: Mapping[str, Any]) -> dict[str, str | int]:
         """The slot of a row of ``calls``."""
@@ -140,37 +146,39 @@ class _Trial:
             own["condition"], own["rep"], row["side"], row["decision"], own["sample_set"]
         ).as_dict()
 
-    def model(self, side: Side) -> LlmDriver:
+    def model(self) -> LanguageModel:
         """A language model that gives the stored replies."""
         ordered = sorted(self.attempts, key=lambda attempt: attempt.row["attempt"])
-        last = {a.row["decision"]: a for a in ordered if a.row["side"] == side}
+        last = {(a.row["side"], a.row["decision"]): a for a in ordered}
 
-        async def ask(_: str, number: int) -> ChatReply:
-            slot = Slot(self.row["condition"], self.row["rep"], side, number, 0)
-            answer = last.get(number)
+        async def ask(_: str, slot: Slot, __: TrialSpec) -> ChatReply:
+            answer = last.get((slot.side, slot.decision))
             key = answer.row["call_key"] if answer else ""
             request = ChatRequest(key, "", "", "", "", {}, "", slot)
             if answer is not None and answer.text is not None:
                 return ChatReply(answer.text, answer.wanted["outcome"], request, (), 0)
             if self.row["status"] == "failed":
                 raise CallFailed("no answer", request)
-            raise _NotStored(f"the reply to decision {number} on the {side} is not stored")
+            raise _NotStored(
+                f"the reply to decision {slot.decision} on the {slot.side} is not stored"
+            )
 
-        return LlmDriver(ask, self.row["variant"] if self.prompts else "baseline", self.scenario)
+        return LanguageModel(ask)
 
 
 @dataclass(frozen=True, slots=True)
 class _AsStored:
     """Drives the stored plans of a side."""
 
-    trial: _Trial
-    side: Side
+    plans: Mapping[tuple[str, int], Decision]
+    seat: Seat
 
     async def decide(self, _: Observation, number: int) -> Decision:
         """The stored decision; raises _NotStored."""
-        if (self.side, number) not in self.trial.plans:
-            raise _NotStored(f"decision {number} on the {self.side} is not stored")
-        return self.trial.plans[self.side, number]
+        side = self.seat.side
+        if (side, number) not in self.plans:
+            raise _NotStored(f"decision {number} on the {side} is not stored")
+        return self.plans[side, number]
 
 
 def check_derived(
@@ -224,10 +232,18 @@ def _trials(
     for key in tables["trials"].rows:
         spec = specs.get(key[1])
         (row,) = tables["trials"].named(key)
-        if spec is None or spec.scenario is None or row["condition"] not in CONDITIONS:
+        if spec is None or spec.scenario is None:
+            continue
+        scenario = SCENARIOS.get(spec.scenario.name)
+        if scenario is None or row["condition"] not in CONDITIONS:
+            found.left_out[NOT_INSTALLED] += 1
+            continue
+        paces = {side: pace for side in SIDES if (pace := spec.pace(side)) is not None}
+        if len(paces) < len(SIDES):
             continue
         known = all(side in wires for side in SIDES if spec.asks(side))
-        if spec.content.get("spec_version") != SPEC_VERSION or not known:
+        same_rules = spec.content.get("spec_version") == SPEC_VERSION
+        if not (same_rules and known and spec.track == scenario.track):
             found.left_out[OTHER_RULES] += 1
             continue
         calls, decisions = tables["calls"].named(key), tables["decisions"].named(key)
@@ -239,9 +255,7 @@ def _trials(
             {(d["side"], d["decision"]): _decided(d) for d in decisions},
             scripted=any(model.provider == "emulator" for model in config.models.values()),
         )
-        _seat(trial, spec)
-        found.left_out[OTHER_PROMPTS] += not trial.prompts
-        found.left_out[OTHER_PROGRAM] += trial.as_stored
+        found.left_out.update(_seat(trial, spec, paces))
         yield trial
 
 
@@ -262,20 +276,34 @@ def _decided(row: Mapping[str, Any]) -> Decision:
     )
 
 
-def _seat(trial: _Trial, spec: Spec) -> None:
-    """Give the trial its drivers; a program that is another one by now drives as it is stored."""
+def _seat(trial: _Trial, spec: Spec, paces: Mapping[Side, Pace]) -> set[str]:
+    """Give the trial its drivers; returns what of it cannot be derived.
+
+    A program that is not registered here, or another one by now, drives as it is stored.
+    """
     variant, blocks = trial.row["variant"], spec.content.get("prompt_blocks")
     trial.prompts = not blocks or (variant in VARIANTS and block_digests(variant) == blocks)
-    for side in SIDES:
+    left_out = set() if trial.prompts else {OTHER_PROMPTS}
+    own = trial.spec if trial.prompts else replace(trial.spec, variant="baseline")
+    for side, pace in paces.items():
         told = spec.driver(side)
-        program = PROGRAMS.get(told.get("program", ""))
-        if spec.asks(side):
-            trial.drivers[side] = trial.model(side)
-        elif program is not None and program.source == told.get("source"):
-            trial.drivers[side] = program.make(trial.scenario, side)
-        else:
-            trial.drivers[side] = _AsStored(trial, side)
-            trial.as_stored = True
+        name = told.get("program", "")
+        program = PROGRAMS.get(name)
+        if spec.asks(side) or (program is not None and program.source == told.get("source")):
+            maker: MakeDriver = trial.model() if spec.asks(side) else PROGRAMS[name]
+            trial.drivers[side] = maker.make(trial.scenario, own, side)
+            continue
+        seat = take_seat(trial.scenario, own, side, pace)
+        trial.drivers[side] = _AsStored(trial.plans, seat)
+        left_out.add(OTHER_PROGRAM if program is not None else _not_here(name))
+    return left_out
+
+
+def _not_here(program: str) -> str:
+    return (
+        f"the decisions of {program!r}, which is no driver here; valid: {', '.join(PROGRAMS)} "
+        "(install the package that registers it)"
+    )
 
 
 def _findings(

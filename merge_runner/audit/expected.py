@@ -10,9 +10,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.pace import Pace, pace_of
+from merge_runner.errors import UsageError
 from merge_runner.llm.keys import between_body_and_slot
 from merge_runner.records import SIDES
+from merge_runner.scenarios.merge.geometry import Track, track_of
 
 
 class _Facts(BaseModel):
@@ -55,7 +58,7 @@ class SweepConfig(_Facts):
 
     @property
     def sides(self) -> dict[str, str]:
-        """Side to the name of its driver."""
+        """Side to the name of its driver; read here on its own, so that the plan is audited too."""
         left, _, right = self.model.partition("+")
         return {"left": left, "right": right or left}
 
@@ -90,15 +93,23 @@ class Spec:
         return content if isinstance(content, dict) else {}
 
     @cached_property
-    def scenario(self) -> Scenario | None:
+    def scenario(self) -> ScenarioConfig | None:
         """The scenario, None where it cannot be read; what it lacks has its default."""
         fields = self.content.get("scenario")
         if not isinstance(fields, dict):
             return None
         try:
-            return Scenario.model_validate(
-                {name: fields[name] for name in Scenario.model_fields if name in fields}
+            return ScenarioConfig.model_validate(
+                {name: fields[name] for name in ScenarioConfig.model_fields if name in fields}
             )
+        except ValidationError:
+            return None
+
+    @cached_property
+    def track(self) -> Track | None:
+        """The track, None where it cannot be read."""
+        try:
+            return track_of(self.content)
         except ValidationError:
             return None
 
@@ -106,6 +117,15 @@ class Spec:
         """What drives on a side."""
         driver = self.content.get(side)
         return driver if isinstance(driver, dict) else {}
+
+    def pace(self, side: str) -> Pace | None:
+        """When the driver of a side decides, None where that cannot be read."""
+        if self.scenario is None:
+            return None
+        try:
+            return pace_of(self.scenario, self.driver(side))
+        except UsageError:
+            return None
 
     def asks(self, side: str) -> bool:
         """Whether a language model drives on a side."""
@@ -150,8 +170,16 @@ def _differences(driver: dict[str, Any], name: str, config: SweepConfig) -> Iter
         return
     # Gemini names the model in the path alone.
     in_path = f"/{model.id}:" in str(driver.get("path")) or model.path is not None
-    if body["model"] != model.id if "model" in body else not in_path:
+    sent = list(_members(body))
+    named = model.id in [value for _, value in sent] or in_path
+    if body["model"] != model.id if "model" in body else not named:
         yield "model"
-    sent = {**body, **(body.get("generationConfig") or {})}
-    if any(sent.get(parameter) != value for parameter, value in model.parameters.items()):
+    if any(parameter not in sent for parameter in model.parameters.items()):
         yield "parameters"
+
+
+def _members(value: object) -> Iterator[tuple[str, object]]:
+    """All members of the objects in a JSON value: formats put the parameters where they like."""
+    for name, each in value.items() if isinstance(value, dict) else ():
+        yield name, each
+        yield from _members(each)

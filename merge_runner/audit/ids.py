@@ -13,7 +13,7 @@ from merge_runner.results.database import streamed
 # Earlier emulators gave every reply the same id: those of a stand-in tell nothing. The present
 # ones give each reply its own, and are audited like any provider.
 CONSTANT_IDS = ("chatcmpl-emulated", "resp_emulated", "msg_emulated", "emulated")
-# Where the four formats have the answer; what stands beside it, as a time, may change in a copy.
+# Where our own formats have the answer; what stands beside it, as a time, may change in a copy.
 ANSWERS = ("choices", "output", "candidates", "content")
 REPLIES = "SELECT rowid, reply::VARCHAR FROM calls WHERE http_status = 200"
 # An id is one within the endpoint that gave it: two emulators answer the same question with the
@@ -54,7 +54,9 @@ def identified(reply: str) -> tuple[str, str] | None:
     found = body.get("id") or body.get("responseId")
     if not isinstance(found, str):
         return None
-    answer = json.dumps([body.get(name) for name in ANSWERS])
+    # Of another format all counts, or any two of its answers would be alike.
+    known = any(name in body for name in ANSWERS)
+    answer = json.dumps([body.get(name) for name in ANSWERS] if known else body)
     return found, hashlib.blake2b(answer.encode(), digest_size=16).hexdigest()
 
 

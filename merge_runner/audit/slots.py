@@ -11,6 +11,7 @@ import duckdb
 from merge_runner.audit.expected import Cell, Spec, SweepConfig
 from merge_runner.audit.findings import Finding
 from merge_runner.llm.keys import spec_hash
+from merge_runner.records import SIDES
 
 TRIALS = """
 SELECT trial_id, spec_hash, links, status, error, variant, condition, rep, sample_set, model_left,
@@ -144,8 +145,10 @@ def _spec_problems(row: Row, config: SweepConfig, specs: Mapping[str, Spec]) -> 
         return
     if spec_hash(spec.text) != row.spec_hash:
         yield f"the spec stored as {row.spec_hash} has the hash {spec_hash(spec.text)}"
-    if spec.scenario is None:
+    if spec.scenario is None or spec.track is None:
         yield f"the scenario of the spec {row.spec_hash} cannot be read: its trials are not checked"
+    elif None in map(spec.pace, SIDES):
+        yield f"the rates of the spec {row.spec_hash} cannot be read: its decisions are not checked"
     cell = config.trials.get(row.trial_id)
     differing = list(spec.disagreements(config, cell.variant)) if cell else []
     if differing:

@@ -33,8 +33,11 @@ from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
 
 TABLES = """
-CREATE OR REPLACE TEMP TABLE rules (spec_hash VARCHAR, executed INTEGER, plan_actions INTEGER,
-    timeout_steps INTEGER, restarts BOOLEAN, reach_m DOUBLE);
+CREATE OR REPLACE TEMP TABLE rules (spec_hash VARCHAR, timeout_steps INTEGER, restarts BOOLEAN,
+    reach_m DOUBLE, tunnel_exit_m DOUBLE, merge_point_m DOUBLE, end_m DOUBLE, branch_sine DOUBLE,
+    branch_cosine DOUBLE);
+CREATE OR REPLACE TEMP TABLE paces (spec_hash VARCHAR, side VARCHAR, interval_steps INTEGER,
+    executed INTEGER, plan_actions INTEGER);
 CREATE OR REPLACE TEMP TABLE drivers (spec_hash VARCHAR, side VARCHAR, endpoint VARCHAR,
     body VARCHAR, between_body_and_slot VARCHAR);
 CREATE OR REPLACE TEMP TABLE done AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
@@ -235,14 +238,27 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
         (
             (
                 spec.spec_hash,
-                scenario.executed_actions,
-                scenario.plan_actions,
                 scenario.timeout_steps,
                 scenario.fallback == "restart",
                 reach_m(scenario),
+                track.tunnel_exit_m,
+                track.merge_point_m,
+                track.end_m,
+                track.branch_sine,
+                track.branch_cosine,
             )
             for spec in specs.values()
-            if (scenario := spec.scenario) is not None
+            if (scenario := spec.scenario) is not None and (track := spec.track) is not None
+        ),
+    )
+    _fill(
+        connection,
+        "paces",
+        (
+            (spec.spec_hash, side, pace.interval_steps, pace.executed_actions, pace.plan_actions)
+            for spec in specs.values()
+            for side in SIDES
+            if (pace := spec.pace(side)) is not None
         ),
     )
     _fill(

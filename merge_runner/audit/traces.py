@@ -9,15 +9,15 @@ import duckdb
 
 from merge_runner.audit.expected import Spec
 from merge_runner.audit.findings import Finding
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided
-from merge_runner.scenarios.merge.geometry import FORWARD, LATERAL, MERGE_POINT_M
+from merge_runner.scenarios.merge.geometry import Track
 
 TOLERANCE_M = 1e-6
 GAPS = "CREATE OR REPLACE TEMP TABLE gaps AS SELECT trial_id, spec_hash, gap_m FROM trial_metrics"
 # A trial's samples before and after the first arrival at the merge point, and all those at which
 # the centres may be within reach of each other, along the road and across it.
-TRACES = f"""
+TRACES = """
 WITH samples AS (
     SELECT trial_id, spec_hash, step,
         max(position_m) FILTER (side = 'left') AS left_m,
@@ -25,23 +25,23 @@ WITH samples AS (
     FROM states SEMI JOIN audited USING (trial_id, spec_hash) GROUP BY ALL
 ), traces AS (
     SELECT trial_id, spec_hash, max(step) AS last_step,
-        arg_max([left_m, right_m], step) FILTER (greatest(left_m, right_m) < {MERGE_POINT_M})
+        arg_max([left_m, right_m], step) FILTER (greatest(left_m, right_m) < merge_point_m)
             AS before_m,
-        arg_min([left_m, right_m], step) FILTER (greatest(left_m, right_m) >= {MERGE_POINT_M})
+        arg_min([left_m, right_m], step) FILTER (greatest(left_m, right_m) >= merge_point_m)
             AS after_m,
         coalesce(list((step, left_m, right_m) ORDER BY step) FILTER (
-            abs(left_m - right_m) < reach_m / {FORWARD}
-            AND left_m + right_m > 2 * {MERGE_POINT_M} - reach_m / {LATERAL}), []) AS close
+            abs(left_m - right_m) < reach_m / branch_cosine
+            AND left_m + right_m > 2 * merge_point_m - reach_m / branch_sine), []) AS close
     FROM samples JOIN rules USING (spec_hash)
     WHERE left_m IS NOT NULL AND right_m IS NOT NULL GROUP BY ALL
 )
 SELECT trial_id, spec_hash, status, last_step, close, before_m, after_m, gap_m
 FROM traces JOIN audited USING (trial_id, spec_hash) LEFT JOIN gaps USING (trial_id, spec_hash)
 ORDER BY ALL
-"""  # noqa: S608 # constants
+"""
 
 
-def reach_m(scenario: Scenario) -> float:
+def reach_m(scenario: ScenarioConfig) -> float:
     """A distance of the centres from which on no rule sees a collision, with room for rounding."""
     return hypot(scenario.vehicle_length_m, scenario.vehicle_width_m) + TOLERANCE_M
 
@@ -52,23 +52,28 @@ def check_traces(
     """Judge the audited trials anew, each by the rule and the vehicles of its own spec."""
     for row in connection.execute(TRACES).fetchall():
         trial_id, spec_hash, status, last_step, close, before_m, after_m, gap_m = row
-        scenario = specs[spec_hash].scenario
+        scenario, track = specs[spec_hash].scenario, specs[spec_hash].track
         assert scenario is not None  # a row of rules stands for it
-        text = _collision(scenario, status, last_step, close)
+        assert track is not None
+        text = _collision(scenario, track, status, last_step, close)
         if text is not None:
             yield Finding("outcome", text, trial=trial_id)
         finished = status == "finished" and before_m is not None and after_m is not None
-        found_m = _gap_m(before_m, after_m, scenario.vehicle_length_m) if finished else None
+        found_m = _gap_m(before_m, after_m, scenario, track) if finished else None
         if not _same(gap_m, found_m):
             text = f"it is {_metres(gap_m)} in trial_metrics, and by its states {_metres(found_m)}"
             yield Finding("gap", text, trial=trial_id)
 
 
 def _collision(
-    scenario: Scenario, status: str, last_step: int, close: Iterable[tuple[int, float, float]]
+    scenario: ScenarioConfig,
+    track: Track,
+    status: str,
+    last_step: int,
+    close: Iterable[tuple[int, float, float]],
 ) -> str | None:
     """What contradicts the status; a trial ends with its first collision."""
-    first = next((step for step, *both in close if collided(scenario, *both)), None)
+    first = next((step for step, *both in close if collided(scenario, track, *both)), None)
     if first is None and status == "collided":
         return f"it is collided, and its states never are by the rule {scenario.collision_rule}"
     if first is not None and (status != "collided" or first < last_step):
@@ -76,13 +81,15 @@ def _collision(
     return None
 
 
-def _gap_m(before_m: Sequence[float], after_m: Sequence[float], length_m: float) -> float:
+def _gap_m(
+    before_m: Sequence[float], after_m: Sequence[float], scenario: ScenarioConfig, track: Track
+) -> float:
     """The net gap at the first arrival at the merge point, linear within the step."""
     steps = list(zip(before_m, after_m, strict=True))
-    shares = ((MERGE_POINT_M - a) / (b - a) for a, b in steps if b >= MERGE_POINT_M)
+    shares = ((track.merge_point_m - a) / (b - a) for a, b in steps if b >= track.merge_point_m)
     share = min(shares, default=nan)  # DuckDB takes what is no number for the largest
     left_m, right_m = (a + share * (b - a) for a, b in steps)
-    return abs(left_m - right_m) - length_m
+    return abs(left_m - right_m) - scenario.vehicle_length_m
 
 
 def _same(one_m: float | None, other_m: float | None) -> bool:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from merge_runner.config import Scenario
-from merge_runner.drivers.base import held
+from merge_runner.drivers.base import Seat
+from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.records import Decision, Observation
 
 
@@ -13,8 +13,11 @@ from merge_runner.records import Decision, Observation
 class ConstantDriver:
     """Keeps its speed where there is no resistance."""
 
-    scenario: Scenario
+    seat: Seat
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Accelerate by nothing."""
-        return held(0.0, self.scenario.plan_actions, self.scenario.executed_actions)
+        return self.seat.held(0.0)
+
+
+PROGRAMS.register("constant", Program(ConstantDriver, "keeps its speed"))

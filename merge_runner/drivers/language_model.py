@@ -5,13 +5,34 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.base import Seat, take_seat
+from merge_runner.drivers.pace import model_pace
 from merge_runner.prompts.parse import ParsedReply, parse_reply
 from merge_runner.prompts.render import render_prompt
-from merge_runner.records import ChatReply, Decision, Observation
+from merge_runner.records import ChatReply, Decision, Observation, Side, Slot, TrialSpec
 
 Ask = Callable[[str, int], Awaitable[ChatReply]]
 """Asks the model with a prompt, for a decision number; raises CallFailed."""
+AskFor = Callable[[str, Slot, TrialSpec], Awaitable[ChatReply]]
+"""Asks the model with a prompt, for a slot of a trial; raises CallFailed."""
+
+
+@dataclass(frozen=True, slots=True)
+class LanguageModel:
+    """Makes drivers that ask one model."""
+
+    ask: AskFor
+
+    def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> LlmDriver:
+        """See MakeDriver."""
+
+        async def ask(prompt: str, number: int) -> ChatReply:
+            slot = Slot(spec.condition, spec.repetition, side, number, spec.sample_set)
+            return await self.ask(prompt, slot, spec)
+
+        assert spec.variant is not None, "only human trials have no prompt variant"
+        return LlmDriver(ask, spec.variant, take_seat(scenario, spec, side, model_pace(scenario)))
 
 
 @dataclass(slots=True)
@@ -20,26 +41,27 @@ class LlmDriver:
 
     ask: Ask
     variant: str
-    scenario: Scenario
+    seat: Seat
     _plan: tuple[float, ...] | None = None
     _executed: int = 0
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Ask the model and drive its plan, or go on with the last valid one."""
+        scenario = self.seat.scenario
         prompt = render_prompt(
-            observation, self._remaining(), variant=self.variant, scenario=self.scenario
+            observation, self._remaining(), variant=self.variant, scenario=scenario
         )
         reply = await self.ask(prompt, number)
         # A refusal or a truncated answer is an outcome of its own; it is not searched for a plan.
         parsed = (
-            parse_reply(reply.text, self.scenario.plan_actions)
+            parse_reply(reply.text, scenario.plan_actions)
             if reply.outcome == "ok"
             else ParsedReply(None, None, reply.text, reply.outcome)
         )
         fallback = parsed.plan is None
         if parsed.plan is not None:
             self._plan, self._executed = parsed.plan, 0
-        elif self.scenario.fallback == "restart":
+        elif scenario.fallback == "restart":
             self._executed = 0
         return Decision(
             plan=parsed.plan,
@@ -57,7 +79,7 @@ class LlmDriver:
 
     def _take(self) -> tuple[float, ...]:
         """The next actions of the plan, and 0 where it is exhausted or there is none."""
-        wanted = self.scenario.executed_actions
+        wanted = self.seat.pace.executed_actions
         actions = (self._remaining() or ())[:wanted]
         self._executed += wanted
         return actions + (0.0,) * (wanted - len(actions))

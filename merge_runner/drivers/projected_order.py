@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from merge_runner.config import Scenario
-from merge_runner.drivers.base import held
-from merge_runner.records import Decision, Observation, Side
+from merge_runner.drivers.base import Seat
+from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.records import Decision, Observation
 
 # The mean human gap at the merge point (arXiv 2604.09609, Table V).
 TARGET_GAP_M = 3.85
 HARDEST_BRAKING_MPS2 = -1.5
-PARAMETERS = {"target_gap_m": TARGET_GAP_M, "hardest_braking_mps2": HARDEST_BRAKING_MPS2}
 TIE_S = 1e-6
 
 
@@ -23,14 +22,12 @@ class ProjectedOrderDriver:
     merge point, but never harder than 1.5 m/s^2, and then follows at that gap.
     """
 
-    scenario: Scenario
-    side: Side
+    seat: Seat
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Keep speed, open a gap, or follow."""
-        scenario = self.scenario
-        action = self._acceleration(observation) / scenario.max_acceleration_mps2
-        return held(min(1.0, max(-1.0, action)), scenario.plan_actions, scenario.executed_actions)
+        action = self._acceleration(observation) / self.seat.scenario.max_acceleration_mps2
+        return self.seat.held(min(1.0, max(-1.0, action)))
 
     def _acceleration(self, seen: Observation) -> float:
         distance = seen.distance_to_merge_m
@@ -41,16 +38,28 @@ class ProjectedOrderDriver:
             return 0.0
         seconds = other_distance / max(seen.other_speed_mps, 0.1)
         spare = distance - seen.own_speed_mps * seconds
-        wanted = TARGET_GAP_M + self.scenario.vehicle_length_m
+        wanted = TARGET_GAP_M + self.seat.scenario.vehicle_length_m
         return min(0.0, max(HARDEST_BRAKING_MPS2, 2 * (spare - wanted) / seconds**2))
 
     def _goes_first(self, seen: Observation, distance: float, other_distance: float) -> bool:
         own_s = distance / max(seen.own_speed_mps, 0.1)
         other_s = other_distance / max(seen.other_speed_mps, 0.1)
-        return own_s < other_s - TIE_S or (abs(own_s - other_s) <= TIE_S and self.side == "left")
+        return own_s < other_s - TIE_S or (
+            abs(own_s - other_s) <= TIE_S and self.seat.side == "left"
+        )
 
     def _follow(self, seen: Observation) -> float:
         """Close the differences in speed and gap within a second and four seconds."""
-        gap = seen.relative_distance_m - self.scenario.vehicle_length_m
+        gap = seen.relative_distance_m - self.seat.scenario.vehicle_length_m
         closing = seen.own_speed_mps - seen.other_speed_mps
         return -closing + (min(gap, TARGET_GAP_M) - TARGET_GAP_M) / 4
+
+
+PROGRAMS.register(
+    "projected-order",
+    Program(
+        ProjectedOrderDriver,
+        "the projected earlier arrival keeps its speed, the later yields",
+        {"target_gap_m": TARGET_GAP_M, "hardest_braking_mps2": HARDEST_BRAKING_MPS2},
+    ),
+)

@@ -5,17 +5,18 @@ from __future__ import annotations
 import ast
 import hashlib
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec, resolve_name
+from pkgutil import iter_modules
 
-from merge_runner.config import Scenario
-from merge_runner.drivers import projected_order
-from merge_runner.drivers.base import Driver
-from merge_runner.drivers.constant import ConstantDriver
-from merge_runner.drivers.projected_order import ProjectedOrderDriver
+from merge_runner import drivers
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.base import Driver, Seat, take_seat
+from merge_runner.drivers.pace import program_pace
 from merge_runner.errors import UsageError
-from merge_runner.records import SIDES, Side
+from merge_runner.records import SIDES, Side, TrialSpec
 from merge_runner.registry import Registry
 
 EMULATOR = "emulator"  # the model that a scripted stand-in of ours answers for
@@ -23,32 +24,43 @@ EMULATOR = "emulator"  # the model that a scripted stand-in of ours answers for
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A driver's class, how one is made for a trial, and the parameters of its rule."""
+    """A class whose instances drive, made with a Seat.
 
-    driver: type
-    make: Callable[[Scenario, Side], Driver]
-    parameters: Mapping[str, float]
+    ``meaning`` says in a few words what it does, and ``parameters`` are those of its rule. It
+    decides ``rate_hz`` times a second; None: at the prompt rate of the scenario.
+    """
+
+    driver: Callable[[Seat], Driver]
+    meaning: str
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    rate_hz: float | None = None
 
     @property
     def source(self) -> str:
         """See ``source_digest``."""
         return source_digest(self.driver)
 
+    def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
+        """See MakeDriver."""
+        pace = program_pace(scenario, self.rate_hz)
+        return self.driver(take_seat(scenario, spec, side, pace))
+
+    def told(self, name: str) -> dict[str, object]:
+        """What the spec of its trials says of it."""
+        own_rate = {} if self.rate_hz is None else {"rate_hz": self.rate_hz}
+        return {
+            "program": name,
+            "parameters": dict(self.parameters),
+            "source": self.source,
+            **own_rate,
+        }
+
 
 PROGRAMS = Registry[Program]("driver")
-PROGRAMS.register(
-    "constant", Program(ConstantDriver, lambda scenario, _: ConstantDriver(scenario), {})
-)
-PROGRAMS.register(
-    "projected-order",
-    Program(ProjectedOrderDriver, ProjectedOrderDriver, projected_order.PARAMETERS),
-)
 
 
-def stand_in(model: str, sides: Collection[Side] = SIDES) -> str:
-    """What is said of trials of ``model`` in which a scripted stand-in answered on these sides."""
-    left, _, right = model.partition("+")
-    names: dict[Side, str] = {"left": left, "right": right or left}
+def stand_in(names: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:
+    """What is said of trials of these models in which a stand-in answered on these sides."""
     models = {side: name for side, name in names.items() if name not in {EMULATOR, *PROGRAMS}}
     posing = "+".join(dict.fromkeys(name for side, name in models.items() if side in sides))
     real = [side for side in models if side not in sides]
@@ -57,12 +69,13 @@ def stand_in(model: str, sides: Collection[Side] = SIDES) -> str:
 
 
 @cache
-def source_digest(driver: type) -> str:
+def source_digest(driver: Callable[[Seat], Driver]) -> str:
     """SHA-256 of the source of a driver's module, and of all that it imports from its package.
 
-    Of our own programs the package is this one: the world and the records, which they share with
-    language models, are covered by the version of the spec. A change of the layout alone is a
-    change, too. Raises UsageError where there is no source to read.
+    Of our own programs the package is this one without this module, which makes no decision: the
+    world and the records, which they share with language models, are covered by the version of the
+    spec. A change of the layout alone is a change, too. Raises UsageError where there is no source
+    to read.
     """
     top = driver.__module__.partition(".")[0]
     package = __package__ if __package__.startswith(f"{top}.") else top
@@ -70,7 +83,7 @@ def source_digest(driver: type) -> str:
     waiting = [driver.__module__]
     while waiting:
         name = waiting.pop()
-        if name not in sources and f"{name}.".startswith(f"{package}."):
+        if name not in {*sources, __name__} and f"{name}.".startswith(f"{package}."):
             source = _source(name)
             if source is not None:
                 sources[name] = source
@@ -107,3 +120,8 @@ def _imported(name: str, source: str) -> Iterator[str]:
             whole = resolve_name("." * node.level + (node.module or ""), package)
             yield whole
             yield from (f"{whole}.{alias.name}" for alias in node.names)
+
+
+# Each program registers itself, in a module of this package that nobody else needs to name.
+for _module in iter_modules(drivers.__path__, f"{drivers.__name__}."):
+    import_module(_module.name)

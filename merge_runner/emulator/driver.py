@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 from merge_runner.emulator.chance import draw, draw_between, draw_index
 from merge_runner.records import Slot
-from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.geometry import MERGE_POINT_M
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 
 VEHICLE_LENGTH_M = 4.5
 MAX_ACCELERATION_MPS2 = 2.5
@@ -120,10 +120,11 @@ def _chance_left_first(condition: str) -> float:
 
 
 def _somebody_misjudges(slot: Slot) -> bool:
-    """Whether a driver misjudges in this trial: in one condition of every third repetition."""
+    """Whether a driver misjudges here: in one human condition of every third repetition."""
     turn = draw_index(3, "misjudge turn", slot.sample_set)
-    chosen = draw_index(len(CONDITIONS), "misjudged condition", slot.repetition, slot.sample_set)
-    return slot.repetition % 3 == turn and list(CONDITIONS)[chosen] == slot.condition
+    names = list(HUMAN_CONDITIONS)
+    chosen = draw_index(len(names), "misjudged condition", slot.repetition, slot.sample_set)
+    return slot.repetition % 3 == turn and names[chosen] == slot.condition
 
 
 def _go_first(seen: Seen, temper: Temper, slot: Slot | None) -> tuple[float, str]:
@@ -201,7 +202,7 @@ def _projected_lead_m(seen: Seen) -> float:
 
 def _even_acceleration(metres: float, distance: float | None, speed: float) -> float:
     """The constant acceleration that gains a distance before the leader reaches the merge."""
-    seconds = max(SHORTEST_S, (distance or MERGE_POINT_M) / max(speed, 0.1))
+    seconds = max(SHORTEST_S, (distance or TRACK.merge_point_m) / max(speed, 0.1))
     return 2 * metres / seconds**2
 
 

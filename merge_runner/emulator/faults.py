@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -16,7 +15,6 @@ from pydantic import (
 
 from merge_runner.config import read_toml
 from merge_runner.emulator.chance import draw, draw_between
-from merge_runner.emulator.scenarios import SCENARIOS
 from merge_runner.errors import UsageError
 
 Fault = Literal[
@@ -40,20 +38,12 @@ OUTCOMES: frozenset[Fault] = frozenset({"empty", "refused", "malformed"})
 TRANSIENT: tuple[Fault, ...] = tuple(fault for fault in FAULTS if fault not in OUTCOMES)
 
 
-def _known(scenario: str) -> str:
-    if scenario not in SCENARIOS:
-        raise ValueError(f"there is no scenario {scenario!r}")
-    return scenario
-
-
 Rate = Annotated[float, Field(ge=0, le=1)]
-ScenarioName = Annotated[str, AfterValidator(_known)]
 
 
 class FaultPlan(BaseModel):
     """How often each fault occurs; ``rates`` are probabilities per attempt.
 
-    ``scenarios`` are the rates of replies that providers are known to send, by name.
     ``latency_s`` delays every answer. ``delay_s`` is how long a rate limit asks to wait. A hang is
     silent for ``hang_s``, longer than a client's patience, and then closes.
     """
@@ -62,14 +52,13 @@ class FaultPlan(BaseModel):
 
     seed: int = 0
     rates: dict[Fault, Rate] = {}
-    scenarios: dict[ScenarioName, Rate] = {}
     latency_s: Annotated[float, Field(ge=0)] = 0.0
     delay_s: Annotated[float, Field(ge=0)] = 0.05
     hang_s: Annotated[float, Field(ge=0)] = 30.0
 
     @model_validator(mode="after")
     def _at_most_one_fault(self) -> FaultPlan:
-        if sum(self.rates.values()) + sum(self.scenarios.values()) > 1 + 1e-9:
+        if sum(self.rates.values()) > 1 + 1e-9:
             raise ValueError("the rates add up to more than 1")
         return self
 
@@ -77,17 +66,15 @@ class FaultPlan(BaseModel):
     def identity(self) -> str:
         """What distinguishes the emulator's answers from those without faults: mostly nothing."""
         outcomes = {str(fault): self.rates[fault] for fault in sorted(OUTCOMES & self.rates.keys())}
-        outcomes |= dict(sorted(self.scenarios.items()))
         return f"#faults-{self.seed}-{outcomes}" if any(outcomes.values()) else ""
 
-    def fault(self, where: str, attempt: int) -> str | None:
-        """The fault or scenario of an attempt, None for none; ``where`` names the request."""
+    def fault(self, where: str, attempt: int) -> Fault | None:
+        """The fault of an attempt, None for none; ``where`` names the request."""
         chance = draw("fault", self.seed, where, attempt)
-        in_order = [(fault, self.rates.get(fault, 0.0)) for fault in FAULTS]
-        for name, rate in (*in_order, *sorted(self.scenarios.items())):
-            chance -= rate
+        for fault in FAULTS:
+            chance -= self.rates.get(fault, 0.0)
             if chance < 0:
-                return name
+                return fault
         return None
 
     def wait_s(self, where: str, attempt: int) -> float:
@@ -110,8 +97,7 @@ def load_faults(path: Path) -> FaultPlan:
         first = exc.errors()[0]
         place = [str(part) for part in first["loc"] if part != "[key]"]
         wrong = first["msg"].removeprefix("Value error, ")
-        names = {"rates": FAULTS, "scenarios": SCENARIOS}
-        valid = names.get(place[0], FaultPlan.model_fields) if place else FaultPlan.model_fields
+        valid = FAULTS if place[:1] == ["rates"] else FaultPlan.model_fields
         raise UsageError(
             f"{path}: {'.'.join(place) or 'rates'}: {wrong}; valid: {', '.join(valid)}"
         ) from exc

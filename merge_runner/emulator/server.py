@@ -11,15 +11,11 @@ import struct
 import sys
 from collections import Counter
 from collections.abc import Awaitable, Callable
-from datetime import UTC, datetime, timedelta
 
 from aiohttp import web
 
-from merge_runner.config import Format
 from merge_runner.emulator.driver import answer
 from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.scenarios import SCENARIOS
-from merge_runner.emulator.scenarios.base import Scene
 from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
 from merge_runner.errors import UsageError
 from merge_runner.records import (
@@ -86,7 +82,7 @@ class Emulator:
         listed = [{"id": model, "object": "model", "owned_by": "emulator"} for model in MODELS]
         return web.json_response({"object": "list", "data": listed})
 
-    async def _serve(self, request: web.Request, wire: Format) -> web.StreamResponse:
+    async def _serve(self, request: web.Request, wire: str) -> web.StreamResponse:
         raw = await request.read()
         try:
             body = json.loads(raw)
@@ -99,10 +95,7 @@ class Emulator:
         where = request.headers.get(SLOT_HEADER) or hashlib.sha256(raw).hexdigest()
         attempt = self._attempt(request, where)
         fault = self._faults.fault(where, attempt)
-        scene = SCENARIOS.get(fault or "", {}).get(wire)
-        await asyncio.sleep(self._faults.latency_s + (scene.after_s if scene else 0.0))
-        if scene and scene.breaks:
-            fault = scene.breaks
+        await asyncio.sleep(self._faults.latency_s)
         if fault in ("hang", "reset", "truncated_body"):
             return await self._break_off(request, fault)
         if fault == "bad_gateway":
@@ -122,7 +115,7 @@ class Emulator:
         }
         if fault == "truncated_json":
             return web.Response(body=dumps(reply.body)[:-20], content_type="application/json")
-        return _play(scene, reply) if scene else _send(reply)
+        return _send(reply)
 
     def _attempt(self, request: web.Request, where: str) -> int:
         """The attempt's number: the client's own count, else how often this was asked."""
@@ -181,19 +174,6 @@ def _slot(header: str | None) -> Slot | None:
     if not known or not all(type(number) is int for number in numbers):
         raise ValueError("no such slot")
     return slot
-
-
-def _play(scene: Scene, usual: Answer) -> web.Response:
-    """A scene's reply, made from the ordinary one."""
-    body = scene.body(usual.body)
-    now = datetime.now(UTC)
-    headers = {
-        name: f"{now + told:%Y-%m-%dT%H:%M:%SZ}" if isinstance(told, timedelta) else told
-        for name, told in scene.headers.items()
-    }
-    if isinstance(body, str):
-        return web.Response(status=scene.status, headers=headers, text=body)
-    return _send(Answer(body, scene.status, headers))
 
 
 def _send(reply: Answer) -> web.Response:

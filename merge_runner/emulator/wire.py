@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from merge_runner.config import Format
 from merge_runner.emulator.chance import draw_index
 from merge_runner.records import SCRIPTED_FIELD
 
@@ -21,7 +20,7 @@ OPENAI_ERRORS = {
     503: "server_is_overloaded",
 }
 # How each provider names an error of a status.
-ERROR_NAMES: dict[Format, dict[int, str]] = {
+ERROR_NAMES: dict[str, dict[int, str]] = {
     "openai-chat": OPENAI_ERRORS,
     "openai-responses": OPENAI_ERRORS,
     "gemini": {
@@ -71,7 +70,7 @@ class _Said:
         return self.visible + self.reasoning
 
 
-def prompt_of(wire: Format, body: dict[str, Any]) -> str:
+def prompt_of(wire: str, body: dict[str, Any]) -> str:
     """The text of the last user message."""
     if wire == "openai-responses":
         content: Any = body.get("input", "")
@@ -86,9 +85,7 @@ def prompt_of(wire: Format, body: dict[str, Any]) -> str:
     return "".join(str(part.get("text", "")) for part in content)
 
 
-def answer_in(
-    wire: Format, reply: str, model: str, prompt: str, text: str, ending: Ending
-) -> Answer:
+def answer_in(wire: str, reply: str, model: str, prompt: str, text: str, ending: Ending) -> Answer:
     """An answer of a model; token counts are about a quarter of the bytes.
 
     ``reply`` becomes part of its id.
@@ -106,7 +103,7 @@ def answer_in(
     return Answer(build(_Said(reply, model, text, ending, tokens_in, visible, reasoning)))
 
 
-def error_in(wire: Format, status: int, message: str, delay_s: float = 0.0) -> Answer:
+def error_in(wire: str, status: int, message: str, delay_s: float = 0.0) -> Answer:
     """An error in a provider's envelope; a rate limit tells the delay in the provider's way."""
     kind = ERROR_NAMES[wire][status]
     if wire == "gemini":

@@ -1,9 +1,12 @@
 """A cap on what a sweep spends, over all its runs, that holds whatever happens.
 
 The worst case of an attempt is set aside when it queues for its turn, and durably, in the ledger,
-right before it is sent. So that money ends trials instead of beginning ever more of them, a trial
-gets an allowance when it first spends: the worst case of a whole trial. Trials get theirs in the
-order of the sweep, as those before them end.
+right before it is sent. ``async with budget.attempt(...)`` stands around all that; PaidAttempt says
+where the money goes when the attempt ends, however it ends.
+
+So that money ends trials instead of beginning ever more of them, a trial gets an allowance when it
+first spends: the worst case of a whole trial. Trials get theirs in the order of the sweep, as those
+before them end.
 
 A server may ignore the output cap. What a reply cost more is taken from what is left, and from then
 on as many times the worst case is set aside as the dearest reply of that driver has cost. Several
@@ -15,13 +18,60 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Iterable
+from collections.abc import AsyncIterator, Iterable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.ledger import TOLERANCE_USD, UNNAMED, Asked, Ledger
+from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.records import Attempt
 
 PATIENCE_S = 90.0
+
+
+@dataclass(slots=True)
+class PaidAttempt:
+    """The money of one attempt, from being set aside to the end of the attempt.
+
+    ``aside_usd`` is set aside in this process, and from ``begin`` on in the ledger. An attempt that
+    ends
+
+    - before ``begin`` (cancelled while waiting, refused by the cap) gives all of it back;
+    - after it (it may have been charged) leaves it in the ledger, until a user releases it;
+    - after ``settle`` or ``keep`` has told the ledger its cost, where that is known.
+    """
+
+    budget: Budget
+    trial: int
+    key: str
+    asked: Asked
+    aside_usd: float
+    _queued: bool = True
+    _freed_usd: float = 0.0
+
+    async def begin(self, attempts: Sequence[Attempt]) -> None:
+        """The attempt is sent now, after these: what is set aside for it becomes durable."""
+        await self.budget.make_durable(self, attempts)
+        self._queued = False
+
+    async def settle(self, attempts: Sequence[Attempt]) -> None:
+        """The attempt, the last of these, brought no answer; its cost may be unknown."""
+        cost_usd = attempts[-1].cost_usd
+        await self.budget.ledger.settle(self.key, attempts, self.aside_usd, cost_usd)
+        if cost_usd == 0:
+            self._freed_usd = self.aside_usd  # the trial needs it again
+
+    async def keep(self, entry: Entry) -> Entry:
+        """Keep the answer that the attempt brought, and what it cost, in one transaction."""
+        cost_usd = entry.attempts[-1].cost_usd
+        return await self.budget.ledger.keep(entry, self.aside_usd, cost_usd)
+
+    def close(self) -> None:
+        """The attempt has ended."""
+        queued_usd = self.aside_usd if self._queued else 0.0
+        freed_usd = queued_usd or self._freed_usd
+        self.budget.give_back(self.trial, queued_usd=queued_usd, freed_usd=freed_usd)
 
 
 class Budget:
@@ -54,6 +104,7 @@ class Budget:
             raise TrialSuspended("its trial is suspended")
         self._at_the_door.append(trial)
         try:
+            # Only the oldest trial takes an allowance: were others let by, it might wait for ever.
             while trial not in self._allowances:
                 allowed = sum(self._allowances.values())
                 fits = (
@@ -75,63 +126,67 @@ class Budget:
         if self._allowances.pop(trial, None) is not None:
             self._tell()
 
-    def forsake(self, trials: Iterable[int], *, in_flight: int, queued_usd: float) -> None:
-        """Whoever played these trials is gone, and they may be admitted anew.
-
-        Of the attempts ``in_flight`` those that were begun stay set aside in the ledger; what was
-        set aside for the others, ``queued_usd`` in all, is free.
-        """
+    def readmit(self, trials: Iterable[int]) -> None:
+        """Whoever played these trials is gone, and they may be admitted anew."""
         for trial in trials:
             self._allowances.pop(trial, None)
             self._left.discard(trial)
-        self._in_flight -= in_flight
-        self._queued_usd -= queued_usd
         self._tell()
 
-    async def reserve(self, trial: int, worst_usd: float, driver: str = "") -> float:
+    @asynccontextmanager
+    async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[PaidAttempt]:
+        """The money of one attempt; waits for it as ``set_aside`` does."""
+        paid = await self.set_aside(trial, key, asked)
+        try:
+            yield paid
+        finally:
+            paid.close()
+
+    async def set_aside(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
         """Set an attempt's worst case aside; waits for others, else raises TrialSuspended.
 
-        Returns what is set aside, which is more where the driver's server ignores the output cap.
+        That is more where the driver's server ignores the output cap. Whoever calls this closes
+        what it returns; ``attempt`` does so by itself.
         """
         waited_s = 0.0
-        honest_usd = worst_usd
-        while not self._taken(trial, worst_usd := honest_usd * self.ledger.spending.times(driver)):
+        while not self._taken(trial, aside_usd := self._expected_usd(asked)):
             self._stuck.add(trial)
             try:
+                # Nothing in flight can free money any more, and no trial but stuck ones will end.
                 if not self._in_flight and (
                     self._allowances.keys() <= self._stuck or waited_s >= PATIENCE_S
                 ):
-                    raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
+                    raise self._suspended(f"the next call may cost {aside_usd:.4f} USD")
                 waited_s += await self._change()
             finally:
                 self._stuck.discard(trial)
         self._in_flight += 1
-        self._largest_usd = max(self._largest_usd, worst_usd)
-        self._queued_usd += worst_usd
-        return worst_usd
+        self._largest_usd = max(self._largest_usd, aside_usd)
+        self._queued_usd += aside_usd
+        return PaidAttempt(self, trial, key, asked, aside_usd)
 
-    async def begin(
-        self, key: str, attempts: list[Attempt], worst_usd: float, asked: Asked = UNNAMED
-    ) -> None:
-        """The attempt is sent now: what is set aside for it becomes durable."""
-        if not await self.ledger.reserve(key, attempts, worst_usd, self.cap_usd, asked):
+    async def make_durable(self, paid: PaidAttempt, attempts: Sequence[Attempt]) -> None:
+        """Move what is set aside for an attempt to the ledger; raises TrialSuspended."""
+        if not await self.ledger.reserve(
+            paid.key, attempts, paid.aside_usd, self.cap_usd, paid.asked
+        ):
             raise self._suspended("another run of the sweep spends from the same cap")
-        self._queued_usd -= worst_usd
+        self._queued_usd -= paid.aside_usd
 
-    def give_back(self, trial: int, worst_usd: float) -> None:
-        """The attempt was not begun."""
-        self._queued_usd -= worst_usd
-        self.settled(trial, worst_usd)
+    def give_back(self, trial: int, *, queued_usd: float, freed_usd: float) -> None:
+        """An attempt has ended: so much was set aside in this process alone.
 
-    def settled(self, trial: int, freed_usd: float = 0.0) -> None:
-        """An attempt has ended, and the ledger knows what it cost.
-
-        ``freed_usd`` was set aside for one that cost nothing: the trial needs it again.
+        ``freed_usd`` was taken from the trial's allowance, and not spent.
         """
         self._in_flight -= 1
+        self._queued_usd -= queued_usd
         if trial in self._allowances:
             self._allowances[trial] = min(self._trial_usd, self._allowances[trial] + freed_usd)
         self._tell()
+
+    def _expected_usd(self, asked: Asked) -> float:
+        """The worst case, as many times as this driver's dearest reply has cost it."""
+        return asked.honest_usd * self.ledger.spending.times(asked.driver)
 
     @property
     def _committed_usd(self) -> float:
@@ -142,6 +197,9 @@ class Budget:
         if self.cap_usd is None:
             return True
         own = min(worst_usd, self._allowances.get(trial, 0.0))
+        # Beside this attempt there must be room for the rest of all allowances, and, where several
+        # are in flight, for each of them to cost twice its worst case: a server that ignores the
+        # output cap is known only by its first dear reply, when the others are sent already.
         others = self._in_flight + 1 if self._in_flight else 0
         spare_usd = max(
             sum(self._allowances.values()) - own, others * max(worst_usd, self._largest_usd)
@@ -165,6 +223,7 @@ class Budget:
         return loop.time() - began
 
     def _tell(self) -> None:
+        # A fresh event: who waits for the next change does not see this one again.
         self._changed.set()
         self._changed = asyncio.Event()
 
@@ -183,3 +242,41 @@ class Budget:
             + ")"
             + (f"; {allowed:.4f} more are kept for the trials that have begun" if allowed else "")
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Unpaid:
+    """In the place of a budget for a model that costs nothing: replies and attempts are kept."""
+
+    cache: ResponseCache
+
+    async def admit(self, trial: int) -> None:
+        """Every trial may begin."""
+
+    def leave(self, trial: int) -> None:
+        """Nothing was kept for the trial."""
+
+    @asynccontextmanager
+    async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[UnpaidAttempt]:
+        """Nothing is set aside."""
+        yield UnpaidAttempt(self.cache, key)
+
+
+@dataclass(frozen=True, slots=True)
+class UnpaidAttempt:
+    """One attempt that costs nothing; see PaidAttempt."""
+
+    cache: ResponseCache
+    key: str
+    aside_usd: float = 0.0
+
+    async def begin(self, attempts: Sequence[Attempt]) -> None:
+        """What a process that dies had in flight is no loss."""
+
+    async def settle(self, attempts: Sequence[Attempt]) -> None:
+        """Keep the attempts for a later run."""
+        await self.cache.put_unanswered(self.key, tuple(attempts))
+
+    async def keep(self, entry: Entry) -> Entry:
+        """Keep the answer."""
+        return await self.cache.put(entry)

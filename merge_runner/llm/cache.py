@@ -83,7 +83,7 @@ _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 
 
 @dataclass(slots=True)
-class Totals:
+class CallTotals:
     """Sums over entries of one model, at one endpoint, asked in one manner (see keys.py).
 
     Tokens and latencies are those of the ``measured`` answers: they tell both, and are the model's
@@ -113,17 +113,17 @@ class Totals:
 class ModelFacts:
     """What the cache knows of a model: totals by endpoint, and there by how it was asked."""
 
-    totals: dict[str, dict[str, Totals]] = field(default_factory=dict)
+    totals: dict[str, dict[str, CallTotals]] = field(default_factory=dict)
 
     def add(self, entry: Entry) -> None:
         """Count an entry."""
         request = entry.request
         asked = manner(request.path, without_prompt(request.body))
-        self.totals.setdefault(request.endpoint, {}).setdefault(asked, Totals()).add(entry)
+        self.totals.setdefault(request.endpoint, {}).setdefault(asked, CallTotals()).add(entry)
 
-    def of(self, endpoint: str, asked: str) -> Totals:
+    def of(self, endpoint: str, asked: str) -> CallTotals:
         """The totals of one endpoint and manner of asking."""
-        return self.totals.get(endpoint, {}).get(asked, Totals())
+        return self.totals.get(endpoint, {}).get(asked, CallTotals())
 
     @property
     def cost_usd(self) -> float:

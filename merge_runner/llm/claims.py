@@ -55,7 +55,7 @@ class Claims:
 
     def release(self, key: str) -> None:
         """Give a claim up; all of them are when this is closed."""
-        if self._closed:
+        if self._closed:  # a call that was dropped at the end of a run may come late
             return
         fcntl.lockf(self._file, fcntl.LOCK_UN, 1, _offset(key))
 

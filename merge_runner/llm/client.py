@@ -1,12 +1,15 @@
-"""The client of one model: cache, then retry, then limiter, then transport."""
+"""The client of one model: cache, then claim, then money, limiter, transport and record.
+
+What an attempt means for its call is decided in consequences.py.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -15,31 +18,37 @@ from typing import Any
 from merge_runner.config import ModelEntry, driver_name
 from merge_runner.errors import (
     CallFailed,
-    EndpointRefused,
-    MergeRunnerError,
     ModelSwapped,
     ProviderDown,
-    QuotaExhausted,
     RecordingError,
     SweepStopped,
 )
+from merge_runner.llm.budget import Unpaid
 from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.first_call import NOBODY_S, FirstCall, refusal, set_base_url, set_key
+from merge_runner.llm.call import Call, Wait, slot_text
+from merge_runner.llm.consequences import Consequences
+from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.base import Reading
-from merge_runner.llm.http_outcome import RawReply, Verdict, is_web_page, judge, may_be_charged
+from merge_runner.llm.formats.base import WireFormat
+from merge_runner.llm.http_outcome import (
+    AttemptOutcome,
+    RawReply,
+    is_web_page,
+    judge,
+    may_be_charged,
+)
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
-from merge_runner.llm.meter import Meter, Wait
+from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import Pricing
-from merge_runner.llm.retry import (
-    OutOfTime,
-    RequestFailed,
-    TryAgain,
-    backoff_s,
-    call_with_retries,
+from merge_runner.llm.retry import Deadline, OutOfTime, RequestFailed, retries
+from merge_runner.llm.shared_services import (
+    AttemptPort,
+    BudgetPort,
+    ClaimPort,
+    PermitPort,
+    RateLimitPort,
 )
-from merge_runner.llm.shared_services import Claiming, Purse, Turn, Turns
 from merge_runner.llm.transport import Transport, TransportFailure
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -52,29 +61,8 @@ from merge_runner.records import (
 )
 from merge_runner.served_model import is_other_model
 
-EMPTY_RETRIES = 2
 CLAIM_POLL_S = 0.1
-MODELS = "`merge-runner models`"
-
-
-@dataclass(slots=True)
-class _Call:
-    """A call under way: its attempts so far, of which the first ``earlier`` by earlier runs.
-
-    ``worst`` bounds its tokens, ``worst_usd`` its cost where the server keeps to the output cap;
-    ``aside_usd`` is set aside for the attempt, and ``spent_usd`` what the answer cost.
-    ``began`` is when the call did, on the event loop's clock.
-    """
-
-    request: ChatRequest
-    order: int
-    attempts: list[Attempt]
-    earlier: int
-    worst: Usage
-    worst_usd: float
-    began: float
-    aside_usd: float = 0.0
-    spent_usd: float | None = None
+LONG_WAIT_S = 5.0
 
 
 @dataclass(slots=True)
@@ -85,8 +73,8 @@ class LlmClient:
     who ask for the same key, and goes on when they are cancelled, so that what is paid for is
     kept; ``drain`` waits for it. ``claims`` keep other processes from making the same call.
     ``budget`` is that of a model which costs money. ``first`` is the run's first call to the
-    endpoint, which goes alone. ``sealed`` says that nothing may be asked
-    anew; ``strict`` that an answer of another model stops the sweep.
+    endpoint, which goes alone. ``sealed`` says that nothing may be asked anew; ``strict`` that an
+    answer of another model stops the sweep.
     """
 
     name: str
@@ -94,15 +82,15 @@ class LlmClient:
     endpoint: str
     cache: ResponseCache
     transport: Transport
-    limiter: Turns
+    limiter: RateLimitPort
     pricing: Pricing
-    budget: Purse | None = None
-    claims: Claiming | None = None
+    budget: BudgetPort | None = None
+    claims: ClaimPort | None = None
     sealed: bool = False
     strict: bool = False
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
     meter: Meter = field(default_factory=Meter)
-    _calls: dict[str, asyncio.Task[tuple[Entry, int]]] = field(default_factory=dict)
+    _calls: dict[str, Call] = field(default_factory=dict)
     _stopping: bool = False
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
@@ -112,39 +100,48 @@ class LlmClient:
         """
         request = self._request(prompt, slot)
         if recorded := self._recorded(request):
-            entry, earlier = recorded, len(recorded.attempts)
+            reply = self._read(recorded)
         elif call := self._calls.get(request.key):
-            entry, _ = await asyncio.shield(call)
-            earlier = len(entry.attempts)  # who asked first tells of them
+            reply = await asyncio.shield(call.task)
+            reply = replace(reply, earlier=len(reply.attempts))  # whoever asked first tells of them
         else:
-            entry, earlier = await asyncio.shield(self._start(request, order))
-        reply = self._reply(entry, earlier)
+            reply = await asyncio.shield(self._start(request, order).task)
         other_model = self._other_model(reply)
         self.meter.count_reply(reply, other_model)
         if self.strict and other_model is not None:
             raise ModelSwapped(
                 f"{self.driver}: {other_model} answered where {self.entry.id} was asked for, at "
-                f"{_who(slot)}; --strict-model stops the sweep. The reply is kept. To go on with "
-                "it, leave --strict-model out, or name it in `aliases` in experiments/models.toml"
+                f"{slot_text(slot)}; --strict-model stops the sweep. The reply is kept. To go on "
+                "with it, leave --strict-model out, or name it in `aliases` in "
+                "experiments/models.toml"
             )
         return reply
 
     async def drain(self) -> None:
         """Let attempts in flight end and be saved, and give up calls that wait for one."""
         self._stopping = True
-        for key in list(self.meter.waits):
-            self._calls[key].cancel()
-        await asyncio.gather(*self._calls.values(), return_exceptions=True)
+        for call in self._calls.values():
+            call.stop()
+        tasks = [call.task for call in self._calls.values()]
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     def leave(self, order: int) -> None:
         """The trial of this order has ended, and needs no more money."""
-        if self.budget is not None:
-            self.budget.leave(order)
+        self._money.leave(order)
 
     @property
-    def flying(self) -> int:
+    def in_flight_calls(self) -> int:
         """How many calls are in flight or being saved."""
-        return len(self._calls) - len(self.meter.waits)
+        return sum(call.wait is None for call in self._calls.values())
+
+    @property
+    def waits(self) -> list[Wait]:
+        """What the other calls wait for."""
+        return [call.wait for call in self._calls.values() if call.wait is not None]
+
+    @property
+    def _format(self) -> WireFormat:
+        return FORMATS[self.entry.format]
 
     @property
     def driver(self) -> str:
@@ -172,8 +169,8 @@ class LlmClient:
             for name in self.cache.set_damage_aside(key):
                 self.meter.damaged.append(name)
                 self.meter.notes.append(
-                    f"{self.driver}: {_who(request.slot)}: what is recorded is damaged; it is set "
-                    f"aside in the cache as 'damaged {name}', and asked again"
+                    f"{self.driver}: {slot_text(request.slot)}: what is recorded is damaged; it is "
+                    f"set aside in the cache as 'damaged {name}', and asked again"
                 )
             return self.cache.get(key), self.cache.unanswered(key)
 
@@ -183,7 +180,7 @@ class LlmClient:
         return served if is_other_model(self.entry.id, served, self.entry.aliases) else None
 
     def _request(self, prompt: str, slot: Slot) -> ChatRequest:
-        wire = FORMATS[self.entry.format].request(self.entry, prompt)
+        wire = self._format.request(self.entry, prompt)
         return make_request(
             provider=self.entry.provider,
             endpoint=self.endpoint,
@@ -194,29 +191,31 @@ class LlmClient:
             slot=slot,
         )
 
-    def _start(self, request: ChatRequest, order: int) -> asyncio.Task[tuple[Entry, int]]:
-        call = asyncio.create_task(self._claimed(request, order))
+    def _start(self, request: ChatRequest, order: int) -> Call:
+        worst = self._worst_case(request)
+        worst_usd = self.pricing.cost_usd(worst) or 0.0
+        call = Call(request, order, self.driver, worst, worst_usd, self._stopping)
+        call.task = asyncio.create_task(self._claimed(call))
         self._calls[request.key] = call
 
-        def forget(done: asyncio.Task[tuple[Entry, int]]) -> None:
+        def forget(done: asyncio.Task[ChatReply]) -> None:
             del self._calls[request.key]
             if not done.cancelled():
                 done.exception()  # all who asked may be gone by now
 
-        call.add_done_callback(forget)
+        call.task.add_done_callback(forget)
         return call
 
-    async def _claimed(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
-        """Make a call when its turn has come; returns the entry and its earlier attempts."""
-        if self.budget is not None:
-            # Before the claim: nobody waits for money with a call that another process needs.
-            with self._giving_way(request, "for trials before it to end, under --max-cost"):
-                await self.budget.admit(order)
+    async def _claimed(self, call: Call) -> ChatReply:
+        """Make a call when its turn has come."""
+        # Before the claim: nobody waits for money with a call that another process needs.
+        with call.waiting("for trials before it to end, under --max-cost"):
+            await self._money.admit(call.order)
         if self.sealed:
-            return await self._make(request, order, ())
-        alone, stopped = await self._goes_alone(request), False
+            return await self._make(call)
+        alone, stopped = await self._goes_alone(call), False
         try:
-            return await self._unless_made(request, order)
+            return await self._unless_made(call)
         except SweepStopped:
             stopped = True  # nobody else is to try the same
             raise
@@ -224,259 +223,146 @@ class LlmClient:
             if alone and not stopped:
                 self.first.give_turn()
 
-    async def _goes_alone(self, request: ChatRequest) -> bool:
+    async def _goes_alone(self, call: Call) -> bool:
         """Wait for the first answer of the run; True: it is for this call to bring it."""
         if self.first.passed:
             return False
-        with self._giving_way(request, f"for the first answer of {self.driver}"):
+        with call.waiting(f"for the first answer of {self.driver}"):
             return await self.first.turn()
 
-    async def _unless_made(self, request: ChatRequest, order: int) -> tuple[Entry, int]:
+    async def _unless_made(self, call: Call) -> ChatReply:
         """Make a call unless another process does."""
-        while self.claims is not None and not await self.claims.claim(request.key):
-            with self._giving_way(request, "for another merge-runner that makes the same call"):
+        key = call.request.key
+        while self.claims is not None and not await self.claims.claim(key):
+            with call.waiting("for another merge-runner that makes the same call"):
                 await asyncio.sleep(CLAIM_POLL_S)
         try:
-            made, earlier = self._known(request)  # maybe just now
-            return (made, len(made.attempts)) if made else await self._make(request, order, earlier)
+            made, earlier = self._known(call.request)  # another process may have made it just now
+            call.attempts, call.earlier = list(earlier), len(earlier)
+            return self._read(made) if made else await self._make(call)
         finally:
             if self.claims is not None:
-                self.claims.release(request.key)
+                self.claims.release(key)
 
-    async def _make(
-        self, request: ChatRequest, order: int, earlier: tuple[Attempt, ...]
-    ) -> tuple[Entry, int]:
-        """Make attempts until there is an answer, and save it with all of them."""
-        worst = self._worst_case(request)
-        worst_usd = self.pricing.cost_usd(worst) or 0.0
-        began = asyncio.get_running_loop().time()
-        call = _Call(request, order, list(earlier), len(earlier), worst, worst_usd, began)
-
-        async def take_turn() -> Turn:
-            return await self._take_turn(call)
-
-        async def attempt(permit: Turn, number: int, seconds_left: float) -> None:
-            await self._attempt(call, permit, call.earlier + number, seconds_left)
+    async def _make(self, call: Call) -> ChatReply:
+        """Make attempts until there is an answer, which is kept with all of them."""
+        call.began_s = asyncio.get_running_loop().time()
+        deadline = Deadline(self.entry.deadline_s)
 
         async def sleep(seconds: float) -> None:
             until = datetime.now(UTC) + timedelta(seconds=seconds)
-            with self._giving_way(request, f"after {_last_failure(call)}", until):
+            with call.waiting(f"after {call.last_failure}", until) as wait:
+                if seconds >= LONG_WAIT_S:
+                    line = f"{wait.who} waits until {until:%H:%M:%S} UTC {wait.what}"
+                    self.meter.notes.append(line)
                 await asyncio.sleep(seconds)
 
-        answered = False
         try:
-            await call_with_retries(
-                take_turn, attempt, deadline_s=self.entry.deadline_s, sleep=sleep
-            )
-            answered = True
+            answer: ChatReply = await retries(deadline, sleep=sleep)(self._attempt, call, deadline)
         except (OutOfTime, RequestFailed) as exc:
-            made = len(call.attempts) - call.earlier
+            why, made = f"{exc} ({call.last_failure})", len(call.own_attempts)
             if isinstance(exc, OutOfTime) and not self.first.passed:
                 raise ProviderDown(
-                    f"{self.driver}: {exc} to the first call of this run ({_last_failure(call)}), "
+                    f"{self.driver}: {exc} to the first call of this run ({call.last_failure}), "
                     f"{made} attempts: nothing else is asked. When the service answers again, run "
                     "the same command"
                 ) from exc
-            raise CallFailed(
-                f"{self.name}: {exc} ({_last_failure(call)}), {made} attempts",
-                request,
-                tuple(call.attempts),
-                call.earlier,
-            ) from exc
-        finally:
-            if not answered:
-                await self._keep_unanswered(call)
-        return await self._keep(call), call.earlier
+            raise call.failed(f"{self.name}: {why}, {made} attempts") from exc
+        return answer
 
-    async def _keep(self, call: _Call) -> Entry:
-        entry = Entry(call.request, tuple(call.attempts))
-        if self.budget is None:
-            return await self.cache.put(entry)
-        try:
-            return await self.budget.ledger.keep(entry, call.aside_usd, call.spent_usd)
-        finally:
-            self.budget.settled(call.order)
+    async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
+        """One attempt: the answer, kept, or an error that says what follows."""
+        async with self._permitted(call) as (paid, permit):
+            await paid.begin(call.attempts)
+            with deadline.attempt() as seconds_left:
+                outcome, raw = await self._send(call, permit, seconds_left)
+            self._tell_overrun(call, paid.aside_usd)
+            error = self._consequences.error(call, outcome, raw)
+            if error is None:
+                kept = await paid.keep(Entry(call.request, tuple(call.attempts)))
+                return self._answer(call, kept, outcome)
+            self._pause(call, outcome)
+            await paid.settle(call.attempts)  # first, since the error may end the whole run
+            raise error
 
-    async def _keep_unanswered(self, call: _Call) -> None:
-        """Keep the attempts for a later run; the ledger of a paid model did so already."""
-        kept = tuple(call.attempts)
-        if self.budget is None and len(kept) > call.earlier:
-            await self.cache.put_unanswered(call.request.key, kept)
-
-    async def _take_turn(self, call: _Call) -> Turn:
+    @asynccontextmanager
+    async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, PermitPort]]:
         """Money first: a permit must be used when it is given, or the limits do not hold."""
-        if self.budget is not None:
-            with self._giving_way(call.request, "for calls in flight to be paid, under --max-cost"):
-                call.aside_usd = await self.budget.reserve(call.order, call.worst_usd, self.driver)
-        permit: Turn | None = None
-        try:
-            with self._giving_way(call.request, "for a turn under the rate limits"):
+        asked = Asked(self.driver, call.who, call.worst_usd)
+        async with AsyncExitStack() as stack:
+            with call.waiting("for calls in flight to be paid, under --max-cost"):
+                paid = await stack.enter_async_context(
+                    self._money.attempt(call.order, call.request.key, asked)
+                )
+            with call.waiting("for a turn under the rate limits"):
                 permit = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
-        finally:
-            if permit is None and self.budget is not None:
-                self.budget.give_back(call.order, call.aside_usd)
-        return permit
+            yield paid, permit
 
-    @contextmanager
-    def _giving_way(
-        self, request: ChatRequest, what: str, until: datetime | None = None
-    ) -> Iterator[None]:
-        """Within this, nothing of the call is in flight, so that a drain gives it up."""
-        if self._stopping:
-            raise CallFailed("the sweep was stopped", request)
-        wait = Wait(f"{self.driver}: {_who(request.slot)}", what, until)
-        self.meter.begin_wait(request.key, wait)
-        try:
-            yield
-        finally:
-            del self.meter.waits[request.key]
-
-    async def _attempt(self, call: _Call, permit: Turn, number: int, seconds_left: float) -> None:
-        """One attempt, appended to the call's; returns if it is the answer."""
-        await self._begin(call)
+    async def _send(
+        self, call: Call, permit: PermitPort, seconds_left: float
+    ) -> tuple[AttemptOutcome, RawReply | None]:
+        """Send the request; what comes of it is the last of the call's attempts."""
+        number = len(call.attempts) + 1
         started_at, started = datetime.now(UTC), time.perf_counter()
-        spent: float | None = None
         raw: RawReply | None = None
         try:
             raw = await self.transport.send(
                 call.request, attempt=number, timeout_s=min(self.entry.timeout_s, seconds_left)
             )
-            verdict = judge(raw, FORMATS[self.entry.format])
-            record = self._record(number, raw, verdict, call.worst)
-            spent = record.cost_usd
+            outcome = judge(raw, self._format)
+            record = self._record(number, raw, outcome, call.worst)
             self._settle_tokens(permit, record.usage)
         except TransportFailure as exc:
-            verdict = Verdict(exc.action, exc.outcome, Reading("error"), str(exc))
+            outcome = AttemptOutcome(exc.action, exc.outcome, str(exc))
             free = self.entry.price == "free" or not exc.sent
-            spent = 0.0 if free else None
-            record = Attempt(number, exc.outcome, error=str(exc), cost_usd=spent)
+            cost_usd = 0.0 if free else None
+            record = Attempt(number, exc.outcome, error=str(exc), cost_usd=cost_usd)
         record = _timed(record, started_at, time.perf_counter() - started)
         call.attempts.append(record)
         self.meter.count_attempt(record)
-        self._tell_overrun(call, spent)
-        try:
-            if raw is None:
-                self._give_up_on_nobody(call)
-            else:
-                self._check_endpoint(raw, verdict)
-            self._act_on(verdict, call)
-        except MergeRunnerError:
-            await self._settle_failed(call, spent)
-            raise
-        call.spent_usd = spent
+        return outcome, raw
 
-    async def _begin(self, call: _Call) -> None:
-        """Note durably that an attempt is made, where it may cost something."""
-        if self.budget is None:
+    def _pause(self, call: Call, outcome: AttemptOutcome) -> None:
+        """Let all calls with the same key wait, where the server asks for it."""
+        pause_s = self._consequences.pause_s(call, outcome)
+        if pause_s is None:
             return
-        try:
-            asked = Asked(self.driver, _who(call.request.slot), call.worst_usd)
-            await self.budget.begin(call.request.key, call.attempts, call.aside_usd, asked)
-        except MergeRunnerError:
-            self.budget.give_back(call.order, call.aside_usd)
-            raise
+        self.limiter.pause(pause_s)
+        until = datetime.now(UTC) + timedelta(seconds=pause_s)
+        self.meter.notes.append(
+            f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
+            f"{outcome.message or outcome.name}"
+        )
 
-    async def _settle_failed(self, call: _Call, spent_usd: float | None) -> None:
-        if self.budget is not None:
-            await self.budget.ledger.settle(
-                call.request.key, call.attempts, call.aside_usd, spent_usd
-            )
-            self.budget.settled(call.order, call.aside_usd if spent_usd == 0 else 0.0)
-
-    def _tell_overrun(self, call: _Call, spent_usd: float | None) -> None:
-        if self.budget is None or (spent_usd or 0.0) <= call.aside_usd + TOLERANCE_USD:
+    def _tell_overrun(self, call: Call, aside_usd: float) -> None:
+        spent_usd = call.attempts[-1].cost_usd or 0.0
+        if spent_usd <= aside_usd + TOLERANCE_USD:
             return
         self.meter.notes.append(
-            f"{self.driver}: {_who(call.request.slot)}: the reply cost {spent_usd:.4f} USD, and "
-            f"{call.aside_usd:.4f} were set aside for it: the server does not keep to the cap of "
+            f"{self.driver}: {call.who}: the reply cost {spent_usd:.4f} USD, and {aside_usd:.4f} "
+            "were set aside for it: the server does not keep to the cap of "
             f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
         )
 
-    def _give_up_on_nobody(self, call: _Call) -> None:
-        """Where nothing was ever answered and nobody listens, waiting helps for seconds at most."""
-        waited_s = asyncio.get_running_loop().time() - call.began
-        if (
-            not self.first.passed
-            and call.attempts[-1].outcome == "no_connection"
-            and waited_s >= NOBODY_S
-        ):
-            raise EndpointRefused(
-                f"{self.driver}: nobody answers there ({_last_failure(call)}): check the network, "
-                f"or {set_base_url(self.name, self.entry)}"
-            )
-
-    def _check_endpoint(self, raw: RawReply, verdict: Verdict) -> None:
-        """End the run at its first call where no other one would fare better."""
-        if not self.first.passed:
-            why = refusal(self.name, self.entry, raw, verdict)
-            if why is not None and self.first.is_final(verdict):
-                raise EndpointRefused(f"{self.driver}: {why}")
-        if verdict.action == "accept":
-            self.first.answered()
-
-    def _act_on(self, verdict: Verdict, call: _Call) -> None:
-        attempts = call.attempts[call.earlier :]
-        message = verdict.message or verdict.outcome
-        delay_s = verdict.delay_s or 0.0
-        if verdict.pause and delay_s > self.entry.deadline_s:
-            raise QuotaExhausted(
-                f"{self.driver}: the provider asks to wait {delay_s:.0f} s, longer than a "
-                f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
-                "is saved; run the same command again later to go on."
-            )
-        if verdict.pause:
-            pause_s = verdict.delay_s or backoff_s(len(attempts))
-            self.limiter.pause(pause_s)
-            until = datetime.now(UTC) + timedelta(seconds=pause_s)
-            self.meter.notes.append(
-                f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
-                f"{message}"
-            )
-        if verdict.action == "retry":
-            raise TryAgain(message, verdict.delay_s)
-        if verdict.action == "fail":
-            which = "reply" if verdict.outcome == "reply_refused" else "request"
-            raise RequestFailed(f"the {which} was rejected")
-        if verdict.action == "quota":
-            raise QuotaExhausted(
-                f"{self.driver}: the account's quota is exhausted ({message}). Every reply so far "
-                "is saved; when there is credit again, run the same command to go on."
-            )
-        if verdict.action == "refused":
-            raise EndpointRefused(f"{self.driver}: {self._refusal_advice(verdict)} ({message})")
-        empty_again = verdict.outcome == "empty" and FORMATS[self.entry.format].retries_empty
-        if empty_again and sum(a.outcome == "empty" for a in attempts) <= EMPTY_RETRIES:
-            raise TryAgain("empty answer")
-
-    def _refusal_advice(self, verdict: Verdict) -> str:
-        if verdict.outcome == "not_allowed":
-            return f"the endpoint does not accept the key; {set_key(self.name, self.entry)}"
-        if verdict.outcome == "bad_certificate":
-            return (
-                "the endpoint's certificate cannot be trusted, and nothing was sent; check the "
-                "base URL, or set SSL_CERT_FILE to the certificates of who signed it"
-            )
-        shutdown = self.entry.shutdown
-        retired = f", which was announced to shut down on {shutdown}" if shutdown else ""
-        other = "" if self._own_host else f", or {set_base_url(self.name, self.entry)}"
-        return f"the endpoint has no model {self.entry.id!r}{retired}; see {MODELS}{other}"
+    @property
+    def _money(self) -> BudgetPort:
+        return self.budget or Unpaid(self.cache)
 
     @property
-    def _own_host(self) -> str | None:
-        """The provider whose own host is asked; None: another server in its format."""
-        return self.entry.provider if self.endpoint == self.entry.provider else None
+    def _consequences(self) -> Consequences:
+        return Consequences(self.name, self.entry, self.endpoint, self.first)
 
-    def _record(self, number: int, raw: RawReply, verdict: Verdict, worst: Usage) -> Attempt:
-        usage = verdict.reading.usage
+    def _record(self, number: int, raw: RawReply, outcome: AttemptOutcome, worst: Usage) -> Attempt:
+        usage = outcome.reading.usage
         return Attempt(
             number=number,
-            outcome=verdict.outcome,
+            outcome=outcome.name,
             http_status=raw.status,
-            model_served=verdict.reading.model_served,
-            finish_reason=verdict.reading.finish_reason,
+            model_served=outcome.reading.model_served,
+            finish_reason=outcome.reading.finish_reason,
             usage=usage,
             reply=raw.body,
-            error=verdict.message,
+            error=outcome.message,
             cost_usd=self._cost_usd(raw, usage, worst),
             scripted=SCRIPTED_HEADER in raw.headers or says_scripted(raw.body),
         )
@@ -495,7 +381,11 @@ class LlmClient:
                 Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
             )
         stray = raw.status == 200 and is_web_page(raw) and not self.first.known
-        return 0.0 if stray or not may_be_charged(raw, self._own_host) else None
+        return (
+            0.0
+            if stray or not may_be_charged(raw, self._format, self._consequences.own_host)
+            else None
+        )
 
     def _worst_case(self, request: ChatRequest) -> Usage:
         """An upper bound on a request's tokens: no tokeniser makes more tokens than bytes."""
@@ -503,20 +393,26 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
 
-    def _settle_tokens(self, permit: Turn, usage: Usage) -> None:
+    def _settle_tokens(self, permit: PermitPort, usage: Usage) -> None:
         if usage.output_tokens is not None:
             permit.settle((usage.input_tokens or 0) + usage.output_tokens)
 
-    def _reply(self, entry: Entry, earlier: int) -> ChatReply:
+    def _answer(self, call: Call, kept: Entry, outcome: AttemptOutcome) -> ChatReply:
+        if kept.attempts[-1] != call.attempts[-1]:  # another process was first
+            return self._read(kept, call.earlier)
+        text = outcome.reading.text
+        return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
+
+    def _read(self, entry: Entry, earlier: int | None = None) -> ChatReply:
+        """A recorded reply; all its attempts are ``earlier`` ones unless it says otherwise."""
         last = entry.attempts[-1]
-        payload: Any = json.loads(last.reply or "{}")
-        text = FORMATS[self.entry.format].read(payload).text if last.http_status == 200 else ""
+        payload: Any = json.loads(last.reply or "{}") if last.http_status == 200 else {}
         return ChatReply(
-            text=text,
+            text=self._format.read(payload).text,
             outcome=last.outcome,
             request=entry.request,
             attempts=entry.attempts,
-            earlier=earlier,
+            earlier=len(entry.attempts) if earlier is None else earlier,
         )
 
 
@@ -531,13 +427,3 @@ def _timed(attempt: Attempt, started_at: datetime, latency_s: float) -> Attempt:
         started_at=started_at.isoformat(timespec="milliseconds"),
         latency_s=round(latency_s, 4),
     )
-
-
-def _who(slot: Slot) -> str:
-    """A slot for a reader."""
-    return f"{slot.condition} rep {slot.repetition} {slot.side}, decision {slot.decision}"
-
-
-def _last_failure(call: _Call) -> str:
-    last = call.attempts[-1]
-    return last.error or last.outcome

@@ -7,12 +7,11 @@ ends, with one line that says what to set.
 from __future__ import annotations
 
 import asyncio
-import json
+from urllib.parse import urlsplit
 
 from merge_runner.config import PROVIDERS, ModelEntry
-from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.base import as_dict, as_text, is_answer
-from merge_runner.llm.http_outcome import RawReply, Verdict, is_web_page
+from merge_runner.llm.formats.base import as_dict, as_text
+from merge_runner.llm.http_outcome import AttemptOutcome, RawReply, is_web_page
 
 NOBODY_S = 5.0
 SEVERAL = 3
@@ -32,7 +31,7 @@ class FirstCall:
     async def turn(self) -> bool:
         """Wait until a call may go; True: it goes alone, until ``give_turn``."""
         await self._alone.acquire()
-        if self.passed:
+        if self.passed:  # answered while this one waited: nobody goes alone any more
             self._alone.release()
         return not self.passed
 
@@ -40,43 +39,37 @@ class FirstCall:
         """The call that went alone has ended, and another one may go."""
         self._alone.release()
 
-    def is_final(self, verdict: Verdict) -> bool:
+    def is_final(self, outcome: AttemptOutcome) -> bool:
         """Whether a refusal is of all calls: who has answered before may mean this one alone."""
-        self._refused += verdict.action == "fail"
-        return not self.known or self._refused >= SEVERAL or verdict.action == "accept"
+        self._refused += outcome.action == "fail"
+        return not self.known or self._refused >= SEVERAL or outcome.action == "accept"
 
     def answered(self) -> None:
         """The endpoint has answered in its format."""
         self.passed = self.known = True
 
 
-def is_foreign(raw: RawReply, entry: ModelEntry) -> bool:
-    """Whether a reply of status 200 is JSON, and nothing of an answer in the entry's format."""
-    payload = _loaded(raw.body)
-    answers = isinstance(payload, dict) and is_answer(payload, FORMATS[entry.format].members)
-    return raw.status == 200 and isinstance(payload, dict) and not answers
-
-
-def refusal(name: str, entry: ModelEntry, raw: RawReply, verdict: Verdict) -> str | None:
+def refusal(name: str, entry: ModelEntry, raw: RawReply, outcome: AttemptOutcome) -> str | None:
     """Why no other call of a run would fare better, and what to set; None: one might."""
     if is_web_page(raw) and raw.status == 200:
         return f"a web page answers there, and no language model: {set_base_url(name, entry)}"
-    if verdict.outcome == "bad_body" and is_foreign(raw, entry):
+    if outcome.name == "bad_body" and isinstance(raw.payload, dict):
         return f"what answers there does not speak {entry.format}: {set_base_url(name, entry)}"
-    if verdict.action != "fail" or "invalid_prompt" in raw.body:
+    if outcome.action != "fail" or outcome.of_prompt:
         return None
     if raw.status not in (200, *REQUEST_ITSELF):
-        return f"no language model answers there: {set_base_url(name, entry)} ({verdict.message})"
-    return f"the request is refused: {_set_parameter(name, entry, raw)} ({verdict.message})"
+        return f"no language model answers there: {set_base_url(name, entry)} ({outcome.message})"
+    return f"the request is refused: {_set_parameter(name, entry, raw)} ({outcome.message})"
 
 
 def set_base_url(name: str, entry: ModelEntry) -> str:
     """Where the base URL of an entry stands."""
-    variable = PROVIDERS[entry.provider].base_url_env
-    if entry.base_url is not None or variable is None:
+    provider = PROVIDERS[entry.provider]
+    if entry.base_url is not None or provider.base_url_env is None:
         return f"correct `base_url` of [{name}] in {REGISTRY}"
-    ending = " (with /v1 at its end)" if entry.format.startswith("openai") else ""
-    return f"set {variable} to the base URL of the service{ending}, or unset it"
+    path = urlsplit(provider.base_url).path
+    ending = f" (with {path} at its end)" if path else ""
+    return f"set {provider.base_url_env} to the base URL of the service{ending}, or unset it"
 
 
 def set_key(name: str, entry: ModelEntry) -> str:
@@ -87,17 +80,9 @@ def set_key(name: str, entry: ModelEntry) -> str:
 
 def _set_parameter(name: str, entry: ModelEntry, raw: RawReply) -> str:
     """Where the parameter stands that an error names."""
-    error = as_dict(as_dict(_loaded(raw.body)).get("error"))
+    error = as_dict(as_dict(raw.payload).get("error"))
     said = f"{as_text(error.get('param'))} {as_text(error.get('message'))}"
     named = next((f"parameters.{each}" for each in entry.parameters if each in said), None)
     if named is None and any(words in said for words in ("max_", "tokens", "Request too large")):
         named = "max_output_tokens"
     return f"look at {f'`{named}` of ' if named else ''}[{name}] in {REGISTRY}"
-
-
-def _loaded(body: str) -> object:
-    try:
-        loaded: object = json.loads(body)
-    except (ValueError, RecursionError):
-        return None
-    return loaded

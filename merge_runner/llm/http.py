@@ -114,8 +114,8 @@ class HttpTransport:
 
     async def _exchange(self, request: ChatRequest, attempt: int) -> RawReply:
         own_id = self._own + next(self._ids)
-        asked = self._asked(request, attempt, own_id)
-        reply = await self._client.send(asked, stream=True)
+        posted = self._http_request(request, attempt, own_id)
+        reply = await self._client.send(posted, stream=True)
         try:
             self._check_id(reply, own_id)
             encoding = reply.headers.get("content-encoding", "")
@@ -126,7 +126,7 @@ class HttpTransport:
         headers = {name.lower(): value for name, value in reply.headers.items()}
         return RawReply(reply.status_code, headers, self._mask(body))
 
-    def _asked(self, request: ChatRequest, attempt: int, own_id: str) -> httpx.Request:
+    def _http_request(self, request: ChatRequest, attempt: int, own_id: str) -> httpx.Request:
         """The request, made without the client, which would put it together anew each time."""
         headers = {**self._headers, **request.headers, **self._endpoint.auth_headers}
         headers |= dict.fromkeys(ID_HEADERS, own_id)

@@ -30,7 +30,7 @@ class Asked:
 
     driver: str = ""
     slot: str = ""
-    honest_usd: float | None = None
+    honest_usd: float = 0.0
 
 
 UNNAMED = Asked()
@@ -138,7 +138,7 @@ class Ledger:
     async def reserve(
         self,
         key: str,
-        attempts: list[Attempt],
+        attempts: Sequence[Attempt],
         worst_usd: float,
         cap_usd: float | None,
         asked: Asked = UNNAMED,
@@ -161,7 +161,7 @@ class Ledger:
         return reserved
 
     async def settle(
-        self, key: str, attempts: list[Attempt], worst_usd: float, actual_usd: float | None
+        self, key: str, attempts: Sequence[Attempt], worst_usd: float, actual_usd: float | None
     ) -> None:
         """An attempt brought no answer, or was not made after all; None: its cost is unknown.
 
@@ -215,11 +215,12 @@ class Ledger:
     def _settle(
         self, key: str, attempts: Sequence[Attempt], worst_usd: float, actual_usd: float | None
     ) -> None:
+        # The row of reasons may be lost or damaged; the sums, which the cap needs, lie elsewhere.
         *earlier, one = self._opened(key) or [SetAside(worst_usd, UNNAMED, _now())]
         if actual_usd is None:
             outcome = attempts[-1].outcome if attempts else IN_FLIGHT
             self._write_open(key, [*earlier, replace(one, outcome=outcome)])
-            return
+            return  # it stays set aside: it may have been charged
         self._write_open(key, earlier)
         spending = self.read()
         spending.spent_usd += actual_usd

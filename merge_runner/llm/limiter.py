@@ -1,7 +1,8 @@
 """Requests and tokens a minute, behind one dispatcher that serves the oldest trial first.
 
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
-only the dispatcher ever asks it, and not before it has room. Tokens are counted in a sliding window
+only the dispatcher ever asks it, and not before it has room: a turn that was taken early, and then
+held up by a pause, would be counted at the wrong time. Tokens are counted in a sliding window
 of a minute: an estimate at dispatch, settled to the actual usage afterwards. What other processes
 send with the same key counts too, see shared_limits.py.
 """
@@ -14,10 +15,12 @@ import heapq
 from collections import deque
 from dataclasses import dataclass, field
 
+from asyncio_throttle.throttler import Throttler
+
 from merge_runner.errors import UsageError
 from merge_runner.llm.shared_limits import WINDOW_S, SharedLimits, request_rules
 
-CLOCK_STEP_S = 1e-6
+CLOCK_STEP_S, POLL_S = 1e-6, 1e-3
 
 
 @dataclass(slots=True, eq=False)
@@ -87,6 +90,7 @@ class Limiter:
                 "experiments/models.toml"
             )
         loop = asyncio.get_running_loop()
+        # No limit and nobody before it: the dispatcher, a task of its own, is not worth its time.
         if not self.limited and not self._waiters and not self.paused_s:
             return Permit(loop.time(), tokens, self, counts=False)
         waiter = _Waiter(order, self._arrivals, tokens, loop.create_future())
@@ -124,13 +128,14 @@ class Limiter:
         loop = asyncio.get_running_loop()
         while waiter := self._head():
             wait = self._blocked_for(waiter, loop.time())
+            # The others' file last: who takes a turn there counts for everybody at once.
             if wait <= 0 and self._shared is not None:
                 wait = self._shared.take(waiter.tokens)
             if wait > 0:
                 await self._wait(wait)
                 continue
             for throttle in self._throttles:
-                await throttle.take()  # at once: it has room
+                await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
             heapq.heappop(self._waiters)
             permit = Permit(loop.time(), waiter.tokens, self, counts=self._tpm is not None)
             if permit.counts:
@@ -139,6 +144,7 @@ class Limiter:
             waiter.turn.set_result(permit)
 
     def _head(self) -> _Waiter | None:
+        # Whoever was cancelled while waiting has a done turn that nobody will use.
         while self._waiters and self._waiters[0].turn.done():
             heapq.heappop(self._waiters)
         return self._waiters[0] if self._waiters else None
@@ -151,6 +157,7 @@ class Limiter:
             self._tokens_in_window -= expired.tokens
         free_at = max(self._pause.until, *(throttle.free_at for throttle in self._throttles), 0.0)
         if self._tpm is not None and self._tokens_in_window + waiter.tokens > self._tpm:
+            # At least until the oldest leaves the window; if that frees too little, looked at anew.
             free_at = max(free_at, self._window[0].dispatched_at + self._window_s)
         return free_at - now
 
@@ -162,27 +169,16 @@ class Limiter:
                 await self._changed.wait()
 
 
-class _Throttle:
+class _Throttle(Throttler):
     """asyncio-throttle, and when it has room again, which it does not tell."""
-
-    def __init__(self, limit: int, period_s: float) -> None:
-        from asyncio_throttle.throttler import Throttler
-
-        self._period_s = period_s
-        self._throttler = Throttler(limit, period_s, retry_interval=0.001)
-        self._taken: deque[float] = deque(maxlen=limit)
 
     @property
     def free_at(self) -> float:
-        """The earliest next turn, on the event loop's clock."""
-        full = len(self._taken) == self._taken.maxlen
-        return self._taken[0] + self._period_s + CLOCK_STEP_S if full else 0.0
-
-    async def take(self) -> None:
-        """Take a turn; at once where there is room."""
-        await self._throttler.acquire()  # type: ignore[no-untyped-call] # ships no types
-        self._taken.append(asyncio.get_running_loop().time())
+        """The earliest next turn, on the event loop's clock, which is the throttle's too."""
+        full = len(self._task_logs) >= self.rate_limit
+        # A little later than that, since it holds a turn for longer than its period.
+        return self._task_logs[0] + self.period + CLOCK_STEP_S if full else 0.0
 
 
 def _throttles(rpm: int, window_s: float) -> list[_Throttle]:
-    return [_Throttle(*rule) for rule in request_rules(rpm, window_s)]
+    return [_Throttle(*rule, retry_interval=POLL_S) for rule in request_rules(rpm, window_s)]

@@ -5,29 +5,18 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
 
 from merge_runner.records import Attempt, ChatReply, is_scripted
 
 MINUTE_S = 60.0
-TOLD_WAIT = timedelta(seconds=5)
-
-
-@dataclass(frozen=True, slots=True)
-class Wait:
-    """Who waits for what, and until when on the wall clock, UTC; None: until it happens."""
-
-    who: str
-    what: str
-    until: datetime | None = None
 
 
 @dataclass(slots=True)
 class Meter:
     """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts.
 
-    ``stand_ins`` counts the answers that one gave in the model's name. ``waits`` are those of the
-    present, by call key; ``damaged`` are the keys of recorded replies that could not be read.
+    ``stand_ins`` counts the answers that one gave in the model's name; ``damaged`` are the keys of
+    recorded replies that could not be read.
     """
 
     calls_live: int = 0
@@ -38,15 +27,8 @@ class Meter:
     mismatches: Counter[str] = field(default_factory=Counter)
     stand_ins: int = 0
     notes: deque[str] = field(default_factory=deque)
-    waits: dict[str, Wait] = field(default_factory=dict)
     damaged: list[str] = field(default_factory=list)
     events: deque[tuple[float, int]] = field(default_factory=deque)
-
-    def begin_wait(self, key: str, wait: Wait) -> None:
-        """A call waits; a long wait whose end is known is told by itself."""
-        self.waits[key] = wait
-        if wait.until is not None and wait.until - datetime.now(UTC) >= TOLD_WAIT:
-            self.notes.append(f"{wait.who} waits until {wait.until:%H:%M:%S} UTC {wait.what}")
 
     def count_attempt(self, attempt: Attempt) -> None:
         """Count one live attempt."""
@@ -72,7 +54,7 @@ class Meter:
             self.stand_ins += is_scripted(reply.request, reply.attempts[-1])
 
     def add(self, other: Meter) -> None:
-        """Count what another one has counted; its waits are not added."""
+        """Count what another one has counted."""
         now = time.monotonic()
         self.calls_live += other.calls_live
         self.calls_cached += other.calls_cached
@@ -83,7 +65,8 @@ class Meter:
         self.stand_ins += other.stand_ins
         self.notes += other.notes
         self.damaged += other.damaged
-        self.events += ((now, tokens) for _, tokens in other.events)  # clocks differ
+        # The other's clock may be another machine's: what it has just counted counts as of now.
+        self.events += ((now, tokens) for _, tokens in other.events)
 
     def last_minute(self) -> tuple[int, int]:
         """Requests and tokens of the last minute."""

@@ -1,18 +1,22 @@
-"""When a call is tried again: after what, for how long, and when to give up."""
+"""When a call is tried again: after what, for how long, and when to give up.
+
+tenacity's loop carries this; what it is given are our wait, which no server can shorten, and our
+deadline, from which the wait for a turn is left out: standing in the limiter's queue is no fault of
+the provider.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Awaitable, Callable
-from typing import TypeVar
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from typing import NoReturn
 
-from tenacity import AsyncRetrying, RetryCallState, RetryError, retry_if_exception_type
+from tenacity import AsyncRetrying, RetryCallState, retry_if_exception_type
 
 from merge_runner.errors import MergeRunnerError
 
-AnswerT = TypeVar("AnswerT")
-TurnT = TypeVar("TurnT")
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
 
 
@@ -37,60 +41,70 @@ def backoff_s(attempts: int) -> float:
     return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
 
 
-async def call_with_retries(
-    take_turn: Callable[[], Awaitable[TurnT]],
-    attempt: Callable[[TurnT, int, float], Awaitable[AnswerT]],
-    *,
-    deadline_s: float,
-    sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
-) -> AnswerT:
-    """Take a turn and make an attempt, again while it raises TryAgain; raises OutOfTime.
-
-    ``attempt`` gets the turn, its number from 1 and the seconds left. The deadline counts the
-    attempts and the waits between them, but not the wait for a turn: standing in the limiter's
-    queue is no fault of the provider.
-    """
-    loop = asyncio.get_running_loop()
-    used_s = 0.0
-
-    def wait(state: RetryCallState) -> float:
-        error = state.outcome.exception() if state.outcome else None
-        asked = error.delay_s if isinstance(error, TryAgain) else None
-        jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
-        backoff = min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
-        return max(asked or 0.0, backoff)
-
-    def stop(state: RetryCallState) -> bool:
-        return used_s + state.upcoming_sleep >= deadline_s
-
-    async def counted_sleep(seconds: float) -> None:
-        nonlocal used_s
-        used_s += seconds
-        await sleep(seconds)
-
-    try:
-        async for state in AsyncRetrying(
-            retry=retry_if_exception_type(TryAgain), wait=wait, stop=stop, sleep=counted_sleep
-        ):
-            with state:
-                turn = await take_turn()
-                started = loop.time()
-                try:
-                    number = state.retry_state.attempt_number
-                    return await attempt(turn, number, deadline_s - used_s)
-                finally:
-                    used_s += loop.time() - started
-    except RetryError as exc:
-        last = exc.last_attempt.exception()
-        raise OutOfTime(_why_given_up(last, deadline_s)) from last
-    raise AssertionError("unreachable: the loop returns or raises")
-
-
-def _why_given_up(last: BaseException | None, deadline_s: float) -> str:
-    asked_s = last.delay_s if isinstance(last, TryAgain) else None
-    if asked_s is None or asked_s < deadline_s:
-        return f"no answer within {deadline_s:.0f} s"
-    return (
-        f"the server asks to wait {asked_s:.0f} s, longer than a call's deadline of "
-        f"{deadline_s:.0f} s: run the same command again after that"
+def retries(
+    deadline: Deadline, *, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
+) -> AsyncRetrying:
+    """Called with a coroutine function: makes attempts while it raises TryAgain, or OutOfTime."""
+    return AsyncRetrying(
+        retry=retry_if_exception_type(TryAgain),
+        wait=_wait_s,
+        stop=deadline.would_pass,
+        before_sleep=deadline.count_wait,
+        sleep=sleep,
+        retry_error_callback=deadline.give_up,
     )
+
+
+class Deadline:
+    """How long a call may take: its attempts and the waits between them."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._used_s = 0.0
+
+    @contextmanager
+    def attempt(self) -> Iterator[float]:
+        """Within this time counts; yields the seconds that are left."""
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        try:
+            yield self._seconds - self._used_s
+        finally:
+            self._used_s += loop.time() - began
+
+    def would_pass(self, state: RetryCallState) -> bool:
+        """Tenacity's ``stop``: whether the deadline ends the next wait."""
+        return self._used_s + state.upcoming_sleep >= self._seconds
+
+    def count_wait(self, state: RetryCallState) -> None:
+        """Tenacity's ``before_sleep``."""
+        self._used_s += state.upcoming_sleep
+
+    def give_up(self, state: RetryCallState) -> NoReturn:
+        """Tenacity's ``retry_error_callback``: raises OutOfTime."""
+        last = _failure(state)
+        asked_s = last.delay_s
+        if asked_s is None or asked_s < self._seconds:
+            raise OutOfTime(f"no answer within {self._seconds:.0f} s") from last
+        raise OutOfTime(
+            f"the server asks to wait {asked_s:.0f} s, longer than a call's deadline of "
+            f"{self._seconds:.0f} s: run the same command again after that"
+        ) from last
+
+
+def _wait_s(state: RetryCallState) -> float:
+    """Tenacity's ``wait``: the backoff, or longer where the server asks for it.
+
+    Its own waits cannot be joined by the longer of two, and 9.2 renames their parameters.
+    """
+    # Calls that failed together, as when a server restarts, do not return together.
+    jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
+    backoff = min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
+    return max(_failure(state).delay_s or 0.0, backoff)
+
+
+def _failure(state: RetryCallState) -> TryAgain:
+    """What the last attempt raised; tenacity asks only after what is tried again."""
+    error = state.outcome.exception() if state.outcome else None
+    assert isinstance(error, TryAgain)
+    return error

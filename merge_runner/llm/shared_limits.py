@@ -13,12 +13,12 @@ import json
 import os
 import stat
 import struct
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from merge_runner.config import runtime_folder
 from merge_runner.errors import UsageError
 
 WINDOW_S = 60.0
@@ -63,7 +63,7 @@ class SharedLimits:
         """Take a turn; 0 where it is taken, else how long in s to wait at least."""
         with self._locked() as locked:
             if not locked:
-                return BUSY_S
+                return BUSY_S  # the event loop never waits for another process, which may hang
             now = self._clock()
             sent, paused_until = self._head(now)
             buckets = self._buckets(now)
@@ -82,6 +82,7 @@ class SharedLimits:
 
     def settle(self, taken_at: float, more_tokens: int) -> None:
         """So many tokens more, or less, were used than a turn had counted."""
+        # Kept here until the file is free: an unused estimate must not be lost for the others.
         self._owed.append((int(taken_at / BUCKET_S), more_tokens))
         self._tell()
 
@@ -200,9 +201,7 @@ def _unusable(place: Path, exc: OSError) -> UsageError:
 
 def _own_folder() -> Path:
     """A folder of this user alone, of this machine."""
-    runtime = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
-    parent = runtime if runtime.is_dir() else Path(tempfile.gettempdir())
-    folder = parent / f"merge-runner-{os.getuid()}"
+    folder = runtime_folder() / f"merge-runner-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()

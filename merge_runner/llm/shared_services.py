@@ -1,12 +1,13 @@
 """What a client shares with others: limits, claims and money, in this process or elsewhere.
 
-Limiter, Claims, Budget and Ledger are those of one process; on a cluster they are the
-coordinator's, and stand-ins at each worker ask there.
+Limiter, Claims and Budget are those of one process; on a cluster they are the coordinator's, and
+stand-ins at each worker ask there (run/cluster/remote.py).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
 from typing import Protocol
 
 from merge_runner.llm.cache import Entry
@@ -14,7 +15,7 @@ from merge_runner.llm.ledger import Asked
 from merge_runner.records import Attempt
 
 
-class Turn(Protocol):
+class PermitPort(Protocol):
     """See limiter.Permit."""
 
     def settle(self, tokens: int) -> None:
@@ -22,10 +23,10 @@ class Turn(Protocol):
         ...
 
 
-class Turns(Protocol):
+class RateLimitPort(Protocol):
     """See limiter.Limiter."""
 
-    async def acquire(self, tokens: int, *, order: int = 0) -> Turn:
+    async def acquire(self, tokens: int, *, order: int = 0) -> PermitPort:
         """Wait for a turn."""
         ...
 
@@ -34,7 +35,7 @@ class Turns(Protocol):
         ...
 
 
-class Claiming(Protocol):
+class ClaimPort(Protocol):
     """See claims.Claims."""
 
     async def claim(self, key: str) -> bool:
@@ -46,27 +47,29 @@ class Claiming(Protocol):
         ...
 
 
-class Account(Protocol):
-    """See ledger.Ledger."""
-
-    async def settle(
-        self, key: str, attempts: list[Attempt], worst_usd: float, actual_usd: float | None
-    ) -> None:
-        """An attempt brought no answer."""
-        ...
-
-    async def keep(self, entry: Entry, worst_usd: float, actual_usd: float | None) -> Entry:
-        """Keep an answered call, and settle its last attempt with it."""
-        ...
-
-
-class Purse(Protocol):
-    """See budget.Budget."""
+class AttemptPort(Protocol):
+    """The money of one attempt; see budget.PaidAttempt."""
 
     @property
-    def ledger(self) -> Account:
-        """Where what is spent is noted."""
+    def aside_usd(self) -> float:
+        """What is set aside for it."""
         ...
+
+    async def begin(self, attempts: Sequence[Attempt]) -> None:
+        """The attempt is sent now, after these."""
+        ...
+
+    async def settle(self, attempts: Sequence[Attempt]) -> None:
+        """The attempt, the last of these, brought no answer."""
+        ...
+
+    async def keep(self, entry: Entry) -> Entry:
+        """Keep the answer that the attempt brought; returns the one that is kept."""
+        ...
+
+
+class BudgetPort(Protocol):
+    """See budget.Budget."""
 
     async def admit(self, trial: int) -> None:
         """Wait for a trial's allowance."""
@@ -76,39 +79,27 @@ class Purse(Protocol):
         """The trial has ended or is suspended."""
         ...
 
-    async def reserve(self, trial: int, worst_usd: float, driver: str) -> float:
-        """Set an attempt's worst case aside; returns what is set aside."""
-        ...
-
-    async def begin(
-        self, key: str, attempts: list[Attempt], worst_usd: float, asked: Asked
-    ) -> None:
-        """The attempt is sent now."""
-        ...
-
-    def give_back(self, trial: int, worst_usd: float) -> None:
-        """The attempt was not begun."""
-        ...
-
-    def settled(self, trial: int, freed_usd: float = 0.0) -> None:
-        """An attempt has ended."""
+    def attempt(
+        self, trial: int, key: str, asked: Asked
+    ) -> AbstractAsyncContextManager[AttemptPort]:
+        """The money of one attempt at the call with this key."""
         ...
 
 
-class Desk(Protocol):
+class SharedServices(Protocol):
     """Where clients get turns, by model, and money and claims."""
 
     @property
-    def limiters(self) -> Mapping[str, Turns]:
+    def limiters(self) -> Mapping[str, RateLimitPort]:
         """The queue of each model."""
         ...
 
     @property
-    def budget(self) -> Purse:
+    def budget(self) -> BudgetPort:
         """That of the models that cost money."""
         ...
 
     @property
-    def claims(self) -> Claiming:
+    def claims(self) -> ClaimPort:
         """Who asks what."""
         ...

@@ -13,7 +13,7 @@ class TransportFailure(MergeRunnerError):
     """An attempt brought no reply; ``outcome`` names it in the calls table.
 
     ``sent`` is False where the request surely never left: nobody can charge for it. ``action`` is
-    that of a Verdict.
+    that of an AttemptOutcome.
     """
 
     def __init__(

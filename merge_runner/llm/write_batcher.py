@@ -21,6 +21,7 @@ class BatchWriter:
 
     async def write(self, operation: Callable[[], ResultT]) -> ResultT:
         """Run an operation in the next batch; returns its result once the batch is durable."""
+        # Whoever comes first begins a batch; all who come until it is written travel with it.
         if self._next_batch is None:
             self._next_batch = asyncio.create_task(self._write_batch())
         batch, place = self._next_batch, len(self._pending)

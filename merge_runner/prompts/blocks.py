@@ -1,24 +1,75 @@
-"""The prompt as named text blocks, C0 to C5 (arXiv 2604.09609, Table II), and its ablations.
+"""The prompt as named text blocks, C0 to C5 (arXiv 2604.09609, Table II), and its variants.
 
-The paper's own wording is not public: this is a reconstruction from its description. A variant
-is the set of blocks that it leaves out, so that an ablation changes nothing else.
+The paper's own wording is not public: this is a reconstruction from its description. A variant is
+the baseline without some blocks and with some others, so that it changes nothing else.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
+from string import Formatter
+from typing import TypedDict
 
+from merge_runner.errors import UsageError
 from merge_runner.records import Road
+from merge_runner.registry import Registry
+
+OUTPUT_FORMAT = "C5"
+
+
+class Fields(TypedDict):
+    """What a template may name in braces, each as it is written in the prompt.
+
+    Numbers have two decimals, in m, s, m/s and m/s^2; lists are those of Python.
+    """
+
+    vehicle_length: str
+    own_speed: str
+    other_speed: str
+    relative_distance: str  # how far the other car is ahead, negative if it is behind
+    distance_to_merge: str  # before the merge point alone
+    own_accelerations: str
+    other_speeds: str
+    remaining_plan: str
+    memory_s: str
+    horizon_s: str
+    step_s: str
+    prompt_interval_s: str
+    plan_actions: str
+    max_acceleration: str
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One paragraph of the prompt: its template per road type, None where it is left out."""
+    """One paragraph of the prompt.
 
-    name: str
+    ``meaning`` says in a few words what it is for. ``merge`` and ``straight`` are its templates
+    before and after the merge point, None where it is left out. It is in the prompt of every
+    variant that does not remove it if ``in_baseline``, else of those that add it, and stands
+    before the block ``before``, None for those of the paper, which stand as they are registered.
+    Raises UsageError where a template names what there is not.
+    """
+
+    meaning: str
     merge: str | None
     straight: str | None
+    in_baseline: bool = False
+    before: str | None = OUTPUT_FORMAT
+
+    def __post_init__(self) -> None:
+        for road, fields in (
+            ("merge", [*Fields.__annotations__]),
+            ("straight", [f for f in Fields.__annotations__ if f != "distance_to_merge"]),
+        ):
+            for name in _named(getattr(self, road) or ""):
+                if name not in fields:
+                    raise UsageError(
+                        f"the block {self.meaning!r} names {{{name}}} on the road {road}; valid: "
+                        + ", ".join(fields)
+                    )
 
     def template(self, road: Road) -> str | None:
         """The block's text on a road."""
@@ -26,9 +77,57 @@ class Block:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of both templates."""
-        return hashlib.sha256(f"{self.merge}\0{self.straight}".encode()).hexdigest()
+        """SHA-256 of both templates, and of where it stands unless that is its place in the paper.
 
+        Its meaning is for readers alone.
+        """
+        place = "" if self.before is None else f"\0{self.before}"
+        return hashlib.sha256(f"{self.merge}\0{self.straight}{place}".encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """The baseline without the blocks that it ``removes``, and with those that it ``adds``."""
+
+    removes: frozenset[str] = frozenset()
+    adds: frozenset[str] = frozenset()
+
+
+def _named(template: str) -> list[str]:
+    try:
+        return [name for _, name, _, _ in Formatter().parse(template) if name is not None]
+    except ValueError as exc:
+        raise UsageError(f"a prompt block cannot be read, {exc}: {template!r}") from exc
+
+
+_SITUATION_BEFORE = """\
+You drive a car towards a merge. Two roads join at a merge point and go on as a single lane. You \
+are on one of the two roads and another car is on the other one. Neither of you has the right of \
+way. You cannot steer and you cannot communicate with the other driver: you control only the \
+acceleration of your own car. You are asked for a new plan every {prompt_interval_s} s.
+
+Situation now:
+- Road type: merge
+- Length of each car: {vehicle_length} m
+- Your speed: {own_speed} m/s
+- Speed of the other car: {other_speed} m/s
+- Relative distance (how far the other car is ahead of you along the road; negative if it is \
+behind): {relative_distance} m
+- Your distance to the merge point: {distance_to_merge} m"""
+
+_SITUATION_AFTER = """\
+You drive a car on a straight road: you have passed a merge point where two roads join to a \
+single lane. Another car comes from the other road and is ahead of you or behind you. You cannot \
+steer and you cannot communicate with the other driver: you control only the acceleration of your \
+own car. You are asked for a new plan every {prompt_interval_s} s.
+
+Situation now:
+- Road type: straight
+- Length of each car: {vehicle_length} m
+- Your speed: {own_speed} m/s
+- Speed of the other car: {other_speed} m/s
+- Relative distance (how far the other car is ahead of you along the road; negative if it is \
+behind): {relative_distance} m"""
 
 _HISTORY = """\
 History of the last {memory_s} s, one value every {step_s} s, oldest first:
@@ -44,6 +143,10 @@ _REASSESS = (
     "Reassess the situation regularly: when the other car behaves differently from what you "
     "expected, adapt your plan."
 )
+_TACTICAL = (
+    "Tactical decision: before you plan your accelerations, decide whether you merge "
+    "first (M) or yield to the other car (Y)."
+)
 
 _SCHEMA = """\
 Output format:
@@ -54,67 +157,58 @@ numbers, one for every {step_s} s. Each number lies between -1 and 1, where 1 st
 acceleration of {max_acceleration} m/s^2 and -1 for a deceleration of {max_acceleration} m/s^2. \
 Write the list in a Python code block that holds nothing but the list."""
 
-BLOCKS: tuple[Block, ...] = (
-    Block(
-        "C0",
-        merge="""\
-You drive a car towards a merge. Two roads join at a merge point and go on as a single lane. You \
-are on one of the two roads and another car is on the other one. Neither of you has the right of \
-way. You cannot steer and you cannot communicate with the other driver: you control only the \
-acceleration of your own car. You are asked for a new plan every {prompt_interval_s} s.
+BLOCKS = Registry[Block]("prompt block")
+_of_paper = partial(Block, in_baseline=True, before=None)
+BLOCKS.register("C0", _of_paper("situation", _SITUATION_BEFORE, _SITUATION_AFTER))
+BLOCKS.register("C1", _of_paper("history", _HISTORY, _HISTORY))
+BLOCKS.register("C2", _of_paper("previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN))
+BLOCKS.register("C3.safety", _of_paper("avoid a collision", _SAFETY, _SAFETY))
+BLOCKS.register("C3.human", _of_paper("drive like a human", _HUMAN, _HUMAN))
+BLOCKS.register("C3.distance", _of_paper("keep a distance", _DISTANCE, _DISTANCE))
+BLOCKS.register("C3.reassess", _of_paper("reassess", _REASSESS, _REASSESS))
+BLOCKS.register("C4", _of_paper("tactical decision", _TACTICAL, None))
+BLOCKS.register(OUTPUT_FORMAT, _of_paper("output format", _SCHEMA, _SCHEMA))
 
-Situation now:
-- Road type: merge
-- Length of each car: {vehicle_length} m
-- Your speed: {own_speed} m/s
-- Speed of the other car: {other_speed} m/s
-- Relative distance (how far the other car is ahead of you along the road; negative if it is \
-behind): {relative_distance} m
-- Your distance to the merge point: {distance_to_merge} m""",
-        straight="""\
-You drive a car on a straight road: you have passed a merge point where two roads join to a \
-single lane. Another car comes from the other road and is ahead of you or behind you. You cannot \
-steer and you cannot communicate with the other driver: you control only the acceleration of your \
-own car. You are asked for a new plan every {prompt_interval_s} s.
+VARIANTS = Registry[Variant]("variant")
+VARIANTS.register("baseline", Variant())
+VARIANTS.register("A1", Variant(removes=frozenset({"C1"})))
+VARIANTS.register("A2", Variant(removes=frozenset({"C2"})))
+VARIANTS.register("A3", Variant(removes=frozenset({"C3.safety"})))
+VARIANTS.register("A4", Variant(removes=frozenset({"C3.human"})))
+VARIANTS.register("A5", Variant(removes=frozenset({"C3.distance"})))
+VARIANTS.register("A6", Variant(removes=frozenset({"C3.reassess"})))
+VARIANTS.register("A7", Variant(removes=frozenset({"C4"})))
 
-Situation now:
-- Road type: straight
-- Length of each car: {vehicle_length} m
-- Your speed: {own_speed} m/s
-- Speed of the other car: {other_speed} m/s
-- Relative distance (how far the other car is ahead of you along the road; negative if it is \
-behind): {relative_distance} m""",
-    ),
-    Block("C1", merge=_HISTORY, straight=_HISTORY),
-    Block("C2", merge=_PREVIOUS_PLAN, straight=_PREVIOUS_PLAN),
-    Block("C3.safety", merge=_SAFETY, straight=_SAFETY),
-    Block("C3.human", merge=_HUMAN, straight=_HUMAN),
-    Block("C3.distance", merge=_DISTANCE, straight=_DISTANCE),
-    Block("C3.reassess", merge=_REASSESS, straight=_REASSESS),
-    Block(
-        "C4",
-        merge=(
-            "Tactical decision: before you plan your accelerations, decide whether you merge "
-            "first (M) or yield to the other car (Y)."
-        ),
-        straight=None,
-    ),
-    Block("C5", merge=_SCHEMA, straight=_SCHEMA),
-)
 
-VARIANTS: dict[str, frozenset[str]] = {
-    "baseline": frozenset(),
-    "A1": frozenset({"C1"}),
-    "A2": frozenset({"C2"}),
-    "A3": frozenset({"C3.safety"}),
-    "A4": frozenset({"C3.human"}),
-    "A5": frozenset({"C3.distance"}),
-    "A6": frozenset({"C3.reassess"}),
-    "A7": frozenset({"C4"}),
-}
+def blocks_of(variant: str) -> dict[str, Block]:
+    """The blocks of a variant by name, in the order of its prompt; raises UsageError."""
+    chosen = VARIANTS.require(variant)
+    for name in sorted(chosen.removes | chosen.adds):
+        BLOCKS.require(name, f"the variant {variant} names it")
+    return {
+        name: block
+        for name, block in _ordered()
+        if name in chosen.adds or (block.in_baseline and name not in chosen.removes)
+    }
 
 
 def block_digests(variant: str) -> dict[str, str]:
-    """Block name to digest, for the blocks that a variant keeps."""
-    removed = VARIANTS[variant]
-    return {block.name: block.digest for block in BLOCKS if block.name not in removed}
+    """Block name to digest, for the blocks of a variant."""
+    return {name: block.digest for name, block in blocks_of(variant).items()}
+
+
+def _ordered() -> Iterator[tuple[str, Block]]:
+    """All blocks: those of the paper, and before each what stands there, by name.
+
+    So the order of what is registered elsewhere is that of no import; raises UsageError.
+    """
+    paper = {name: block for name, block in BLOCKS.items() if block.before is None}
+    added = {name: block for name, block in sorted(BLOCKS.items()) if block.before is not None}
+    for name, block in added.items():
+        if block.before not in paper:
+            raise UsageError(
+                f"the prompt block {name} stands before {block.before}; valid: {', '.join(paper)}"
+            )
+    for name, block in paper.items():
+        yield from ((n, other) for n, other in added.items() if other.before == name)
+        yield name, block

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cache
+from statistics import fmean
 
-from merge_runner.config import Scenario
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS
+from merge_runner.config import ScenarioConfig
+from merge_runner.prompts.blocks import Fields, blocks_of
 from merge_runner.records import Observation, Road
 
 
@@ -15,7 +16,7 @@ def render_prompt(
     remaining_plan: Sequence[float] | None,
     *,
     variant: str,
-    scenario: Scenario,
+    scenario: ScenarioConfig,
 ) -> str:
     """The prompt of a variant.
 
@@ -29,35 +30,47 @@ def render_prompt(
 @cache
 def _template(variant: str, road: Road) -> str:
     """The blocks of a variant that a road has, one below the other."""
-    removed = VARIANTS[variant]
-    templates = (block.template(road) for block in BLOCKS if block.name not in removed)
+    templates = (block.template(road) for block in blocks_of(variant).values())
     return "\n\n".join(template for template in templates if template is not None) + "\n"
 
 
 def _fields(
-    observation: Observation, remaining_plan: Sequence[float] | None, scenario: Scenario
-) -> dict[str, str]:
+    observation: Observation, remaining_plan: Sequence[float] | None, scenario: ScenarioConfig
+) -> Fields:
     distance = observation.distance_to_merge_m
+    every = scenario.action_steps
     return {
         "vehicle_length": f"{scenario.vehicle_length_m:g}",
         "own_speed": decimal(observation.own_speed_mps),
         "other_speed": decimal(observation.other_speed_mps),
         "relative_distance": decimal(observation.relative_distance_m),
         "distance_to_merge": "" if distance is None else decimal(distance),
-        "own_accelerations": listing(observation.own_accelerations_mps2),
-        "other_speeds": listing(observation.other_speeds_mps),
+        "own_accelerations": listing(_means(observation.own_accelerations_mps2, every)),
+        "other_speeds": listing(_firsts(observation.other_speeds_mps, every)),
         "remaining_plan": (
             "none, this is your first decision"
             if remaining_plan is None
-            else f"{listing(remaining_plan)}, one value every {scenario.step_s:g} s, next first"
+            else f"{listing(remaining_plan)}, one value every {scenario.action_s:g} s, next first"
         ),
         "memory_s": f"{scenario.memory_s:g}",
         "horizon_s": f"{scenario.horizon_s:g}",
-        "step_s": f"{scenario.step_s:g}",
+        "step_s": f"{scenario.action_s:g}",
         "prompt_interval_s": f"{1 / scenario.prompt_rate_hz:g}",
         "plan_actions": str(scenario.plan_actions),
         "max_acceleration": f"{scenario.max_acceleration_mps2:g}",
     }
+
+
+def _firsts(values: Sequence[float], every: int) -> Sequence[float]:
+    """One in so many of the world's samples, back from now; what is left over is oldest."""
+    return values if every == 1 else values[len(values) % every :: every]
+
+
+def _means(values: Sequence[float], every: int) -> Sequence[float]:
+    """The mean of each so many of the world's samples, back from now, likewise."""
+    if every == 1:
+        return values
+    return [fmean(values[i : i + every]) for i in range(len(values) % every, len(values), every)]
 
 
 def decimal(value: float) -> str:

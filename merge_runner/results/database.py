@@ -20,10 +20,12 @@ import duckdb
 
 from merge_runner.errors import StoreError, StoreLocked, UsageError
 from merge_runner.records import SCRIPTED_FIELD
+from merge_runner.scenarios.merge.measures import measures_sql, measures_version
 from merge_runner.text_safety import first_line, quoted
 
 SCHEMA_VERSION = 4
 SCHEMA = Path(__file__).with_name("schema.sql")
+"""The tables; see ``schema_sql`` for all that a database has."""
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
 LOGS = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
@@ -45,6 +47,21 @@ REBUILD = (
     "move it away, or name another with --db, and run the same sweep again: it is rebuilt from the "
     "cache without a call"
 )
+
+
+def schema_sql() -> str:
+    """What makes a database: its tables, and views on them with the measures."""
+    return f"{SCHEMA.read_text(encoding='utf-8')}\n{measures_sql()}"
+
+
+def update_measures(connection: duckdb.DuckDBPyConnection) -> None:
+    """Define the measures anew where another version of the program did."""
+    found = connection.execute(
+        "SELECT comment FROM system.main.duckdb_views() WHERE view_name = 'trial_metrics' "
+        "AND database_name = system.main.current_database()"
+    ).fetchall()
+    if found != [(measures_version(),)]:
+        connection.execute(measures_sql())
 
 
 def spill_folder() -> Path:
@@ -406,7 +423,7 @@ def _numbers() -> Iterator[str]:
 def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
     """Make a new file with all rows of the open one."""
     with duckdb.connect(str(copy)) as made:
-        made.execute(SCHEMA.read_text(encoding="utf-8"))
+        made.execute(schema_sql())
     connection.execute(f"ATTACH {quoted(copy)} AS copied")
     try:
         with room_for_texts(connection):

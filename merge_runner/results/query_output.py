@@ -35,7 +35,7 @@ def write_json(names: list[str], rows: Rows, out: TextIO) -> None:
 
 
 def write_table(names: list[str], rows: Rows, out: TextIO) -> None:
-    """Write columns as wide as their widest cell."""
+    """Write columns as wide as their widest cell; rich would hold all rows in memory at once."""
     widths = [0] * len(names)
     with TemporaryFile("w+", encoding="utf-8", errors="surrogatepass") as kept:
         for row in chain((names,), rows):

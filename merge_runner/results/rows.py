@@ -143,24 +143,23 @@ def call_row(
         attempt.cost_usd,
         attempt.finish_reason,
         request.body,
-        _as_json(attempt.reply),
+        _as_json(attempt),
         attempt.error,
         is_scripted(request, attempt),
     )
 
 
-def _as_json(text: str | None) -> str | None:
+def _as_json(attempt: Attempt) -> str | None:
     """A reply that is not JSON, such as a proxy's HTML page, becomes a JSON string.
 
     So does one that the database would refuse: with half of a surrogate pair, or nested deeper than
-    any honest reply.
+    any honest reply. An answer was read as JSON already.
     """
-    if text is None:
-        return None
+    text = attempt.reply
+    if text is None or (attempt.answered and not _SURROGATE.search(text)):
+        return text
     try:
-        value = json.loads(text)
-        if _SURROGATE.search(text):
-            json.dumps(value, ensure_ascii=False).encode()
+        json.dumps(json.loads(text), ensure_ascii=False).encode()
     except (ValueError, RecursionError):
         return json.dumps(text.encode(errors="replace").decode())
     return text

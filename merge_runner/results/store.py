@@ -21,7 +21,6 @@ from merge_runner.records import TrialRecord
 from merge_runner.results.comparison import PLACES, TrialKey, stored_rows
 from merge_runner.results.database import (
     PATIENCE_S,
-    SCHEMA,
     SCHEMA_VERSION,
     TEXTS,
     Instance,
@@ -31,9 +30,11 @@ from merge_runner.results.database import (
     open_database,
     read_database,
     room_for_texts,
+    schema_sql,
     schema_version,
     streamed,
     unreadable_is_usage,
+    update_measures,
 )
 from merge_runner.results.rows import Row, rows_of, state_rows, trial_row
 from merge_runner.served_model import other_models, sql_of
@@ -74,8 +75,10 @@ class Store:
             tables = connection.execute("SHOW TABLES").fetchall()
             older = bool(tables) and schema_version(connection, path) < SCHEMA_VERSION
             if not tables:
-                connection.execute(SCHEMA.read_text(encoding="utf-8"))
+                connection.execute(schema_sql())
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
+            elif not older:
+                update_measures(connection)
         if older:
             migrate(path)
 

@@ -26,7 +26,7 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.shared_limits import SharedLimits, limits_file
-from merge_runner.llm.shared_services import Desk
+from merge_runner.llm.shared_services import SharedServices
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.run.plan import Limits
 
@@ -34,8 +34,8 @@ SPARE_FILES = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
-    """On what terms a sweep asks.
+class SpendingTerms:
+    """What a sweep may send and spend.
 
     ``ledger`` holds its spending, over all its runs; ``trial_usd`` is the worst case of a whole
     trial.
@@ -47,8 +47,8 @@ class Terms:
 
 
 @dataclass(frozen=True, slots=True)
-class Addressed:
-    """The endpoints of a sweep: their identities, and the variables of their base URLs.
+class EndpointPlan:
+    """The endpoints of a sweep: their identities, and the variables that hold their base URLs.
 
     ``known`` are the models whose endpoint has ever answered in its format, ``passed`` those where
     it has done so in this run. ``strict`` stops at an answer of another model.
@@ -62,8 +62,8 @@ class Addressed:
 
 
 @dataclass(frozen=True, slots=True)
-class OwnDesk:
-    """The desk of this process; see Desk."""
+class LocalServices:
+    """The services of this process; see SharedServices."""
 
     limiters: Mapping[str, Limiter]
     budget: Budget
@@ -92,14 +92,14 @@ def sealed_clients(
     }
 
 
-def open_desk(
+def open_services(
     entries: Mapping[str, ModelEntry],
     endpoints: Mapping[str, str],
     cache: ResponseCache,
-    terms: Terms,
+    terms: SpendingTerms,
     stack: AsyncExitStack,
-) -> OwnDesk:
-    """The desk of a run; its claims are given up with ``stack``.
+) -> LocalServices:
+    """The services of a run; its claims are given up with ``stack``.
 
     Raises UsageError where a cap could not hold.
     """
@@ -115,7 +115,7 @@ def open_desk(
     claims = Claims(cache.folder)
     stack.callback(claims.close)
     pauses: dict[str, Pause] = {}
-    return OwnDesk(
+    return LocalServices(
         limiters={
             name: Limiter(
                 rpm=limits.rpm or entry.rpm,
@@ -145,7 +145,7 @@ def _shared_limits(
     return shared
 
 
-async def reached(
+async def start_endpoints(
     entries: Mapping[str, ModelEntry], emulator_options: Sequence[str], stack: AsyncExitStack
 ) -> dict[str, str]:
     """The variables of base URLs that lead to the entries' endpoints.
@@ -162,9 +162,9 @@ async def reached(
 
 def live_clients(
     entries: Mapping[str, ModelEntry],
-    addressed: Addressed,
+    endpoint_plan: EndpointPlan,
     cache: ResponseCache,
-    desk: Desk,
+    services: SharedServices,
     *,
     connections: int,
     stack: AsyncExitStack,
@@ -175,7 +175,7 @@ def live_clients(
     _allow_open_files(connections + SPARE_FILES)
     clients = {}
     for name, entry in entries.items():
-        endpoint = resolve_endpoint(name, entry, with_base_urls(addressed.urls))
+        endpoint = resolve_endpoint(name, entry, with_base_urls(endpoint_plan.urls))
         check_network(endpoint.base_url)
         transport = HttpTransport(
             endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 1e6)
@@ -184,15 +184,15 @@ def live_clients(
         clients[name] = LlmClient(
             name=name,
             entry=entry,
-            endpoint=addressed.endpoints[name],
+            endpoint=endpoint_plan.endpoints[name],
             cache=cache,
             transport=transport,
-            limiter=desk.limiters[name],
+            limiter=services.limiters[name],
             pricing=pricing(entry),
-            budget=None if entry.price == "free" else desk.budget,
-            claims=desk.claims,
-            strict=addressed.strict,
-            first=FirstCall(passed=name in addressed.passed, known=name in addressed.known),
+            budget=None if entry.price == "free" else services.budget,
+            claims=services.claims,
+            strict=endpoint_plan.strict,
+            first=FirstCall(passed=name in endpoint_plan.passed, known=name in endpoint_plan.known),
         )
     return clients
 

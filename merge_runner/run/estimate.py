@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
-from merge_runner.llm.cache import Totals
+from merge_runner.drivers.pace import model_pace
+from merge_runner.llm.cache import CallTotals
 from merge_runner.llm.prices import pricing
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
 from merge_runner.run.plan import Limits, Plan
-from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.world import World
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
 PROMPT_MARGIN = 1.25
@@ -30,7 +29,7 @@ class Missing:
 
     trials: int
     calls: Mapping[str, float]
-    facts: Mapping[str, Totals]
+    facts: Mapping[str, CallTotals]
     endpoints: Mapping[str, str]
 
 
@@ -100,7 +99,7 @@ def worst_trial_usd(plan: Plan) -> float:
     """What a whole trial may cost: to the timeout, every byte a token, every answer at its cap."""
     prompt_bytes = len(_typical_prompt(plan).encode()) * PROMPT_MARGIN
     return sum(
-        math.ceil(plan.scenario.timeout_steps / plan.scenario.executed_actions)
+        math.ceil(plan.scenario.timeout_steps / model_pace(plan.scenario).interval_steps)
         * (
             pricing(entry).cost_usd(
                 Usage(input_tokens=int(prompt_bytes), output_tokens=entry.max_output_tokens)
@@ -111,7 +110,7 @@ def worst_trial_usd(plan: Plan) -> float:
     )
 
 
-def _per_call(plan: Plan, entry: ModelEntry, facts: Totals) -> _PerCall:
+def _per_call(plan: Plan, entry: ModelEntry, facts: CallTotals) -> _PerCall:
     if facts.measured:
         usage = Usage(
             input_tokens=round(facts.input_tokens / facts.measured),
@@ -139,7 +138,7 @@ def _limited_s(entry: ModelEntry, limits: Limits, calls: int, each: _PerCall) ->
 
 def _typical_prompt(plan: Plan) -> str:
     """The longest variant's prompt in the midst of an approach."""
-    world = World(plan.scenario, CONDITIONS[plan.conditions[0]])
+    world = plan.world(plan.conditions[0])
     rest = (0.25,) * (plan.scenario.plan_actions - plan.scenario.executed_actions)
     prompts = (
         render_prompt(world.observe("left"), rest, variant=variant, scenario=plan.scenario)

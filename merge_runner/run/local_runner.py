@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Protocol
 
-from merge_runner.drivers.base import Driver
-from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.drivers.base import MakeDriver
+from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import TrialSuspended
+from merge_runner.llm.call import Wait
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
-from merge_runner.records import SIDES, Cell, ChatReply, Side, Slot, TrialRecord, TrialSpec
+from merge_runner.records import SIDES, Cell, ChatReply, Slot, TrialRecord, TrialSpec
 from merge_runner.run.plan import Plan
 from merge_runner.run.scheduler import Gate, run_bounded
 from merge_runner.trial import play_trial
@@ -30,7 +31,7 @@ async def no_wait() -> None:
     """Room without end."""
 
 
-class Crew(Protocol):
+class TrialRunner(Protocol):
     """Whoever plays the trials of a sweep: this process, or workers in a cluster."""
 
     @property
@@ -49,8 +50,13 @@ class Crew(Protocol):
         ...
 
     @property
-    def flying(self) -> int:
+    def in_flight_calls(self) -> int:
         """How many calls are in flight or being saved."""
+        ...
+
+    @property
+    def waits(self) -> Sequence[Wait]:
+        """What the other calls wait for."""
         ...
 
     @property
@@ -71,8 +77,8 @@ class Crew(Protocol):
         ...
 
 
-@dataclass(slots=True)
-class Players:
+@dataclass
+class LocalRunner:
     """Plays at most ``in_flight`` trials at once."""
 
     plan: Plan
@@ -81,6 +87,12 @@ class Players:
     gate: Gate = field(default_factory=Gate)
     playing: Counter[Cell] = field(default_factory=Counter)
     workers: None = None
+
+    @cached_property
+    def drivers(self) -> Mapping[str, MakeDriver]:
+        """Who makes the drivers of a name: a program, or a model that one of the clients asks."""
+        models = {name: LanguageModel(partial(self._ask, name)) for name in self.clients}
+        return {**PROGRAMS, **models}
 
     @property
     def running(self) -> int:
@@ -93,16 +105,21 @@ class Players:
         return {name: client.meter for name, client in self.clients.items()}
 
     @property
-    def flying(self) -> int:
+    def in_flight_calls(self) -> int:
         """How many calls are in flight or being saved."""
-        return sum(client.flying for client in self.clients.values())
+        return sum(client.in_flight_calls for client in self.clients.values())
+
+    @property
+    def waits(self) -> Sequence[Wait]:
+        """What the other calls wait for."""
+        return [wait for client in self.clients.values() for wait in client.waits]
 
     def answers(self, name: str) -> int:
         """How many live replies a model's trials have used."""
         return self.clients[name].meter.calls_live
 
     async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
-        """See Crew."""
+        """See TrialRunner."""
         await run_bounded(
             (partial(self._trial, spec, room) for spec in specs),
             in_flight=self.in_flight,
@@ -110,17 +127,20 @@ class Players:
         )
 
     async def drain(self) -> None:
-        """See Crew."""
+        """See TrialRunner."""
         await asyncio.gather(*(client.drain() for client in self.clients.values()))
 
     async def _trial(
         self, spec: TrialSpec, room: Room
     ) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
         await room()
-        drivers = {side: self._driver(spec, side) for side in SIDES}
+        scenario = self.plan.scenario
+        drivers = {
+            side: self.drivers[self.plan.sides[side]].make(scenario, spec, side) for side in SIDES
+        }
         self.playing[spec.cell] += 1
         try:
-            return spec, await play_trial(spec, self.plan.scenario, drivers)
+            return spec, await play_trial(spec, scenario, drivers)
         except TrialSuspended as exc:
             return spec, exc
         finally:
@@ -128,16 +148,6 @@ class Players:
             for client in self.clients.values():
                 client.leave(spec.order)
 
-    def _driver(self, spec: TrialSpec, side: Side) -> Driver:
-        name, scenario = self.plan.sides[side], self.plan.scenario
-        if name in PROGRAMS:
-            return PROGRAMS[name].make(scenario, side)
-        client = self.clients[name]
-
-        async def ask(prompt: str, number: int) -> ChatReply:
-            await self.gate.enter()
-            slot = Slot(spec.condition, spec.repetition, side, number, spec.sample_set)
-            return await client.ask(prompt, slot, order=spec.order)
-
-        assert spec.variant is not None, "only human trials have no prompt variant"
-        return LlmDriver(ask, spec.variant, scenario)
+    async def _ask(self, model: str, prompt: str, slot: Slot, spec: TrialSpec) -> ChatReply:
+        await self.gate.enter()
+        return await self.clients[model].ask(prompt, slot, order=spec.order)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -10,20 +11,26 @@ from typing import Literal
 from merge_runner.config import (
     MOST_REPETITIONS,
     ModelEntry,
-    Scenario,
+    ScenarioConfig,
     SweepFile,
-    load_models,
+    both_sides,
     load_sweep,
     pair_name,
 )
+from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import SPEC_VERSION, canonical_json, spec_hash
-from merge_runner.prompts.blocks import VARIANTS, block_digests
+from merge_runner.llm.models import load_models
+from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import Side, TrialSpec
+from merge_runner.scenarios.base import World
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.registry import SCENARIOS, task_of
 
+# It stands in ids, lists and names of files.
+CONDITION_NAME = re.compile(r"[A-Za-z0-9_.-]+")
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 PROMPTS_PER_DRIVER = 10.5
 
@@ -59,7 +66,7 @@ class Plan:
     model: str
     sides: dict[Side, str]
     entries: dict[str, ModelEntry]
-    scenario: Scenario
+    scenario: ScenarioConfig
     repetitions: dict[str, int]
     conditions: tuple[str, ...]
     sample_set: int
@@ -90,6 +97,10 @@ class Plan:
         """Whether the emulator takes part."""
         return any(entry.provider == "emulator" for entry in self.entries.values())
 
+    def world(self, condition: str) -> World:
+        """The world of a new trial."""
+        return SCENARIOS[self.scenario.name].world(self.scenario, CONDITIONS[condition])
+
     def driver(self, endpoints: Mapping[str, str]) -> str:
         """The drivers with their endpoints; see ``pair_name``."""
         return pair_name(self.sides.values(), endpoints)
@@ -100,7 +111,7 @@ class Plan:
             variant: canonical_json(
                 {
                     "spec_version": SPEC_VERSION,
-                    "scenario": self.scenario.model_dump(),
+                    **task_of(self.scenario),
                     "prompt_blocks": block_digests(variant) if self.entries else {},
                     "left": self._driver(self.sides["left"], endpoints),
                     "right": self._driver(self.sides["right"], endpoints),
@@ -162,12 +173,7 @@ class Plan:
     def _driver(self, name: str, endpoints: Mapping[str, str]) -> dict[str, object]:
         entry = self.entries.get(name)
         if entry is None:
-            program = PROGRAMS[name]
-            return {
-                "program": name,
-                "parameters": dict(program.parameters),
-                "source": program.source,
-            }
+            return PROGRAMS[name].told(name)
         sent = FORMATS[entry.format].request(entry, "")
         return {
             "endpoint": endpoints[name],
@@ -186,35 +192,50 @@ def make_plan(choice: Choice) -> Plan:
     """Resolve a choice against the sweep's file and the registry; raises UsageError."""
     name, file = load_sweep(choice.sweep)
     models = load_models()
-    left, _, right = choice.model.partition("+")
-    sides: dict[Side, str] = {"left": left, "right": right or left}
+    sides = both_sides(choice.model)
     valid = (*models, *PROGRAMS)
     for driver in sides.values():
         _require(driver, valid, "model", "two joined by + drive left and right")
-    wanted = choice.conditions if choice.conditions is not None else file.conditions
-    conditions = tuple(dict.fromkeys(CONDITIONS if wanted is None else wanted))
-    if not conditions:
-        raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
-    for condition in conditions:
-        _require(condition, tuple(CONDITIONS), "condition")
+    for driver in {*sides.values()} - {*models}:
+        pace_of(file.scenario, PROGRAMS[driver].told(driver))
     if choice.sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
+    scenario = SCENARIOS.require(file.scenario.name)
+    if file.scenario.collision_rule not in scenario.collision_rules:
+        raise UsageError(
+            f"the scenario {file.scenario.name} has no collision_rule "
+            f"{file.scenario.collision_rule!r}; valid: {', '.join(scenario.collision_rules)}"
+        )
     return Plan(
         name=name,
-        model=left if left == sides["right"] else f"{left}+{right}",
+        model="+".join(dict.fromkeys(sides.values())),
         sides=sides,
         entries={driver: models[driver] for driver in sides.values() if driver in models},
         scenario=file.scenario,
         repetitions=_repetitions(name, file, choice),
-        conditions=conditions,
+        conditions=_conditions(file, choice),
         sample_set=choice.sample_set,
         order_seed=choice.order_seed,
     )
 
 
+def _conditions(file: SweepFile, choice: Choice) -> tuple[str, ...]:
+    scenario = SCENARIOS[file.scenario.name]
+    wanted = choice.conditions if choice.conditions is not None else file.conditions
+    conditions = tuple(dict.fromkeys(scenario.conditions if wanted is None else wanted))
+    if not conditions:
+        raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
+    for name in conditions:
+        condition = CONDITIONS.require(name)
+        if not CONDITION_NAME.fullmatch(name):
+            raise UsageError(f"the condition {name!r} needs a name of letters, digits, _, - and .")
+        scenario.world(file.scenario, condition)  # raises where it cannot be played
+    return conditions
+
+
 def _repetitions(name: str, file: SweepFile, choice: Choice) -> dict[str, int]:
     for variant in (*file.repetitions, *(choice.variants or ())):
-        _require(variant, tuple(VARIANTS), "variant")
+        blocks_of(variant)
     if choice.repetitions is not None and not 1 <= choice.repetitions <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
     wanted: dict[str, int] = {}

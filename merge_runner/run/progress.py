@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
 
+from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Ledger
-from merge_runner.llm.meter import Meter, Wait
+from merge_runner.llm.meter import Meter
 from merge_runner.records import Cell
 from merge_runner.results.progress_file import (
     EVERY_S,
@@ -29,7 +30,7 @@ from merge_runner.text_safety import printable
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from merge_runner.run.local_runner import Crew
+    from merge_runner.run.local_runner import TrialRunner
 
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
@@ -40,7 +41,7 @@ REASONS_SHOWN = 3
 
 @dataclass(slots=True)
 class Progress:
-    """Where a sweep stands; ``crew`` plays its trials.
+    """Where a sweep stands; ``runner`` plays its trials.
 
     ``expected_calls`` is about how many calls all trials take: trials that run in step all end
     late, so the calls tell the time left better than the trials do. ``worst_stall_s`` is by how
@@ -51,7 +52,7 @@ class Progress:
     title: str
     total: int
     expected_calls: int = 0
-    crew: Crew | None = None
+    runner: TrialRunner | None = None
     cap_usd: float | None = None
     ledger: Ledger | None = None
     done: Counter[str] = field(default_factory=Counter)
@@ -90,7 +91,7 @@ class Progress:
         left = "" if left_s is None else f", about {left_s:.0f} s left"
         window = min(60.0, max(elapsed, 1.0)) / 60
         before = f" (+{self.stored_before} stored before)" if self.stored_before else ""
-        running = self.crew.running if self.crew else 0
+        running = self.runner.running if self.runner else 0
         return [
             *(("WARNING", text) for text in self._warnings()),
             ("trials", f"{self.ended}/{self.total} ended{before}, {running} running{self._on()}"),
@@ -98,13 +99,13 @@ class Progress:
             ("calls", f"{live} live, {cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
             ("cost", f"{cost:.2f} USD{self._spent()}"),
-            *(("calls waiting", "; ".join(texts)) for texts in [_waiting(meters)] if texts),
+            *(("calls waiting", "; ".join(texts)) for texts in [_waiting(self._waits)] if texts),
             ("time", f"{elapsed:.0f} s{left}"),
         ]
 
     def standing(self, sweep_id: str) -> Standing:
         """The same for other processes, cell by cell."""
-        meters, crew = self.meters, self.crew
+        meters, runner = self.meters, self.runner
         live = sum(meter.calls_live for meter in meters)
         cached = sum(meter.calls_cached for meter in meters)
         return Standing(
@@ -118,8 +119,8 @@ class Progress:
             doing=self.doing,
             trials=self.total + self.stored_before,
             stored_before=self.stored_before,
-            running=crew.running if crew else 0,
-            workers=crew.workers if crew else None,
+            running=runner.running if runner else 0,
+            workers=runner.workers if runner else None,
             cells=tuple(map(self._cell, self.planned)),
             calls_live=live,
             calls_cached=cached,
@@ -128,17 +129,21 @@ class Progress:
             committed_usd=self.ledger.spending.committed_usd if self.ledger else None,
             left_s=self._left_s(time.monotonic() - self.started, live + cached),
             worst_stall_s=self.worst_stall_s,
-            waiting=tuple(map(printable, _waiting(meters))),
+            waiting=tuple(map(printable, _waiting(self._waits))),
             warnings=tuple(map(printable, self._warnings())),
         )
 
     @property
     def meters(self) -> Sequence[Meter]:
         """One for each model."""
-        return tuple(self.crew.meters.values()) if self.crew else ()
+        return tuple(self.runner.meters.values()) if self.runner else ()
+
+    @property
+    def _waits(self) -> Sequence[Wait]:
+        return self.runner.waits if self.runner else ()
 
     def _on(self) -> str:
-        workers = self.crew.workers if self.crew else None
+        workers = self.runner.workers if self.runner else None
         return "" if workers is None else f" on {workers or 'no'} worker{'s' * (workers != 1)}"
 
     def _spent(self) -> str:
@@ -148,7 +153,7 @@ class Progress:
         return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
 
     def _cell(self, cell: Cell) -> CellStanding:
-        playing = self.crew.playing if self.crew else {}
+        playing = self.runner.playing if self.runner else {}
         ways = self.by_cell.get(cell, Counter())
         return CellStanding(
             *cell,
@@ -164,7 +169,7 @@ class Progress:
 
     def _warnings(self) -> list[str]:
         others = sum((meter.mismatches for meter in self.meters), Counter[str]())
-        meters = self.crew.meters.items() if self.crew else ()
+        meters = self.runner.meters.items() if self.runner else ()
         return [
             *(f"another model answers: {pair}" for pair in sorted(others)),
             *(f"a scripted stand-in answers, not {name}" for name, m in meters if m.stand_ins),
@@ -179,20 +184,20 @@ class Progress:
 
 
 @asynccontextmanager
-async def told(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
+async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
     """Keep the file of a sweep up to date while the body runs, and remove it at its end."""
     clear_dead(file.db)
     file.write(progress.standing(file.sweep_id))
-    telling = asyncio.create_task(_tell(progress, file))
+    publishing = asyncio.create_task(_publish(progress, file))
     try:
         yield
     finally:
-        telling.cancel()
+        publishing.cancel()
         file.remove()
 
 
 @asynccontextmanager
-async def shown(progress: Progress) -> AsyncIterator[None]:
+async def display_progress(progress: Progress) -> AsyncIterator[None]:
     """Show the progress on stderr while the body runs, and once more at its end."""
     show = _show_live if sys.stderr.isatty() else _show_plain
     stop = asyncio.Event()
@@ -206,7 +211,7 @@ async def shown(progress: Progress) -> AsyncIterator[None]:
         await display
 
 
-async def _tell(progress: Progress, file: ProgressFile) -> None:
+async def _publish(progress: Progress, file: ProgressFile) -> None:
     while True:
         await asyncio.sleep(EVERY_S)
         await asyncio.to_thread(file.write, progress.standing(file.sweep_id))
@@ -271,14 +276,13 @@ def _notes(progress: Progress) -> list[str]:
     return lines[:NOTES_SHOWN] + more
 
 
-def _waiting(meters: Sequence[Meter]) -> list[str]:
+def _waiting(waits: Sequence[Wait]) -> list[str]:
     """How many calls wait for what, and until when at the latest, where that is known."""
-    waits: dict[str, list[Wait]] = {}
-    for meter in meters:
-        for wait in meter.waits.values():
-            waits.setdefault(wait.what, []).append(wait)
+    alike: dict[str, list[Wait]] = {}
+    for wait in waits:
+        alike.setdefault(wait.what, []).append(wait)
     texts = []
-    for what, those in sorted(waits.items(), key=lambda item: -len(item[1])):
+    for what, those in sorted(alike.items(), key=lambda item: -len(item[1])):
         ends = [wait.until for wait in those if wait.until is not None]
         until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
         texts.append(f"{len(those)} {what}{until}")

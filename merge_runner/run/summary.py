@@ -228,5 +228,6 @@ def _statuses(facts: SweepFacts) -> dict[str, int]:
 
 
 def _row(name: str, values: object) -> str:
+    # Widths that no count changes, so that two runs can be laid beside each other; rich fits them.
     assert hasattr(values, "__iter__")
     return f"{name:<10}" + "".join(f"{value:>12}" for value in values)

@@ -22,7 +22,7 @@ from merge_runner.errors import (
     TrialSuspended,
     UsageError,
 )
-from merge_runner.llm.cache import Entry, ResponseCache, Totals
+from merge_runner.llm.cache import CallTotals, Entry, ResponseCache
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import canonical_json, manner, spec_hash
 from merge_runner.llm.ledger import Ledger, Spending
@@ -34,18 +34,18 @@ from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Spilled
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
-    Addressed,
-    Terms,
+    EndpointPlan,
+    SpendingTerms,
     live_clients,
-    open_desk,
-    reached,
+    open_services,
     sealed_clients,
+    start_endpoints,
 )
 from merge_runner.run.estimate import Missing, worst_trial_usd
 from merge_runner.run.flusher import Flusher
-from merge_runner.run.local_runner import Crew, Players
+from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.plan import PROMPTS_PER_DRIVER, Limits, Plan
-from merge_runner.run.progress import Progress, shown, told
+from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain, misses_of
 from merge_runner.signals import on_interrupt
 
@@ -115,7 +115,7 @@ class Outcome:
 
 
 @dataclass(slots=True)
-class Outage:
+class FailureStreak:
     """How many trials a model failed since it gave its last of so many answers."""
 
     answers: int = 0
@@ -144,7 +144,7 @@ class Sweep:
         self._sealed = SealedTransport()
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
-        self._outages: dict[str, Outage] = {}
+        self._failure_streaks: dict[str, FailureStreak] = {}
         self._suspended: list[TrialSuspended] = []
         driver = plan.driver(self._endpoints)
         self._progress = Progress(
@@ -170,7 +170,7 @@ class Sweep:
         with unreadable_is_usage():
             sweep_id = self._begin()
         file = ProgressFile(self._options.db, sweep_id)
-        async with told(self._progress, file):
+        async with publish_progress(self._progress, file):
             outcome = await self._run(sweep_id)
             self._progress.doing = "checking"
             file.write(self._progress.standing(sweep_id))
@@ -187,13 +187,13 @@ class Sweep:
         )
         async with AsyncExitStack() as stack:
             stack.callback(self._cache.close)
-            crew = await self._crew(stack)
-            self._progress.crew = crew
+            runner = await self._runner(stack)
+            self._progress.runner = runner
             flusher = Flusher(self._store, outcome.sweep_id, self._say)
             began = time.perf_counter()
             try:
-                async with shown(self._progress):
-                    await self._play(crew, flusher, outcome)
+                async with display_progress(self._progress):
+                    await self._play(runner, flusher, outcome)
             finally:
                 outcome.playing_s = time.perf_counter() - began
                 outcome.worst_stall_s = self._progress.worst_stall_s
@@ -207,7 +207,7 @@ class Sweep:
                     outcome.messages.append(str(exc))
                 else:
                     outcome.fail(exc.exit_code, str(exc))
-        for meter in crew.meters.values():
+        for meter in runner.meters.values():
             outcome.damaged += meter.damaged
             outcome.calls_live += meter.calls_live
             outcome.calls_cached += meter.calls_cached
@@ -244,11 +244,11 @@ class Sweep:
                     answered = sum(row.side == side for row in record.decisions)
                     calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
 
-        await Players(self._plan, clients, in_flight=1).play(self._todo, ended)
+        await LocalRunner(self._plan, clients, in_flight=1).play(self._todo, ended)
         facts = {name: self._measured(name, entry) for name, entry in self._plan.entries.items()}
         return Missing(trials, calls, facts, self._endpoints)
 
-    def _measured(self, name: str, entry: ModelEntry) -> Totals:
+    def _measured(self, name: str, entry: ModelEntry) -> CallTotals:
         """What is known of answers to requests like those of this sweep."""
         sent = FORMATS[entry.format].request(entry, "")
         asked = manner(sent.path, canonical_json(sent.body))
@@ -291,42 +291,42 @@ class Sweep:
         )
         return sweep_id
 
-    async def _crew(self, stack: AsyncExitStack) -> Crew:
+    async def _runner(self, stack: AsyncExitStack) -> TrialRunner:
         """Who plays: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if options.replay or not self._todo or not plan.entries:
             clients = sealed_clients(plan.entries, self._endpoints, self._cache, self._sealed)
             # Recorded replies are there at once: more in flight only take more memory.
-            return Players(plan, clients, min(options.in_flight, FROM_RECORDINGS))
-        terms = Terms(options.limits, self._ledger, worst_trial_usd(plan))
-        desk = open_desk(plan.entries, self._endpoints, self._cache, terms, stack)
-        urls = await reached(plan.entries, options.emulator_options, stack)
+            return LocalRunner(plan, clients, min(options.in_flight, FROM_RECORDINGS))
+        terms = SpendingTerms(options.limits, self._ledger, worst_trial_usd(plan))
+        services = open_services(plan.entries, self._endpoints, self._cache, terms, stack)
+        urls = await start_endpoints(plan.entries, options.emulator_options, stack)
         known = frozenset(
             name
             for name, entry in plan.entries.items()
             if self._endpoints[name] in self._cache.facts(entry.id).totals
         )
-        addressed = Addressed(self._endpoints, urls, options.strict_model, known)
+        endpoint_plan = EndpointPlan(self._endpoints, urls, options.strict_model, known)
         if options.dask is None:
             clients = live_clients(
                 plan.entries,
-                addressed,
+                endpoint_plan,
                 self._cache,
-                desk,
+                services,
                 connections=options.limits.connections,
                 stack=stack,
             )
-            return Players(plan, clients, options.in_flight)
+            return LocalRunner(plan, clients, options.in_flight)
         from merge_runner.run.cluster.connect import connected
 
         client = await stack.enter_async_context(connected(options.dask))
         from merge_runner.run.cluster.coordinator import Coordinator  # needs what was asked for
 
         return await stack.enter_async_context(
-            Coordinator(client, plan, addressed, self._cache, desk, options.in_flight)
+            Coordinator(client, plan, endpoint_plan, self._cache, services, options.in_flight)
         )
 
-    async def _play(self, crew: Crew, flusher: Flusher, outcome: Outcome) -> None:
+    async def _play(self, runner: TrialRunner, flusher: Flusher, outcome: Outcome) -> None:
         """Run the trials until all have ended, or the sweep is stopped or interrupted."""
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
@@ -337,14 +337,15 @@ class Sweep:
             self._progress.count(spec.cell, record.status)
             self._misses += misses_of(record, self._sealed)
             flusher.add(record)
-            self._watch_for_outage(record, crew)
+            self._watch_for_outage(record, runner)
 
-        work = asyncio.create_task(crew.play(self._todo, ended, room=flusher.room))
-        drain = asyncio.create_task(_drained(crew, work))
+        work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
+        drain = asyncio.create_task(_drained(runner, work))
 
         def interrupted() -> None:
             self._say(
-                f"Stopping: {crew.flying} calls in flight are saved first; Ctrl-C again drops them."
+                f"Stopping: {runner.in_flight_calls} calls in flight are saved first; "
+                "Ctrl-C again drops them."
             )
             work.cancel()
 
@@ -392,26 +393,26 @@ class Sweep:
         except (StoreError, UsageError) as exc:
             outcome.fail(exc.exit_code, str(exc))
 
-    def _watch_for_outage(self, record: TrialRecord, crew: Crew) -> None:
+    def _watch_for_outage(self, record: TrialRecord, runner: TrialRunner) -> None:
         """Stop when trials fail for want of one model, which answers no call in between."""
         if self._options.replay:
             return
         for name in {self._plan.sides[failed.side] for failed in record.failed_calls}:
-            outage = self._outages.setdefault(name, Outage())
-            answers = crew.answers(name)
-            if answers > outage.answers:
-                outage.answers, outage.trials = answers, 0
-            outage.trials += 1
-            if outage.trials >= FAILURES_IN_A_ROW:
+            streak = self._failure_streaks.setdefault(name, FailureStreak())
+            answers = runner.answers(name)
+            if answers > streak.answers:
+                streak.answers, streak.trials = answers, 0
+            streak.trials += 1
+            if streak.trials >= FAILURES_IN_A_ROW:
                 raise ProviderDown(
-                    f"the last {outage.trials} trials with {name} failed and no call was answered "
+                    f"the last {streak.trials} trials with {name} failed and no call was answered "
                     f"in between ({record.error}): the rest is not tried. When the service answers "
                     "again, run the same command to go on"
                 )
 
     def _endpoint(self, name: str, entry: ModelEntry) -> str:
         """The endpoint's identity: in a replay, the one under which the model is recorded."""
-        configured = endpoint_identity(name, entry)
+        configured = endpoint_identity(entry)
         if entry.provider == "emulator":
             configured += self._options.faults_identity
         if not self._options.replay:
@@ -433,10 +434,10 @@ def _differing(trials: Mapping[str, Sequence[str]]) -> str:
     return "; ".join(f"{trial_id} ({', '.join(columns)})" for trial_id, columns in shown)
 
 
-async def _drained(crew: Crew, work: asyncio.Task[None]) -> None:
+async def _drained(runner: TrialRunner, work: asyncio.Task[None]) -> None:
     """When the work has ended, in whatever way, save the calls that are in flight."""
     await asyncio.wait([work])
-    await crew.drain()
+    await runner.drain()
 
 
 def _overlay(recording: Path | None) -> Mapping[str, Entry]:

@@ -17,7 +17,7 @@ from analysis.explorer.export import export_folder
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
 from analysis.report.writer import write_report
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.results.database import open_database
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -52,18 +52,18 @@ def partial_import(db: Path) -> None:
     files = {}
     for number in range(IMPORTED):
         experiment = (4, 5, 6, 8, 9)[number % 5]
-        condition = list(CONDITIONS.values())[number // 5 % len(CONDITIONS)]
+        played, condition = list(CONDITIONS.items())[number // 5 % len(CONDITIONS)]
         ahead = condition.projected_headway_m - condition.relative_velocity_mps
         yields = "right" if ahead > 0 or (ahead == 0 and number % 2) else "left"
         name = f"experiment_{experiment}/experiment_{experiment}_iter_{number + 1}.csv"
-        files[name] = drive(condition.name, yields=yields).csv()
+        files[name] = drive(played, yields=yields).csv()
     with open_files(write_folder(db.parent / "recordings", files)) as found:
         import_trials(sort_files(found).trials, Store(db))
 
 
 def other_vehicle_length(db: Path) -> None:
     """Vehicles of 8 m."""
-    write_study(db, yielding("o3", reps=3), Scenario(vehicle_length_m=8.0), asked=OWN)
+    write_study(db, yielding("o3", reps=3), ScenarioConfig(vehicle_length_m=8.0), asked=OWN)
 
 
 def temperature(db: Path) -> None:

@@ -14,7 +14,7 @@ from scipy.io import savemat
 from analysis.human.archive import File
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.geometry import place
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance
 
 STEP_S = 0.05
@@ -62,7 +62,8 @@ def drive(condition="L_4_0", *, yields="right", late=False) -> Recording:
     ``late`` leaves out the first sample, as the recorder of simulated drivers does.
     """
     start = CONDITIONS[condition]
-    positions, speeds, inputs = [list(start.starts_m)], [list(start.speeds_mps)], [[0.0, 0.0]]
+    positions, speeds = [list(start.starts_m(TRACK))], [list(start.speeds_mps)]
+    inputs = [[0.0, 0.0]]
     end_state = None
     while end_state is None:
         s, v = positions[-1], speeds[-1]
@@ -106,7 +107,7 @@ def _recording(positions, speeds, inputs, end_state) -> Recording:
     }
     columns = {name: [value] for name, value in scalars.items()}
     for i, side in enumerate(SIDES):
-        columns[f"positions.{side}"] = [list(place(side, s[i])) for s in positions]
+        columns[f"positions.{side}"] = [list(TRACK.place(side, s[i])) for s in positions]
         columns[f"travelled_distance.{side}"] = [s[i] for s in positions]
         columns[f"velocities.{side}"] = [v[i] for v in speeds]
         columns[f"raw_input.{side}"] = [u[i] for u in inputs]

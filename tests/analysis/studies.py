@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import duckdb
 
 from analysis.data.study import Study
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import (
     SIDES,
     Attempt,
@@ -29,9 +29,10 @@ from merge_runner.records import (
 )
 from merge_runner.results.store import Store, SweepRow
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 ANSWERS = ("ok", "refusal", "truncated", "empty")
 
 
@@ -66,9 +67,9 @@ class Drive:
     said: Mapping[int, Said] | None = None
 
 
-def played(drive: Drive, scenario: Scenario = SCENARIO) -> TrialRecord:
+def played(drive: Drive, scenario: ScenarioConfig = SCENARIO) -> TrialRecord:
     """Play a trial; after the last given second the drivers keep their speed."""
-    world = World(scenario, CONDITIONS[drive.condition])
+    world = World(scenario, CONDITIONS[drive.condition], TRACK)
     decisions: list[DecisionRow] = []
     lost: list[FailedCall] = []
     number = 0
@@ -145,7 +146,7 @@ def answered(drive: Drive, side: Side, number: int, decision: Decision) -> Decis
 def write_study(
     path: Path,
     drives: Iterable[Drive],
-    scenario: Scenario = SCENARIO,
+    scenario: ScenarioConfig = SCENARIO,
     config: object = None,
     asked: Mapping[str, object] | None = None,
 ) -> Path:
@@ -196,7 +197,7 @@ def _empty() -> bytes:
 def yielding(driver: str, variant: str = "baseline", reps: int = 3) -> list[Drive]:
     """A driver like the humans: who is ahead, or slower where level, goes first."""
     drives = []
-    for condition in CONDITIONS.values():
+    for name, condition in CONDITIONS.items():
         ahead = condition.projected_headway_m - 2 * condition.relative_velocity_mps
         for rep in range(1, reps + 1):
             # One repetition in five, and every second where nobody is ahead, is decided otherwise.
@@ -209,7 +210,7 @@ def yielding(driver: str, variant: str = "baseline", reps: int = 3) -> list[Driv
                 Drive(
                     driver,
                     variant,
-                    condition.name,
+                    name,
                     rep,
                     faster if left else slower,
                     slower if left else faster,

@@ -36,14 +36,14 @@ def imported(tmp_path_factory):
     files = {}
     for experiment in (4, 6, 8):
         number = 0
-        for condition in CONDITIONS.values():
+        for played, condition in CONDITIONS.items():
             for rep in range(2):
                 number += 1
                 ahead = condition.projected_headway_m + 0.1 * experiment - 0.5 + 0.3 * (rep - 1)
                 yields = "both" if rep == 1 and experiment == 8 else None
                 yields = yields or ("right" if ahead > 0 else "left")
                 name = f"experiment_{experiment}/experiment_{experiment}_iter_{number}.csv"
-                files[name] = drive(condition.name, yields=yields).csv()
+                files[name] = drive(played, yields=yields).csv()
     db = write_study(folder / "t.duckdb", yielding("o3", reps=2))
     with open_files(write_folder(folder / "recordings", files)) as found:
         import_trials(sort_files(found).trials, Store(db))

@@ -11,7 +11,7 @@ import pytest
 
 from merge_runner.audit import NOT_DERIVED, audit_cache, audit_database, audit_recording
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.results.database import SCHEMA, in_memory
+from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.recording import export_recording
 from tests.harness import PROJECT, as_a_model, watched
 
@@ -67,7 +67,7 @@ def findings(db: Path, cache: Path | None = None) -> list:
 
 def columns() -> list[tuple[str, str, str]]:
     with in_memory({}) as connection:
-        connection.execute(SCHEMA.read_text())
+        connection.execute(schema_sql())
         return connection.execute(
             "SELECT table_name, column_name, data_type FROM duckdb_columns() "
             "WHERE table_name IN (SELECT table_name FROM duckdb_tables()) AND table_name <> 'meta'"

@@ -2,8 +2,10 @@
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.base import Seat
 from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.drivers.pace import model_pace
 from merge_runner.records import ChatReply, ChatRequest, Observation, Slot
 
 PLAN = tuple(round(0.01 * k, 2) for k in range(1, 21))  # 0.01 to 0.20, no two alike
@@ -41,7 +43,8 @@ async def decide(*replies, seen=SEEN, variant="baseline", **scenario):
         reply = replies[number]
         return chat_reply(reply) if isinstance(reply, str) else reply
 
-    driver = LlmDriver(ask, variant, Scenario(**scenario))
+    scenario = ScenarioConfig(**scenario)
+    driver = LlmDriver(ask, variant, Seat(scenario, "left", model_pace(scenario), 0))
     decisions = [await driver.decide(seen, number) for number in range(len(replies))]
     assert [prompt for prompt, _ in asked] == [decision.prompt for decision in decisions]
     assert [number for _, number in asked] == list(range(len(replies)))

@@ -2,9 +2,8 @@
 
 import pytest
 
-from merge_runner.config import Scenario
-from merge_runner.drivers.constant import ConstantDriver
-from merge_runner.drivers.projected_order import ProjectedOrderDriver
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.records import SIDES, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
@@ -16,7 +15,7 @@ RULES = ("euclid2d", "rectangle", "shared_lane")
 
 async def play(condition, driver, **scenario):
     """A trial with the same kind of driver on both sides."""
-    scenario = Scenario(**scenario)
+    scenario = ScenarioConfig(**scenario)
     spec = TrialSpec(
         trial_id="test",
         spec_hash="test",
@@ -29,17 +28,14 @@ async def play(condition, driver, **scenario):
         sample_set=0,
         order=0,
     )
-    return await play_trial(spec, scenario, {side: driver(scenario, side) for side in SIDES})
-
-
-def constant(scenario, side):
-    return ConstantDriver(scenario)
+    drivers = {side: PROGRAMS[driver].make(scenario, spec, side) for side in SIDES}
+    return await play_trial(spec, scenario, drivers)
 
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("condition", CONDITIONS)
 async def test_two_constant_drivers_collide_in_every_condition(condition, rule):
-    trial = await play(condition, constant, collision_rule=rule)
+    trial = await play(condition, "constant", collision_rule=rule)
     assert (trial.status, trial.merged_first) == ("collided", None)
     assert {row.acceleration_mps2 for row in trial.states} == {0.0}
 
@@ -49,7 +45,7 @@ async def test_two_constant_drivers_collide_in_every_condition(condition, rule):
 async def test_the_projected_order_lets_the_earlier_arrival_go_first_without_a_collision(
     condition, rule
 ):
-    trial = await play(condition, ProjectedOrderDriver, collision_rule=rule)
+    trial = await play(condition, "projected-order", collision_rule=rule)
     # The condition's name says who is projected to lead; on a tie the right one yields.
     first = "right" if CONDITIONS[condition].projected_headway_m < 0 else "left"
     assert (trial.status, trial.merged_first) == ("finished", first)
@@ -57,7 +53,7 @@ async def test_the_projected_order_lets_the_earlier_arrival_go_first_without_a_c
 
 @pytest.mark.parametrize("condition", CONDITIONS)
 async def test_under_the_projected_order_only_the_second_car_brakes_and_gently(condition):
-    trial = await play(condition, ProjectedOrderDriver)
+    trial = await play(condition, "projected-order")
     first = trial.merged_first
     assert {row.acceleration_mps2 for row in trial.states if row.side == first} == {0.0}
     braking = [row.acceleration_mps2 for row in trial.states if row.side != first]
@@ -67,7 +63,7 @@ async def test_under_the_projected_order_only_the_second_car_brakes_and_gently(c
 @pytest.mark.parametrize("condition", CONDITIONS)
 async def test_under_the_projected_order_a_human_gap_is_open_at_the_merge_point(condition):
     """Net of the vehicle length, at the moment when the first car is there: 3.85 m."""
-    trial = await play(condition, ProjectedOrderDriver)
+    trial = await play(condition, "projected-order")
     first = [row.position_m for row in trial.states if row.side == trial.merged_first]
     second = [row.position_m for row in trial.states if row.side != trial.merged_first]
     step = next(k for k, position in enumerate(first) if position >= MERGE_POINT_M)
@@ -77,7 +73,7 @@ async def test_under_the_projected_order_a_human_gap_is_open_at_the_merge_point(
     assert MERGE_POINT_M - behind - LENGTH_M == pytest.approx(3.85, abs=0.01)
 
 
-@pytest.mark.parametrize("driver", [constant, ProjectedOrderDriver])
+@pytest.mark.parametrize("driver", ["constant", "projected-order"])
 async def test_a_program_holds_one_action_over_a_whole_plan(driver):
     trial = await play("L_4_-8", driver)
     for row in trial.decisions:

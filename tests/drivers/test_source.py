@@ -100,10 +100,10 @@ async def test_an_edited_program_is_played_anew(merge_runner, tmp_path):
     again = await merge_runner(*part, "--json")
     assert again.summary["trials"]["stored_before"] == 1
     edited = tmp_path / "edited"
-    for folder in ("merge_runner", "experiments"):
+    for folder in ("merge_runner", "analysis", "experiments"):
         shutil.copytree(PROJECT / folder, edited / folder)
     driver = edited / "merge_runner/drivers/constant.py"
-    driver.write_text(driver.read_text().replace("held(0.0,", "held(0.1,"))
+    driver.write_text(driver.read_text().replace("held(0.0)", "held(0.1)"))
     run = await merge_runner.start(*part, "--json", PYTHONPATH=str(edited))
     out, _ = await run.communicate()
     assert b'"stored_before": 0' in out

@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import pytest
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.server import serve
 from merge_runner.prompts.render import render_prompt
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 
@@ -27,6 +28,6 @@ async def emulator():
 @pytest.fixture(scope="session")
 def driving_prompt():
     """What the left driver is asked first in a symmetric trial."""
-    scenario = Scenario()
-    seen = World(scenario, CONDITIONS["N_0_0"]).observe("left")
+    scenario = ScenarioConfig()
+    seen = World(scenario, CONDITIONS["N_0_0"], TRACK).observe("left")
     return render_prompt(seen, None, variant="baseline", scenario=scenario)

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner.config import Scenario
-from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.emulator.chance import draw, draw_between, draw_index
 from merge_runner.emulator.driver import answer
 from merge_runner.llm.keys import make_request
@@ -17,21 +17,22 @@ from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import SIDES, ChatReply, Slot, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.trial import play_trial
 
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 SAMPLE_SETS = range(6)
 REPETITIONS = range(1, 11)
 
 
 def first_prompt(condition, side, variant="baseline"):
-    seen = World(SCENARIO, CONDITIONS[condition]).observe(side)
+    seen = World(SCENARIO, CONDITIONS[condition], TRACK).observe(side)
     return render_prompt(seen, None, variant=variant, scenario=SCENARIO)
 
 
 def straight_prompt(variant="baseline", previous=None, **changes):
-    seen = World(SCENARIO, CONDITIONS["L_4_0"]).observe("right")
+    seen = World(SCENARIO, CONDITIONS["L_4_0"], TRACK).observe("right")
     seen = replace(seen, road="straight", distance_to_merge_m=None, **changes)
     return render_prompt(seen, previous, variant=variant, scenario=SCENARIO)
 
@@ -55,21 +56,17 @@ def first_action(prompt, slot=None):
 async def play(condition, repetition, sample_set):
     """A trial in this process, the scripted driver on either side."""
 
-    def ask_as(side):
-        async def ask(prompt, number):
-            slot = Slot(condition, repetition, side, number, sample_set)
-            request = make_request(
-                provider="emulator",
-                endpoint="emulator",
-                model="scripted-driver",
-                path="/",
-                headers={},
-                body={"prompt": prompt},
-                slot=slot,
-            )
-            return ChatReply(answer(prompt, slot), "ok", request, (), earlier=0)
-
-        return ask
+    async def ask(prompt, slot, _):
+        request = make_request(
+            provider="emulator",
+            endpoint="emulator",
+            model="scripted-driver",
+            path="/",
+            headers={},
+            body={"prompt": prompt},
+            slot=slot,
+        )
+        return ChatReply(answer(prompt, slot), "ok", request, (), earlier=0)
 
     spec = TrialSpec(
         trial_id="t",
@@ -83,7 +80,7 @@ async def play(condition, repetition, sample_set):
         sample_set=sample_set,
         order=0,
     )
-    drivers = {side: LlmDriver(ask_as(side), "baseline", SCENARIO) for side in SIDES}
+    drivers = {side: LanguageModel(ask).make(SCENARIO, spec, side) for side in SIDES}
     return await play_trial(spec, SCENARIO, drivers)
 
 

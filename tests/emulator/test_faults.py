@@ -7,7 +7,6 @@ from collections import Counter
 import pytest
 
 from merge_runner.emulator.faults import FAULTS, TRANSIENT, FaultPlan, load_faults, transient_faults
-from merge_runner.emulator.scenarios import SCENARIOS
 from merge_runner.errors import UsageError
 from tests.harness import PROJECT
 
@@ -38,11 +37,9 @@ def test_a_fault_is_a_function_of_seed_request_and_attempt():
 
 def test_each_fault_occurs_at_its_rate():
     rates = {"rate_limit": 0.1, "hang": 0.04, "reset": 0.3, "refused": 0.02, "malformed": 0.2}
-    scenarios = {"openai/ok": 0.1, "gemini/bare": 0.05}
-    counts = drawn(FaultPlan(seed=7, rates=rates, scenarios=scenarios))
-    expected = {**rates, **scenarios}
-    assert set(counts) == {*expected, None}
-    for fault, rate in {**expected, None: 1 - sum(expected.values())}.items():
+    counts = drawn(FaultPlan(seed=7, rates=rates))
+    assert set(counts) == {*rates, None}
+    for fault, rate in {**rates, None: 1 - sum(rates.values())}.items():
         standard_error = math.sqrt(rate * (1 - rate) / DRAWS)
         assert abs(counts[fault] / DRAWS - rate) < 4 * standard_error
 
@@ -98,29 +95,21 @@ def test_a_rate_that_is_no_probability_is_refused(rate):
 def test_a_file_sets_every_part_of_a_plan(tmp_path):
     plan = load(
         tmp_path,
-        "seed = 3\nlatency_s = 0.5\ndelay_s = 2\nhang_s = 7\n[rates]\nreset = 0.25\nempty = 0.1\n"
-        '[scenarios]\n"openai/insufficient_quota" = 0.2\n',
+        "seed = 3\nlatency_s = 0.5\ndelay_s = 2\nhang_s = 7\n[rates]\nreset = 0.25\nempty = 0.1\n",
     )
     assert plan == FaultPlan(
         seed=3,
         rates={"reset": 0.25, "empty": 0.1},
-        scenarios={"openai/insufficient_quota": 0.2},
         latency_s=0.5,
         delay_s=2,
         hang_s=7,
     )
 
 
-def test_the_file_of_the_docs_is_one_and_every_scenario_is_told(tmp_path):
+def test_the_file_of_the_docs_is_one_and_has_every_fault(tmp_path):
     page = (PROJECT / "docs/reference/emulator.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    plan = load(tmp_path, example)
-    assert set(plan.rates) == set(FAULTS)
-    assert plan.scenarios
-    rows = dict(re.findall(r"^\| `(\w+)/…` \| (.*) \|$", page, re.MULTILINE))
-    for scenario in SCENARIOS:
-        provider, name = scenario.split("/")
-        assert f"`{name}`" in rows.get(provider, "") or f"`{scenario}`" in page, scenario
+    assert set(load(tmp_path, example).rates) == set(FAULTS)
 
 
 def test_an_unknown_fault_is_refused_with_the_valid_ones(tmp_path):
@@ -129,23 +118,17 @@ def test_an_unknown_fault_is_refused_with_the_valid_ones(tmp_path):
     assert all(fault in str(refusal.value) for fault in FAULTS)
 
 
-def test_an_unknown_scenario_is_refused_in_one_line_with_the_valid_ones(tmp_path):
-    with pytest.raises(UsageError, match="openai/insuficient_quota") as refusal:
-        load(tmp_path, '[scenarios]\n"openai/insuficient_quota" = 0.1\n')
-    assert all(scenario in str(refusal.value) for scenario in SCENARIOS)
-    assert "\n" not in str(refusal.value)
-
-
-def test_what_plays_scenarios_is_told_apart_from_what_does_not():
+def test_faults_that_change_outcomes_are_told_apart_from_those_that_pass():
     plans = [
         FaultPlan(),
-        FaultPlan(scenarios={"openai/refusal": 0.1}),
-        FaultPlan(scenarios={"openai/refusal": 0.2}),
-        FaultPlan(scenarios={"openai/refusal": 0.1}, seed=1),
-        FaultPlan(scenarios={"openai/refusal": 0.1}, rates={"empty": 0.1}),
+        FaultPlan(rates={"refused": 0.1}),
+        FaultPlan(rates={"refused": 0.2}),
+        FaultPlan(rates={"refused": 0.1}, seed=1),
+        FaultPlan(rates={"refused": 0.1, "empty": 0.1}),
     ]
     assert len({plan.identity for plan in plans}) == len(plans)
-    assert plans[0].identity == FaultPlan(scenarios={"openai/refusal": 0.0}).identity == ""
+    passing = FaultPlan(rates={"refused": 0.0, "reset": 0.5}, seed=1)
+    assert plans[0].identity == passing.identity == ""
 
 
 def test_an_unknown_key_is_refused_by_name(tmp_path):
@@ -167,9 +150,6 @@ def test_the_refusal_of_an_unknown_key_lists_the_valid_ones(tmp_path):
         "[rates]\nreset = nan\n",
         "[rates]\nreset = 'often'\n",
         "rates = 0.5\n",
-        "scenarios = 0.5\n",
-        '[scenarios]\n"openai/ok" = 2\n',
-        '[scenarios]\n"openai/ok" = 0.7\n[rates]\nreset = 0.7\n',
         "seed = 'x'\n",
         "latency_s = -1\n",
         "delay_s = -1\n",

@@ -9,13 +9,13 @@ import aiohttp
 import pytest
 
 from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.scenarios import SCENARIOS
 from merge_runner.emulator.server import run, serve
 from merge_runner.errors import UsageError
-from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.base import read_error
+from merge_runner.llm.formats.delays import server_delay_s
 from merge_runner.prompts.parse import parse_reply
-from merge_runner.records import ANSWERED_FIELD, SCRIPTED_FIELD, SCRIPTED_HEADER, says_scripted
+from merge_runner.records import ANSWERED_FIELD, SCRIPTED_FIELD, SCRIPTED_HEADER
 
 WIRES = ("openai-chat", "openai-responses", "gemini", "anthropic")
 PATHS = {
@@ -346,7 +346,7 @@ async def test_a_status_fault_is_an_error_in_the_providers_envelope(
     assert headers["content-type"].startswith("application/json")
     assert error_names(wire, body)
     assert body["error"]["message"]
-    assert server_delay_s(headers, body) is None
+    assert server_delay_s(read_error(429, headers, "", body), FORMATS.values()) is None
     if wire == "gemini":
         assert body["error"]["code"] == status
 
@@ -374,7 +374,8 @@ async def test_a_rate_limit_says_in_the_providers_way_how_long_to_wait(
     if wire != "anthropic":
         assert "retry-after" not in got
     lower = {name.lower(): value for name, value in got.items()}
-    assert server_delay_s(lower, body) == pytest.approx(wait_s, abs=0.0005)
+    error = read_error(429, lower, "", body)
+    assert server_delay_s(error, FORMATS.values()) == pytest.approx(wait_s, abs=0.0005)
 
 
 @all_wires
@@ -422,34 +423,6 @@ async def test_a_malformed_answer_is_prose_without_a_plan(emulator, driving_prom
     assert (status, reading.outcome) == (200, "ok")
     parsed = parse_reply(reading.text, 20)
     assert (parsed.failure, parsed.tactical) == ("no_array", "M")
-
-
-async def test_a_scenario_is_played_in_the_formats_that_it_concerns(emulator, driving_prompt):
-    url = await emulator(FaultPlan(scenarios={"openai/insufficient_quota": 1.0}))
-    for wire, expected in zip(WIRES, (429, 429, 200, 200), strict=True):
-        status, _, body = await ask(url, wire, driving_prompt)
-        assert status == expected
-        if status == 429:
-            assert error_names(wire, body) == {"insufficient_quota"}
-
-
-async def test_a_scenarios_answer_is_the_ordinary_one_but_for_what_it_changes(
-    emulator, driving_prompt
-):
-    url = await emulator(FaultPlan(scenarios={"gemini/substituted": 1.0}))
-    _, _, played = await ask(url, "gemini", driving_prompt)
-    _, _, usual = await ask(await emulator(), "gemini", driving_prompt)
-    assert played == usual | {"modelVersion": "gemini-3.8-flash"}
-
-
-async def test_a_scenario_tells_points_in_time_from_now_on(emulator, driving_prompt):
-    url = await emulator(FaultPlan(scenarios={"anthropic/rate_limit": 1.0}))
-    status, headers, body = await ask(url, "anthropic", driving_prompt)
-    assert status == 429
-    assert re.fullmatch(
-        r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", headers["anthropic-ratelimit-requests-reset"]
-    )
-    assert 30 < server_delay_s({k.lower(): v for k, v in headers.items()}, body) <= 42
 
 
 async def test_a_reset_is_one(emulator):
@@ -611,23 +584,6 @@ async def test_every_reply_says_that_a_stand_in_made_it(emulator, driving_prompt
     assert headers[SCRIPTED_HEADER] == "true"
     if fault != "bad_gateway":  # an HTML page
         assert json.loads(body)[SCRIPTED_FIELD] is True
-
-
-PLAYED = [
-    (name, wire)
-    for name, scenes in SCENARIOS.items()
-    for wire, scene in scenes.items()
-    if not (scene.breaks or scene.after_s)
-]
-
-
-@pytest.mark.parametrize(("scenario", "wire"), PLAYED)
-async def test_every_scene_says_that_a_stand_in_plays_it(emulator, driving_prompt, scenario, wire):
-    url = await emulator(FaultPlan(scenarios={scenario: 1.0}))
-    _, headers, body = await post(url, PATHS[wire], body_for(wire, driving_prompt))
-    assert headers[SCRIPTED_HEADER] == "true"
-    if headers["content-type"].startswith("application/json"):
-        assert says_scripted(body.decode())
 
 
 async def test_a_reply_that_is_cut_off_says_it_too(emulator):

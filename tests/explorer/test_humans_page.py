@@ -12,12 +12,13 @@ from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
-from analysis.explorer.pages.humans import KINDS, chart
+from analysis.explorer.pages.humans import HUMAN, chart, kinds, marker, marks
 from analysis.explorer.site import Site
+from analysis.figures.styles import HUMAN_STYLE, MARKERS, driver_style
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
 from analysis.tables.notes import sample_notes
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.recordings import drive, write_folder
@@ -35,7 +36,9 @@ KILLED = [
 @pytest.fixture
 def db(tmp_path):
     return write_study(
-        tmp_path / "t.duckdb", [*yielding("o3", reps=5), *KILLED], Scenario(vehicle_length_m=4)
+        tmp_path / "t.duckdb",
+        [*yielding("o3", reps=5), *KILLED],
+        ScenarioConfig(vehicle_length_m=4),
     )
 
 
@@ -95,10 +98,22 @@ def test_the_page_says_what_counts_as_a_collision_for_whom(ask):
     assert "human: their outlines overlapped, looked for 20 times a second" in text
 
 
+def test_a_driver_looks_as_in_the_figures_and_no_other_driver_does():
+    groups = [{"id": HUMAN, "driver": HUMAN}]
+    groups += [{"id": f"{i}/baseline", "driver": str(i)} for i in range(12)]
+    human, *drivers = marks(groups).values()
+    assert human.style == HUMAN_STYLE
+    assert [mark.style for mark in drivers] == [driver_style(i) for i in range(12)]
+    assert len({mark.style for mark in drivers}) == 12
+    shapes = {mark.style.shape for mark in (human, *drivers)}
+    assert shapes == set(MARKERS)
+    assert len({marker(shape, 7, 7) for shape in shapes}) == len(shapes)
+
+
 def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
     content = Numbers(db).answer(["humans"])
     gap, rmse = (
-        next(kind for kind in KINDS if kind.name == name) for name in ("gap_m", "rmse_mps")
+        next(kind for kind in kinds() if kind.name == name) for name in ("gap_m", "rmse_mps")
     )
     (killed,) = (group for group in content["groups"] if group["id"] == "killed/baseline")
     huge = killed["conditions"]["L_4_0"]["gap_m"]

@@ -15,7 +15,7 @@ from analysis.explorer.site import Site
 from analysis.explorer.views import collision_bounds
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.collision import collided
 from tests.analysis.recordings import drive, write_folder
@@ -36,7 +36,7 @@ RULES = {
 @pytest.fixture
 def study_of(tmp_path):
     def write(rule):
-        scenario = Scenario(vehicle_length_m=6, vehicle_width_m=2.4, collision_rule=rule)
+        scenario = ScenarioConfig(vehicle_length_m=6, vehicle_width_m=2.4, collision_rule=rule)
         return write_study(tmp_path / f"{rule}.duckdb", [MEETING, PASSING], scenario)
 
     return write
@@ -80,10 +80,12 @@ def test_the_band_of_the_chart_holds_the_headways_that_collide(study_of, rule):
     places = zip(*(samples["position_m"] for samples in trial.states.values()), strict=True)
     for bound, (left, right) in zip(bounds, places, strict=True):
         mean = (left + right) / 2
-        assert collided(trial.scenario, left, right) == (abs(left - right) < (bound or 0))
+        assert collided(trial.scenario, trial.track, left, right) == (
+            abs(left - right) < (bound or 0)
+        )
         if rule != "shared_lane":
             assert bound is None or collided(
-                trial.scenario, mean + bound / 2 - 0.01, mean - bound / 2 + 0.01
+                trial.scenario, trial.track, mean + bound / 2 - 0.01, mean - bound / 2 + 0.01
             )
     assert max(filter(None, bounds)) == pytest.approx(6, abs=0.2)
 

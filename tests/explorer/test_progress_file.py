@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from merge_runner.results.progress_file import ProgressFile, clear_dead, read_standing
-from merge_runner.run.local_runner import Players
+from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Choice, make_plan
 from merge_runner.run.progress import Progress
 from merge_runner.run.sweep import Options, Sweep
@@ -158,9 +158,9 @@ def test_a_file_that_is_none_of_ours_says_nothing(tmp_path, text):
 
 def test_trials_are_told_cell_by_cell():
     cells = [("baseline", "N_0_0"), ("A1", "N_0_0")]
-    players = Players(None, {}, 1)
-    players.playing[cells[1]] += 1
-    progress = Progress("t", 5, planned=dict.fromkeys(cells, 3), crew=players)
+    runner = LocalRunner(None, {}, 1)
+    runner.playing[cells[1]] += 1
+    progress = Progress("t", 5, planned=dict.fromkeys(cells, 3), runner=runner)
     progress.stored[cells[0]] = 1
     for status in ("collided", "failed", "suspended"):
         progress.count(cells[0], status)

@@ -18,7 +18,7 @@ from analysis.explorer.app import explorer
 from analysis.explorer.pages import sweep as page
 from analysis.explorer.pages.trials import filter_of
 from analysis.explorer.site import Site
-from analysis.explorer.sweeps import Config, Entry, config_of, verdict_of
+from analysis.explorer.sweeps import Config, ListedSweep, assessment_of, config_of
 from merge_runner.audit.expected import ModelFacts
 from merge_runner.results.progress_file import ProgressFile
 from merge_runner.results.store import Store, sweep_facts
@@ -228,18 +228,18 @@ def test_while_it_runs_the_cells_are_those_of_its_progress_file(study):
 def test_the_verdict_says_how_it_ended_and_what_to_type(code, ended, failed, kind, words, goes_on):
     row = {"sweep_id": "s", "name": "baseline", "exit_code": code, "trials": ended + failed,
            "failed": failed, "ended_at": None if code is None else END}  # fmt: skip
-    entry = Entry(row, config_of(json.dumps(CONFIG)), None)
-    verdict = verdict_of(entry, "", 0)
+    entry = ListedSweep(row, config_of(json.dumps(CONFIG)), None)
+    verdict = assessment_of(entry, "", 0)
     assert verdict.kind == kind
     assert words in verdict.text
     assert verdict.command == ("merge-runner sweep baseline --model o3" if goes_on else "")
-    assert verdict_of(entry, "later", 0).command == ""
+    assert assessment_of(entry, "later", 0).command == ""
 
 
 def test_a_finished_sweep_that_another_model_answered_is_doubtful():
     row = {"sweep_id": "s", "name": "n", "exit_code": 0, "trials": 0, "failed": 0, "ended_at": END}
-    entry = Entry(row, Config(models={"o3": ModelFacts(id="o3", provider="openai")}), None)
-    assert verdict_of(entry, "", 7).kind == "doubtful"
+    entry = ListedSweep(row, Config(models={"o3": ModelFacts(id="o3", provider="openai")}), None)
+    assert assessment_of(entry, "", 7).kind == "doubtful"
 
 
 async def test_a_stream_tells_what_is_new_and_ends_with_the_sweep(study, monkeypatch):

@@ -27,10 +27,10 @@ from analysis.explorer.analysis_process import (
 from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
 from analysis.explorer.pages.ablations import ablations
-from analysis.explorer.pages.humans import KINDS, scale
+from analysis.explorer.pages.humans import kinds, scale
 from analysis.explorer.pages.tables import ABOUT
 from analysis.explorer.site import Site
-from analysis.stats.measures import MEASURES
+from analysis.metrics import shown_in
 from analysis.tables import TABLES, make_tables
 from merge_runner.errors import MergeRunnerError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -282,14 +282,14 @@ def test_an_ablation_has_the_numbers_of_both_tables(ask, db):
         assert base.difference is None
     text = ask("/ablations")
     assert "without C1: history" in text
-    assert text.count("<svg") == len(MEASURES)
+    assert text.count("<svg") == len(shown_in("tables"))
     assert "/discordant?model=o3&amp;variant=A1&amp;by=outcome" in text
 
 
 def test_humans_stand_in_every_condition_with_both_denominators(ask):
     text = ask("/humans")
     panels = re.findall(r'<text class="condition"[^>]*>([^<]+)<', text)
-    assert panels == list(CONDITIONS) * len(KINDS)
+    assert panels == list(CONDITIONS) * len(kinds())
     # The published counts: 28 of 990 collided; o3 lost no baseline trial.
     assert re.search(r"<strong>28</strong> of 990 ended.*?of 990 trials", text, re.DOTALL)
     assert re.search(r"<strong>0</strong> of 33 ended.*?of 33 trials", text, re.DOTALL)
@@ -383,6 +383,6 @@ def test_a_process_of_its_own_answers_alike_and_its_end_is_a_failure(db):
     ],
 )
 def test_a_scale_holds_all_that_is_shown_and_0(kind, reached, ends):
-    low, high, ticks = scale(next(each for each in KINDS if each.name == kind), *reached)
+    low, high, ticks = scale(next(each for each in kinds() if each.name == kind), *reached)
     assert (low, high) == ends
     assert {low, 0, high} <= {round(tick, 6) for tick in ticks}

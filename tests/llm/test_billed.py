@@ -11,7 +11,6 @@ import itertools
 import json
 import tempfile
 from collections.abc import Iterator
-from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,8 +19,6 @@ from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry, Price
 from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.scenarios import SCENARIOS
-from merge_runner.emulator.server import HOST, Emulator
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
@@ -33,6 +30,8 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import pricing
 from merge_runner.records import Slot, Usage
+from tests.emulator.scenarios import SCENARIOS
+from tests.emulator.scenarios.playing import ScenarioPlan, playing
 from tests.llm.test_scenarios import (  # noqa: F401 # fixtures
     GEMINI,
     MODELS,
@@ -149,24 +148,10 @@ def entry_of(wire, **changes):
     return ModelEntry(**fields | changes)
 
 
-@asynccontextmanager
-async def billing(till, faults):
-    """An emulator that plays these faults and bills what it does."""
-    app = Emulator(faults).app
-    app.middlewares.append(till.middle)
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.01)
-    await runner.setup()
-    await web.TCPSite(runner, HOST, 0).start()
-    try:
-        yield f"http://{HOST}:{runner.addresses[0][1]}"
-    finally:
-        await runner.cleanup()
-
-
 async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
     """Ask for samples at once under a cap of so many worst cases; returns client and cap in USD."""
     entry = entry_of(till.wire)
-    async with billing(till, faults) as url:
+    async with playing(faults, till.middle) as url:
         base_url = f"{url}/v1" if till.wire in OPENAI else url
         transport = HttpTransport(Endpoint("openai", name, base_url, {}), connections=calls)
         client = LlmClient(
@@ -208,7 +193,7 @@ def slot(number):
 @in_virtual_time
 async def test_no_scenario_bills_more_than_the_cap(cache, shares, scenario, wire, tells):
     till = Till(wire, tells, pricing(entry_of(wire)))
-    faults = FaultPlan(seed=3, scenarios={scenario: 0.7}, hang_s=600)
+    faults = ScenarioPlan(seed=3, scenario=scenario, rate=0.7, hang_s=600)
     name = f"https://gateway/{scenario}/{wire}/{tells}"
     client, cap_usd = await asked(cache, till, faults, cap=4.5, name=name)
     spending = client.budget.ledger.read()

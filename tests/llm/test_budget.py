@@ -40,15 +40,26 @@ def ledger(cache, request):
     return Ledger(cache, request.node.name)
 
 
+def asked(worst, driver=""):
+    return Asked(driver, "", worst)
+
+
+def tried(actual, outcome="server_error"):
+    return [Attempt(1, outcome, cost_usd=actual)]
+
+
 async def attempt(budget, trial, worst, actual, turns=0):
     """Spend on one attempt as a client does."""
     await budget.admit(trial)
-    await budget.reserve(trial, worst)
-    await budget.begin("key", [], worst)
-    for _ in range(turns):
-        await asyncio.sleep(0)
-    await budget.ledger.settle("key", [], worst, actual)
-    budget.settled(trial, worst if actual == 0 else 0.0)
+    async with budget.attempt(trial, "key", asked(worst)) as paid:
+        await paid.begin([])
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await paid.settle(tried(actual))
+
+
+def set_aside(budget, trial, worst, driver=""):
+    return budget.set_aside(trial, f"key {trial}", asked(worst, driver))
 
 
 async def soon(job):
@@ -115,29 +126,29 @@ async def test_an_attempt_of_unknown_cost_counts_with_its_worst_case_for_ever(le
 
 async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
     dead = Budget(ledger, cap_usd=1.0)
-    await dead.reserve(1, 0.75)
-    await dead.begin("a key", [], 0.75)
-    assert [a.outcome for a in cache.unanswered("a key")] == ["unknown"]
+    paid = await set_aside(dead, 1, 0.75)
+    await paid.begin([])
+    assert [a.outcome for a in cache.unanswered("key 1")] == ["unknown"]
     with pytest.raises(TrialSuspended):
-        await Budget(ledger, cap_usd=1.0).reserve(1, 0.5)
+        await set_aside(Budget(ledger, cap_usd=1.0), 1, 0.5)
 
 
 async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, cache):
     both = [Budget(Ledger(cache, "shared"), cap_usd=1.0) for _ in range(2)]
-    for budget in both:
-        await budget.reserve(1, 0.75)  # neither knows of the other's yet
-    await both[0].begin("a", [], 0.75)
+    # Neither knows of the other's yet.
+    paid = [await set_aside(budget, trial, 0.75) for trial, budget in enumerate(both)]
+    await paid[0].begin([])
     with pytest.raises(TrialSuspended, match="another run"):
-        await both[1].begin("b", [], 0.75)
+        await paid[1].begin([])
     assert both[1].ledger.read().committed_usd == 0.75
 
 
 async def test_a_reservation_waits_for_what_is_in_flight(ledger):
     budget = Budget(ledger, cap_usd=1.0)
-    await budget.reserve(1, 0.75)
-    waiting = await soon(budget.reserve(2, 0.5))
+    paid = await set_aside(budget, 1, 0.75)
+    waiting = await soon(set_aside(budget, 2, 0.5))
     assert not waiting.done()
-    budget.give_back(1, 0.75)
+    paid.close()
     await waiting
 
 
@@ -193,7 +204,7 @@ async def test_without_money_for_a_whole_trial_none_begins(ledger):
 async def test_a_begun_trial_is_paid_before_another_begins(ledger):
     budget = Budget(ledger, cap_usd=5.0, trial_usd=4.0)
     await budget.admit(1)
-    other = await soon(budget.reserve(2, 2.0))  # 4 of 5 USD are the first trial's
+    other = await soon(set_aside(budget, 2, 2.0))  # 4 of 5 USD are the first trial's
     assert not other.done()
     await attempt(budget, 1, 4.0, 4.0)
     budget.leave(1)
@@ -277,13 +288,13 @@ async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
 async def test_what_is_released_counts_no_longer_and_stays_visible(ledger, cache):
     await attempt(Budget(ledger, cap_usd=1.0), 1, 0.75, None)
     with pytest.raises(TrialSuspended):
-        await Budget(ledger, cap_usd=1.0).reserve(1, 0.5)
+        await set_aside(Budget(ledger, cap_usd=1.0), 1, 0.5)
     released = ledger.release()
     assert (released.usd, released.attempts) == (0.75, 1)
     again = Ledger(cache, ledger._name.removeprefix("spent "))
     assert (again.spending.committed_usd, again.reasons()) == (0, [])
     assert again.spending.releases == [released]
-    await Budget(again, cap_usd=1.0).reserve(1, 0.5)
+    await set_aside(Budget(again, cap_usd=1.0), 1, 0.5)
 
 
 async def test_a_ledger_of_an_earlier_version_is_read_and_says_that_it_noted_no_reason(
@@ -309,28 +320,28 @@ async def test_a_damaged_reason_changes_no_sum(ledger, cache):
 
 async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
     budget = Budget(ledger, cap_usd=10.0)
-    aside = await budget.reserve(1, 0.25, O3.driver)
-    await budget.begin("key", [], aside, O3)
-    await ledger.settle("key", [Attempt(1, "server_error")], aside, 0.75)
-    budget.settled(1)
+    async with budget.attempt(1, "key", O3) as paid:
+        await paid.begin([])
+        await paid.settle(tried(0.75))
     assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
     assert ledger.spending.dearest == "o3 at gateway up to 3.00 times as much"
     next_run = Budget(Ledger(cache, ledger._name.removeprefix("spent ")), cap_usd=10.0)
-    assert await next_run.reserve(1, 0.25, O3.driver) == 0.75
-    assert await next_run.reserve(1, 0.25, "another driver") == 0.25
-    # A reply within what is now set aside does not count as another overrun of it.
-    await next_run.begin("other", [], 0.75, O3)
-    await ledger.settle("other", [Attempt(1, "server_error")], 0.75, 0.5)
+    assert (await set_aside(next_run, 2, 0.25, "another driver")).aside_usd == 0.25
+    async with next_run.attempt(1, "other", O3) as paid:
+        assert paid.aside_usd == 0.75
+        await paid.begin([])
+        # A reply within what is now set aside does not count as another overrun of it.
+        await paid.settle(tried(0.5))
     assert ledger.spending.times(O3.driver) == 3
 
 
 async def test_several_are_in_flight_only_while_twice_their_worst_cases_fit(ledger):
     budget = Budget(ledger, cap_usd=1.0)
-    await budget.reserve(1, 0.25)
-    await budget.reserve(2, 0.25)  # 2 x 0.5 fit
-    third = await soon(budget.reserve(3, 0.25))
+    paid = await set_aside(budget, 1, 0.25)
+    await set_aside(budget, 2, 0.25)  # 2 x 0.5 fit
+    third = await soon(set_aside(budget, 3, 0.25))
     assert not third.done()
-    budget.give_back(1, 0.25)
+    paid.close()
     await third
     third.result()
 
@@ -341,9 +352,42 @@ async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):
     await attempt(budget, 1, 0.5, None)
     await budget.admit(2)
     with pytest.raises(TrialSuspended) as caught:
-        await asyncio.gather(budget.reserve(1, 4.0), budget.reserve(2, 4.0))
+        await asyncio.gather(set_aside(budget, 1, 4.0), set_aside(budget, 2, 4.0))
     assert str(caught.value) == (
         "the next call may cost 4.0000 USD, and 1.0000 of 5 USD are spent or set aside (0.5000 "
         "spent, 0.5000 set aside for 1 attempts whose cost is not known: `merge-runner ledger`); "
         "2.5000 more are kept for the trials that have begun"
     )
+
+
+ENDS = {
+    "cancelled before it was sent": (False, [], asyncio.CancelledError, (1.0, 0.0, 0.0)),
+    "refused before it was sent": (False, [], UsageError, (1.0, 0.0, 0.0)),
+    "dropped in flight": (True, [], asyncio.CancelledError, (0.5, 0.5, 0.0)),
+    "of unknown cost": (True, tried(None), TrialSuspended, (0.5, 0.5, 0.0)),
+    "free": (True, tried(0.0), TrialSuspended, (1.0, 0.0, 0.0)),
+    "charged": (True, tried(0.25), TrialSuspended, (0.5, 0.0, 0.25)),
+}
+
+
+@pytest.mark.parametrize(("begun", "attempts", "error", "money"), ENDS.values(), ids=list(ENDS))
+async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
+    ledger, begun, attempts, error, money
+):
+    """``money``: what is allowed to the trial, set aside for ever, and spent."""
+    budget = Budget(ledger, cap_usd=1.0, trial_usd=1.0)
+    await budget.admit(1)
+
+    async def ended():
+        async with budget.attempt(1, "key", asked(0.5)) as paid:
+            if begun:
+                await paid.begin([])
+            if attempts:
+                await paid.settle(attempts)
+            raise error("whatever")
+
+    with pytest.raises(error):
+        await ended()
+    spending = budget.ledger.read()
+    assert (budget._allowances[1], spending.reserved_usd, spending.spent_usd) == money
+    assert (budget._in_flight, budget._queued_usd) == (0, 0)

@@ -19,8 +19,9 @@ from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
+from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.transport import SealedTransport, TransportFailure
 from merge_runner.records import Slot
@@ -405,7 +406,7 @@ async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     client.transport.open.clear()
     asked = asyncio.create_task(client.ask("prompt", slot()))
     await ticks()
-    assert client.flying == 1
+    assert client.in_flight_calls == 1
     asked.cancel()
     drained = asyncio.create_task(client.drain())
     await ticks()
@@ -413,7 +414,7 @@ async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     assert not drained.done()
     client.transport.open.set()
     await drained
-    assert client.flying == 0
+    assert client.in_flight_calls == 0
     (kept,) = cache.entries()
     assert kept.request == client.transport.sent[0]
     assert outcomes(kept.attempts) == ["ok"]
@@ -560,7 +561,7 @@ async def test_a_call_that_gets_no_turn_gives_its_money_back(make):
     await ticks()
     await client.drain()
     await asyncio.gather(asked, return_exceptions=True)
-    await client.budget.reserve(0, 0.0015)
+    await client.budget.set_aside(0, "key", Asked("", "", 0.0015))
     assert client.budget.ledger.read().committed_usd == 0
 
 
@@ -669,3 +670,32 @@ async def test_the_call_with_the_lowest_order_is_sent_first(make):
     orders = [3, 1, 2, 0]
     await asyncio.gather(*(client.ask("prompt", slot(n + 1), order=n) for n in orders))
     assert [request.slot.repetition for request in client.transport.sent] == [1, 2, 3, 4]
+
+
+@in_virtual_time
+async def test_a_call_knows_itself_whether_it_is_in_flight(make, cache):
+    """A cluster's worker takes its meter away twice a second; that gives no call up."""
+    client = make(error(503, retry_after="300"), answer("paid for"))
+    retrying = asyncio.create_task(client.ask("prompt", slot(1)))
+    await ticks()
+    client.transport.open.clear()
+    flying = asyncio.create_task(client.ask("prompt", slot(2)))
+    while client.in_flight_calls != 1 or len(client.transport.sent) < 2:
+        await asyncio.sleep(0)
+    client.meter = Meter()
+    assert [wait.what for wait in client.waits] == ["after HTTP 503: m"]
+    drained = asyncio.create_task(client.drain())
+    await ticks()
+    client.transport.open.set()
+    await drained
+    results = await asyncio.gather(retrying, flying, return_exceptions=True)
+    assert [getattr(result, "text", None) for result in results] == [None, "paid for"]
+    assert (client.waits, client.in_flight_calls) == ([], 0)
+
+
+@in_virtual_time
+async def test_attempts_at_a_free_model_are_kept_as_they_fail(make, cache):
+    client = make(error(503), error(400))
+    with pytest.raises(CallFailed) as caught:
+        await client.ask("prompt", slot())
+    assert cache.unanswered(caught.value.request.key) == caught.value.attempts

@@ -4,13 +4,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.llm.delays import MOST_S, duration_s, server_delay_s
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.base import read_error
+from merge_runner.llm.formats.delays import MOST_S, duration_s, server_delay_s
 
 NOW = datetime(2026, 10, 21, 7, 28, 0, tzinfo=UTC)
 
 
 def delay(headers=None, payload=None):
-    return server_delay_s(headers or {}, payload, lambda: NOW)
+    return server_delay_s(read_error(429, headers or {}, "", payload), FORMATS.values(), NOW)
 
 
 def message(text):

@@ -61,9 +61,7 @@ async def test_the_others_wait_until_the_first_call_is_answered(begin):
     asked = ask_all(client)
     await ticks()
     assert len(client.transport.sent) == 1
-    assert [wait.what for wait in client.meter.waits.values()] == [
-        "for the first answer of my-model"
-    ] * 4
+    assert [wait.what for wait in client.waits] == ["for the first answer of my-model"] * 4
     client.transport.open.set()
     await asyncio.gather(*asked)
     assert len(client.transport.sent) == 5
@@ -155,7 +153,7 @@ async def test_a_first_call_that_is_given_up_lets_the_next_one_go(begin):
     asked = ask_all(client, 2)
     await ticks()
     for call in client._calls.values():
-        call.cancel()
+        call.task.cancel()
         break
     await ticks()
     assert len(client.transport.sent) == 2

@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 from aiohttp import web
 
-from merge_runner.config import Endpoint, ModelEntry, Scenario, resolve_endpoint
+from merge_runner.config import Endpoint, ModelEntry, ScenarioConfig, resolve_endpoint
 from merge_runner.emulator.driver import answer
 from merge_runner.emulator.faults import FaultPlan, transient_faults
 from merge_runner.emulator.server import serve
@@ -27,6 +27,7 @@ from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 SLOT = Slot("N_0_0", 1, "left", 0, 0)
@@ -407,8 +408,8 @@ def is_quick(plan):
 
 
 def driving_prompt():
-    scenario = Scenario()
-    seen = World(scenario, CONDITIONS["L_4_8"]).observe("left")
+    scenario = ScenarioConfig()
+    seen = World(scenario, CONDITIONS["L_4_8"], TRACK).observe("left")
     return render_prompt(seen, None, variant="baseline", scenario=scenario)
 
 

@@ -4,7 +4,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats import FORMATS, PASSED_ON
+from merge_runner.llm.formats.base import Reading, WireFormat, WireRequest
 from merge_runner.llm.http_outcome import RawReply, is_web_page, judge, may_be_charged
 
 OPENAI_QUOTA = (
@@ -303,10 +304,10 @@ ERRORS = [
 
 @pytest.mark.parametrize(("wire", "status", "body", "headers", "action", "outcome"), ERRORS)
 def test_what_an_error_means(wire, status, body, headers, action, outcome):
-    verdict = judged(wire, status, body, headers)
-    assert (verdict.action, verdict.outcome, verdict.pause) == (action, outcome, False)
-    assert verdict.reading.outcome == "error"
-    assert str(status) in verdict.message
+    found = judged(wire, status, body, headers)
+    assert (found.action, found.name, found.pause) == (action, outcome, False)
+    assert found.reading.outcome == "error"
+    assert str(status) in found.message
 
 
 # A rate limit: format, status, body, headers, and how long everybody waits.
@@ -393,15 +394,15 @@ LIMITS = [
 
 @pytest.mark.parametrize(("wire", "status", "body", "headers", "delay"), LIMITS)
 def test_a_rate_limit_makes_all_calls_of_the_key_wait(wire, status, body, headers, delay):
-    verdict = judged(wire, status, body, headers)
-    assert (verdict.action, verdict.outcome, verdict.pause) == ("retry", "rate_limited", True)
-    assert verdict.delay_s == (None if delay is None else pytest.approx(delay))
+    found = judged(wire, status, body, headers)
+    assert (found.action, found.name, found.pause) == ("retry", "rate_limited", True)
+    assert found.delay_s == (None if delay is None else pytest.approx(delay))
 
 
 @pytest.mark.parametrize("status", [408, 409, 500, 502, 503, 504, 520, 524, 529])
 def test_the_delay_that_a_failing_server_asks_for_is_kept_for_this_call_alone(status):
-    verdict = judged("openai-chat", status, HTML, {"retry-after": "9"})
-    assert (verdict.action, verdict.delay_s, verdict.pause) == ("retry", 9, False)
+    found = judged("openai-chat", status, HTML, {"retry-after": "9"})
+    assert (found.action, found.delay_s, found.pause) == ("retry", 9, False)
 
 
 def choice(content="M", finish="stop", **changes):
@@ -466,8 +467,8 @@ SUCCESSES = [
 
 @pytest.mark.parametrize(("wire", "body", "action", "outcome"), SUCCESSES)
 def test_what_a_body_of_status_200_means(wire, body, action, outcome):
-    verdict = judged(wire, 200, body)
-    assert (verdict.action, verdict.outcome, verdict.pause) == (action, outcome, False)
+    found = judged(wire, 200, body)
+    assert (found.action, found.name, found.pause) == (action, outcome, False)
 
 
 AZURE_FILTER = {
@@ -485,16 +486,16 @@ OPENROUTER_FILTER = openrouter(403, "Your input was flagged", flagged_input="PRO
     ("status", "body"), [(400, {"error": AZURE_FILTER}), (403, OPENROUTER_FILTER)]
 )
 def test_a_filter_is_a_refusal_and_no_failure(status, body):
-    verdict = judged("openai-chat", status, body)
-    assert (verdict.action, verdict.outcome) == ("accept", "refusal")
-    assert verdict.reading.outcome == "refusal"
-    assert verdict.reading.text == ""
+    found = judged("openai-chat", status, body)
+    assert (found.action, found.name) == ("accept", "refusal")
+    assert found.reading.outcome == "refusal"
+    assert found.reading.text == ""
 
 
 @pytest.mark.parametrize(("status", "outcome"), [(200, "bad_body"), (500, "server_error")])
 def test_a_body_that_is_nested_too_deep_is_no_json(status, outcome):
-    verdict = judged("openai-chat", status, "[" * 100_000)
-    assert (verdict.action, verdict.outcome) == ("retry", outcome)
+    found = judged("openai-chat", status, "[" * 100_000)
+    assert (found.action, found.name) == ("retry", outcome)
 
 
 @pytest.mark.parametrize(
@@ -541,9 +542,63 @@ json_values = st.recursive(
 # A digit, but not a decimal one.
 @example("openai-chat", 200, '{"error": {"code": "²"}}')
 def test_no_body_makes_it_raise(wire, status, body):
-    verdict = judged(wire, status, body)
-    assert verdict.action in ("accept", "retry", "fail", "quota", "refused")
-    assert verdict.outcome
+    found = judged(wire, status, body)
+    assert found.action in ("accept", "retry", "fail", "quota", "refused")
+    assert found.name
+
+
+class Stubborn(WireFormat):
+    """A format that understands a few errors otherwise than all others."""
+
+    members = frozenset({"said"})
+    charged_errors = frozenset({"late_refusal"})
+
+    def request(self, entry, prompt):
+        return WireRequest("/", {})
+
+    def read(self, payload):
+        return Reading("error" if payload.get("error") else "ok")
+
+    def meaning(self, error):
+        return "request_too_large" if "insufficient_quota" in error.names else None
+
+    def status_of(self, error):
+        return 503 if "rate_limit_exceeded" in error.names else None
+
+    def delay_s(self, error):
+        return 11.0 if "soon" in error.names else None
+
+    def reset_s(self, headers, now):
+        return 12.0 if headers.get("x-left") == "0" else None
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "headers", "name", "delay_s"),
+    [
+        (429, "insufficient_quota", {}, "request_too_large", None),
+        (200, "rate_limit_exceeded", {}, "overloaded", None),
+        (503, "soon", {"x-left": "0"}, "overloaded", 11),
+        (503, None, {"x-left": "0"}, "overloaded", 12),
+        (503, "soon", {"retry-after": "13"}, "overloaded", 13),
+        # What only another format knows, as a gateway may pass it on.
+        (400, "model_not_found", {}, "unknown_model", None),
+        (429, "enforced_spend_limit_reached", {}, "quota_exhausted", None),
+        (429, None, {"x-ratelimit-remaining-tokens": "0", "x-ratelimit-reset-tokens": "14"},
+         "rate_limited", 14),
+    ],
+)  # fmt: skip
+def test_a_formats_own_word_on_an_error_goes_before_that_of_others(
+    status, code, headers, name, delay_s
+):
+    raw = RawReply(status, headers, json.dumps(openai(code=code)))
+    found = judge(raw, Stubborn())
+    assert (found.name, found.delay_s) == (name, delay_s)
+
+
+def test_work_that_only_the_format_knows_to_be_charged_may_be_charged():
+    raw = RawReply(400, {}, json.dumps(openai(code="late_refusal")))
+    assert may_be_charged(raw, Stubborn(), None)
+    assert not any(may_be_charged(raw, wire, None) for wire in PASSED_ON)
 
 
 OPENAI_ERROR = {"error": {"message": "m", "type": "server_error", "param": None, "code": None}}
@@ -590,7 +645,7 @@ ANTHROPIC_ERROR = {"type": "error", "error": {"type": "overloaded_error", "messa
 )
 def test_what_may_be_charged_though_no_usage_is_told(provider, status, body, charged):
     text = body if isinstance(body, str) else json.dumps(body)
-    assert may_be_charged(RawReply(status, {}, text), provider) == charged
+    assert may_be_charged(RawReply(status, {}, text), FORMATS["openai-chat"], provider) == charged
 
 
 @pytest.mark.parametrize("status", [400, 429, 500, 503])

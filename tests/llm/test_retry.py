@@ -6,11 +6,12 @@ import pytest
 from merge_runner.errors import CallFailed, QuotaExhausted, UsageError
 from merge_runner.llm import retry
 from merge_runner.llm.retry import (
+    Deadline,
     OutOfTime,
     RequestFailed,
     TryAgain,
     backoff_s,
-    call_with_retries,
+    retries,
 )
 
 
@@ -32,8 +33,8 @@ class Call:
         self.now += self.queue_s
         return f"turn {self.turns}"
 
-    async def attempt(self, turn, number, seconds_left):
-        self.attempts.append((turn, number, seconds_left))
+    async def attempt(self, turn, seconds_left):
+        self.attempts.append((turn, seconds_left))
         self.now += self.takes_s
         result = self.results.pop(0) if len(self.results) > 1 else self.results[0]
         if isinstance(result, Exception):
@@ -45,9 +46,14 @@ class Call:
         self.now += seconds
 
     async def run(self, deadline_s=600.0):
-        return await call_with_retries(
-            self.take_turn, self.attempt, deadline_s=deadline_s, sleep=self.sleep
-        )
+        deadline = Deadline(deadline_s)
+
+        async def attempt():
+            turn = await self.take_turn()
+            with deadline.attempt() as seconds_left:
+                return await self.attempt(turn, seconds_left)
+
+        return await retries(deadline, sleep=self.sleep)(attempt)
 
 
 @pytest.fixture
@@ -60,19 +66,14 @@ async def make_call():
 async def test_an_answer_at_once_is_one_attempt(make_call):
     call = make_call("answer")
     assert await call.run() == "answer"
-    assert call.attempts == [("turn 1", 1, 600.0)]
+    assert call.attempts == [("turn 1", 600.0)]
     assert call.sleeps == []
 
 
 async def test_attempts_go_on_until_there_is_an_answer_each_with_its_own_turn(make_call):
     call = make_call(TryAgain("a"), TryAgain("b"), TryAgain("c"), "answer")
     assert await call.run() == "answer"
-    assert [(turn, number) for turn, number, _ in call.attempts] == [
-        ("turn 1", 1),
-        ("turn 2", 2),
-        ("turn 3", 3),
-        ("turn 4", 4),
-    ]
+    assert [turn for turn, _ in call.attempts] == ["turn 1", "turn 2", "turn 3", "turn 4"]
 
 
 async def test_waits_double_from_half_a_second_to_a_minute(make_call):
@@ -118,14 +119,14 @@ async def test_attempts_and_waits_count_against_the_deadline(make_call):
     call = make_call(TryAgain("wait", 10.0), takes_s=25.0)
     with pytest.raises(OutOfTime, match="100 s"):
         await call.run(deadline_s=100.0)
-    assert [left for _, _, left in call.attempts] == pytest.approx([100, 65, 30], abs=1)
+    assert [left for _, left in call.attempts] == pytest.approx([100, 65, 30], abs=1)
     assert len(call.sleeps) == 2
 
 
 async def test_the_wait_for_a_turn_does_not_count(make_call):
     call = make_call(TryAgain("wait", 10.0), TryAgain("wait", 10.0), "answer", queue_s=1000.0)
     assert await call.run(deadline_s=100.0) == "answer"
-    assert [left for _, _, left in call.attempts] == pytest.approx([100, 90, 80], abs=1)
+    assert [left for _, left in call.attempts] == pytest.approx([100, 90, 80], abs=1)
 
 
 async def test_a_wait_that_would_pass_the_deadline_is_not_begun(make_call):
@@ -156,15 +157,16 @@ async def test_any_other_error_passes_through_at_once(make_call, error):
     assert call.sleeps == []
 
 
-async def test_an_error_while_waiting_for_a_turn_passes_through_without_an_attempt():
+async def test_an_error_while_waiting_for_a_turn_passes_through_without_an_attempt(make_call):
+    call = make_call("never asked")
+
     async def no_turn():
         raise CallFailed("the sweep was stopped", None)
 
-    async def never(turn, number, seconds_left):
-        raise AssertionError("an attempt without a turn")
-
+    call.take_turn = no_turn
     with pytest.raises(CallFailed):
-        await call_with_retries(no_turn, never, deadline_s=10.0)
+        await call.run()
+    assert call.attempts == []
 
 
 async def test_a_wait_that_the_deadline_does_not_allow_is_told(make_call):

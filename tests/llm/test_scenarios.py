@@ -1,6 +1,6 @@
-"""What becomes of a call in every scenario that the emulator plays, in every format of it.
+"""What becomes of a call in every scenario, in every format of it.
 
-The real client asks the real emulator over loopback, in virtual time: see virtual_time.py.
+The real client asks an emulator over loopback, in virtual time: see virtual_time.py.
 """
 
 from __future__ import annotations
@@ -14,9 +14,6 @@ import pytest
 
 from merge_runner.config import Endpoint, ModelEntry
 from merge_runner.emulator.driver import answer
-from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.scenarios import SCENARIOS
-from merge_runner.emulator.server import serve
 from merge_runner.errors import CallFailed, EndpointRefused, QuotaExhausted
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
@@ -25,6 +22,8 @@ from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.retry import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
 from merge_runner.records import Slot
+from tests.emulator.scenarios import SCENARIOS
+from tests.emulator.scenarios.playing import ScenarioPlan, playing
 from tests.virtual_time import in_virtual_time, now_s
 
 CHAT, RESPONSES, GEMINI, ANTHROPIC = "openai-chat", "openai-responses", "gemini", "anthropic"
@@ -149,13 +148,6 @@ PASSES = [
 WALL_CLOCK_S = 0.6
 
 
-class AtFirst(FaultPlan):
-    """Plays its scenario on the first attempt alone."""
-
-    def fault(self, where, attempt):
-        return super().fault(where, attempt) if attempt == 1 else None
-
-
 @pytest.fixture(autouse=True)
 def _no_settings_of_the_user(monkeypatch, tmp_path):
     for name in list(os.environ):
@@ -195,28 +187,27 @@ def entry_of(wire):
 @asynccontextmanager
 async def client_of(cache, wire, plan):
     """A client of an emulator that plays a plan."""
-    runner, url = await serve(0, plan)
-    base_url = f"{url}/v1" if wire in OPENAI else url
-    entry, identity = entry_of(wire), f"{type(plan).__name__} {plan.scenarios} {wire}"
-    transport = HttpTransport(Endpoint("openai", identity, base_url, {}), connections=4)
-    try:
-        yield LlmClient(
-            name="my-model",
-            entry=entry,
-            endpoint=identity,
-            cache=cache,
-            transport=transport,
-            limiter=Limiter(),
-            pricing=pricing(entry),
-        )
-    finally:
-        await transport.close()
-        await runner.cleanup()
+    entry, identity = entry_of(wire), f"{plan} {wire}"
+    async with playing(plan) as url:
+        base_url = f"{url}/v1" if wire in OPENAI else url
+        transport = HttpTransport(Endpoint("openai", identity, base_url, {}), connections=4)
+        try:
+            yield LlmClient(
+                name="my-model",
+                entry=entry,
+                endpoint=identity,
+                cache=cache,
+                transport=transport,
+                limiter=Limiter(),
+                pricing=pricing(entry),
+            )
+        finally:
+            await transport.close()
 
 
-def always(scenario, plan=FaultPlan):
+def always(scenario, **changes):
     """A hang lasts longer than any deadline."""
-    return plan(scenarios={scenario: 1.0}, hang_s=10 * DEADLINE_S)
+    return ScenarioPlan(scenario=scenario, hang_s=10 * DEADLINE_S, **changes)
 
 
 def ask(client):
@@ -290,7 +281,7 @@ async def test_what_no_attempt_would_mend_is_not_tried_again(
 @pytest.mark.parametrize(("scenario", "wire", "row"), per_format(PASSES))
 @in_virtual_time
 async def test_what_passes_is_tried_again_after_the_servers_delay(cache, scenario, wire, row):
-    async with client_of(cache, wire, always(scenario, AtFirst)) as client:
+    async with client_of(cache, wire, always(scenario, first_alone=True)) as client:
         reply = await ask(client)
         waited_s = now_s() - row.takes_s
     assert [attempt.outcome for attempt in reply.attempts] == [row.outcome, "ok"]

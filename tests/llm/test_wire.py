@@ -12,7 +12,8 @@ import time
 import pytest
 
 from merge_runner.config import Endpoint
-from merge_runner.llm.delays import server_delay_s
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.delays import server_delay_s
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.transport import TransportFailure
 from tests.llm.raw_server import a_request, head, ok, raw_server
@@ -261,4 +262,4 @@ async def test_of_a_header_that_is_sent_several_times_no_value_is_lost():
     twice = head(503, retry_after=7, Retry_After=3600, content_length=0)
     async with raw_server(twice) as server, transport_to(server.url) as transport:
         reply = await transport.send(a_request(), attempt=1, timeout_s=5)
-    assert server_delay_s(reply.headers, None) == 3600
+    assert server_delay_s(reply.error, FORMATS.values()) == 3600

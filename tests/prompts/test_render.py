@@ -12,11 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.config import Scenario
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS, block_digests
+from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
+from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, block_digests
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import SIDES, Observation
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "prompts"
@@ -65,7 +67,7 @@ law = settings(deadline=None, derandomize=True)  # the gate must not depend on l
 
 def render(variant, form, **scenario):
     observation, rest = FORMS[form]
-    return render_prompt(observation, rest, variant=variant, scenario=Scenario(**scenario))
+    return render_prompt(observation, rest, variant=variant, scenario=ScenarioConfig(**scenario))
 
 
 @pytest.mark.parametrize(("variant", "form"), CASES)
@@ -108,8 +110,8 @@ def test_the_first_decision_is_told_that_it_has_no_previous_plan():
 
 
 def test_both_sides_of_the_symmetric_condition_get_the_identical_prompt():
-    scenario = Scenario()
-    world = World(scenario, CONDITIONS["N_0_0"])
+    scenario = ScenarioConfig()
+    world = World(scenario, CONDITIONS["N_0_0"], TRACK)
     for action in (0.0, 0.3, -0.7):
         left, right = (
             render_prompt(world.observe(side), None, variant="baseline", scenario=scenario)
@@ -128,7 +130,7 @@ def test_no_prompt_tells_left_from_right(form):
 @pytest.mark.parametrize("value", [-0.0, -0.001, -0.00499])
 def test_a_value_that_rounds_to_zero_has_no_sign(value):
     seen = Observation("merge", value, value, value, value, (value,) * 10, (value,) * 10)
-    prompt = render_prompt(seen, (value,) * 15, variant="baseline", scenario=Scenario())
+    prompt = render_prompt(seen, (value,) * 15, variant="baseline", scenario=ScenarioConfig())
     assert "-0.00" not in prompt
     # Three speeds and distances, one to the merge point, two histories and the plan.
     assert prompt.count("0.00") == 4 + 2 * 10 + 15
@@ -138,7 +140,7 @@ def test_a_value_that_rounds_to_zero_has_no_sign(value):
 @given(st.floats(-200, 200))
 def test_every_value_is_shown_to_two_decimals(value):
     seen = replace(FIRST, relative_distance_m=value)
-    prompt = render_prompt(seen, None, variant="baseline", scenario=Scenario())
+    prompt = render_prompt(seen, None, variant="baseline", scenario=ScenarioConfig())
     line = next(x for x in prompt.splitlines() if x.startswith("- Relative distance"))
     shown = line.split("): ")[1].removesuffix(" m")
     assert abs(float(shown) - value) <= 0.005 + 1e-9
@@ -170,21 +172,66 @@ def test_no_two_blocks_share_a_digest():
     assert len(set(block_digests("baseline").values())) == len(BLOCKS)
 
 
-@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.name)
-def test_a_changed_text_on_either_road_changes_the_digest(block):
+@pytest.mark.parametrize("name", BLOCKS)
+def test_a_changed_text_on_either_road_or_another_place_changes_the_digest(name):
+    block = BLOCKS[name]
     changed = {
         block.digest,
         replace(block, merge=f"{block.merge} ").digest,
         replace(block, straight=f"{block.straight or ''} ").digest,
-        replace(block, merge=block.straight, straight=block.merge).digest,
+        replace(block, before="C1").digest,
+        replace(block, before="C5").digest,
     }
-    # Where both roads share one text, swapping them changes nothing.
-    assert len(changed) == (3 if block.merge == block.straight else 4)
+    assert len(changed) == 5
+    assert replace(block, meaning="something else").digest == block.digest
+
+
+def test_texts_that_change_roads_change_the_digest():
+    assert Block("x", "One.", "Two.").digest != Block("x", "Two.", "One.").digest
+
+
+def test_added_blocks_stand_where_they_say_in_the_order_of_their_names(monkeypatch):
+    """Also where the last one was registered first."""
+    monkeypatch.setattr(BLOCKS, "_things", dict(BLOCKS))
+    monkeypatch.setattr(VARIANTS, "_things", dict(VARIANTS))
+    for name, before in (("Z", "C5"), ("B", "C1"), ("Y", "C5"), ("X", "C5")):
+        BLOCKS.register(name, Block("more", f"Text {name}.", None, before=before))
+    VARIANTS.register("A8", Variant(removes=frozenset({"C4"}), adds=frozenset("ZBY")))
+    kept = [name for name in block_digests("baseline") if name != "C4"]
+    assert [*block_digests("A8")] == ["C0", "B", *kept[1:-1], "Y", "Z", "C5"]
+    prompt = render_prompt(FIRST, None, variant="A8", scenario=ScenarioConfig())
+    assert "\n\nText B.\n\nHistory of" in prompt
+    assert "\n\nText Y.\n\nText Z.\n\nOutput format" in prompt
+
+
+def test_a_variant_of_a_block_that_there_is_not_is_refused(monkeypatch):
+    monkeypatch.setattr(VARIANTS, "_things", dict(VARIANTS))
+    VARIANTS.register("A8", Variant(adds=frozenset({"C6"})))
+    with pytest.raises(UsageError, match=r"unknown prompt block 'C6'; valid: C0, .*variant A8"):
+        block_digests("A8")
+
+
+@pytest.mark.parametrize("history_start", ["cruise", "empty"])
+def test_in_a_finer_world_the_histories_are_those_of_the_plans_steps(history_start):
+    coarse = ScenarioConfig(history_start=history_start)
+    fine = coarse.model_copy(update={"step_s": 0.05, "plan_step_s": 0.2})
+    worlds = [World(scenario, CONDITIONS["L_4_0"]) for scenario in (coarse, fine)]
+    for number in range(4):
+        prompts = [
+            render_prompt(world.observe("right"), [0.5], variant="baseline", scenario=scenario)
+            for world, scenario in zip(worlds, (coarse, fine), strict=True)
+        ]
+        assert prompts[0] == prompts[1]
+        for k in range(5):
+            action = (0.313, -0.717, 0.919, 0.123, -0.231)[k] / (number + 1)
+            for world, steps in zip(worlds, (1, 4), strict=True):
+                for _ in range(steps):
+                    world.advance({"left": action / 2, "right": action})
 
 
 @pytest.mark.parametrize("variant", REMOVED)
 def test_a_variant_keeps_the_digests_of_all_blocks_but_its_own(variant):
-    (removed,) = VARIANTS[variant]
+    (removed,) = VARIANTS[variant].removes
     kept = dict(block_digests("baseline"))
     del kept[removed]
     assert block_digests(variant) == kept
@@ -192,5 +239,6 @@ def test_a_variant_keeps_the_digests_of_all_blocks_but_its_own(variant):
 
 def test_the_seven_ablations_remove_seven_different_blocks():
     assert set(VARIANTS) == {"baseline", *REMOVED}
-    assert VARIANTS["baseline"] == frozenset()
-    assert len(set().union(*VARIANTS.values())) == len(REMOVED)
+    assert VARIANTS["baseline"] == Variant()
+    removed = [variant.removes for variant in VARIANTS.values()]
+    assert len(frozenset().union(*removed)) == len(REMOVED)

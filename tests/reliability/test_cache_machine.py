@@ -25,11 +25,11 @@ from hypothesis.stateful import (
 )
 
 from merge_runner.errors import RecordingError, TrialSuspended, UsageError
-from merge_runner.llm.budget import Budget
+from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.claims import Claims
 from merge_runner.llm.keys import make_request
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, Slot
 
 QUESTIONS = 4
@@ -62,7 +62,7 @@ class Process:
         self.cache = ResponseCache(folder)
         self.claims = Claims(folder)
         self.budget = Budget(Ledger(self.cache, "s"), cap_usd=cap_usd)
-        self.flying: dict[int, list[Attempt]] = {}
+        self.in_flight_calls: dict[int, tuple[PaidAttempt, list[Attempt]]] = {}
 
     def known(self, question: int) -> tuple[Entry | None, tuple[Attempt, ...]]:
         """What a client that has claimed a call knows of it."""
@@ -115,7 +115,7 @@ class CacheMachine(RuleBasedStateMachine):
 
     def claimed(self, number: int, question: int) -> bool:
         """POSIX locks are those of a process, and both are played in this one."""
-        return not any(question in each.flying for each in self.running.values())
+        return not any(question in each.in_flight_calls for each in self.running.values())
 
     @rule(number=processes, question=questions)
     def ask(self, number, question):
@@ -129,43 +129,50 @@ class CacheMachine(RuleBasedStateMachine):
             process.claims.release(REQUESTS[question].key)
             return
         assert entry is None
-        if self.paid_for(process, question, list(earlier)):
+        if paid := self.paid_for(process, question, list(earlier)):
             self.tried.pop(question, None)
             self.bent = None
-            process.flying[question] = list(earlier)
+            process.in_flight_calls[question] = paid, list(earlier)
         else:
             process.claims.release(REQUESTS[question].key)
 
-    def paid_for(self, process: Process, question: int, earlier: list[Attempt]) -> bool:
-        """Set the worst case aside; False where there is no money, or none before others end."""
+    def paid_for(
+        self, process: Process, question: int, earlier: list[Attempt]
+    ) -> PaidAttempt | None:
+        """Set the worst case aside; None where there is no money, or none before others end."""
 
         async def at_once():
-            waiting = asyncio.create_task(process.budget.reserve(question, WORST_USD))
+            key, asked = REQUESTS[question].key, Asked("", "", WORST_USD)
+            waiting = asyncio.create_task(process.budget.set_aside(question, key, asked))
             for _ in range(3):
                 await asyncio.sleep(0)
             if not waiting.done():
                 waiting.cancel()
-            await waiting
-            await process.budget.begin(REQUESTS[question].key, earlier, WORST_USD)
+            paid = await waiting
+            try:
+                await paid.begin(earlier)
+            except TrialSuspended:
+                paid.close()
+                raise
+            return paid
 
         try:
-            self.wait(at_once())
+            return self.wait(at_once())
         except (TrialSuspended, asyncio.CancelledError):
-            return False
-        return True
+            return None
 
-    def landed(self, number: int, data) -> tuple[Process, int, list[Attempt]]:
+    def landed(self, number: int, data) -> tuple[Process, int, PaidAttempt, list[Attempt]]:
         process = self.running[number]
-        question = data.draw(st.sampled_from(sorted(process.flying)))
-        return process, question, process.flying.pop(question)
+        question = data.draw(st.sampled_from(sorted(process.in_flight_calls)))
+        return process, question, *process.in_flight_calls.pop(question)
 
     def in_flight(self) -> list[int]:
-        return [number for number, process in self.running.items() if process.flying]
+        return [number for number, process in self.running.items() if process.in_flight_calls]
 
     @precondition(in_flight)
     @rule(data=st.data(), cost=costs)
     def answer(self, data, cost):
-        process, question, attempts = self.landed(
+        process, question, paid, attempts = self.landed(
             data.draw(st.sampled_from(self.in_flight())), data
         )
         self.made += 1
@@ -173,8 +180,8 @@ class CacheMachine(RuleBasedStateMachine):
         reply = f'{{"text": "ä {self.made}"}}'
         attempts.append(Attempt(len(attempts) + 1, "ok", 200, reply=reply, cost_usd=float(cost)))
         entry = Entry(REQUESTS[question], tuple(attempts))
-        kept = self.wait(process.budget.ledger.keep(entry, WORST_USD, float(cost)))
-        process.budget.settled(question)
+        kept = self.wait(paid.keep(entry))
+        paid.close()
         process.claims.release(REQUESTS[question].key)
         self.bent = None
         assert kept == entry
@@ -185,15 +192,15 @@ class CacheMachine(RuleBasedStateMachine):
     @rule(data=st.data(), cost=costs, known=st.booleans())
     def fail(self, data, cost, known):
         """An attempt brings no answer, and what it cost is told or not."""
-        process, question, attempts = self.landed(
+        process, question, paid, attempts = self.landed(
             data.draw(st.sampled_from(self.in_flight())), data
         )
         self.charged_usd += cost
         told = float(cost) if known else None
         attempts.append(Attempt(len(attempts) + 1, "server_error", 500, cost_usd=told))
         key = REQUESTS[question].key
-        self.wait(process.budget.ledger.settle(key, attempts, WORST_USD, told))
-        process.budget.settled(question)
+        self.wait(paid.settle(attempts))
+        paid.close()
         process.claims.release(key)
         if known:
             self.bent = None
@@ -205,7 +212,7 @@ class CacheMachine(RuleBasedStateMachine):
         """The server charges for what is in flight all the same."""
         number = data.draw(st.sampled_from(sorted(self.running)))
         process = self.running.pop(number)
-        self.charged_usd += cost * len(process.flying)
+        self.charged_usd += cost * len(process.in_flight_calls)
         process.die()
 
     @rule(more=st.integers(1, 4 * WORST_USD))

@@ -5,13 +5,13 @@ import json
 
 import pytest
 
-from merge_runner.config import Scenario
-from merge_runner.drivers.constant import ConstantDriver
-from merge_runner.drivers.language_model import LlmDriver
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.language_model import LanguageModel
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.llm.keys import make_request
 from merge_runner.records import Attempt, ChatReply, Slot, TrialRecord, TrialSpec, Usage
 from merge_runner.results.comparison import PLACES, stored_rows
-from merge_runner.results.database import SCHEMA, in_memory
+from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.rows import rows_of
 from merge_runner.results.store import OF_A_RUN
 from merge_runner.trial import play_trial
@@ -29,22 +29,24 @@ ANOTHER = {
 
 def played() -> TrialRecord:
     """A trial that a language model drove, with a reply beyond ASCII and one attempt in vain."""
-    scenario = Scenario()
+    scenario = ScenarioConfig()
 
-    async def ask(prompt: str, number: int) -> ChatReply:
+    async def ask(prompt: str, slot: Slot, spec: TrialSpec) -> ChatReply:
         text = f"M\nI go, \u00fcber alles \u20ac.\n```python\n{[0.1] * 20}\n```"
         request = make_request(
             provider="local", endpoint="local", model="m", path="/", headers={},
-            body={"prompt": prompt}, slot=Slot("L_4_0", 1, "left", number, 0),
+            body={"prompt": prompt}, slot=slot,
         )  # fmt: skip
         attempts = (
             Attempt(1, "overloaded", 503, reply="<html>", error="HTTP 503", started_at=CLOCK),
             Attempt(2, "ok", 200, "m", "stop", Usage(9, 1, 5, 2), 1.5, CLOCK,
-                    json.dumps({"id": str(number), "text": text}, ensure_ascii=False), None, 0.25),
+                    json.dumps({"id": str(slot.decision), "text": text}, ensure_ascii=False),
+                    None, 0.25),
         )  # fmt: skip
         return ChatReply(text, "ok", request, attempts, earlier=0)
 
-    drivers = {"left": LlmDriver(ask, "baseline", scenario), "right": ConstantDriver(scenario)}
+    makers = {"left": LanguageModel(ask), "right": PROGRAMS["constant"]}
+    drivers = {side: maker.make(scenario, SPEC, side) for side, maker in makers.items()}
     return asyncio.run(play_trial(SPEC, scenario, drivers))
 
 
@@ -55,7 +57,7 @@ RECORD = played()
 def stored():
     """A database with the trial, and another one beside it."""
     connection = in_memory({})
-    connection.execute(SCHEMA.read_text())
+    connection.execute(schema_sql())
     for table, rows in rows_of(RECORD).items():
         appender = connection.appender(table)
         appender.append_rows(rows)
@@ -77,7 +79,7 @@ def differing(connection, **how) -> list[str]:
 
 def columns():
     with in_memory({}) as connection:
-        connection.execute(SCHEMA.read_text())
+        connection.execute(schema_sql())
         return connection.execute(
             "SELECT table_name, column_name, data_type FROM duckdb_columns() "
             "WHERE table_name IN ('trials', 'states', 'decisions', 'calls') "

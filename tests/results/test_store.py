@@ -13,9 +13,8 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from merge_runner.config import Scenario
-from merge_runner.drivers.constant import ConstantDriver
-from merge_runner.drivers.projected_order import ProjectedOrderDriver
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.store import Store, SweepRow, query, results_digest, sweep_facts
@@ -24,7 +23,7 @@ from merge_runner.run.flusher import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
-SCENARIO = Scenario()
+SCENARIO = ScenarioConfig()
 SWEEP = SweepRow("s1", "baseline", datetime(2026, 1, 1), "{}", None, None, "{}")  # noqa: DTZ001
 LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True); input()"
 
@@ -36,13 +35,10 @@ def spec(condition="L_4_0", repetition=1, spec_hash="h"):
     )
 
 
-def played(condition="L_4_0", *, driver=ProjectedOrderDriver, **of_spec) -> TrialRecord:
-    drivers = (
-        {side: driver(SCENARIO, side) for side in ("left", "right")}
-        if driver is ProjectedOrderDriver
-        else {side: driver(SCENARIO) for side in ("left", "right")}
-    )
-    return asyncio.run(play_trial(spec(condition, **of_spec), SCENARIO, drivers))
+def played(condition="L_4_0", *, driver="projected-order", **of_spec) -> TrialRecord:
+    trial = spec(condition, **of_spec)
+    drivers = {side: PROGRAMS[driver].make(SCENARIO, trial, side) for side in ("left", "right")}
+    return asyncio.run(play_trial(trial, SCENARIO, drivers))
 
 
 def failed(record: TrialRecord) -> TrialRecord:
@@ -142,7 +138,7 @@ def test_the_digest_sees_every_result_and_no_order(tmp_path):
 
 def test_the_metrics_are_those_computed_by_hand(store, path):
     record = played("L_4_-8")
-    store.write("s1", [record, played("N_0_0", driver=ConstantDriver)], patience_s=1)
+    store.write("s1", [record, played("N_0_0", driver="constant")], patience_s=1)
     left = [s for s in record.states if s.side == "left"]
     right = [s for s in record.states if s.side == "right"]
     first = next(k for k in range(len(left)) if max(left[k].position_m, right[k].position_m) >= 100)

@@ -7,7 +7,7 @@ from itertools import groupby
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.cache import Totals
+from merge_runner.llm.cache import CallTotals
 from merge_runner.run.estimate import Missing, estimate
 from merge_runner.run.plan import PROGRAMS, Choice, Limits, make_plan
 
@@ -144,7 +144,7 @@ def test_what_is_named_twice_is_played_once():
 def test_the_estimate_takes_the_limits_into_account(limits, minutes):
     plan = make_plan(Choice("baseline", "o3"))
     nothing_recorded = Missing(
-        plan.trials, {"o3": plan.trials * 21}, {"o3": Totals()}, {"o3": "openai"}
+        plan.trials, {"o3": plan.trials * 21}, {"o3": CallTotals()}, {"o3": "openai"}
     )
     expected = estimate(plan, nothing_recorded, limits)
     assert expected.minutes == pytest.approx(minutes, rel=0.08)

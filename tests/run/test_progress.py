@@ -12,9 +12,9 @@ from merge_runner.records import Attempt, Usage
 from merge_runner.run.progress import Progress
 
 
-def crew(*meters, running=0):
+def runner(*meters, running=0):
     named = {str(number): meter for number, meter in enumerate(meters)}
-    return SimpleNamespace(meters=named, running=running, workers=None)
+    return SimpleNamespace(meters=named, waits=(), running=running, workers=None)
 
 
 def test_every_figure_is_that_of_the_meters():
@@ -26,7 +26,7 @@ def test_every_figure_is_that_of_the_meters():
         title="t",
         total=10,
         expected_calls=184,
-        crew=crew(*meters, running=5),
+        runner=runner(*meters, running=5),
         cap_usd=20,
         ledger=SimpleNamespace(spending=Spending(spent_usd=4.0, reserved_usd=0.25)),
         done=Counter(finished=2, failed=1),
@@ -46,8 +46,8 @@ def test_every_figure_is_that_of_the_meters():
 
 def test_the_calls_tell_the_time_left_while_no_trial_has_ended():
     meter = Meter(calls_live=25)
-    progress = Progress("t", 10, expected_calls=100, crew=crew(meter))
+    progress = Progress("t", 10, expected_calls=100, runner=runner(meter))
     progress.started = time.monotonic() - 10
     assert dict(progress.fields())["time"] == "10 s, about 30 s left"
-    progress.crew = crew(Meter())
+    progress.runner = runner(Meter())
     assert dict(progress.fields())["time"] == "10 s"

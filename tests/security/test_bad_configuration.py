@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from analysis.commands import main
-from merge_runner.config import PROVIDERS, ModelEntry, Scenario, SweepFile
+from merge_runner.config import PROVIDERS, ModelEntry, ScenarioConfig, SweepFile
 from merge_runner.emulator.faults import FAULTS, FaultPlan
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -75,7 +75,10 @@ def refused(program, *arguments):
         ),
         (model(provider="3"), "provider: Input should be a valid string"),
         (model(provider='"opnai"'), f"unknown provider 'opnai'; valid: {', '.join(PROVIDERS)}"),
-        (model(format='"openai"'), "'openai-chat', 'openai-responses', 'gemini' or 'anthropic'"),
+        (
+            model(format='"openai"'),
+            "[m]: unknown wire format 'openai'; valid: openai-chat, openai-responses, gemini,",
+        ),
         (model(rpm="-5"), "rpm: Input should be greater than 0"),
         (model(tpm="-5"), "tpm: Input should be greater than 0"),
         (model(rpm="0"), "rpm: Input should be greater than 0"),
@@ -147,7 +150,7 @@ def test_a_registry_that_is_wrong(program, tmp_path, content, says):
         (sweep(repetitions="{ baseline = 100001 }"), "less than or equal to 100000"),
         (
             scenario("horizn_s = 5"),
-            f"'scenario.horizn_s'; valid: {', '.join(Scenario.model_fields)}",
+            f"'scenario.horizn_s'; valid: {', '.join(ScenarioConfig.model_fields)}",
         ),
         (scenario("horizon_s = nan"), "scenario.horizon_s: Input should be a finite number"),
         (scenario("horizon_s = inf"), "scenario.horizon_s: Input should be a finite number"),

@@ -10,8 +10,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from merge_runner.config import Endpoint
-from merge_runner.llm.delays import MOST_S, server_delay_s
 from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.base import read_error
+from merge_runner.llm.formats.delays import MOST_S, server_delay_s
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
 from merge_runner.llm.transport import TransportFailure
@@ -99,18 +100,18 @@ JSON = st.recursive(
 @example({"retry-after": "Mon, 01 Jan 2026 00:00:00 -99999999999999999999"}, None)
 @example({"retry-after": "Wed, 21 Oct 2026 07:28:00 +99999999999"}, None)
 def test_fuzz_of_headers_every_delay_is_one_that_can_be_waited_for(headers, payload):
-    delay_s = server_delay_s(headers, payload)
+    delay_s = server_delay_s(read_error(429, headers, "", payload), FORMATS.values())
     assert delay_s is None or (0 < delay_s <= MOST_S and math.isfinite(delay_s))
 
 
 @given(STATUSES, HEADERS, st.text(max_size=80) | JSON.map(str), st.sampled_from(sorted(FORMATS)))
 @example(200, {}, "[" * 100_000, "gemini")
 @example(500, {}, '{"error": {"code": ' + "9" * 5000 + "}}", "openai-chat")
-def test_fuzz_of_replies_every_reply_has_a_verdict(status, headers, body, wire):
+def test_fuzz_of_replies_every_reply_has_an_outcome(status, headers, body, wire):
     raw = RawReply(status, headers, body)
     assert judge(raw, FORMATS[wire]).action in {"accept", "retry", "fail", "quota", "refused"}
     for provider in ("openai", None):
-        assert may_be_charged(raw, provider) in (True, False)
+        assert may_be_charged(raw, FORMATS[wire], provider) in (True, False)
 
 
 @pytest.fixture(scope="module")

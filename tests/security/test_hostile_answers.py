@@ -9,7 +9,8 @@ from types import SimpleNamespace
 from aiohttp import web
 from rich.console import Console
 
-from merge_runner.llm.meter import Meter, Wait
+from merge_runner.llm.call import Wait
+from merge_runner.llm.meter import Meter
 from merge_runner.run.progress import Progress, _table
 from tests.harness import watched
 
@@ -61,9 +62,9 @@ async def test_an_error_in_a_servers_words_speaks_to_no_terminal(merge_runner):
 
 
 def test_a_servers_words_are_no_markup_in_the_display():
-    meter = Meter(waits={"key": Wait("m: L_4_0", f"after HTTP 503: [/nope] {ESCAPE}")})
+    wait = Wait("m: L_4_0", f"after HTTP 503: [/nope] {ESCAPE}")
     shown = io.StringIO()
-    crew = SimpleNamespace(meters={"m": meter}, running=1, workers=None)
-    Console(file=shown, width=200).print(_table(Progress("title", 1, crew=crew)))
+    runner = SimpleNamespace(meters={"m": Meter()}, waits=[wait], running=1, workers=None)
+    Console(file=shown, width=200).print(_table(Progress("title", 1, runner=runner)))
     assert "[/nope]" in shown.getvalue()
     assert "\x1b" not in shown.getvalue()

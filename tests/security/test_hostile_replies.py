@@ -14,12 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 N = 20
@@ -63,10 +64,10 @@ def every_audit_event():
 
 def emulated():
     """Real replies of the emulator, in every condition, with and without the tactical token."""
-    scenario = Scenario()
+    scenario = ScenarioConfig()
     for name, condition in CONDITIONS.items():
         for variant in ("baseline", "A1"):
-            seen = World(scenario, condition).observe("left")
+            seen = World(scenario, condition, TRACK).observe("left")
             prompt = render_prompt(seen, None, variant=variant, scenario=scenario)
             yield answer(prompt, Slot(name, 1, "left", 0, 0))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from analysis.explorer import views
@@ -12,13 +13,21 @@ from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.reading import reading
 from analysis.explorer.site import NotThere, Site
+from analysis.metrics import COLLISIONS
+from analysis.metrics import JOINT as JOINT_RATE
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Column, Row, Table, Value, from_text
-from merge_runner.prompts.blocks import VARIANTS
+from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
 
 BASELINE = "baseline"
+# The blocks of each prompt, as its spec names them; a program has none.
+STORED = """
+SELECT variant, any_value(names) FROM trials JOIN (
+    SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
+) USING (spec_hash) WHERE len(names) > 0 GROUP BY ALL
+"""
 # Rates are decided trial by trial, and differ in single trials. Collisions are outcomes.
-FATES = {"collided_percent": "outcome", "joint_percent": "joint"}
+FATES = {COLLISIONS.name: "outcome", JOINT_RATE.name: "joint"}
 JOINT = {True: "joint", False: "not joint"}
 # What the rates count of it.
 COUNTED: dict[str, str | bool] = {"outcome": "collided", "joint": True}
@@ -97,7 +106,7 @@ def ablations_page(site: Site, asked: Mapping[str, str], *, patient: bool = Fals
         "ablations.html",
         here="ablations",
         computed=found,
-        left_out=left_out,
+        left_out=partial(left_out, site),
         fates=FATES,
         bar=bar,
         width=WIDTH,
@@ -105,12 +114,23 @@ def ablations_page(site: Site, asked: Mapping[str, str], *, patient: bool = Fals
     )
 
 
-def left_out(variant: str) -> str:
-    """What a variant's prompt leaves out, by name and purpose."""
-    names = sorted(VARIANTS.get(variant, ()))
-    if not names:
-        return "the whole prompt" if variant in VARIANTS else ""
-    return "without " + ", ".join(f"{name}: {views.BLOCK_MEANINGS[name]}" for name in names)
+def left_out(site: Site, variant: str) -> str:
+    """What a variant's prompt leaves out and adds, by name and meaning."""
+    known = VARIANTS.get(variant) or _as_stored(site, variant)
+    if known is None:
+        return f"of which {views.UNKNOWN}"
+    changes = views.changes_text(known, lambda name: f"{name}: {views.block_meaning(name)}")
+    return changes or "the whole prompt"
+
+
+def _as_stored(site: Site, variant: str) -> Variant | None:
+    """What a variant that is not registered here changes, by the blocks that its specs name."""
+    with reading(site.db) as connection:
+        stored = dict(connection.execute(STORED).fetchall())
+    if variant not in stored:
+        return None
+    own, baseline = frozenset(stored[variant]), frozenset(blocks_of(BASELINE))
+    return Variant(removes=baseline - own, adds=own - baseline)
 
 
 def measures(quantitative: Table) -> list[Column]:
@@ -158,7 +178,7 @@ def _cell(
     limits = row.values.get(interval.name)
     n = of_baseline.get((row.id, column.name)) if found is None else found.values["n"]
     # Collisions are counted over all that ended, which is the n of the row.
-    n = row.values["n"] if column.name == "collided_percent" else n
+    n = row.values["n"] if column.name == COLLISIONS.name else n
     return Cell(
         column.name,
         row.id,
@@ -238,7 +258,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
         model=model,
         name=name,
         variant=variant,
-        left_out=left_out(variant),
+        left_out=left_out(site, variant),
         by=fate,
         said=_fate,
         pairs=pairs,

@@ -12,83 +12,60 @@ from analysis.explorer import views
 from analysis.explorer.details import scenario_of
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import Site
+from analysis.figures.styles import HUMAN_STYLE, Style, driver_style
+from analysis.metrics import Metric, intervals_of, shown_in
 from analysis.tables.formats import notes_of, shown_value
 from analysis.tables.model import Table, from_text
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 HUMAN = "human"
-# Okabe and Ito's colours that show on white, each with a shape; humans are black circles.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-SHAPES = ("square", "triangle", "diamond", "down", "cross", "plus")
-SHAPE_WORDS = {
-    "circle": "circle",
-    "square": "square",
-    "triangle": "triangle",
-    "diamond": "diamond",
-    "down": "triangle that points down",
-    "cross": "cross",
-    "plus": "plus",
-}
+SHAPE_WORDS = {"down": "triangle that points down"}
 # Of a picture, in its units.
 LEFT, TOP, HEIGHT, FOOT, STEP, LEAST, ARROW = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0, 3.0
 
 
+# Shares of the few trials of a condition are not known to more digits.
+PERCENT_DIGITS = 1
+
+
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A row of panels: one measure. ``least`` and ``most``: the ends of a scale that has them."""
+    """A row of panels: a metric as this page shows it."""
 
-    name: str
-    heading: str
-    unit: str
-    digits: int
-    meaning: str
-    least: float | None = 0.0
-    most: float | None = None
+    metric: Metric
+
+    @property
+    def name(self) -> str:
+        """The metric's."""
+        return self.metric.name
+
+    @property
+    def heading(self) -> str:
+        """``The gap``."""
+        return self.metric.in_sentences[0].upper() + self.metric.in_sentences[1:]
+
+    @property
+    def meaning(self) -> str:
+        """What is drawn."""
+        return f"{self.metric.meaning}; intervals: {intervals_of([self.metric])}"
+
+    @property
+    def digits(self) -> int:
+        """How many decimals a value has."""
+        digits = self.metric.decimals
+        return min(digits, PERCENT_DIGITS) if self.metric.rate else digits
+
+    @property
+    def denominators(self) -> bool:
+        """Whether its table tells those who ended from all, of whom some may be undecided."""
+        return self.metric.rate and self.metric.trials == "ended"
 
 
-KINDS = (
-    Kind(
-        "left_first_percent",
-        "The left vehicle merges first",
-        "%",
-        0,
-        "of finished trials with a first merger; Wilson intervals",
-        most=100.0,
-    ),
-    Kind(
-        "gap_m",
-        "Gap",
-        "m",
-        2,
-        "mean of finished trials; Student's t",
-        least=None,
-    ),
-    Kind(
-        "rmse_mps",
-        "RMSE of the speed",
-        "m/s",
-        2,
-        "from the initial speed to the first merge, mean of both vehicles and of finished trials; "
-        "Student's t",
-    ),
-    Kind(
-        "collided_boxes_percent",
-        "Collisions by the humans' rule",
-        "%",
-        1,
-        "boxes that overlap, looked for at 20 Hz, of the trials that ended and are decided; Wilson "
-        "intervals; the table has both denominators",
-    ),
-    Kind(
-        "collided_percent",
-        "Collisions by the drivers' rule",
-        "%",
-        1,
-        "by the rule of the trials' scenario, in the paper centres closer than a vehicle length, "
-        "of the trials that ended and are decided; Wilson intervals",
-    ),
-)
-COLLISIONS = ("collided_boxes_percent", "collided_percent")
+def kinds() -> list[Kind]:
+    """The rows of panels, those with denominators last, and what humans have outcomes of first."""
+    metrics = shown_in("humans")
+    metrics.sort(key=lambda one: (one.trials == "ended", one.humans_from != "outcomes"))
+    return [Kind(metric) for metric in metrics]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,14 +73,13 @@ class Mark:
     """How a group is drawn."""
 
     group: str
-    colour: str
-    shape: str
+    style: Style
     label: str
 
     @property
     def word(self) -> str:
         """The shape in words."""
-        return SHAPE_WORDS[self.shape]
+        return SHAPE_WORDS.get(self.style.shape, self.style.shape)
 
 
 def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
@@ -119,12 +95,22 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         values = {
             "human": next((group for group in groups if group["id"] == HUMAN), None),
             "measured": content["measured"],
-            "published": content["published"],
+            "outcomes_from": content["outcomes_from"],
+            "conditions": {
+                name: views.condition_text(*of) for name, of in content["conditions"].items()
+            },
+            "own": [name for name in content["conditions"] if name not in HUMAN_CONDITIONS],
+            "published": [one["text"] for one in content["published"].values()],
             "groups": groups,
             "rules": {group["id"]: rule_text(group) for group in groups},
             "marks": marks(groups),
-            "charts": [chart(kind, groups, content["published"]) for kind in KINDS],
-            "collisions": {name: collisions(groups, name) for name in COLLISIONS},
+            "charts": [
+                chart(kind, groups, list(content["conditions"]), content["published"])
+                for kind in kinds()
+            ],
+            "collisions": {
+                kind.name: collisions(groups, kind.name) for kind in kinds() if kind.denominators
+            },
             "caveat": content["caveat"],
             "notes": content["notes"],
             "differences": differences(contrasts),
@@ -136,7 +122,7 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         "humans.html",
         here="humans",
         computed=found,
-        conditions={name: views.condition_text(name) for name in CONDITIONS},
+        in_table={metric.name for metric in shown_in("tables")},
         path=marker,
         value=value_text,
         **values,
@@ -155,13 +141,11 @@ def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
     found: dict[str, Mark] = {}
     models = 0
     for group in groups:
-        colour, shape = "#000000", "circle"
+        style = HUMAN_STYLE
         if group["id"] != HUMAN:
-            # With more drivers than colours the next round pairs them otherwise.
-            colour = COLOURS[models % len(COLOURS)]
-            shape = SHAPES[(models + models // len(COLOURS)) % len(SHAPES)]
+            style = driver_style(models)
             models += 1
-        found[group["id"]] = Mark(group["id"], colour, shape, group["driver"])
+        found[group["id"]] = Mark(group["id"], style, group["driver"])
     return found
 
 
@@ -207,13 +191,14 @@ def differences(contrasts: Table) -> list[dict[str, Any]]:
 def chart(
     kind: Kind,
     groups: Sequence[Mapping[str, Any]],
-    published: Mapping[str, Any] | None,
+    conditions: Sequence[str],
+    published: Mapping[str, Any],
 ) -> dict[str, Any]:
     """One row of panels: where everything is drawn, in the units of the picture.
 
     ``cut`` names the intervals that go on beyond the axis.
     """
-    printed = _printed(kind, published)
+    printed: dict[str, float] = published.get(kind.name, {}).get("values", {})
     labels = {group["id"]: group["driver"] for group in groups}
     known = [
         found
@@ -224,7 +209,7 @@ def chart(
     axis = Axis(*scale(kind, *reach(known, list(printed.values()))))
     panel = max(LEAST, STEP * (len(groups) + 1))
     panels: list[dict[str, Any]] = []
-    for i, name in enumerate(CONDITIONS):
+    for i, name in enumerate(conditions):
         x0 = LEFT + i * panel
         points = []
         for j, group in enumerate(groups):
@@ -237,7 +222,7 @@ def chart(
         panels.append({"name": name, "x": round(x0, 1), "points": points, "line": line})
     return {
         "kind": kind,
-        "width": round(LEFT + panel * len(CONDITIONS) + 4),
+        "width": round(LEFT + panel * len(conditions) + 4),
         "height": TOP + HEIGHT + FOOT,
         "top": TOP,
         "bottom": TOP + HEIGHT,
@@ -296,8 +281,9 @@ def reach(estimates: Sequence[Mapping[str, Any]], printed: Sequence[float]) -> t
 
 def scale(kind: Kind, low: float, high: float) -> tuple[float, float, list[float]]:
     """Both ends of an axis, and its ticks: round steps, with 0 in it."""
-    low = min(low, 0.0) if kind.least is None else kind.least
-    high = max(high, 0.0) if kind.most is None else kind.most
+    lowest, highest = kind.metric.lowest, kind.metric.highest
+    low = min(low, 0.0) if lowest is None else lowest
+    high = max(high, 0.0) if highest is None else highest
     high = high if high > low else low + 1.0
     rough = (high - low) / 4
     size = 10.0 ** floor(log10(rough))
@@ -336,11 +322,3 @@ def value_text(found: Mapping[str, Any] | None, digits: int) -> str:
     if found["low"] is not None:
         interval = f" [{found['low']:.{digits}f}, {found['high']:.{digits}f}]"
     return f"{found['value']:.{digits}f}{interval}, n {found['n']}"
-
-
-def _printed(kind: Kind, published: Mapping[str, Any] | None) -> dict[str, float]:
-    """The published human value in each condition, where no trial of humans has the measure."""
-    value = (published or {}).get(kind.name)
-    if value is None:
-        return {}
-    return dict(value) if isinstance(value, Mapping) else dict.fromkeys(CONDITIONS, float(value))

@@ -13,12 +13,12 @@ from markupsafe import escape
 
 from analysis.explorer.display_text import visible
 from analysis.explorer.site import NothingNew, NotThere, Site
-from analysis.explorer.sweeps import Cell, Sweep, duration, find_sweep, list_sweeps
+from analysis.explorer.sweeps import Sweep, VariantCondition, duration, find_sweep, list_sweeps
 from analysis.explorer.views import condition_text, prompt_text
 from merge_runner.errors import MergeRunnerError
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.results.progress_file import read_standing
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 LOOK_EVERY_S = 1.0
 READ_EVERY_S = 3.0
@@ -53,7 +53,7 @@ def sweep_page(site: Site, sweep_id: str, seen: str = "") -> str:
     newer = newest if newest.sweep_id != sweep_id else None
     state = (sweep, newer and (newer.sweep_id, newer.state))
     return site.render(
-        "sweep.html", here="sweeps", newer=newer, seen=_news(state, seen), **_values(sweep)
+        "sweep.html", here="sweeps", newer=newer, seen=_news(state, seen), **_values(site, sweep)
     )
 
 
@@ -125,15 +125,15 @@ class _Watched:
         if catalogue.held and not alive:
             return []  # how it ended cannot be read yet
         self.updated_at = alive.updated_at if alive else None
-        shown = self.site.render("_sweep.html", seen="", **_values(sweep))
+        shown = self.site.render("_sweep.html", seen="", **_values(self.site, sweep))
         events = [("sweep", shown)] if shown != self.shown else []
         self.shown = shown
-        if sweep.verdict.text != self.said:
+        if sweep.assessment.text != self.said:
             # Read out once per state, and not once a second.
             quiet = ' aria-live="off"' if sweep.entry.state == self.state else ""
-            text = escape(visible(sweep.verdict.text))
+            text = escape(visible(sweep.assessment.text))
             events.append(("state", f"<span{quiet}>{text}</span>"))
-            self.said, self.state = sweep.verdict.text, sweep.entry.state
+            self.said, self.state = sweep.assessment.text, sweep.entry.state
         return events if sweep.entry.followed else [*events, ("done", "")]
 
 
@@ -144,10 +144,10 @@ def _find(site: Site, sweep_id: str) -> Sweep:
     return sweep
 
 
-def _values(sweep: Sweep) -> dict[str, object]:
+def _values(site: Site, sweep: Sweep) -> dict[str, object]:
     """What the templates of a sweep show."""
     variants = _ordered({variant for variant, _ in sweep.cells}, VARIANTS)
-    conditions = _ordered({condition for _, condition in sweep.cells}, CONDITIONS)
+    conditions = _ordered({condition for _, condition in sweep.cells}, HUMAN_CONDITIONS)
     rows = [
         (condition, [sweep.cells.get((variant, condition)) for variant in variants])
         for condition in conditions
@@ -155,7 +155,7 @@ def _values(sweep: Sweep) -> dict[str, object]:
     return {
         "sweep": sweep,
         "entry": sweep.entry,
-        "verdict": sweep.verdict,
+        "assessment": sweep.assessment,
         "variants": variants,
         "matrix": rows,
         "totals": [_total(variant, [cells[i] for _, cells in rows]) for i, variant in
@@ -165,13 +165,25 @@ def _values(sweep: Sweep) -> dict[str, object]:
             for kind, text in KINDS.items()
         },
         "bar": bar,
-        "condition_texts": {
-            name: condition_text(name) if name in CONDITIONS else "" for name in conditions
-        },
+        "condition_texts": _condition_texts(site, conditions),
         "prompt_text": prompt_text,
         "duration": duration,
         "lasted": _lasted(sweep.entry.row["started_at"], sweep.entry.last_word),
     }  # fmt: skip
+
+
+def _condition_texts(site: Site, names: list[str]) -> dict[str, str]:
+    """Conditions in words; nothing is said of one that no human drove and no trial tells yet."""
+    known = {
+        name: (one.projected_headway_m, one.relative_velocity_mps)
+        for name, one in HUMAN_CONDITIONS.items()
+    } | {
+        row["condition"]: (row["projected_headway_m"], row["relative_velocity_mps"])
+        for row in site.catalogue.ask(
+            "SELECT DISTINCT condition, projected_headway_m, relative_velocity_mps FROM listed"
+        )
+    }
+    return {name: condition_text(*known[name]) if name in known else "" for name in names}
 
 
 def _ordered(names: Iterable[str], usual: Iterable[str]) -> list[str]:
@@ -180,7 +192,7 @@ def _ordered(names: Iterable[str], usual: Iterable[str]) -> list[str]:
     return sorted(names, key=lambda name: (places.get(name, len(places)), name))
 
 
-def bar(cell: Cell) -> list[tuple[str, float, float]]:
+def bar(cell: VariantCondition) -> list[tuple[str, float, float]]:
     """(what, from, width) of a bar of 100 units for the planned trials of a cell."""
     whole = max(cell.planned, cell.ended + cell.failed + (cell.running or 0), 1)
     parts, begin = [], 0.0
@@ -196,11 +208,11 @@ def bar(cell: Cell) -> list[tuple[str, float, float]]:
     return parts
 
 
-def _total(variant: str, cells: list[Cell | None]) -> Cell:
+def _total(variant: str, cells: list[VariantCondition | None]) -> VariantCondition:
     """One variant over all conditions."""
     there = [cell for cell in cells if cell is not None]
     running = [cell.running for cell in there]
-    return Cell(
+    return VariantCondition(
         variant,
         "",
         planned=sum(cell.planned for cell in there),

@@ -16,7 +16,7 @@ ABOUT = {
     "gap": "Table IV: the gap, by headway and relative velocity",
     "indicators": "Table V: the indicators I1 to I5, the score and the measures",
     "ablation-qualitative": "Table VI: the indicators of every driver and variant",
-    "ablation-quantitative": "Table VII: collisions, gap, RMSE and joint rate of these",
+    "ablation-quantitative": "Table VII: the measures of every driver and variant",
     "contrasts": "every variant against its baseline, every baseline against the humans",
     "differences": "who merges first and the gap, against the humans in one model of both",
     "who-first-variants": "Table III for every prompt variant, and what differs from the baseline",

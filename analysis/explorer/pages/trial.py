@@ -11,9 +11,10 @@ from markupsafe import Markup, escape
 
 from analysis.explorer import views
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.details import Decision, Row, Trial, read_decisions, read_trial
+from analysis.explorer.details import Decision, Trial, read_decisions, read_trial
 from analysis.explorer.display_text import shortened
 from analysis.explorer.query_params import whole
+from analysis.explorer.reading import Row
 from analysis.explorer.site import NotThere, Site
 from merge_runner.records import SIDES
 
@@ -51,7 +52,7 @@ def shown(row: Row, trial: Trial) -> dict[str, Any]:
         "outcome": views.outcome_text(row, trial.scenario),
         "facts": views.facts(row),
         "judged": views.judged_text(trial.scenario),
-        "view_box": views.view_box(),
+        "view_box": views.view_box(trial.track),
         "data": embedded(views.replay_data(row, trial)) if trial.states else None,
         "lines": views.summary(row, trial),
         "samples": views.sample_table(trial),
@@ -87,7 +88,7 @@ def rendered(site: Site, row: Row, trial: Trial, found: Decision) -> str:
         d=found.row,
         before=found.before,
         parts=found.parts,
-        meanings=views.BLOCK_MEANINGS,
+        meaning=views.block_meaning,
         attempts=found.attempts,
         others=site.catalogue.others,
         reply=None if body is None else {"text": text, "more": more},

@@ -186,7 +186,7 @@ window.startReplay = () => {
 
   const decisions = [...document.querySelectorAll("a.decision")];
   const begins = (link) => Number(link.dataset.t);
-  const until = (link) => Math.min(begins(link) + trial.every, trial.end);
+  const until = (link) => Math.min(begins(link) + trial.every[link.dataset.side], trial.end);
   const placeRibbons = () => {
     const ribbons = at("ribbons");
     if (!ribbons || !charts.length) return;

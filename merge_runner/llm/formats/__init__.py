@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from merge_runner.config import Format
 from merge_runner.llm.formats.anthropic import AnthropicMessages
 from merge_runner.llm.formats.base import WireFormat
 from merge_runner.llm.formats.gemini import GeminiGenerateContent
 from merge_runner.llm.formats.openai_chat import OpenAIChat
 from merge_runner.llm.formats.openai_responses import OpenAIResponses
+from merge_runner.registry import Registry
 
-FORMATS: dict[Format, WireFormat] = {
-    "openai-chat": OpenAIChat(),
-    "openai-responses": OpenAIResponses(),
-    "gemini": GeminiGenerateContent(),
-    "anthropic": AnthropicMessages(),
-}
+FORMATS: Registry[WireFormat] = Registry("wire format")
+# Gateways pass on the errors of these providers, whatever format they speak themselves. What an
+# added format knows is its own alone: it must not change how the replies of another are read.
+PASSED_ON = (
+    FORMATS.register("openai-chat", OpenAIChat()),
+    FORMATS.register("openai-responses", OpenAIResponses()),
+    FORMATS.register("gemini", GeminiGenerateContent()),
+    FORMATS.register("anthropic", AnthropicMessages()),
+)

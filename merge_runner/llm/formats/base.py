@@ -1,9 +1,12 @@
-"""What every wire format offers, and how to read JSON that servers send in many shapes."""
+"""What a wire format is, and how to read JSON that servers send in many shapes."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from datetime import datetime
+from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue
 
@@ -37,31 +40,75 @@ class Reading:
     usage: Usage = field(default_factory=Usage)
 
 
-class WireFormat(Protocol):
-    """One provider's request and reply."""
-
-    retries_empty: bool
-    """Whether an empty answer is a known fault of the service that asking again may mend."""
-
-    members: frozenset[str]
-    """Those of which an answer has one, whatever it says."""
-
-    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
-        """The request for a prompt."""
-        ...
-
-    def read(self, payload: dict[str, Any]) -> Reading:
-        """Read a body of status 200; unknown keys and missing ones are normal."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
-class ErrorInfo:
-    """An error body in one shape: servers send nested, flat, listed and string errors."""
+class ServerError:
+    """An error in one shape: servers send nested, flat, listed and string errors.
 
+    ``status`` is that of the reply, or the one that an error within a 200 stands for. ``names``
+    are its type, its code, its status in words and the reasons among its ``details``.
+    """
+
+    status: int
+    headers: Mapping[str, str]
+    body: str
     message: str
     names: frozenset[str]
     details: tuple[dict[str, Any], ...]
+
+
+# What an error can mean where its status does not tell. All but ``bad_prompt``, which speaks of one
+# prompt alone, are outcomes of the table of calls.
+Meaning = Literal[
+    "refusal",
+    "quota_exhausted",
+    "unknown_model",
+    "not_allowed",
+    "rate_limited",
+    "request_too_large",
+    "bad_prompt",
+]
+
+
+class WireFormat(ABC):
+    """One format of requests and replies, with all that is particular to it.
+
+    What a format knows of errors may be said by a server of any format, since gateways pass on
+    the errors of others; None leaves a question to the rules for all servers (http_outcome.py,
+    delays.py).
+    """
+
+    members: ClassVar[frozenset[str]]
+    """Those of which an answer has one, whatever it says."""
+
+    retries_empty: ClassVar[bool] = False
+    """Whether an empty answer is a known fault of the service that asking again may mend."""
+
+    charged_errors: ClassVar[frozenset[str]] = frozenset()
+    """The names of errors 400 that a server may send after work that it charges for."""
+
+    @abstractmethod
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """The request for a prompt."""
+
+    @abstractmethod
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Read a body of status 200; unknown keys and missing ones are normal."""
+
+    def meaning(self, error: ServerError) -> Meaning | None:
+        """What an error means where that is not what its status says."""
+        return None
+
+    def status_of(self, error: ServerError) -> int | None:
+        """The status that an error within a 200 stands for, by its names."""
+        return None
+
+    def delay_s(self, error: ServerError) -> float | None:
+        """How long to wait by a member of the error; its words are read for every format."""
+        return None
+
+    def reset_s(self, headers: Mapping[str, str], now: datetime) -> float | None:
+        """The time until exhausted limits are reset, by headers with lower-case names."""
+        return None
 
 
 def is_answer(payload: dict[str, Any], members: frozenset[str]) -> bool:
@@ -111,7 +158,7 @@ def total(*counts: int | None) -> int | None:
     return sum(known) if known else None
 
 
-def error_info(payload: object, body: str) -> ErrorInfo:
+def read_error(status: int, headers: Mapping[str, str], body: str, payload: object) -> ServerError:
     """Read an error body of any known shape; the text itself serves where it is no JSON."""
     top = as_dict(payload)
     nested = top.get("error")
@@ -134,4 +181,4 @@ def error_info(payload: object, body: str) -> ErrorInfo:
     }
     # It reaches a user as one line; Gemini's has several.
     message = " ".join((as_text(error.get("message")) or body[:200]).split())
-    return ErrorInfo(message, frozenset(names), tuple(listed))
+    return ServerError(status, headers, body, message, frozenset(names), tuple(listed))

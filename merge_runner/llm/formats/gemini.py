@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from pydantic import JsonValue
 
 from merge_runner.config import ModelEntry
 from merge_runner.llm.formats.base import (
+    Meaning,
     Reading,
+    ServerError,
+    WireFormat,
     WireRequest,
     as_count,
     as_dict,
@@ -31,9 +35,11 @@ REFUSALS = frozenset(
         "MODEL_ARMOR",
     }
 )
+# A protobuf Duration as JSON.
+DURATION = re.compile(r"(\d+(?:\.\d+)?)s")
 
 
-class GeminiGenerateContent:
+class GeminiGenerateContent(WireFormat):
     """``POST /v1beta/models/MODEL:generateContent``: the model is in the path alone.
 
     The parameters are members of ``generationConfig``.
@@ -87,3 +93,22 @@ class GeminiGenerateContent:
                 reasoning_tokens=thoughts,
             ),
         )
+
+    def meaning(self, error: ServerError) -> Meaning | None:
+        """A quota per day, which waiting does not mend, has the words of one per minute."""
+        if error.status == 400 and "API_KEY_INVALID" in error.names:
+            return "not_allowed"
+        per_day = any(
+            "PerDay" in str(as_dict(violation).get("quotaId"))
+            for detail in error.details
+            for violation in as_list(detail.get("violations"))
+        )
+        return "quota_exhausted" if error.status == 429 and per_day else None
+
+    def delay_s(self, error: ServerError) -> float | None:
+        """The RetryInfo among the details."""
+        for detail in error.details:
+            match = DURATION.fullmatch(as_text(detail.get("retryDelay")) or "")
+            if match:
+                return float(match.group(1))
+        return None

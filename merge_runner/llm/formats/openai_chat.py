@@ -14,13 +14,13 @@ from merge_runner.llm.formats.base import (
     as_text,
     outcome_of,
 )
+from merge_runner.llm.formats.openai_errors import OpenAIErrors
 from merge_runner.records import Usage
 
 
-class OpenAIChat:
+class OpenAIChat(OpenAIErrors):
     """``POST /chat/completions``; the path can be overridden, as Azure's classic form needs."""
 
-    retries_empty = False
     members = frozenset({"choices"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:

@@ -14,13 +14,13 @@ from merge_runner.llm.formats.base import (
     as_text,
     outcome_of,
 )
+from merge_runner.llm.formats.openai_errors import OpenAIErrors
 from merge_runner.records import Usage
 
 
-class OpenAIResponses:
+class OpenAIResponses(OpenAIErrors):
     """``POST /responses``, not stored at the provider."""
 
-    retries_empty = False
     members = frozenset({"output", "status"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:

@@ -11,7 +11,7 @@ from pathlib import Path
 import merge_runner
 from merge_runner.llm.cache import Entry
 from merge_runner.records import Attempt, TrialSpec
-from merge_runner.run.clients import Addressed
+from merge_runner.run.clients import EndpointPlan
 from merge_runner.run.plan import Plan
 
 
@@ -27,14 +27,14 @@ class Batch:
     specs: tuple[TrialSpec, ...]
     in_flight: int
     plan: Plan
-    addressed: Addressed
+    endpoint_plan: EndpointPlan
     folder: str
     limited: frozenset[str]
     pauses_s: Mapping[str, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class KnownCall:
     """What the main cache holds of a call: its entry, or earlier attempts.
 
     ``damaged`` names what was found damaged and set aside.

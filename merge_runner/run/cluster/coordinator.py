@@ -14,7 +14,7 @@ import math
 import secrets
 import socket
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -39,8 +39,9 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from merge_runner.llm.cache import ResponseCache
+    from merge_runner.llm.call import Wait
     from merge_runner.records import TrialRecord, TrialSpec
-    from merge_runner.run.clients import Addressed, OwnDesk
+    from merge_runner.run.clients import EndpointPlan, LocalServices
     from merge_runner.run.local_runner import Ended, Room
     from merge_runner.run.plan import Plan
 
@@ -55,7 +56,7 @@ _IDENTITY = "identity"
 
 
 class Coordinator:
-    """Plays trials on the workers of a Dask cluster; see Crew.
+    """Plays trials on the workers of a Dask cluster; see TrialRunner.
 
     ``in_flight`` trials are played at once over all workers. A worker's thread is a slot: one
     batch at a time.
@@ -65,12 +66,12 @@ class Coordinator:
         self,
         client: Client,
         plan: Plan,
-        addressed: Addressed,
+        endpoint_plan: EndpointPlan,
         cache: ResponseCache,
-        desk: OwnDesk,
+        services: LocalServices,
         in_flight: int,
     ) -> None:
-        self.desk = desk
+        self.services = services
         self.cache = cache
         self.claimed: set[str] = set()
         self.answered: Counter[str] = Counter()
@@ -79,9 +80,9 @@ class Coordinator:
         self.playing = None
         self._client = client
         self._plan = plan
-        self._addressed = addressed
+        self._endpoint_plan = endpoint_plan
         self._in_flight = in_flight
-        self._limited = frozenset(n for n, turns in desk.limiters.items() if turns.limited)
+        self._limited = frozenset(n for n, turns in services.limiters.items() if turns.limited)
         self._token = secrets.token_hex(16)
         self._folder = ""
         self._waiting: deque[TrialSpec] = deque()
@@ -128,16 +129,21 @@ class Coordinator:
         return sum(session.running for session in self._sessions)
 
     @property
-    def flying(self) -> int:
+    def in_flight_calls(self) -> int:
         """How many calls are in flight or being saved, as the workers told last."""
-        return sum(session.flying for session in self._sessions)
+        return sum(session.in_flight_calls for session in self._sessions)
+
+    @property
+    def waits(self) -> Sequence[Wait]:
+        """What the other calls wait for, as the workers told last."""
+        return [wait for session in self._sessions for wait in session.waits]
 
     def answers(self, name: str) -> int:
         """How many calls of this run a model has answered."""
         return self.answered[self._plan.entries[name].id]
 
     async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
-        """See Crew."""
+        """See TrialRunner."""
         self._ended = ended
         self._room = room
         self._waiting.extend(specs)
@@ -156,7 +162,7 @@ class Coordinator:
                 batch.result()
 
     async def drain(self) -> None:
-        """See Crew."""
+        """See TrialRunner."""
         self._stopping = True
         self._waiting.clear()
         for session in self._sessions:
@@ -202,6 +208,7 @@ class Coordinator:
             )
         self._refuse_unreachable_emulator(host)
         await self._room()
+        # All --in-flight trials may be given out; the next worker waits until a batch has ended.
         while not self._free and self._waiting:
             self._freed.clear()
             await self._freed.wait()
@@ -210,6 +217,8 @@ class Coordinator:
         slots = max(1, min(self._slots, self._in_flight))
         share = min(self._free, max(1, self._in_flight // slots))
         idle = max(1, slots - sum(bool(other.trials) for other in self._sessions))
+        # Many at first, so that little is said, and fewer toward the end, so that no worker is left
+        # with a long rest; never fewer than it plays at once.
         size = min(
             math.ceil(len(self._waiting) / idle),
             max(share, math.ceil(len(self._waiting) / (BATCHES_PER_WORKER * slots))),
@@ -222,12 +231,12 @@ class Coordinator:
             specs=tuple(specs),
             in_flight=session.in_flight,
             plan=self._plan,
-            addressed=replace(self._addressed, passed=self._passed()),
+            endpoint_plan=replace(self._endpoint_plan, passed=self._passed()),
             folder=self._folder,
             limited=self._limited,
             pauses_s={
                 name: turns.paused_s
-                for name, turns in self.desk.limiters.items()
+                for name, turns in self.services.limiters.items()
                 if name not in self._limited
             },
         )
@@ -249,6 +258,8 @@ class Coordinator:
             self.fail(error)  # a fault of ours: the run raises it
         if self._stopping:
             return
+        # What it had not ended goes to the front, in order: a trial is played where its replies are
+        # found, in the main cache, whoever plays it.
         rest = sorted(session.trials.values(), key=lambda spec: spec.order)
         self._waiting.extendleft(reversed(rest))
         if rest and not session.ended:
@@ -272,7 +283,7 @@ class Coordinator:
         self._batches[asyncio.create_task(_finished(future))] = future
 
     def _refuse_unreachable_emulator(self, host: str) -> None:
-        url = self._addressed.urls.get("EMULATOR_BASE_URL", "")
+        url = self._endpoint_plan.urls.get("EMULATOR_BASE_URL", "")
         if "//127.0.0.1:" in url and host != socket.gethostname():
             raise UsageError(
                 f"the emulator listens on this machine alone, and a Dask worker is on {host}: play "

@@ -3,6 +3,13 @@
 What is said within two milliseconds travels together, so that one packet carries many calls. The
 content is pickled as everything is that Dask carries: whoever reaches a Dask scheduler can run
 code there anyway, so protect the cluster, by TLS where the network is shared.
+
+None of Dask's public primitives does this. An Actor lives on a worker, and the books of the whole
+sweep would die with that one; asked 500 things at once it answered 80 to 180 a second, and a link
+2,600 to 3,900 (on 2 busy cores; a single question took 1 to 20 ms there, and 12 ms here, where a
+model takes a second). A Semaphore serves whoever asked first, while turns and money go to the
+oldest trial, and it freed what a killed worker held after 34 s, while the end of a connection is
+seen at once. Queues, events and topics carry no answers, errors or cancellations.
 """
 
 from __future__ import annotations
@@ -30,8 +37,8 @@ class LinkLost(SweepStopped):
 class Link:
     """One end. ``handlers`` answer what the other end asks or tells, by name.
 
-    Those named in ``lasting`` end also when the other side is gone meanwhile; the others wait for
-    something on its behalf, and are cancelled.
+    Those named in ``survives_disconnect`` end also when the other side is gone meanwhile; the
+    others wait for something on its behalf, and are cancelled.
     """
 
     def __init__(
@@ -39,11 +46,11 @@ class Link:
         comm: Comm,
         handlers: Mapping[str, Callable[..., Any]],
         *,
-        lasting: frozenset[str] = frozenset(),
+        survives_disconnect: frozenset[str] = frozenset(),
     ) -> None:
         self._comm = comm
         self._handlers = handlers
-        self._lasting = lasting
+        self._survives_disconnect = survives_disconnect
         self._out = BatchedSend(interval=TOGETHER)
         self._out.start(comm)
         self._asked: dict[int, asyncio.Future[Any]] = {}
@@ -66,6 +73,7 @@ class Link:
         try:
             return await self._asked[number]
         except asyncio.CancelledError:
+            # Else the other side would go on waiting, for a turn for one, on behalf of nobody.
             self._send(number, CANCEL, ())
             raise
         finally:
@@ -85,8 +93,9 @@ class Link:
                 if not future.done():
                     future.set_exception(LinkLost("the other side is gone"))
             for task in self._answering.values():
-                if task.get_name() not in self._lasting:
+                if task.get_name() not in self._survives_disconnect:
                     task.cancel()
+            # Only then does serve return, and what the other side held is given back.
             await asyncio.gather(*self._answering.values(), return_exceptions=True)
         if self._broken is not None:
             raise self._broken

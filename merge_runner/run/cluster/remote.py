@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+import itertools
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,10 +13,10 @@ from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import Entry, ResponseCache
 from merge_runner.llm.ledger import Asked
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.shared_services import Turns
+from merge_runner.llm.shared_services import RateLimitPort
 from merge_runner.llm.write_batcher import Operation
 from merge_runner.records import Attempt
-from merge_runner.run.cluster.batch import Told
+from merge_runner.run.cluster.batch import KnownCall
 from merge_runner.run.cluster.link import Link
 
 
@@ -26,19 +28,19 @@ class WorkerCache(ResponseCache):
 
     def __init__(self, folder: Path, link: Link) -> None:
         super().__init__(folder)
-        self.told: dict[str, Told] = {}
+        self.known: dict[str, KnownCall] = {}
         self._link = link
         self._sending: dict[str, asyncio.Task[None]] = {}
 
     def get(self, key: str) -> Entry | None:
         """What the main cache holds, else what a worker that died has left on this disk."""
-        told = self.told.get(key)
-        if told is None:
+        known = self.known.get(key)
+        if known is None:
             return None
-        if told.damaged:
+        if known.damaged:
             raise RecordingError("what the main cache held of the call is damaged")
-        if told.entry is not None:
-            return told.entry
+        if known.entry is not None:
+            return known.entry
         left = super().get(key)
         if left is not None:
             self._send(left)
@@ -50,23 +52,23 @@ class WorkerCache(ResponseCache):
         self._send(kept)
         return kept
 
-    async def put_paid(self, entry: Entry, worst_usd: float, actual_usd: float | None) -> Entry:
-        """Keep an entry on this disk, then in the main cache, with what it cost."""
+    async def put_paid(self, entry: Entry, attempt: int) -> Entry:
+        """Keep an entry on this disk, then in the main cache, with what its attempt cost."""
         kept = await super().put(entry)
-        await self._link.ask("keep", entry.to_json(), (worst_usd, actual_usd))
+        await self._link.ask("keep", entry.to_json(), attempt)
         await self._discard(entry.request.key)
         return kept
 
     def set_damage_aside(self, key: str) -> list[str]:
         """What was damaged, there or here."""
-        told = self.told[key]
-        self.told[key] = replace(told, damaged=())
-        return [*told.damaged, *super().set_damage_aside(key)]
+        known = self.known[key]
+        self.known[key] = replace(known, damaged=())
+        return [*known.damaged, *super().set_damage_aside(key)]
 
     def unanswered(self, key: str) -> tuple[Attempt, ...]:
         """The attempts that the main cache knows."""
-        told = self.told.get(key)
-        return told.attempts if told else ()
+        known = self.known.get(key)
+        return known.attempts if known else ()
 
     async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """Keep the attempts in the main cache."""
@@ -109,15 +111,15 @@ class RemoteClaims:
 
     async def claim(self, key: str) -> bool:
         """Claim a key and learn what is known of the call."""
-        told: Told | None = await self._link.ask("claim", key)
-        if told is None:
+        known: KnownCall | None = await self._link.ask("claim", key)
+        if known is None:
             return False
-        self._cache.told[key] = told
+        self._cache.known[key] = known
         return True
 
     def release(self, key: str) -> None:
         """Give a claim up, once the coordinator has the reply."""
-        self._cache.told.pop(key, None)
+        self._cache.known.pop(key, None)
         if sending := self._cache.sending(key):
             sending.add_done_callback(lambda _: self._link.tell("release", key))
         else:
@@ -125,7 +127,7 @@ class RemoteClaims:
 
 
 @dataclass(frozen=True, slots=True)
-class RemoteTurn:
+class RemotePermit:
     """See Permit."""
 
     number: int
@@ -137,22 +139,22 @@ class RemoteTurn:
 
 
 @dataclass(frozen=True, slots=True)
-class RemoteTurns:
+class RemoteRateLimit:
     """See Limiter: that of the coordinator, so that the limits hold over all workers."""
 
     link: Link
     name: str
 
-    async def acquire(self, tokens: int, *, order: int = 0) -> RemoteTurn:
+    async def acquire(self, tokens: int, *, order: int = 0) -> RemotePermit:
         """Wait for a turn."""
-        return RemoteTurn(await self.link.ask("turn", self.name, tokens, order), self.link)
+        return RemotePermit(await self.link.ask("turn", self.name, tokens, order), self.link)
 
     def pause(self, seconds: float) -> None:
         """All calls of all workers wait."""
         self.link.tell("pause", self.name, seconds)
 
 
-class UnlimitedTurns(Limiter):
+class UnlimitedRate(Limiter):
     """Turns of a model without limits need no question; a pause holds for all workers."""
 
     def __init__(self, link: Link, name: str) -> None:
@@ -171,62 +173,62 @@ class UnlimitedTurns(Limiter):
 
 
 @dataclass(frozen=True, slots=True)
-class RemoteLedger:
-    """See Ledger: that of the coordinator."""
+class RemoteAttempt:
+    """See PaidAttempt: the one that the coordinator holds under this number."""
 
     link: Link
     cache: WorkerCache
+    number: int
+    aside_usd: float
 
-    async def settle(
-        self, key: str, attempts: list[Attempt], worst_usd: float, actual_usd: float | None
-    ) -> None:
-        """An attempt brought no answer."""
-        await self.link.ask("settle", key, attempts, worst_usd, actual_usd)
+    async def begin(self, attempts: Sequence[Attempt]) -> None:
+        """The attempt is sent now."""
+        await self.link.ask("begin", self.number, attempts)
 
-    async def keep(self, entry: Entry, worst_usd: float, actual_usd: float | None) -> Entry:
-        """Keep an answered call, and settle its last attempt with it."""
-        return await self.cache.put_paid(entry, worst_usd, actual_usd)
+    async def settle(self, attempts: Sequence[Attempt]) -> None:
+        """The attempt brought no answer."""
+        await self.link.ask("settle", self.number, attempts)
+
+    async def keep(self, entry: Entry) -> Entry:
+        """Keep the answer, and what it cost."""
+        return await self.cache.put_paid(entry, self.number)
 
 
-@dataclass(frozen=True, slots=True)
 class RemoteBudget:
     """See Budget: that of the coordinator, so that the cap holds over all workers."""
 
-    link: Link
-    ledger: RemoteLedger
+    def __init__(self, link: Link, cache: WorkerCache) -> None:
+        self._link = link
+        self._cache = cache
+        self._numbers = itertools.count()
 
     async def admit(self, trial: int) -> None:
         """Wait for a trial's allowance."""
-        await self.link.ask("admit", trial)
+        await self._link.ask("admit", trial)
 
     def leave(self, trial: int) -> None:
         """The trial has ended or is suspended."""
-        self.link.tell("leave", trial)
+        self._link.tell("leave", trial)
 
-    async def reserve(self, trial: int, worst_usd: float, driver: str) -> float:
-        """Set an attempt's worst case aside; returns what is set aside."""
-        aside_usd: float = await self.link.ask("reserve", trial, worst_usd, driver)
-        return aside_usd
+    @asynccontextmanager
+    async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[RemoteAttempt]:
+        """The money of one attempt, which the coordinator sets aside and holds.
 
-    async def begin(
-        self, key: str, attempts: list[Attempt], worst_usd: float, asked: Asked
-    ) -> None:
-        """The attempt is sent now."""
-        await self.link.ask("begin", key, attempts, worst_usd, asked)
-
-    def give_back(self, trial: int, worst_usd: float) -> None:
-        """The attempt was not begun."""
-        self.link.tell("give_back", trial, worst_usd)
-
-    def settled(self, trial: int, freed_usd: float = 0.0) -> None:
-        """An attempt has ended."""
-        self.link.tell("settled", trial, freed_usd)
+        It is told of the end in any case: who gives up waiting cannot know whether the money was
+        set aside meanwhile, its answer being under way.
+        """
+        number = next(self._numbers)
+        try:
+            aside_usd = await self._link.ask("set_aside", number, trial, key, asked)
+            yield RemoteAttempt(self._link, self._cache, number, aside_usd)
+        finally:
+            self._link.tell("close", number)
 
 
 @dataclass(frozen=True, slots=True)
-class RemoteDesk:
-    """See Desk."""
+class RemoteServices:
+    """See SharedServices."""
 
-    limiters: Mapping[str, Turns]
+    limiters: Mapping[str, RateLimitPort]
     budget: RemoteBudget
     claims: RemoteClaims

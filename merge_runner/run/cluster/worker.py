@@ -22,13 +22,12 @@ from merge_runner.run.cluster.link import Link, LinkLost, taken_apart
 from merge_runner.run.cluster.remote import (
     RemoteBudget,
     RemoteClaims,
-    RemoteDesk,
-    RemoteLedger,
-    RemoteTurns,
-    UnlimitedTurns,
+    RemoteRateLimit,
+    RemoteServices,
+    UnlimitedRate,
     WorkerCache,
 )
-from merge_runner.run.local_runner import Players
+from merge_runner.run.local_runner import LocalRunner
 
 REPORT_EVERY_S = 0.5
 
@@ -49,7 +48,7 @@ class _Worker:
     def __init__(self) -> None:
         self._work: asyncio.Task[None] | None = None
         self._stopping = False
-        self._turns: dict[str, UnlimitedTurns] = {}
+        self._turns: dict[str, UnlimitedRate] = {}
         self._early_pauses: dict[str, float] = {}
 
     async def play(self, address: str, token: str) -> None:
@@ -85,35 +84,35 @@ class _Worker:
         async with AsyncExitStack() as stack:
             cache = WorkerCache(folder, link)
             stack.callback(cache.close)
-            self._turns = {name: UnlimitedTurns(link, name) for name in batch.pauses_s}
+            self._turns = {name: UnlimitedRate(link, name) for name in batch.pauses_s}
             for name, seconds in {**batch.pauses_s, **self._early_pauses}.items():
                 self._pause(name, seconds)
-            limited = {name: RemoteTurns(link, name) for name in batch.limited}
-            desk = RemoteDesk(
+            limited = {name: RemoteRateLimit(link, name) for name in batch.limited}
+            services = RemoteServices(
                 limiters={**limited, **self._turns},
-                budget=RemoteBudget(link, RemoteLedger(link, cache)),
+                budget=RemoteBudget(link, cache),
                 claims=RemoteClaims(link, cache),
             )
             clients = live_clients(
                 batch.plan.entries,
-                batch.addressed,
+                batch.endpoint_plan,
                 cache,
-                desk,
+                services,
                 connections=2 * batch.in_flight,
                 stack=stack,
             )
-            players = Players(batch.plan, clients, batch.in_flight)
-            self._work = asyncio.create_task(players.play(batch.specs, partial(_tell, link)))
+            runner = LocalRunner(batch.plan, clients, batch.in_flight)
+            self._work = asyncio.create_task(runner.play(batch.specs, partial(_tell, link)))
             if self._stopping:
                 self._work.cancel()
-            reporting = asyncio.create_task(_report(players, link))
+            reporting = asyncio.create_task(_report(runner, link))
             try:
                 await asyncio.wait([self._work])
-                await players.drain()
+                await runner.drain()
                 await cache.sent()
             finally:
                 reporting.cancel()
-                _tell_meters(players, link)
+                _tell_progress(runner, link)
             self._work.result()
 
     def _stop(self) -> None:
@@ -142,15 +141,15 @@ def _tell(link: Link, spec: TrialSpec, record: TrialRecord | TrialSuspended) -> 
     link.tell("trial", spec.order, told)
 
 
-async def _report(players: Players, link: Link) -> None:
+async def _report(runner: LocalRunner, link: Link) -> None:
     while True:
-        _tell_meters(players, link)
+        _tell_progress(runner, link)
         await asyncio.sleep(REPORT_EVERY_S)
 
 
-def _tell_meters(players: Players, link: Link) -> None:
-    """What was counted since the last time; what waits is told anew."""
+def _tell_progress(runner: LocalRunner, link: Link) -> None:
+    """What was counted since the last time, and what is under way now."""
     since = {}
-    for name, client in players.clients.items():
-        since[name], client.meter = client.meter, Meter(waits=client.meter.waits)
-    link.tell("report", since, players.running, players.flying)
+    for name, client in runner.clients.items():
+        since[name], client.meter = client.meter, Meter()
+    link.tell("report", since, runner.running, runner.in_flight_calls, runner.waits)

@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
-from merge_runner.config import Scenario
-from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, heading, place
+from merge_runner.config import ScenarioConfig
+from merge_runner.scenarios.merge.geometry import Track
 
 Vector = tuple[float, float]
 
 
-def collided(scenario: Scenario, left_m: float, right_m: float) -> bool:
+def collided(config: ScenarioConfig, track: Track, left_m: float, right_m: float) -> bool:
     """Whether vehicles at these travelled distances collide under the scenario's rule."""
-    length = scenario.vehicle_length_m
-    if scenario.collision_rule == "euclid2d":
-        return squared_distance_m2(left_m, right_m) < length**2
-    if scenario.collision_rule == "shared_lane":
-        return max(left_m, right_m) >= MERGE_POINT_M and abs(left_m - right_m) < length
-    return rectangles_overlap(left_m, right_m, length, scenario.vehicle_width_m)
+    length = config.vehicle_length_m
+    if config.collision_rule == "euclid2d":
+        return squared_distance_m2(track, left_m, right_m) < length**2
+    if config.collision_rule == "shared_lane":
+        return max(left_m, right_m) >= track.merge_point_m and abs(left_m - right_m) < length
+    return rectangles_overlap(track, left_m, right_m, length, config.vehicle_width_m)
 
 
-def squared_distance_m2(left_m: float, right_m: float) -> float:
+def squared_distance_m2(track: Track, left_m: float, right_m: float) -> float:
     """The squared distance between the two centres in the plane."""
-    (x_left, y_left), (x_right, y_right) = place("left", left_m), place("right", right_m)
+    x_left, y_left = track.place("left", left_m)
+    x_right, y_right = track.place("right", right_m)
     return (x_left - x_right) ** 2 + (y_left - y_right) ** 2
 
 
-def rectangles_overlap(left_m: float, right_m: float, length_m: float, width_m: float) -> bool:
+def rectangles_overlap(
+    track: Track, left_m: float, right_m: float, length_m: float, width_m: float
+) -> bool:
     """Whether the two oriented vehicle boxes overlap, by the separating axis theorem."""
-    (x_left, y_left), (x_right, y_right) = place("left", left_m), place("right", right_m)
+    x_left, y_left = track.place("left", left_m)
+    x_right, y_right = track.place("right", right_m)
     apart = (x_right - x_left, y_right - y_left)
-    ahead_left, ahead_right = heading("left", left_m), heading("right", right_m)
+    ahead_left, ahead_right = track.heading("left", left_m), track.heading("right", right_m)
     for ahead in (ahead_left, ahead_right):
         for axis in (ahead, (ahead[1], -ahead[0])):
             reach = _half_extent(ahead_left, axis, length_m, width_m) + _half_extent(

@@ -1,68 +1,76 @@
-"""The 11 kinematic conditions of the human experiment (Siebinga et al., 4TU 19550377).
-
-A name says who has the projected headway advantage (L, R or N), the projected headway in m and
-the relative velocity in 0.1 m/s, both left minus right: in ``L_4_-8`` the left vehicle would be
-4 m ahead at the merge point and is 0.8 m/s slower.
-"""
+"""The kinematic conditions: the 11 of the human experiment, and those that others register."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from math import isfinite
 
-from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, TUNNEL_EXIT_M
+from merge_runner.errors import UsageError
+from merge_runner.registry import Registry
+from merge_runner.scenarios.merge.geometry import Track
 
 MEAN_SPEED_MPS = 10.0
+"""That of every condition of the human experiment."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One condition: projected headway and relative velocity, signed left minus right."""
+    """How two vehicles approach the merge point; what is relative is signed left minus right.
 
-    name: str
+    ``projected_headway_m`` is how far the left one would be ahead at constant speeds when the
+    first of them is at the merge point. ``mean_speed_mps`` is the mean of both initial speeds.
+    Raises UsageError where a vehicle would stand still or drive backwards.
+    """
+
     projected_headway_m: float
     relative_velocity_mps: float
+    mean_speed_mps: float = MEAN_SPEED_MPS
+
+    def __post_init__(self) -> None:
+        if not isfinite(self.projected_headway_m) or not all(v > 0 for v in self.speeds_mps):
+            raise UsageError(f"{self} is no condition: both vehicles must drive forwards")
 
     @property
     def speeds_mps(self) -> tuple[float, float]:
         """Initial speeds (left, right)."""
         half = self.relative_velocity_mps / 2
-        return MEAN_SPEED_MPS + half, MEAN_SPEED_MPS - half
+        return self.mean_speed_mps + half, self.mean_speed_mps - half
 
-    @cached_property
-    def starts_m(self) -> tuple[float, float]:
+    def starts_m(self, track: Track) -> tuple[float, float]:
         """Travelled distances (left, right) at the start of the run, inside the tunnels.
 
         The projected leader stands at the merge point, the other |h| behind; both run backwards
         at constant speed until one of them is at 0.
         """
         speed_left, speed_right = self.speeds_mps
-        left = MERGE_POINT_M + min(self.projected_headway_m, 0.0)
-        right = MERGE_POINT_M - max(self.projected_headway_m, 0.0)
+        left = track.merge_point_m + min(self.projected_headway_m, 0.0)
+        right = track.merge_point_m - max(self.projected_headway_m, 0.0)
         seconds = min(left / speed_left, right / speed_right)
         return left - speed_left * seconds, right - speed_right * seconds
 
-    @property
-    def exit_times_s(self) -> tuple[float, float]:
+    def exit_times_s(self, track: Track) -> tuple[float, float]:
         """When (left, right) leave their tunnels at constant speed, from the start of the run."""
-        (start_left, start_right), (speed_left, speed_right) = self.starts_m, self.speeds_mps
-        return (TUNNEL_EXIT_M - start_left) / speed_left, (
-            TUNNEL_EXIT_M - start_right
+        (start_left, start_right), (speed_left, speed_right) = self.starts_m(track), self.speeds_mps
+        return (track.tunnel_exit_m - start_left) / speed_left, (
+            track.tunnel_exit_m - start_right
         ) / speed_right
 
-    def positions_m(self, time_s: float) -> tuple[float, float]:
+    def positions_m(self, time_s: float, track: Track) -> tuple[float, float]:
         """Travelled distances (left, right) at constant speed, ``time_s`` into the run."""
-        (start_left, start_right), (speed_left, speed_right) = self.starts_m, self.speeds_mps
+        (start_left, start_right), (speed_left, speed_right) = self.starts_m(track), self.speeds_mps
         return start_left + speed_left * time_s, start_right + speed_right * time_s
 
 
-def _condition(name: str) -> Condition:
+def _human(name: str) -> Condition:
     _, headway, velocity = name.split("_")
-    return Condition(name, float(headway), int(velocity) / 10)
+    return Condition(float(headway), int(velocity) / 10)
 
 
-CONDITIONS: dict[str, Condition] = {
-    name: _condition(name)
+# A name says who has the projected headway advantage (L, R or N), the projected headway in m and
+# the relative velocity in 0.1 m/s: in ``L_4_-8`` the left vehicle would be 4 m ahead at the merge
+# point and is 0.8 m/s slower.
+HUMAN_CONDITIONS: dict[str, Condition] = {
+    name: _human(name)
     for name in (
         "R_-4_-8",
         "R_-4_0",
@@ -77,3 +85,9 @@ CONDITIONS: dict[str, Condition] = {
         "L_4_8",
     )
 }
+"""Those of the human experiment (Siebinga et al., 4TU 19550377), which the paper's tables mean."""
+
+CONDITIONS = Registry[Condition]("condition")
+"""All that a sweep can play. What is stored tells its own condition: see ``trials``."""
+for _name, _condition in HUMAN_CONDITIONS.items():
+    CONDITIONS.register(_name, _condition)

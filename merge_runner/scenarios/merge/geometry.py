@@ -1,35 +1,80 @@
-"""The inverse-Y track: two branches of 100 m meet at the merge point, 50 m of lane follow.
+"""The inverse-Y track: two branches meet at the merge point, and one lane follows.
 
-Positions are travelled distances s along the own branch. The start points are 25 m apart, so a
-branch leaves the centreline at the angle whose sine is 12.5 / 100.
+Positions are travelled distances s along the own branch. The start points lie apart, so that a
+branch leaves the centreline at the angle whose sine is half their distance over its length.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from math import sqrt
+from typing import Any
+
+from pydantic import TypeAdapter
 
 from merge_runner.records import Side
 
-TUNNEL_EXIT_M = 50.0
-MERGE_POINT_M = 100.0
-TRACK_END_M = 150.0
-START_DISTANCE_M = 25.0
 
-LATERAL = START_DISTANCE_M / 2 / MERGE_POINT_M
-FORWARD = sqrt(1 - LATERAL**2)
-MERGE_Y_M = MERGE_POINT_M * FORWARD
+@dataclass(frozen=True)
+class Track:
+    """Where a run leads, in m; the defaults are the human experiment's.
+
+    ``tunnel_exit_m``, ``merge_point_m`` and ``end_m`` are travelled distances. The measures in SQL
+    know no other numbers (measures.sql), and a spec holds those of every scenario but ``merge``.
+    """
+
+    tunnel_exit_m: float = 50.0
+    merge_point_m: float = 100.0
+    end_m: float = 150.0
+    start_distance_m: float = 25.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.tunnel_exit_m < self.merge_point_m < self.end_m < float("inf"):
+            raise ValueError("a track leads from its tunnels to the merge point and to its end")
+        if not 0 < self.start_distance_m < 2 * self.merge_point_m:
+            raise ValueError("the start points of a track are less than both branches apart")
+
+    @cached_property
+    def branch_sine(self) -> float:
+        """How far a branch leads across the centreline, by metre."""
+        return self.start_distance_m / 2 / self.merge_point_m
+
+    @cached_property
+    def branch_cosine(self) -> float:
+        """How far a branch leads along the centreline, by metre."""
+        return sqrt(1 - self.branch_sine**2)
+
+    @cached_property
+    def merge_y_m(self) -> float:
+        """How far along the centreline the merge point is."""
+        return self.merge_point_m * self.branch_cosine
+
+    @cached_property
+    def end_y_m(self) -> float:
+        """How far along the centreline the track ends."""
+        return self.merge_y_m + self.end_m - self.merge_point_m
+
+    def place(self, side: Side, position_m: float) -> tuple[float, float]:
+        """The point (x, y) in m of a vehicle's centre; x is negative on the left branch."""
+        if position_m >= self.merge_point_m:
+            return 0.0, self.merge_y_m + position_m - self.merge_point_m
+        offset = (self.merge_point_m - position_m) * self.branch_sine
+        return (-offset if side == "left" else offset), position_m * self.branch_cosine
+
+    def heading(self, side: Side, position_m: float) -> tuple[float, float]:
+        """The unit vector of travel at a position."""
+        if position_m > self.merge_point_m:
+            return 0.0, 1.0
+        return (self.branch_sine if side == "left" else -self.branch_sine), self.branch_cosine
 
 
-def place(side: Side, position_m: float) -> tuple[float, float]:
-    """The point (x, y) in m of a vehicle's centre; x is negative on the left branch."""
-    if position_m >= MERGE_POINT_M:
-        return 0.0, MERGE_Y_M + position_m - MERGE_POINT_M
-    offset = (MERGE_POINT_M - position_m) * LATERAL
-    return (-offset if side == "left" else offset), position_m * FORWARD
+TRACK = Track()
+"""The human experiment's."""
+_READ = TypeAdapter(Track)
 
 
-def heading(side: Side, position_m: float) -> tuple[float, float]:
-    """The unit vector of travel at a position."""
-    if position_m > MERGE_POINT_M:
-        return 0.0, 1.0
-    return (LATERAL if side == "left" else -LATERAL), FORWARD
+def track_of(spec: Mapping[str, Any]) -> Track:
+    """The track of a stored spec, the human experiment's where it tells none; raises ValueError."""
+    return _READ.validate_python(spec["track"]) if "track" in spec else TRACK

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
 from merge_runner.records import SIDES, Observation, Side, StateRow, Status
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
-from merge_runner.scenarios.merge.geometry import MERGE_POINT_M, TRACK_END_M, TUNNEL_EXIT_M
+from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration, time_to_reach
 
 OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
@@ -16,39 +17,42 @@ class World:
     """Two vehicles on the track, from the start of control to the end of the trial.
 
     ``status`` is None while the trial runs. Time 0 is the start of control. Sampled states are
-    kept from step 0 on, in SI units.
+    kept from step 0 on, in SI units. Raises UsageError for a condition in which a vehicle would
+    be at the merge point before that.
     """
 
-    def __init__(self, scenario: Scenario, condition: Condition) -> None:
-        exits = condition.exit_times_s
-        start = max(exits) if scenario.control_start == "both_exits" else min(exits)
-        self._scenario = scenario
+    def __init__(self, config: ScenarioConfig, condition: Condition, track: Track) -> None:
+        exits = condition.exit_times_s(track)
+        start = max(exits) if config.control_start == "both_exits" else min(exits)
+        self._config, self._track = config, track
         self.step = 0
         self.status: Status | None = None
         self._merge_times: dict[Side, float] = {}
         self._positions = {
             side: [position]
-            for side, position in zip(SIDES, condition.positions_m(start), strict=True)
+            for side, position in zip(SIDES, condition.positions_m(start, track), strict=True)
         }
         self._velocities = {
             side: [speed] for side, speed in zip(SIDES, condition.speeds_mps, strict=True)
         }
         self._accelerations: dict[Side, list[float]] = {side: [0.0] for side in SIDES}
-        if collided(scenario, self._positions["left"][0], self._positions["right"][0]):
+        if max(self._positions["left"][0], self._positions["right"][0]) >= track.merge_point_m:
+            raise UsageError(f"{condition}: a vehicle is at the merge point before both are driven")
+        if self._collided():
             self.status = "collided"
 
     @property
     def time_s(self) -> float:
         """The time since the start of control."""
-        return _time(self.step, self._scenario.step_s)
+        return _time(self.step, self._config.step_s)
 
     def in_control(self, side: Side) -> bool:
         """Whether the vehicle has left its tunnel; until then it cruises by itself."""
-        return self._positions[side][-1] > TUNNEL_EXIT_M - 1e-9
+        return self._positions[side][-1] > self._track.tunnel_exit_m - 1e-9
 
     def advance(self, actions: dict[Side, float | None]) -> None:
         """Drive one step with normalised actions in [-1, 1]; None lets a vehicle cruise."""
-        scenario = self._scenario
+        config = self._config
         for side in SIDES:
             velocity = self._velocities[side][-1]
             action = actions[side]
@@ -56,7 +60,7 @@ class World:
                 0.0
                 if action is None
                 else net_acceleration(
-                    action * scenario.max_acceleration_mps2, velocity, scenario.resistance
+                    action * config.max_acceleration_mps2, velocity, config.resistance
                 )
             )
             self._move(side, acceleration)
@@ -75,16 +79,16 @@ class World:
         position = self._positions[side][-1]
         farthest_back = (
             position
-            if self._scenario.straight_after == "own"
+            if self._config.straight_after == "own"
             else min(position, self._positions[other][-1])
         )
-        straight = farthest_back >= MERGE_POINT_M
+        straight = farthest_back >= self._track.merge_point_m
         return Observation(
             road="straight" if straight else "merge",
             own_speed_mps=self._velocities[side][-1],
             other_speed_mps=self._velocities[other][-1],
             relative_distance_m=self._positions[other][-1] - position,
-            distance_to_merge_m=None if straight else MERGE_POINT_M - position,
+            distance_to_merge_m=None if straight else self._track.merge_point_m - position,
             own_accelerations_mps2=self._history(self._accelerations[side][1:], 0.0),
             other_speeds_mps=self._history(
                 self._velocities[other][:-1], self._velocities[other][0]
@@ -96,7 +100,7 @@ class World:
         return tuple(
             StateRow(
                 step=step,
-                time_s=_time(step, self._scenario.step_s),
+                time_s=_time(step, self._config.step_s),
                 side=side,
                 position_m=self._positions[side][step],
                 velocity_mps=self._velocities[side][step],
@@ -107,11 +111,11 @@ class World:
         )
 
     def _move(self, side: Side, acceleration: float) -> None:
-        dt = self._scenario.step_s
+        dt = self._config.step_s
         position, velocity = self._positions[side][-1], self._velocities[side][-1]
         new_position, new_velocity = advance(position, velocity, acceleration, dt)
-        if position < MERGE_POINT_M <= new_position:
-            reach = time_to_reach(MERGE_POINT_M - position, velocity, acceleration)
+        if position < self._track.merge_point_m <= new_position:
+            reach = time_to_reach(self._track.merge_point_m - position, velocity, acceleration)
             self._merge_times[side] = self.time_s + reach
         self._positions[side].append(new_position)
         self._velocities[side].append(new_velocity)
@@ -121,16 +125,20 @@ class World:
 
     def _end(self) -> Status | None:
         left, right = self._positions["left"][-1], self._positions["right"][-1]
-        if collided(self._scenario, left, right):
+        if self._collided():
             return "collided"
-        if max(left, right) >= TRACK_END_M:
+        if max(left, right) >= self._track.end_m:
             return "finished"
-        return "timeout" if self.step >= self._scenario.timeout_steps else None
+        return "timeout" if self.step >= self._config.timeout_steps else None
+
+    def _collided(self) -> bool:
+        left, right = self._positions["left"][-1], self._positions["right"][-1]
+        return collided(self._config, self._track, left, right)
 
     def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
-        wanted = self._scenario.memory_samples
+        wanted = self._config.memory_samples
         recent = samples[-wanted:]
-        if self._scenario.history_start == "cruise":
+        if self._config.history_start == "cruise":
             return (before,) * (wanted - len(recent)) + tuple(recent)
         return tuple(recent)
 

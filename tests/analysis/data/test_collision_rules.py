@@ -12,6 +12,7 @@ from analysis.data.collision_rules import (
     READINGS,
     RULES,
     UNDECIDED,
+    Task,
     judged,
     outcomes,
     redrive,
@@ -19,10 +20,11 @@ from analysis.data.collision_rules import (
 from analysis.data.load import load, load_trials
 from analysis.data.study import Study
 from analysis.tables.robustness import robustness
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import StateRow, TrialRecord, TrialSpec
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from tests.analysis.studies import Drive, write_study
 from tests.harness import RECORDING
 
@@ -33,6 +35,11 @@ repetitions = {baseline = 1}
 scenario = {control_start = "own_exit"}
 """
 CRUISE = [0.0] * 5  # a decision's actions
+
+
+def redriven(scenario, condition, applied, last_plans, **looks):
+    task = Task(scenario, TRACK)
+    return redrive(task, CONDITIONS[condition], applied, last_plans, **looks)
 
 
 def by_rule(found) -> dict[str, pd.DataFrame]:
@@ -53,7 +60,8 @@ def driven(condition, left, right, rest=0):
     decided = [[side[k : k + 5] for k in range(0, len(side), 5)] for side in (left, right)]
     last = [[*decisions[-1], *[0.0] * rest] for decisions in decided]
     return {
-        rule: redrive(Scenario(collision_rule=rule), condition, decided, last) for rule in RULES
+        rule: redriven(ScenarioConfig(collision_rule=rule), condition, decided, last)
+        for rule in RULES
     }
 
 
@@ -155,20 +163,20 @@ def test_a_last_plan_goes_on_after_the_actions_that_were_driven():
     """
     applied = [[CRUISE, [1.0, 1.0]], [CRUISE, [0.0, 0.0]]]
     last = [1.0, 1.0, -1.0, -1.0, *[0.0] * 64]
-    scenario = Scenario(collision_rule="shared_lane")
-    assert redrive(scenario, "L_4_0", applied, [last, [0.0] * 68]) == ("collided", None)
+    scenario = ScenarioConfig(collision_rule="shared_lane")
+    assert redriven(scenario, "L_4_0", applied, [last, [0.0] * 68]) == ("collided", None)
     longer = [*[1.0] * 3, *[-1.0] * 3, *[0.0] * 60]  # 0.9 m are enough
-    assert redrive(scenario, "L_4_0", applied, [longer, [0.0] * 66]) == ("finished", "left")
+    assert redriven(scenario, "L_4_0", applied, [longer, [0.0] * 66]) == ("finished", "left")
 
 
 def test_it_stays_open_where_one_drivers_plan_is_not_known():
     """A fallback has no plan of its own."""
     applied = [[CRUISE] * 4, [CRUISE] * 4]
-    scenario = Scenario(collision_rule="shared_lane")
+    scenario = ScenarioConfig(collision_rule="shared_lane")
     known = [0.0] * 20
-    assert redrive(scenario, "N_0_0", applied, [known, known]) == ("collided", None)
-    assert redrive(scenario, "N_0_0", applied, [known, []]) == (UNDECIDED, None)
-    assert redrive(scenario, "N_0_0", applied, [[], known]) == (UNDECIDED, None)
+    assert redriven(scenario, "N_0_0", applied, [known, known]) == ("collided", None)
+    assert redriven(scenario, "N_0_0", applied, [known, []]) == (UNDECIDED, None)
+    assert redriven(scenario, "N_0_0", applied, [[], known]) == (UNDECIDED, None)
 
 
 def test_an_open_trial_has_no_first_merger():
@@ -180,12 +188,12 @@ def test_an_open_trial_has_no_first_merger():
 
 def test_a_driver_that_decided_later_cruised_in_the_steps_before():
     """Full throttle from the right's first decision on, five steps late, comes too late to pass."""
-    scenario = Scenario(control_start="own_exit")
+    scenario = ScenarioConfig(control_start="own_exit")
     early = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 12], [[], []])
-    late = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 8], [[], []])
+    late = redrive(scenario, "N_0_0", [[CRUISE] * 12, [[1.0] * 5] * 8], [[], []], begins=(0, 20))
     assert early == ("finished", "right")
     assert late == ("collided", None)
-    drawn_out = redrive(
+    drawn_out = redriven(
         scenario, "N_0_0", [[[0.0] * 5] * 12, [CRUISE] * 4 + [[1.0] * 5] * 8], [[], []]
     )
     assert late == drawn_out
@@ -225,7 +233,7 @@ def test_stored_plans_are_driven_again_under_each_rule(tmp_path):
 def test_stored_traces_are_judged_as_their_plans_driven_again(tmp_path, length_m):
     """Trials of any plans, of which many collide; also of longer vehicles."""
     rng = np.random.default_rng(7)
-    scenario = Scenario(vehicle_length_m=length_m)
+    scenario = ScenarioConfig(vehicle_length_m=length_m)
     drives = [
         Drive("o3", "baseline", str(rng.choice(list(CONDITIONS))), rep,
               *(tuple(rng.uniform(-0.3, 0.3, 12).tolist()) for _ in "lr"))
@@ -243,7 +251,7 @@ def test_stored_traces_are_judged_as_their_plans_driven_again(tmp_path, length_m
     for rule in READINGS:
         own = scenario.model_copy(update={"collision_rule": rule.split(" at ")[0]})
         expected = [
-            redrive(own, trial.condition,
+            redriven(own, trial.condition,
                     *(decided.get_group(trial.trial_id)[name].tolist()
                       for name in ("applied", "last")), between=rule == BOXES)
             for trial in trials.itertuples()
@@ -305,7 +313,7 @@ def test_human_traces_are_judged_as_they_are(humans):
 
 def test_the_table_says_how_long_the_vehicles_are_that_it_judges(tmp_path):
     drive = Drive("long", "baseline", "L_4_0", 1, (0.8, 0.8), (-0.8, -0.8))
-    db = write_study(tmp_path / "long.duckdb", [drive], Scenario(vehicle_length_m=8.0))
+    db = write_study(tmp_path / "long.duckdb", [drive], ScenarioConfig(vehicle_length_m=8.0))
     notes = robustness(Study(db)).notes
     assert "the vehicles are 8 m x 1.8 m" in notes
     assert not any("4.5" in note for note in notes)

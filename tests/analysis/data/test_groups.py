@@ -14,6 +14,7 @@ from analysis.explain import explain
 from analysis.report.alarms import alarms
 from analysis.tables import make_tables
 from analysis.tables.formats import value_rows
+from merge_runner.config import both_sides
 from merge_runner.drivers.registry import stand_in
 from tests.analysis.studies import changed, write_study, yielding
 
@@ -46,6 +47,28 @@ def test_a_driver_is_named_by_its_endpoint_unless_that_is_the_providers_own(db, 
     study = changed(db, endpoint(url))
     assert [group.driver for group in study.models] == [name, "other"]
     assert [group.id for group in Study(db, [name]).models] == [f"{name}/baseline"]
+
+
+def test_who_was_asked_is_read_from_the_columns_and_not_from_a_trials_name(db):
+    study = changed(
+        db,
+        "UPDATE trials SET trial_id = 'again/' || trial_id, model_right = 'other'",
+        "UPDATE decisions SET trial_id = 'again/' || trial_id",
+        "UPDATE states SET trial_id = 'again/' || trial_id",
+        "UPDATE trials SET scripted = true WHERE model_left = 'o3'",
+    )
+    assert [(group.driver, group.models) for group in study.models] == [
+        ("other", ("other",)),
+        ("o3+other", ("o3", "other")),
+    ]
+    assert study.models[1].posing == "scripted stand-in, not o3+other"
+
+
+def test_a_bracket_in_a_drivers_name_is_no_mark(tmp_path):
+    drives = [*yielding("o3", reps=1), *yielding("o3 [preview]", reps=1)]
+    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    titles = [alarm.title for alarm in alarms(study, provenance(study.db))]
+    assert "Several settings under one name" not in titles
 
 
 def test_stand_ins_stand_last_and_every_row_of_theirs_says_so(db):
@@ -135,7 +158,7 @@ def test_equal_trials_of_a_driver_that_samples_are_told_and_count(db):
     ],
 )
 def test_a_stand_in_stands_for_the_models_on_whose_sides_it_answered(model, sides, words):
-    assert stand_in(model, sides) == words
+    assert stand_in(both_sides(model), sides) == words
 
 
 def test_the_sides_are_those_of_the_scripted_calls(tmp_path):

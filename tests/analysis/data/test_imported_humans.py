@@ -10,7 +10,8 @@ import pytest
 from analysis.data.imported_humans import by_condition, by_pair, human_trials, imported
 from analysis.data.reference_data import PAIRS, human_outcomes
 from analysis.data.study import Study
-from analysis.stats.measures import BOXES, COLLISIONS, LEFT_FIRST, counts, known
+from analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST
+from analysis.stats.measures import counts, known
 from analysis.tables import make_tables
 from merge_runner.records import StateRow, TrialRecord, TrialSpec
 from merge_runner.results.store import Store

@@ -16,7 +16,7 @@ from analysis.data.load import load
 from analysis.data.study import Study
 from analysis.figures.drawing import PAGE_IN
 from analysis.figures.gallery import FIGURES, SETTINGS, figure_2, rendered, write_figures
-from analysis.figures.panels import VELOCITIES_MPS, deviations, gaps, left_first, left_traces
+from analysis.figures.panels import HUMAN_VELOCITIES_MPS, deviations, gaps, left_first, left_traces
 from analysis.figures.variant_figure import figure_2_variants
 from analysis.stats.intervals import mean, proportion
 from merge_runner.errors import UsageError
@@ -61,14 +61,14 @@ def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(
     group = study.models[0]
     points = {
         (velocity, point.headway_m): point.estimate
-        for velocity in VELOCITIES_MPS
+        for velocity in HUMAN_VELOCITIES_MPS
         for point in left_first(group, velocity)
     }
     assert set(points) == {
         (c.relative_velocity_mps, c.projected_headway_m) for c in CONDITIONS.values()
     }
-    for condition in CONDITIONS.values():
-        trials = group.finished[group.finished["condition"] == condition.name]
+    for name, condition in CONDITIONS.items():
+        trials = group.finished[group.finished["condition"] == name]
         found = points[condition.relative_velocity_mps, condition.projected_headway_m]
         assert found == proportion(int((trials["merged_first"] == "left").sum()), len(trials))
         (gap,) = [
@@ -188,7 +188,7 @@ def test_each_group_has_a_row_of_its_own_with_its_trials(study):
         for axis, side in zip(row[:2], ("left", "right"), strict=True):
             assert sum(len(c.get_segments()) for c in axis.collections[:3]) == firsts[side]
         for axis, points in zip(row[2:], (left_first, gaps, deviations), strict=True):
-            for index, velocity in enumerate(VELOCITIES_MPS):
+            for index, velocity in enumerate(HUMAN_VELOCITIES_MPS):
                 found = points(group, velocity)
                 line = axis.containers[index].lines[0]
                 assert list(line.get_ydata()) == [p.estimate.value for p in found]
@@ -219,7 +219,7 @@ def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
     ]
     study = Study(write_study(tmp_path / "t.duckdb", drives))
     low, high = rows_of(figure_2_variants(study))[0][3].get_ylim()
-    found = [p.estimate for g in study.groups for v in VELOCITIES_MPS for p in gaps(g, v)]
+    found = [p.estimate for g in study.groups for v in HUMAN_VELOCITIES_MPS for p in gaps(g, v)]
     assert max(one.high - one.low for one in found) > 2 * (high - low)
     assert all(low < one.value < high for one in found)
     assert sum(low < one.low and one.high < high for one in found) >= 0.8 * len(found)

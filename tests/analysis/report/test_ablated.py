@@ -8,14 +8,13 @@ import duckdb
 import pytest
 
 from analysis.data.study import Study
+from analysis.metrics import COLLISIONS, GAP
 from analysis.report.ablated import ablation_sentences, smallest_p
 from analysis.stats.contrasts import contrast_means, contrast_rates
-from analysis.stats.measures import MEASURES
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Drive, write_study, yielding
 
-COLLISIONS, GAP = MEASURES[:2]
 LEVEL = [d for d in yielding("o3", reps=2) if d.condition == "N_0_0"]
 CRASHES = [Drive("o3", "A1", name, 1, (0.0,), (0.0,)) for name in CONDITIONS]
 

@@ -5,21 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 
 from analysis.data.reference_data import human_outcomes
 from analysis.stats.ceiling import (
     DATA_SETS,
+    Draws,
     Population,
-    _Draws,
-    _firth_tests,
-    _gap_tests,
-    _wald,
     ceiling,
+    drawn,
+    firth_fits,
+    gap_fits,
     imported_humans,
+    logit_fits,
+    passes,
     published_humans,
 )
-from analysis.stats.indicators import paper_verdicts, robust_verdicts
+from analysis.stats.indicators import PAPER, ROBUST, paper_verdicts, robust_verdicts
 from analysis.stats.regressions import Regression, gap_ols, who_first_firth, who_first_logit
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
@@ -37,6 +41,12 @@ COLUMNS = ["projected_headway_m", "relative_velocity_mps", "status", "merged_fir
 def few(monkeypatch):
     """Draws as many data sets as are compared with single fits."""
     monkeypatch.setattr("analysis.stats.ceiling.DATA_SETS", COMPARED)
+
+
+def judged(draws):
+    """Which data sets pass each indicator, by the paper's rule and by the robust one."""
+    ols, hc3 = gap_fits(draws)
+    return passes(PAPER, logit_fits(draws), ols), passes(ROBUST, firth_fits(draws), hc3)
 
 
 def even(n):
@@ -82,8 +92,8 @@ def rows(draws, number) -> pd.DataFrame:
     "sizes", [even(5), even(10), UNEVEN], ids=["5 each", "10 each", "0 to 7 each"]
 )
 def test_who_first_verdicts_equal_those_of_single_fits(sizes):
-    draws = _Draws(HUMANS, sizes)
-    wald, firth = _wald(draws), _firth_tests(draws)
+    draws = drawn(HUMANS, sizes)
+    wald, firth = judged(draws)
     outcomes = set()
     for number in range(COMPARED):
         trials = rows(draws, number)
@@ -96,10 +106,52 @@ def test_who_first_verdicts_equal_those_of_single_fits(sizes):
     assert {("I1", True), ("I1", False), ("I2", False)} <= outcomes
 
 
+@st.composite
+def data_sets(draw):
+    """Outcomes and gaps of 0 to 4 finished trials in each condition."""
+    gap_m = st.floats(0.1, 20).map(lambda gap: round(gap, 3))
+    trial = st.tuples(st.sampled_from(["left", "right"]), gap_m)
+    return [
+        (h, dv, "finished", *drawn_trial)
+        for h, dv in CELLS
+        for drawn_trial in draw(st.lists(trial, max_size=4))
+    ]
+
+
+def summed(trials: pd.DataFrame) -> Draws:
+    """One data set of these trials."""
+    n, left, gap, squared_gap = np.zeros((4, 1, len(CELLS)))
+    for i, (h, dv) in enumerate(CELLS):
+        own = trials[(trials["projected_headway_m"] == h) & (trials["relative_velocity_mps"] == dv)]
+        n[0, i], left[0, i] = len(own), (own["merged_first"] == "left").sum()
+        gap[0, i], squared_gap[0, i] = own["gap_m"].sum(), (own["gap_m"] ** 2).sum()
+    return Draws(n, left, gap, squared_gap)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data_sets())
+def test_of_any_trials_the_fits_at_once_are_those_one_by_one(trials):
+    table = pd.DataFrame(trials, columns=COLUMNS)
+    draws = summed(table)
+    ols, hc3 = gap_fits(draws)
+    for at_once, alone in (
+        (logit_fits(draws), who_first_logit(table)),
+        (firth_fits(draws), who_first_firth(table)),
+        (ols, gap_ols(table)),
+        (hc3, gap_ols(table, robust=True)),
+    ):
+        for i, (name, term) in enumerate(alone.terms.items()):
+            assert at_once.sound[0]
+            assert at_once.terms[i] == name
+            assert at_once.b[0, i] == pytest.approx(term.b, rel=1e-3, abs=1e-4)
+            if i:  # Firth's intercept is not tested
+                assert at_once.p[0, i] == pytest.approx(term.p, rel=2e-2, abs=1e-4)
+
+
 @pytest.mark.usefixtures("few")
 def test_penalised_verdicts_equal_those_of_single_fits_also_where_they_fail():
-    draws = _Draws(HUMANS, even(2))
-    firth = _firth_tests(draws)
+    draws = drawn(HUMANS, even(2))
+    _, firth = judged(draws)
     found = [
         robust_verdicts(who_first_firth(rows(draws, number)), MISSING)["I2"].passed
         for number in range(COMPARED)
@@ -116,18 +168,18 @@ def test_penalised_verdicts_equal_those_of_single_fits_also_where_they_fail():
     ids=["5 each", "10 each", "0 to 12 each", "published"],
 )  # fmt: skip
 def test_gap_verdicts_equal_those_of_single_fits(humans, sizes):
-    draws = _Draws(humans, sizes)
-    classic, robust = _gap_tests(draws)
+    draws = drawn(humans, sizes)
+    classic, robust = judged(draws)
     outcomes = set()
     for number in range(COMPARED):
         trials = rows(draws, number)
-        judged = (
+        both = (
             (classic, paper_verdicts(MISSING, gap_ols(trials))),
             (robust, robust_verdicts(MISSING, gap_ols(trials, robust=True))),
         )
-        for rule, (passes, verdicts) in enumerate(judged):
+        for rule, (found, verdicts) in enumerate(both):
             for name in ("I3", "I4"):
-                assert passes[name][number] == bool(verdicts[name].passed)
+                assert found[name][number] == bool(verdicts[name].passed)
                 outcomes.add((rule, name, bool(verdicts[name].passed)))
     assert {(rule, "I3", passed) for rule in (0, 1) for passed in (True, False)} <= outcomes
     assert {(0, "I4", True), (1, "I4", False)} <= outcomes
@@ -136,7 +188,7 @@ def test_gap_verdicts_equal_those_of_single_fits(humans, sizes):
 def test_drawn_data_sets_are_sums_over_human_trials_that_did_not_collide():
     left = HUMANS.left
     gaps = tuple(np.where(who == 1, 3.0, np.where(who == 0, 5.0, np.nan)) for who in left)
-    draws = _Draws(Population(left, gaps), even(10))
+    draws = drawn(Population(left, gaps), even(10))
     assert draws.n.shape == (DATA_SETS, len(CONDITIONS))
     assert (draws.n <= 10).all()
     assert (draws.gap == 3 * draws.left + 5 * (draws.n - draws.left)).all()
@@ -157,7 +209,7 @@ def test_the_published_population_is_the_human_counts():
 
 
 def test_published_gaps_scatter_about_the_papers_regression():
-    draws = _Draws(HUMANS, even(20))
+    draws = drawn(HUMANS, even(20))
     for i, (h, dv) in enumerate(CELLS):
         n, expected = draws.n[:, i].sum(), 3.54 + 0.17 * abs(h) - 0.2 * abs(dv) + 0.06 * h * dv
         mean = draws.gap[:, i].sum() / n
@@ -224,9 +276,9 @@ def test_too_few_conditions_pass_nothing(sizes):
 
 def test_four_trials_are_too_few_for_the_four_coefficients_of_the_gap():
     four = {"N_0_0", "L_0_-8", "L_4_0", "L_4_8"}
-    draws = _Draws(gapped(), [int(name in four) for name in CONDITIONS])
-    for passes in _gap_tests(draws):
-        assert not (passes["I3"] | passes["I4"]).any()
+    draws = drawn(gapped(), [int(name in four) for name in CONDITIONS])
+    for found in judged(draws):
+        assert not (found["I3"] | found["I4"]).any()
 
 
 @pytest.mark.usefixtures("few")
@@ -237,32 +289,31 @@ def test_opposite_effects_pass_no_signed_indicator():
         8 - 0.5 * abs(h) + (gap - 4) / 3 for gap, (h, _) in zip(humans.gap_m, CELLS, strict=True)
     ]
     opposite = Population(tuple(1 - who for who in humans.left), tuple(shrinking))
-    draws = _Draws(opposite, even(20))
-    for passes in (_wald(draws), _firth_tests(draws)):
-        assert not (passes["I1"] | passes["I2"]).any()
-    for passes in _gap_tests(draws):
-        assert not passes["I3"].any()
-    draws = _Draws(gapped(), even(20))
-    assert _wald(draws)["I1"].mean() > 0.9
-    assert _gap_tests(draws)[0]["I3"].mean() > 0.3
+    draws = drawn(opposite, even(20))
+    for found in judged(draws):
+        assert not (found["I1"] | found["I2"] | found["I3"]).any()
+    draws = drawn(gapped(), even(20))
+    paper, _ = judged(draws)
+    assert paper["I1"].mean() > 0.9
+    assert paper["I3"].mean() > 0.3
 
 
 @pytest.mark.usefixtures("few")
 def test_a_condition_without_human_trials_is_left_out():
     left, gaps = list(HUMANS.left), list(gapped().gap_m)
     left[0], gaps[0] = left[0][:0], gaps[0][:0]
-    draws = _Draws(Population(tuple(left), tuple(gaps)), even(10))
+    draws = drawn(Population(tuple(left), tuple(gaps)), even(10))
     assert (draws.n[:, 0] == 0).all()
     assert (draws.n[:, 1:] > 0).all()
-    assert _firth_tests(draws)["I1"].mean() > 0.9
+    assert judged(draws)[1]["I1"].mean() > 0.9
 
 
 def test_equal_gaps_disturb_no_ceiling():
     """All residuals are rounding then, some below 0."""
     for gap in (3.7, 8.37):
         gaps = tuple(np.where(np.isfinite(who), gap, np.nan) for who in HUMANS.left)
-        for passes in _gap_tests(_Draws(Population(HUMANS.left, gaps), even(2))):
-            assert not passes["I3"].all()
+        for found in judged(drawn(Population(HUMANS.left, gaps), even(2))):
+            assert not found["I3"].all()
 
 
 @pytest.mark.usefixtures("few")
@@ -276,9 +327,9 @@ def test_i1_to_i4_together_pass_where_each_does():
     found = ceiling(HUMANS, even(10)).paper
     each = [found[name] for name in ("I1", "I2", "I3", "I4")]
     assert sum(each) - 3 <= found["I1-I4"] <= min(each)
-    draws = _Draws(HUMANS, even(10))
-    passes = _wald(draws) | _gap_tests(draws)[0]
-    together = [all(passes[name][k] for name in passes) for k in range(DATA_SETS)]
+    draws = drawn(HUMANS, even(10))
+    paper, _ = judged(draws)
+    together = [all(paper[name][k] for name in paper) for k in range(DATA_SETS)]
     assert found["I1-I4"] == np.mean(together)
 
 
@@ -316,6 +367,6 @@ def test_imported_gaps_are_drawn_with_the_outcome_of_the_same_trial():
     """Who merged first on the left kept 3 m, on the right 5 m."""
     trials = finished_humans()
     trials["gap_m"] = trials["merged_first"].map({"left": 3.0, "right": 5.0})
-    draws = _Draws(imported_humans(trials), even(3))
+    draws = drawn(imported_humans(trials), even(3))
     assert (draws.n == 3).all()
     assert (draws.gap == 15 - 2 * draws.left).all()

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
+from statsmodels.stats.multitest import multipletests
 
 from analysis.stats.contrasts import (
     PERMUTATIONS,
@@ -59,10 +60,10 @@ RATES = [
 @pytest.mark.parametrize(("first", "second"), RATES)
 def test_rates_are_compared_by_fishers_test_and_newcombes_interval(first, second):
     found = contrast_rates(first, second)
-    assert found.difference == pytest.approx(first[0] / first[1] - second[0] / second[1])
+    assert found.value == pytest.approx(first[0] / first[1] - second[0] / second[1])
     assert (found.low, found.high) == pytest.approx(newcombe(first, second), abs=1e-6)
     assert found.p == pytest.approx(fisher(first, second), rel=1e-6)
-    assert found.low <= found.difference <= found.high
+    assert found.low <= found.value <= found.high
 
 
 def test_o3s_collisions_do_not_differ_from_the_humans_and_geminis_do():
@@ -168,7 +169,7 @@ def test_the_interval_is_that_of_least_squares_with_a_level_for_each_condition()
     freedom = len(y) - 3
     se = sqrt(residual[0] / freedom * np.linalg.inv(x.T @ x)[0, 0])
     half = stats.t.ppf(0.975, freedom) * se
-    assert found.difference == pytest.approx(b[0]) == pytest.approx(within(FIRST, SECOND))
+    assert found.value == pytest.approx(b[0]) == pytest.approx(within(FIRST, SECOND))
     assert (found.low, found.high) == pytest.approx((b[0] - half, b[0] + half))
     t = stats.t(freedom)
     assert found.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * se)
@@ -221,18 +222,25 @@ def test_a_contrast_of_means_is_the_same_every_time():
 def test_where_nothing_varies_there_is_no_difference():
     equal = group(N_0_0=[3.0] * 4)
     found = contrast_means(equal, equal, "gap_m")
-    assert (found.difference, found.low, found.high, found.p) == (0, 0, 0, 1)
+    assert (found.value, found.low, found.high, found.p) == (0, 0, 0, 1)
 
 
 def test_two_trials_alone_have_no_interval():
     found = contrast_means(group(N_0_0=[3.0]), group(N_0_0=[4.0]), "gap_m")
-    assert (found.difference, found.low, found.detectable, found.p) == (-1, None, None, 1)
+    assert (found.value, found.low, found.detectable, found.p) == (-1, None, None, 1)
 
 
 def test_a_family_is_corrected_by_holm_and_by_benjamini_and_hochberg():
     holm, false_discovery = corrected([0.01, 0.04, 0.03, 0.005])
     assert list(holm) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert list(false_discovery) == pytest.approx([0.02, 0.04, 0.04, 0.02])
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 40])
+def test_the_corrections_are_those_of_statsmodels(n):
+    family = list(np.random.default_rng(n).random(n).round(1) ** 3)  # with ties
+    for found, method in zip(corrected(family), ("holm", "fdr_bh"), strict=True):
+        assert list(found) == pytest.approx(list(multipletests(family, method=method)[1]))
 
 
 def test_corrected_p_values_stay_at_most_1():

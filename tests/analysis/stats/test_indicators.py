@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from math import inf
+
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 
 from analysis.stats.group_scores import total
@@ -10,9 +15,12 @@ from analysis.stats.indicators import (
     GAP_MARGIN_M,
     INDICATORS,
     LARGEST_VELOCITY_MPS,
+    PAPER,
+    ROBUST,
     SLOPE_MARGIN_S,
     Verdict,
     equivalence_p,
+    judged,
     paper_verdicts,
     robust_verdicts,
 )
@@ -100,6 +108,29 @@ def test_equivalence_is_the_larger_p_of_two_one_sided_t_tests(b, freedom):
     not_below = stats.t.sf((b + 1.25) / se, freedom)  # against a slope of at most -1.25
     not_above = stats.t.cdf((b - 1.25) / se, freedom)  # against a slope of at least 1.25
     assert equivalence_p(b, se, freedom) == pytest.approx(max(not_below, not_above))
+
+
+COEFFICIENTS = st.lists(
+    st.tuples(
+        st.floats(-3, 3),
+        st.floats(0.01, 2),
+        st.floats(0, 1),
+        st.one_of(st.integers(1, 500).map(float), st.just(inf)),
+    ),
+    min_size=1,
+)
+
+
+@given(COEFFICIENTS)
+@pytest.mark.parametrize("criteria", [PAPER, ROBUST])
+def test_many_fits_are_judged_like_each_of_them(criteria, rows):
+    together = [np.array(column) for column in zip(*rows, strict=True)]
+    for criterion in criteria.values():
+        p, holds = criterion.judge(*together)
+        for i, (b, se, alone_p, freedom) in enumerate(rows):
+            fit = Regression(9, {criterion.term: Term(b, se, None, alone_p)}, freedom=freedom)
+            verdict = judged(criterion, fit)
+            assert (verdict.passed, verdict.p) == (bool(holds[i]), pytest.approx(p[i]))
 
 
 def test_equivalence_at_the_margin_is_a_coin_toss():

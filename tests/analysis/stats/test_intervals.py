@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import hypot, inf
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +11,14 @@ from hypothesis import strategies as st
 from scipy import stats
 from statsmodels.stats.proportion import proportion_confint
 
-from analysis.stats.intervals import Estimate, mean, proportion
+from analysis.stats.intervals import (
+    Estimate,
+    detectable,
+    difference,
+    mean,
+    proportion,
+    standard_error,
+)
 
 NOTHING = Estimate(None, None, None, 0)
 SHARES = st.integers(1, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
@@ -89,3 +98,35 @@ def test_a_mean_lies_inside_its_interval_and_between_the_extremes(values):
     found = mean(values)
     assert found.low <= found.value <= found.high
     assert min(values) - 1e-6 <= found.value <= max(values) + 1e-6
+
+
+SAMPLES = st.lists(st.integers(-50, 50).map(float), min_size=2, max_size=20).map(np.array)
+
+
+@pytest.mark.filterwarnings("ignore:Precision loss occurred")
+@given(SAMPLES, SAMPLES)
+def test_a_difference_of_means_is_welchs_t_test(one, other):
+    errors = [(standard_error(sample), len(sample) - 1) for sample in (one, other)]
+    found = difference(one.mean() - other.mean(), *errors, by="means")
+    if not any(se for se, _ in errors):
+        assert found is None
+        return
+    welch = stats.ttest_ind(one, other, equal_var=False)
+    assert (found.p, found.freedom) == (pytest.approx(welch.pvalue), pytest.approx(welch.df))
+    interval = welch.confidence_interval(0.95)
+    assert found.bounds() == pytest.approx((interval.low, interval.high))
+    assert found.bounds(100) == pytest.approx((100 * interval.low, 100 * interval.high))
+    assert found.by == "means"
+
+
+def test_a_difference_of_likelihood_estimates_is_a_normal_test():
+    found = difference(0.7, (0.3, inf), (0.4, inf))
+    assert found.freedom == inf
+    assert found.p == pytest.approx(2 * stats.norm.sf(0.7 / hypot(0.3, 0.4)))
+    assert found.bounds() == pytest.approx(stats.norm.interval(0.95, 0.7, 0.5))
+    assert found.detectable == detectable(0.5) == pytest.approx(0.5 * (1.959964 + 0.841621))
+
+
+def test_what_has_no_interval_has_no_bounds():
+    assert NOTHING.bounds() is None
+    assert Estimate(4.2, None, None, 1).bounds(100) is None

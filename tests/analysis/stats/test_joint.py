@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 import pandas as pd
@@ -49,7 +49,7 @@ def driven(rng, pairs, reps, *, alone=False, gap_more=0.0, turned=0.0) -> pd.Dat
 
 def group(trials, setting="baseline", **more) -> Group:
     name = "driver" if setting else "human"
-    return Group(name, setting, "s", trials, label=name, model=name, **more)
+    return Group(name, setting, "s", trials, label=name, models=(name,), name=name, **more)
 
 
 def humans(trials) -> Group:
@@ -80,14 +80,14 @@ def test_it_is_the_logit_of_both_with_the_source_in_every_term():
     (x, left), (own, own_left) = (who_first_data(g.outcomes) for g in (not_imported(), driver()))
     fit = Logit(np.concatenate([left, own_left]), joined(x, own)).fit(disp=0)
     found = of(differences(not_imported(), driver()), WHO_FIRST)
-    assert [one.method for one in found] == ["ML"] * 3
-    assert [one.b for one in found] == pytest.approx(fit.params[3:], abs=1e-6)
+    assert [one.found.by for one in found] == ["ML"] * 3
+    assert [one.found.value for one in found] == pytest.approx(fit.params[3:], abs=1e-6)
     assert [one.human for one in found] == pytest.approx(fit.params[:3], abs=1e-6)
     assert [one.driver for one in found] == pytest.approx(fit.params[:3] + fit.params[3:], abs=1e-6)
-    assert [one.p for one in found] == pytest.approx(fit.pvalues[3:], rel=1e-4)
-    bounds = np.array([(one.low, one.high) for one in found])
+    assert [one.found.p for one in found] == pytest.approx(fit.pvalues[3:], rel=1e-4)
+    bounds = np.array([(one.found.low, one.found.high) for one in found])
     assert bounds == pytest.approx(fit.conf_int()[3:], abs=1e-5)
-    assert [(one.n, one.n_human, one.freedom) for one in found] == [(110, 962, None)] * 3
+    assert [(one.n, one.n_human, one.found.freedom) for one in found] == [(110, 962, inf)] * 3
 
 
 def test_the_gaps_interactions_are_those_of_least_squares_over_both():
@@ -95,7 +95,7 @@ def test_the_gaps_interactions_are_those_of_least_squares_over_both():
     (x, gap, _), (z, own_gap, _) = gap_data(human.trials), gap_data(own.trials)
     fit = OLS(np.concatenate([gap, own_gap]), joined(x, z)).fit()
     found = of(differences(human, own), GAP)
-    assert [one.b for one in found] == pytest.approx(fit.params[4:])
+    assert [one.found.value for one in found] == pytest.approx(fit.params[4:])
     assert [one.human for one in found] == pytest.approx(fit.params[:4])
 
 
@@ -131,9 +131,13 @@ def test_errors_by_pairs_add_up_with_those_of_the_driver():
         # Satterthwaite: 9 pairs have 8 degrees of freedom, 110 trials and 4 terms 106.
         freedom = total**2 / (term.se**4 / 106 + se**4 / 8)
         half = stats.t.ppf(0.975, freedom) * sqrt(total)
-        assert one.freedom == pytest.approx(freedom)
-        assert (one.low, one.high) == pytest.approx((one.b - half, one.b + half))
-        assert one.p == pytest.approx(2 * stats.t.sf(abs(one.b) / sqrt(total), freedom))
+        assert one.found.freedom == pytest.approx(freedom)
+        assert (one.found.low, one.found.high) == pytest.approx(
+            (one.found.value - half, one.found.value + half)
+        )
+        assert one.found.p == pytest.approx(
+            2 * stats.t.sf(abs(one.found.value) / sqrt(total), freedom)
+        )
         assert "9 pairs" in one.remark
 
 
@@ -144,10 +148,10 @@ def test_before_an_import_the_gap_is_compared_with_the_published_regression():
     for one in found:
         b, se = rows.loc[one.term, ["b", "se"]].astype(float)
         assert (one.human, one.n_human) == (b, 962)
-        assert one.b == pytest.approx(mine[one.term].b - b)
+        assert one.found.value == pytest.approx(mine[one.term].b - b)
         total = sqrt(mine[one.term].se ** 2 + se**2)
-        half = stats.t.ppf(0.975, one.freedom) * total
-        assert one.high - one.b == pytest.approx(half)
+        half = stats.t.ppf(0.975, one.found.freedom) * total
+        assert one.found.high - one.found.value == pytest.approx(half)
         assert "as published" in one.remark
 
 
@@ -208,15 +212,15 @@ def best(design, left, start, term, value):
 def test_under_separation_the_joint_fit_is_firths_with_its_likelihood_ratios():
     human, own = not_imported(), separated()
     found = of(differences(human, own), WHO_FIRST)
-    assert [one.method for one in found] == ["Firth"] * 3
+    assert [one.found.by for one in found] == ["Firth"] * 3
     (x, left), (z, own_left) = (who_first_data(g.outcomes) for g in (human, own))
     design, left = joined(x, z), np.concatenate([left, own_left])
-    at = [one.human for one in found] + [one.b for one in found]
+    at = [one.human for one in found] + [one.found.value for one in found]
     top = penalised(design, left, np.array(at))
     for i, one in enumerate(found):
         without = best(design, left, at, 3 + i, 0.0)
-        assert one.p == pytest.approx(stats.chi2.sf(2 * (top - without), 1), abs=2e-3)
-        for bound in (one.low, one.high):
+        assert one.found.p == pytest.approx(stats.chi2.sf(2 * (top - without), 1), abs=2e-3)
+        for bound in (one.found.low, one.found.high):
             drop = top - best(design, left, at, 3 + i, bound)
             assert drop == pytest.approx(stats.chi2.ppf(0.95, 1) / 2, abs=0.01)
 
@@ -224,7 +228,7 @@ def test_under_separation_the_joint_fit_is_firths_with_its_likelihood_ratios():
 def test_firths_fit_beside_pairs_says_that_it_takes_trials_as_independent():
     human = humans(driven(np.random.default_rng(2), 9, 2))
     found = of(differences(human, separated()), WHO_FIRST)
-    assert all(one.method == "Firth" and "independent" in one.remark for one in found)
+    assert all(one.found.by == "Firth" and "independent" in one.remark for one in found)
 
 
 def without(trials):
@@ -248,7 +252,7 @@ def test_data_that_allow_no_comparison_give_a_reason(reason):
     lacking = [one for one in found if one.problem]
     assert {one.term for one in lacking} >= {"intercept", "projected_headway", "relative_velocity"}
     assert any(reason in one.problem for one in lacking)
-    assert {(one.b, one.low, one.p, one.detectable) for one in lacking} == {(None,) * 4}
+    assert {one.found for one in lacking} == {None}
 
 
 def test_humans_whose_fit_hangs_on_one_pair_are_compared_by_firths():
@@ -256,14 +260,16 @@ def test_humans_whose_fit_hangs_on_one_pair_are_compared_by_firths():
     ahead = np.where(trials["projected_headway_m"] > 0, "left", "right")
     trials.loc[trials["pair"] != "pair0", "merged_first"] = ahead[trials["pair"] != "pair0"]
     found = of(differences(humans(trials), driver()), WHO_FIRST)
-    assert {one.method for one in found} == {"Firth"}
+    assert {one.found.by for one in found} == {"Firth"}
 
 
 def test_the_detectable_difference_is_found_in_four_of_five_studies():
     found = of(differences(not_imported(), driver()), WHO_FIRST)
     for one in found:
-        se = (one.high - one.b) / stats.norm.ppf(0.975)
-        assert stats.norm.sf(stats.norm.ppf(0.975) - one.detectable / se) == pytest.approx(0.8)
+        se = (one.found.high - one.found.value) / stats.norm.ppf(0.975)
+        assert stats.norm.sf(stats.norm.ppf(0.975) - one.found.detectable / se) == pytest.approx(
+            0.8
+        )
     # Few degrees of freedom cost power: the exact power is that of the noncentral t.
     found = 1 - stats.nct.cdf(stats.t.ppf(0.975, 8), 8, detectable(1.0, 8))
     assert found == pytest.approx(0.8, abs=0.02)
@@ -280,7 +286,7 @@ def alarms(tested, count, **kept):
 
 
 def jointly(human, own):
-    return [one.p for one in differences(humans(human), group(own)) if not one.problem]
+    return [one.found.p for one in differences(humans(human), group(own)) if not one.problem]
 
 
 def pooled(human, own):

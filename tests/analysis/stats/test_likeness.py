@@ -19,7 +19,7 @@ from analysis.stats.intervals import Estimate
 from analysis.stats.likeness import compared, judged, mean_gain
 from analysis.stats.likeness import gains as trial_gains
 from analysis.tables import make_tables
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from tests.analysis.studies import SCENARIO, write_study, yielding
 
 PAIRS = 9
@@ -155,7 +155,7 @@ def test_both_vehicles_count_where_both_acted(tmp_path):
 
 def test_a_model_that_drives_against_the_resistance_is_measured_as_without(tmp_path):
     """Its pedal is held: so are its accelerations, though its speed is nowhere a straight line."""
-    study = driving(tmp_path, scenario=Scenario(resistance="human"), right=(0.4, 0.2, 0.0))
+    study = driving(tmp_path, scenario=ScenarioConfig(resistance="human"), right=(0.4, 0.2, 0.0))
     slowed = load(SPEEDS, study.db)
     assert slowed["resisted"].all()
     with_it = measure_profiles(slowed.assign(resisted=False))["gain"]

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from analysis.data.load import load, load_trials
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
 from tests.analysis.studies import Drive, played, write_study
 
 SIZES = ((4.5, 1.8), (8.0, 2.5), (3.0, 1.2))
@@ -20,7 +21,7 @@ SIZES = ((4.5, 1.8), (8.0, 2.5), (3.0, 1.2))
 @pytest.fixture(scope="module", params=SIZES, ids=lambda size: "{} m x {} m".format(*size))
 def scenario(request):
     length_m, width_m = request.param
-    return Scenario(vehicle_length_m=length_m, vehicle_width_m=width_m)
+    return ScenarioConfig(vehicle_length_m=length_m, vehicle_width_m=width_m)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,9 @@ def rmse(trace, condition, until_s):
 
 
 def overlaps(scenario, left_m, right_m):
-    return rectangles_overlap(left_m, right_m, scenario.vehicle_length_m, scenario.vehicle_width_m)
+    return rectangles_overlap(
+        TRACK, left_m, right_m, scenario.vehicle_length_m, scenario.vehicle_width_m
+    )
 
 
 def edge(overlap, inside, outside):
@@ -209,7 +212,9 @@ def test_the_measures_of_vehicles_of_8_m_are_those_worked_out_by_hand(tmp_path):
     right = (-0.4, -0.4)
     steady = Drive("hand", "baseline", "L_4_0", 1, (0.8, 0.8), right)
     braking = Drive("hand", "baseline", "L_4_0", 2, (0.8, 0.8, 0, 0, -1, -1, -1), right)
-    db = write_study(tmp_path / "hand.duckdb", [steady, braking], Scenario(vehicle_length_m=8.0))
+    db = write_study(
+        tmp_path / "hand.duckdb", [steady, braking], ScenarioConfig(vehicle_length_m=8.0)
+    )
     first, second = load_trials(db).sort_values("rep").to_dict("records")
     expected = {
         # Left is at 100 m after 2 s + 22/14 s, right at 68 m + 8 * 22/14 m.

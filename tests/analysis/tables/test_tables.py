@@ -21,7 +21,7 @@ from analysis.tables import TABLES, make_tables
 from analysis.tables.against import against, in_paper
 from analysis.tables.formats import render
 from analysis.tables.model import Column, Row, Table
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -246,7 +246,9 @@ def test_a_model_under_two_specs_makes_two_rows_that_tell_themselves_apart(tmp_p
 def test_another_task_leaves_a_baseline_and_its_variants_together(tmp_path):
     """A baseline that was also run with drag must not tear the ablation study apart."""
     db = write_study(tmp_path / "t.duckdb", [*yielding("o3", reps=2), *yielding("o3", "A1", 2)])
-    other = write_study(tmp_path / "u.duckdb", yielding("o3", reps=1), Scenario(resistance="human"))
+    other = write_study(
+        tmp_path / "u.duckdb", yielding("o3", reps=1), ScenarioConfig(resistance="human")
+    )
     with duckdb.connect(str(db)) as connection:
         connection.execute(f"ATTACH '{other}' AS other (READ_ONLY)")
         for name in ("specs", "trials", "states", "decisions"):

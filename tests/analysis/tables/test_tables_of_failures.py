@@ -12,7 +12,8 @@ from analysis.data.load import load
 from analysis.data.provenance import tally
 from analysis.data.study import Study
 from analysis.explain import explain
-from analysis.stats.measures import LEFT_FIRST, estimate
+from analysis.metrics import LEFT_FIRST
+from analysis.stats.measures import estimate
 from analysis.stats.regressions import gap_ols
 from analysis.tables import make_tables
 from analysis.tables.fallbacks import without_fallbacks

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from merge_runner.config import Scenario
-from merge_runner.results.database import SCHEMA
+from merge_runner.config import ScenarioConfig
+from merge_runner.results.database import schema_sql
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
-from merge_runner.scenarios.merge.geometry import LATERAL, MERGE_POINT_M, TRACK_END_M
+from merge_runner.scenarios.merge.geometry import TRACK
 
 HAIR_M = 1e-6
 
@@ -21,7 +21,7 @@ HAIR_M = 1e-6
 @pytest.fixture(scope="module")
 def database():
     with duckdb.connect() as connection:
-        connection.execute(SCHEMA.read_text(encoding="utf-8"))
+        connection.execute(schema_sql())
         yield connection
 
 
@@ -40,13 +40,13 @@ def of_size(database, length_m, width_m):
 
 def test_the_track_in_sql_is_the_simulators(database):
     sql = "SELECT merge_point_m(), track_end_m(), branch_sine(), mean_speed_mps()"
-    track = (MERGE_POINT_M, TRACK_END_M, LATERAL, MEAN_SPEED_MPS)
+    track = (TRACK.merge_point_m, TRACK.end_m, TRACK.branch_sine, MEAN_SPEED_MPS)
     assert database.execute(sql).fetchall() == [track]
 
 
 @pytest.mark.parametrize("spec", [{"source": "human"}, {"scenario": {}}])
 def test_a_size_that_a_spec_does_not_say_is_that_of_the_experiment(database, spec):
-    found, default = geometry(database, spec), Scenario()
+    found, default = geometry(database, spec), ScenarioConfig()
     assert found["length_m"] == default.vehicle_length_m
     assert found["width_m"] == default.vehicle_width_m
 
@@ -74,8 +74,8 @@ def test_boxes_overlap_between_the_bounds_and_nowhere_else(database, length_m, w
     found = of_size(database, length_m, width_m)
     points = (
         (found["contact_m"] + HAIR_M / 1000, found["contact_m"], found["contact_high_m"]),
-        (MERGE_POINT_M, found["merge_low_m"], found["merge_high_m"]),
-        (TRACK_END_M, TRACK_END_M - length_m, TRACK_END_M + length_m),
+        (TRACK.merge_point_m, found["merge_low_m"], found["merge_high_m"]),
+        (TRACK.end_m, TRACK.end_m - length_m, TRACK.end_m + length_m),
     )
     for at_m, low_m, high_m in points:
         inside = [low_m + HAIR_M, high_m - HAIR_M]
@@ -85,9 +85,9 @@ def test_boxes_overlap_between_the_bounds_and_nowhere_else(database, length_m, w
             for far_m in (0, 0.1, 1, 5, 20)
         ]
         for other_m in inside:
-            assert rectangles_overlap(at_m, other_m, length_m, width_m)
+            assert rectangles_overlap(TRACK, at_m, other_m, length_m, width_m)
         for other_m in outside:
-            assert not rectangles_overlap(at_m, other_m, length_m, width_m)
+            assert not rectangles_overlap(TRACK, at_m, other_m, length_m, width_m)
 
 
 @given(st.floats(0.5, 30), st.floats(0.2, 6), st.floats(0, 60), st.floats(0, 1))
@@ -96,5 +96,5 @@ def test_boxes_on_the_two_branches_cannot_overlap_before_the_contact_point(
 ):
     contact_m = of_size(database, length_m, width_m)["contact_m"]
     own_m = contact_m - HAIR_M - before_m
-    other_m = own_m + share * (MERGE_POINT_M - own_m)
-    assert not rectangles_overlap(own_m, other_m, length_m, width_m)
+    other_m = own_m + share * (TRACK.merge_point_m - own_m)
+    assert not rectangles_overlap(TRACK, own_m, other_m, length_m, width_m)

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.config import Scenario
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
 STEP_S = 0.2
@@ -23,7 +24,7 @@ actions = st.floats(-1, 1)
 action_pairs = st.lists(st.tuples(actions, actions), max_size=30)
 names = st.sampled_from(sorted(CONDITIONS))
 scenarios = st.builds(
-    Scenario,
+    ScenarioConfig,
     collision_rule=st.sampled_from(["euclid2d", "rectangle", "shared_lane"]),
     control_start=st.sampled_from(["both_exits", "own_exit"]),
     resistance=st.sampled_from(["none", "human"]),
@@ -33,7 +34,7 @@ scenarios = st.builds(
 
 
 def start(name="N_0_0", **scenario):
-    return World(Scenario(**scenario), CONDITIONS[name])
+    return World(ScenarioConfig(**scenario), CONDITIONS[name], TRACK)
 
 
 def drive(world, left, right, steps=10_000):
@@ -54,14 +55,14 @@ def trace(world, side):
 
 def mirrored(name):
     condition = CONDITIONS[name]
-    return Condition("mirror", -condition.projected_headway_m, -condition.relative_velocity_mps)
+    return Condition(-condition.projected_headway_m, -condition.relative_velocity_mps)
 
 
 @law
 @given(names, scenarios, action_pairs)
 def test_mirroring_left_and_right_mirrors_the_whole_trial(name, scenario, pairs):
     """Exactly: a bias towards one side would pass for a finding about who goes first."""
-    world, mirror = World(scenario, CONDITIONS[name]), World(scenario, mirrored(name))
+    world, mirror = World(scenario, CONDITIONS[name], TRACK), World(scenario, mirrored(name), TRACK)
     for left, right in pairs:
         drive(world, left, right, STEPS_PER_SECOND)
         drive(mirror, right, left, STEPS_PER_SECOND)
@@ -153,7 +154,7 @@ def test_after_a_collision_nobody_merged_first_although_one_passed_the_merge_poi
 @pytest.mark.parametrize(("headway_m", "first"), [(1.0, "left"), (-1.0, "right")])
 def test_who_merged_first_is_told_apart_within_one_step(headway_m, first):
     """Short vehicles 1 m apart both pass the merge point within the same 2 m step."""
-    world = World(Scenario(vehicle_length_m=0.5), Condition("close", headway_m, 0.0))
+    world = World(ScenarioConfig(vehicle_length_m=0.5), Condition(headway_m, 0.0), TRACK)
     drive(world, 0.0, 0.0)
     assert world.status == "finished"
     crossings = [

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import get_args
 
-from merge_runner.config import Format
-from merge_runner.emulator.scenarios.base import Break, Scenario, Scene
+from merge_runner.llm.formats import FORMATS
+from tests.emulator.scenarios.base import Break, Scenario, Scene
 
-FORMATS: tuple[Format, ...] = get_args(Format)
 BREAKS: tuple[Break, ...] = get_args(Break)
 
 NETWORK: dict[str, Scenario] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from merge_runner.emulator.scenarios.base import Scenario, Scene, answer, fixed
+from tests.emulator.scenarios.base import Scenario, Scene, answer, fixed
 
 O3 = "o3-2025-04-16"
 REFUSAL = "I'm sorry, but I cannot help with that."

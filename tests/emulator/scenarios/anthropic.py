@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from datetime import timedelta
 from typing import Any
 
-from merge_runner.emulator.scenarios.base import Scenario, Scene, answer, fixed
+from tests.emulator.scenarios.base import Scenario, Scene, answer, fixed
 
 
 def _error(

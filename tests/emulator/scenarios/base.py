@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any, Literal
 
-from merge_runner.config import Format
-
 Body = Callable[[dict[str, Any]], object]
 Break = Literal["hang", "reset", "truncated_body", "truncated_json"]
 
@@ -34,7 +32,7 @@ class Scene:
     breaks: Break | None = None
 
 
-Scenario = dict[Format, Scene]
+Scenario = dict[str, Scene]
 """A scene for each format that it concerns."""
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
-from merge_runner.llm.formats.base import as_text, error_info
+from merge_runner.llm.formats.base import ServerError, WireFormat
 
 _UNIT_S = {"ms": 0.001, "s": 1, "m": 60, "h": 3600, "d": 86400}
 # 1.574s and 5m, but also 5 minutes.
@@ -18,36 +18,33 @@ _PART = (
 )
 _PARTS = re.compile(_PART, re.I)
 _DURATION = re.compile(rf"{_PART}(?:(?:,|\s|and)*{_PART})*", re.I)
-_PROTOBUF_DURATION = re.compile(r"(\d+(?:\.\d+)?)s")
 # A header that is sent several times has all its values in one, and a date has a comma of its own.
 _LISTED = re.compile(r"(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*,)?[^,]+", re.I)
 # A server that asks for longer means for good, and no clock counts that far.
 MOST_S = 366 * 86400.0
 _IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_DURATION.pattern})", re.I)
 # Azure counts on below zero.
-_NONE_REMAINS = re.compile(r"0|-\d+")
+NONE_REMAINS = re.compile(r"0|-\d+")
 
 
 def server_delay_s(
-    headers: Mapping[str, str], payload: object, now: Callable[[], datetime] | None = None
+    error: ServerError, formats: Iterable[WireFormat], now: datetime | None = None
 ) -> float | None:
     """The delay in s that a failed reply asks for, None where it says nothing usable.
 
-    Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), Gemini's
-    RetryInfo, "try again in 1.574s" or "retry after 5 minutes" in the message, then the reset
-    times of exhausted limits. Of several values of a header the longest counts, and of a delay a
-    year at most.
-    ``headers`` have lower-case names; ``now`` gives the UTC time.
+    Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), a member of the
+    error that one of the ``formats`` knows, "try again in 1.574s" or "retry after 5 minutes" in
+    the message, then the reset times of exhausted limits that one of them knows. Of several values
+    of a header the longest counts, and of a delay a year at most.
     """
-    clock = now or (lambda: datetime.now(UTC))
-    error = error_info(payload, "")
+    at = now or datetime.now(UTC)
+    wires = tuple(formats)
     candidates = (
-        _longest(headers, "retry-after-ms", lambda text: _scaled(text, 1000)),
-        _longest(headers, "retry-after", lambda text: _retry_after(text, clock)),
-        _retry_info(error.details),
+        _longest(error.headers, "retry-after-ms", lambda text: _scaled(text, 1000)),
+        _longest(error.headers, "retry-after", lambda text: _retry_after(text, at)),
+        *(wire.delay_s(error) for wire in wires),
         _in_text(error.message),
-        _openai_resets(headers),
-        _anthropic_resets(headers, clock),
+        *(wire.reset_s(error.headers, at) for wire in wires),
     )
     return next((min(d, MOST_S) for d in candidates if _usable(d)), None)
 
@@ -81,22 +78,14 @@ def _scaled(text: str | None, per_second: float) -> float | None:
         return None
 
 
-def _retry_after(text: str, clock: Callable[[], datetime]) -> float | None:
+def _retry_after(text: str, now: datetime) -> float | None:
     seconds = _scaled(text, 1)
     if seconds is not None:
         return seconds
     try:
-        return _until(parsedate_to_datetime(text), clock)
+        return until_s(parsedate_to_datetime(text), now)
     except (ValueError, OverflowError):  # the latter: a zone that is further away than time is long
         return None
-
-
-def _retry_info(details: Sequence[dict[str, Any]]) -> float | None:
-    for detail in details:
-        match = _PROTOBUF_DURATION.fullmatch(as_text(detail.get("retryDelay")) or "")
-        if match:
-            return float(match.group(1))
-    return None
 
 
 def _in_text(message: str) -> float | None:
@@ -104,29 +93,7 @@ def _in_text(message: str) -> float | None:
     return duration_s(match.group(1)) if match else None
 
 
-def _openai_resets(headers: Mapping[str, str]) -> float | None:
-    """The longest reset among the limits of which nothing remains."""
-    delays = [
-        duration_s(headers.get(f"x-ratelimit-reset-{kind}", ""))
-        for kind in ("requests", "tokens")
-        if _NONE_REMAINS.fullmatch(headers.get(f"x-ratelimit-remaining-{kind}", ""))
-    ]
-    return max((delay for delay in delays if delay is not None), default=None)
-
-
-def _anthropic_resets(headers: Mapping[str, str], clock: Callable[[], datetime]) -> float | None:
-    delays = []
-    for kind in ("requests", "tokens", "input-tokens", "output-tokens"):
-        if not _NONE_REMAINS.fullmatch(headers.get(f"anthropic-ratelimit-{kind}-remaining", "")):
-            continue
-        try:
-            reset = datetime.fromisoformat(headers.get(f"anthropic-ratelimit-{kind}-reset", ""))
-        except ValueError:
-            continue
-        delays.append(_until(reset, clock))
-    return max(delays, default=None)
-
-
-def _until(moment: datetime, clock: Callable[[], datetime]) -> float:
+def until_s(moment: datetime, now: datetime) -> float:
+    """Seconds until a moment, which is UTC where it names no zone."""
     aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    return (aware - clock()).total_seconds()
+    return (aware - now).total_seconds()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from merge_runner.emulator.scenarios.base import Body, Scenario, Scene, answer, fixed
+from tests.emulator.scenarios.base import Body, Scenario, Scene, answer, fixed
 
 RPC = "type.googleapis.com/google.rpc."
 QUOTA = "You exceeded your current quota, please check your plan and billing details."
@@ -24,7 +24,7 @@ HELP = {
 ALL_THOUGHTS = {"promptTokenCount": 700, "thoughtsTokenCount": 15996, "totalTokenCount": 16696}
 
 
-def _candidate(finish: str, **content: Any) -> Body:  # noqa: ANN401 # members of any JSON type
+def _candidate(finish: str, **content: Any) -> Body:  # members of any JSON type
     return answer(
         candidates=[{**content, "finishReason": finish, "index": 0}], usageMetadata=ALL_THOUGHTS
     )

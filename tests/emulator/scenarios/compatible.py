@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from merge_runner.emulator.scenarios.base import Scenario, Scene, answer, fixed
-from merge_runner.emulator.scenarios.openai import error
+from tests.emulator.scenarios.base import Scenario, Scene, answer, fixed
+from tests.emulator.scenarios.openai import error
 
 TOO_LONG = "This model's maximum context length is 8192 tokens. However, you requested 9000 tokens."
 UPSTREAM = {

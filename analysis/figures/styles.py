@@ -1,0 +1,46 @@
+"""How drivers are told apart in every picture: by a colour and a shape each; humans are black.
+
+The figures draw with matplotlib and the pages with SVG of their own, since their points are links
+with words for a screen reader, and an exported page draws nothing else; both take this from here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+# The palette of Okabe and Ito (2008), safe for the colour-blind.
+BLUE, VERMILION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+SKY_BLUE, ORANGE = "#56b4e9", "#e69f00"
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, SKY_BLUE, ORANGE)
+SHAPES = ("square", "triangle", "diamond", "down", "plus", "cross")
+MARKERS = {
+    "circle": "o",
+    "square": "s",
+    "triangle": "^",
+    "diamond": "D",
+    "down": "v",
+    "plus": "P",
+    "cross": "X",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Style:
+    """A colour, and a shape by its name."""
+
+    colour: str
+    shape: str
+
+    @property
+    def marker(self) -> str:
+        """The shape as matplotlib names it."""
+        return MARKERS[self.shape]
+
+
+HUMAN_STYLE = Style("#000000", "circle")
+
+
+def driver_style(number: int) -> Style:
+    """The style of a driver, counted from 0; a seventh has the first colour with another shape."""
+    turn = number + number // len(COLOURS)
+    return Style(COLOURS[number % len(COLOURS)], SHAPES[turn % len(SHAPES)])

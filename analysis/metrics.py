@@ -1,0 +1,303 @@
+"""The list of metrics: what each trial has, how a group is summed up, and where that is shown.
+
+Tables, figures, conclusions and pages ask this list, and name no metric that is not in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from analysis.bounded import Bounded
+from merge_runner.errors import UsageError
+from merge_runner.registry import Registry
+
+Estimator = Literal["proportion", "mean", "median"]
+# tables: Tables V and VII, the contrasts, and what is said and shown of these; fallbacks,
+# criticality: the tables of these names; distributions: the figure; humans: the page of the
+# explorer; conclusions: a sentence on each driver.
+Place = Literal["tables", "fallbacks", "criticality", "distributions", "humans", "conclusions"]
+PLACES: frozenset[Place] = frozenset(get_args(Place))
+EVERYWHERE = PLACES - {"criticality"}
+# The trials that a metric may be of, in SQL.
+STATUS = {"finished": "status = 'finished'", "ended": "status <> 'failed'"}
+INTERVALS: dict[Estimator, str] = {
+    "proportion": "Wilson for rates",
+    "mean": "Student's t for means",
+    "median": "order statistics for medians",
+}
+# What the analysis finds out of each trial that no column of the database has: whether it collided
+# by the rule of its scenario, and by that of the human experiment.
+JUDGED = ("collided", "collided_boxes")
+
+
+@dataclass(frozen=True, slots=True)
+class HumanReference(Bounded):
+    """A published human value in the unit of its metric, with its 95 % interval if it has one.
+
+    ``source`` cites it. ``n``: the trials that a share is of, without which it is not tested.
+    """
+
+    value: float
+    low: float | None = field(default=None, kw_only=True)
+    high: float | None = field(default=None, kw_only=True)
+    source: str
+    n: int | None = field(default=None, kw_only=True)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Metric:
+    """A number of each trial, and what is made of it.
+
+    ``name`` is that of its columns and rows, and ends with the unit. ``value`` is SQL over the
+    columns of ``trials`` and ``trial_metrics``, or one of JUDGED; a subquery over another table
+    knows the trial as ``trials.trial_id`` and ``trials.spec_hash``. A proportion is of a BOOLEAN
+    and printed in percent. ``trials`` are those that count, unless their value is NULL.
+
+    ``label`` and ``unit`` head a column, ``meaning`` says what the number of one trial is, or of
+    what a proportion is the share. ``word`` is how a list in a sentence names it, ``phrase`` what a
+    sentence has as its subject, and ``told`` is what the report says of a driver. ``lowest`` and
+    ``highest`` are ends that an axis always has.
+
+    ``human`` is a published value beside those of the paper: ``paper_of_drivers`` and
+    ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``. ``humans_from`` says
+    what our own human value rests on: the outcomes that are published, the recordings that are
+    imported, or these once they are complete.
+    """
+
+    name: str
+    label: str
+    unit: str
+    meaning: str
+    value: str
+    estimator: Estimator = "mean"
+    trials: Literal["finished", "ended"] = "finished"
+    decimals: int = 2
+    word: str = ""
+    phrase: str = ""
+    told: str = "comes to {value} in {subject}, the {estimator} of {trials}"
+    lowest: float | None = None
+    highest: float | None = None
+    human: HumanReference | None = None
+    humans_from: Literal["outcomes", "recordings", "all recordings"] = "recordings"
+    paper_of_drivers: str = ""
+    paper_of_humans: str = ""
+    shown: frozenset[Place] = EVERYWHERE
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier():
+            raise UsageError(f"the metric {self.name!r} needs a name of letters, digits and _")
+        if unknown := self.shown - PLACES:
+            raise UsageError(
+                f"the metric {self.name!r} is shown in {', '.join(sorted(unknown))}; valid: "
+                f"{', '.join(get_args(Place))}"
+            )
+
+    @property
+    def heading(self) -> str:
+        """``gap (m)``."""
+        return f"{self.label} ({self.unit})"
+
+    @property
+    def rate(self) -> bool:
+        """Whether it is a share, in percent."""
+        return self.estimator == "proportion"
+
+    @property
+    def kind(self) -> Literal["percent", "number"]:
+        """The kind of its columns."""
+        return "percent" if self.rate else "number"
+
+    @property
+    def column(self) -> str:
+        """The column of the trials that holds its value, missing where a trial does not count."""
+        return self.value if self.value in JUDGED else f"counted_{self.name}"
+
+    @property
+    def counts(self) -> str:
+        """The predicate of the trials that count, where they have its column."""
+        return f"{self.column} IS NOT NULL"
+
+    @property
+    def counts_in_database(self) -> str:
+        """The same as a condition on ``trials JOIN trial_metrics``, unless it is JUDGED."""
+        there = f"{self.value} IS NOT NULL"
+        if not self.value.isidentifier():  # what is no finite number is no value
+            there = f"({self.value}) IS NOT NULL" if self.rate else f"isfinite({self._typed})"
+        return f"{STATUS[self.trials]} AND {there}"
+
+    @property
+    def selected(self) -> str:
+        """Its column as an expression of SQL."""
+        return f"CASE WHEN {self.counts_in_database} THEN {self._typed} END AS {self.column}"
+
+    @property
+    def _typed(self) -> str:
+        return f"({self.value})::{'BOOLEAN' if self.rate else 'DOUBLE'}"
+
+    @property
+    def in_lists(self) -> str:
+        """How a list in a sentence names it."""
+        return self.word or self.label
+
+    @property
+    def in_sentences(self) -> str:
+        """What it is as the subject of a sentence."""
+        return self.phrase or f"the {self.in_lists}"
+
+
+METRICS = Registry[Metric]("metric")
+
+
+def register(metric: Metric) -> Metric:
+    """Add a metric to the list; raises UsageError where its name is taken."""
+    return METRICS.register(metric.name, metric)
+
+
+def shown_in(place: Place) -> list[Metric]:
+    """The metrics that a place shows, in the order of the list."""
+    return [metric for metric in METRICS.values() if place in metric.shown]
+
+
+def intervals_of(metrics: Iterable[Metric]) -> str:
+    """``Wilson for rates, Student's t for means``, as far as there are such."""
+    used = {metric.estimator for metric in metrics}
+    return ", ".join(text for estimator, text in INTERVALS.items() if estimator in used)
+
+
+def compared() -> list[Metric]:
+    """Those of the tables that are tested; there is no test of a difference of medians here."""
+    return [metric for metric in shown_in("tables") if metric.estimator != "median"]
+
+
+COLLISIONS = register(
+    Metric(
+        name="collided_percent",
+        label="coll.",
+        unit="%",
+        meaning="share of ended trials with a collision by the rule of their scenario, looked for "
+        "at its steps (the paper's: centres closer than a vehicle length, every 0.2 s)",
+        value="collided",
+        estimator="proportion",
+        trials="ended",
+        word="collisions",
+        phrase="collisions by the scenario's rule",
+        lowest=0.0,
+        humans_from="all recordings",
+        paper_of_drivers="collided_percent",
+        shown=frozenset({"tables", "fallbacks", "humans"}),
+    )
+)
+BOXES = register(
+    Metric(
+        name="collided_boxes_percent",
+        label="coll. boxes",
+        unit="%",
+        meaning="share of ended trials with a collision by the rule of the human experiment: boxes "
+        "that overlap, looked for at 20 Hz",
+        value="collided_boxes",
+        estimator="proportion",
+        trials="ended",
+        word="collisions",
+        phrase="collisions of boxes",
+        lowest=0.0,
+        humans_from="outcomes",
+        paper_of_humans="collided_percent",
+        shown=frozenset({"tables", "fallbacks", "humans"}),
+    )
+)
+LEFT_FIRST = register(
+    Metric(
+        name="left_first_percent",
+        label="left first",
+        unit="%",
+        meaning="share of finished trials with a first merger in which it is the left vehicle",
+        value="merged_first = 'left'",
+        estimator="proportion",
+        phrase="the left vehicle merging first",
+        lowest=0.0,
+        highest=100.0,
+        humans_from="outcomes",
+        shown=frozenset({"fallbacks", "humans"}),
+    )
+)
+GAP = register(
+    Metric(
+        name="gap_m",
+        label="gap",
+        unit="m",
+        meaning="net gap when the first vehicle reaches the merge point",
+        value="gap_m",
+        told="leaves {value} on average of {trials}",
+        paper_of_drivers="gap_m",
+        paper_of_humans="gap_m",
+    )
+)
+RMSE = register(
+    Metric(
+        name="rmse_mps",
+        label="RMSE",
+        unit="m/s",
+        meaning="RMSE of the speed from the initial speed, mean of both vehicles, to the first "
+        "merge",
+        value="rmse_mps",
+        phrase="the RMSE of the speed",
+        lowest=0.0,
+        paper_of_drivers="rmse_mps",
+        paper_of_humans="rmse_mps",
+        shown=EVERYWHERE - {"conclusions"},
+    )
+)
+JOINT = register(
+    Metric(
+        name="joint_percent",
+        label="joint",
+        unit="%",
+        meaning="share of finished trials with an RMSE of at least 0.5 m/s on both sides",
+        value="joint",
+        estimator="proportion",
+        word="joint rate",
+        phrase="joint contributions",
+        lowest=0.0,
+        paper_of_drivers="joint_percent",
+        paper_of_humans="joint_percent",
+        shown=frozenset({"tables", "fallbacks"}),
+    )
+)
+
+
+def _criticality(name: str, label: str, unit: str, meaning: str) -> Metric:
+    """A surrogate measure of safety, a column of ``trial_metrics``, of which medians are told."""
+    shown = frozenset[Place]({"criticality"})
+    return register(
+        Metric(
+            name=name,
+            label=label,
+            unit=unit,
+            meaning=meaning,
+            value=name,
+            estimator="median",
+            shown=shown,
+        )
+    )
+
+
+_criticality(
+    "time_to_merge_s", "time to merge", "s", "until the first vehicle reaches the merge point"
+)
+_criticality(
+    "post_encroachment_s",
+    "PET",
+    "s",
+    "from when the first vehicle has left the merge point to when the second reaches it",
+)
+_criticality("min_ttc_s", "min. TTC", "s", "smallest time to collision after the first merge")
+_criticality(
+    "max_acceleration_mps2", "max |a|", "m/s²", "largest absolute acceleration of either vehicle"
+)
+RULES_NOTE = (
+    f"{COLLISIONS.heading}: by the rule of the trials' scenario, in the paper centres closer than "
+    f"a vehicle length at a step of 0.2 s; {BOXES.heading}: by the rule of the human experiment, "
+    "boxes that overlap, looked for at 20 Hz, the one by which drivers are compared with humans"
+)

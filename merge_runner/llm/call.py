@@ -1,0 +1,87 @@
+"""A call under way: what it has tried so far, and whether anything of it is in flight."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+
+from merge_runner.errors import CallFailed
+from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """Who waits for what, and until when on the wall clock, UTC; None: until it happens."""
+
+    who: str
+    what: str
+    until: datetime | None = None
+
+
+@dataclass(slots=True, eq=False)
+class Call:
+    """A call that somebody waits for.
+
+    ``attempts`` are all that were made, the first ``earlier`` of them by earlier runs. ``worst``
+    bounds the tokens of one attempt, and ``worst_usd`` its cost where the server keeps to the
+    output cap. ``began_s`` is when the first attempt was due, on the event loop's clock. While
+    the call waits, ``wait`` says for what; otherwise it is in flight, or being saved. A call that
+    is ``stopping`` waits for nothing any more. ``task`` makes it.
+    """
+
+    request: ChatRequest
+    order: int
+    driver: str
+    worst: Usage
+    worst_usd: float
+    stopping: bool
+    attempts: list[Attempt] = field(default_factory=list)
+    earlier: int = 0
+    began_s: float = 0.0
+    wait: Wait | None = None
+    task: asyncio.Task[ChatReply] = field(init=False)
+
+    @property
+    def who(self) -> str:
+        """Whose decision it is, for a reader."""
+        return slot_text(self.request.slot)
+
+    @property
+    def own_attempts(self) -> list[Attempt]:
+        """Those of this run."""
+        return self.attempts[self.earlier :]
+
+    @property
+    def last_failure(self) -> str:
+        """Why the last attempt brought no answer."""
+        last = self.attempts[-1]
+        return last.error or last.outcome
+
+    @contextmanager
+    def waiting(self, what: str, until: datetime | None = None) -> Iterator[Wait]:
+        """Within this nothing of the call is in flight, so that it can be given up."""
+        if self.stopping:
+            raise CallFailed("the sweep was stopped", self.request)
+        self.wait = wait = Wait(f"{self.driver}: {self.who}", what, until)
+        try:
+            yield wait
+        finally:
+            self.wait = None
+
+    def stop(self) -> None:
+        """Give the call up, now where it waits, else as soon as it would."""
+        self.stopping = True
+        if self.wait is not None:
+            self.task.cancel()
+
+    def failed(self, why: str) -> CallFailed:
+        """The error of a call that ends without an answer."""
+        return CallFailed(why, self.request, tuple(self.attempts), self.earlier)
+
+
+def slot_text(slot: Slot) -> str:
+    """A slot for a reader."""
+    return f"{slot.condition} rep {slot.repetition} {slot.side}, decision {slot.decision}"

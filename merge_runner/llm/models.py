@@ -1,0 +1,31 @@
+"""The models of ``experiments/models.toml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from merge_runner.config import (
+    ModelEntry,
+    endpoint_identity,
+    find_experiments,
+    read_toml,
+    validated,
+)
+from merge_runner.errors import UsageError
+from merge_runner.llm.formats import FORMATS
+from merge_runner.text_safety import one_line
+
+
+def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
+    """The entries by name, of which each names a format and a provider; raises UsageError."""
+    path = path or find_experiments() / "models.toml"
+    entries = {}
+    for name, table in read_toml(path).items():
+        where = f"{path}: [{name}]"
+        entry = entries[name] = validated(ModelEntry, table, where)
+        try:
+            FORMATS.require(entry.format)
+            endpoint_identity(entry, {})
+        except UsageError as exc:
+            raise UsageError(one_line(f"{where}: {exc}")) from exc
+    return entries

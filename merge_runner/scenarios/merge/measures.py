@@ -1,0 +1,36 @@
+"""The measures in SQL (measures.sql), and the program's own numbers that they start from."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from pathlib import Path
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
+from merge_runner.scenarios.merge.geometry import TRACK
+
+
+def measures_sql() -> str:
+    """Definitions that take the place of older ones, and leave word of which they are."""
+    return f"{_definitions()}\nCOMMENT ON VIEW trial_metrics IS '{measures_version()}';\n"
+
+
+def measures_version() -> str:
+    """A hash of the definitions: a database has it as the comment on ``trial_metrics``."""
+    return hashlib.sha256(_definitions().encode()).hexdigest()
+
+
+@cache
+def _definitions() -> str:
+    numbers = {
+        "merge_point_m": TRACK.merge_point_m,
+        "track_end_m": TRACK.end_m,
+        "branch_sine": TRACK.branch_sine,
+        "mean_speed_mps": MEAN_SPEED_MPS,
+        "usual_length_m": ScenarioConfig().vehicle_length_m,
+        "usual_width_m": ScenarioConfig().vehicle_width_m,
+    }
+    macros = [f"CREATE OR REPLACE MACRO {name}() AS {n!r}::DOUBLE;" for name, n in numbers.items()]
+    views = Path(__file__).with_name("measures.sql").read_text(encoding="utf-8")
+    return "\n".join([*macros, "", views])

@@ -1,0 +1,189 @@
+-- The measures of a trial. The numbers of the human experiment, for specs that tell no others, are
+-- macros such as merge_point_m(), which measures.py writes before this.
+
+-- One row a spec: its vehicles' size and its track, in a human recording those of the experiment,
+-- and where the vehicles' boxes overlap (collision.py). With half lengths l, half widths w and each branch at the angle phi
+-- from the centreline, the four separating axes are along and across either vehicle. Two vehicles
+-- u and v before the merge point are apart in their sums
+--     |v - u cos 2phi|, |u - v cos 2phi| < along2 = l (1 + cos 2phi) + w sin 2phi
+--     u sin 2phi, v sin 2phi < across2 = w (1 + cos 2phi) + l sin 2phi
+-- and one u before it, the other d behind it, with along and across likewise of phi, in
+--     u + d cos phi, u cos phi + d < along;  u sin phi, d sin phi < across
+-- The contact point is the first at which two vehicles touch that are both before the merge point.
+CREATE OR REPLACE VIEW geometry AS
+WITH sizes AS (
+    SELECT spec_hash,
+        coalesce((spec -> 'scenario' ->> 'vehicle_length_m')::DOUBLE, usual_length_m()) AS length_m,
+        coalesce((spec -> 'scenario' ->> 'vehicle_width_m')::DOUBLE, usual_width_m()) AS width_m,
+        coalesce((spec -> 'track' ->> 'merge_point_m')::DOUBLE, merge_point_m()) AS merge_point_m,
+        coalesce((spec -> 'track' ->> 'end_m')::DOUBLE, track_end_m()) AS end_m,
+        coalesce((spec -> 'track' ->> 'start_distance_m')::DOUBLE / 2 / merge_point_m,
+            branch_sine()) AS sin1
+    FROM specs
+), angles AS (
+    SELECT *,
+        sqrt(1 - sin1 ** 2) AS cos1,
+        2 * sin1 * cos1 AS sin2, 1 - 2 * sin1 ** 2 AS cos2
+    FROM sizes
+), reaches AS (
+    SELECT *,
+        (length_m * (1 + cos1) + width_m * sin1) / 2 AS along,
+        (width_m * (1 + cos1) + length_m * sin1) / 2 AS across,
+        (length_m * (1 + cos2) + width_m * sin2) / 2 AS along2,
+        (width_m * (1 + cos2) + length_m * sin2) / 2 / sin2 AS contact
+    FROM angles
+)
+SELECT spec_hash, length_m, width_m, merge_point_m, end_m,
+    merge_point_m - length_m / 2 AS front_m,
+    merge_point_m + length_m / 2 AS rear_m,
+    -- A vehicle at contact_m overlaps the other from there to contact_high_m, one at the merge point
+    -- from merge_low_m to merge_high_m.
+    merge_point_m - contact AS contact_m,
+    if(contact < along, merge_point_m + (along - contact) / cos1, contact_m + length_m)
+        AS contact_high_m,
+    merge_point_m - least(along2, contact) AS merge_low_m,
+    merge_point_m + least(along, across / sin1) AS merge_high_m
+FROM reaches;
+
+-- On a collision course for a point: when a vehicle will be there at its present speed, the other
+-- will be within the bounds in which their boxes overlap (Siebinga et al., conflict_signal.py).
+CREATE OR REPLACE MACRO on_course(at_m, low_m, high_m, own_m, own_mps, other_m, other_mps) AS
+    coalesce(own_m < at_m AND own_mps > 0
+        AND other_m + other_mps * (at_m - own_m) / own_mps BETWEEN low_m AND high_m, false);
+
+-- When a vehicle passes a level: linear within the step in which it does, else NULL.
+CREATE OR REPLACE MACRO passing_s(level_m, before_m, now_m, before_s, now_s) AS
+    CASE WHEN before_m < level_m AND now_m >= level_m
+    THEN before_s + (now_s - before_s) * (level_m - before_m) / (now_m - before_m) END;
+
+-- One row a sample, both vehicles side by side, the sample before, and the speeds of the first.
+CREATE OR REPLACE VIEW vehicle_pairs AS
+WITH pairs AS (
+    SELECT trial_id, spec_hash, step, time_s,
+        max(position_m) FILTER (side = 'left') AS left_m,
+        max(position_m) FILTER (side = 'right') AS right_m,
+        max(velocity_mps) FILTER (side = 'left') AS left_mps,
+        max(velocity_mps) FILTER (side = 'right') AS right_mps,
+        max(abs(acceleration_mps2)) AS hardest_mps2
+    FROM states GROUP BY ALL
+)
+SELECT *,
+    lag(time_s) OVER trial AS time_before_s,
+    lag(left_m) OVER trial AS left_before_m,
+    lag(right_m) OVER trial AS right_before_m,
+    first_value(left_mps) OVER trial AS left_first_mps,
+    first_value(right_mps) OVER trial AS right_first_mps
+FROM pairs WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step);
+
+-- When each vehicle's centre reaches the merge point, when its front does, and when its rear has
+-- left it; NULL: never.
+CREATE OR REPLACE VIEW merge_times AS
+SELECT *,
+    least(left_s, right_s) AS first_s,
+    if(left_s IS NULL OR right_s IS NULL, NULL, greatest(left_s, right_s)) AS both_s
+FROM (SELECT trial_id, spec_hash,
+    min(passing_s(point_m, left_before_m, left_m, time_before_s, time_s)) AS left_s,
+    min(passing_s(point_m, right_before_m, right_m, time_before_s, time_s)) AS right_s,
+    min(passing_s(front_m, left_before_m, left_m, time_before_s, time_s)) AS left_front_s,
+    min(passing_s(front_m, right_before_m, right_m, time_before_s, time_s)) AS right_front_s,
+    min(passing_s(rear_m, left_before_m, left_m, time_before_s, time_s)) AS left_rear_s,
+    min(passing_s(rear_m, right_before_m, right_m, time_before_s, time_s)) AS right_rear_s
+FROM (SELECT *, coalesce(merge_point_m, merge_point_m()) AS point_m
+    FROM vehicle_pairs LEFT JOIN geometry USING (spec_hash)) GROUP BY ALL);
+
+-- RMSE of each vehicle's speed from its initial speed, over four readings of "the interaction
+-- window": from the start of control to the first vehicle's merge, to the second's, to the end,
+-- and the whole trial with the tunnel where it was recorded. A window ends with the first sample
+-- at which it is over. A human's speed is compared with that of the condition, which the
+-- simulator gave the vehicle; a recording begins up to a step later.
+CREATE OR REPLACE VIEW speed_deviations AS
+SELECT *,
+    (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
+    least(rmse_left_mps, rmse_right_mps) >= 0.5 AS joint
+FROM (SELECT trial_id, spec_hash, time_window,
+    sqrt(avg((left_mps - if(source = 'human', mean_speed_mps() + relative_velocity_mps / 2,
+        left_first_mps)) ** 2)) AS rmse_left_mps,
+    sqrt(avg((right_mps - if(source = 'human', mean_speed_mps() - relative_velocity_mps / 2,
+        right_first_mps)) ** 2)) AS rmse_right_mps
+FROM vehicle_pairs
+JOIN trials USING (trial_id, spec_hash)
+JOIN merge_times USING (trial_id, spec_hash)
+CROSS JOIN (VALUES ('first_merge'), ('both_merges'), ('end'), ('whole')) AS windows (time_window)
+WHERE status = 'finished' AND CASE time_window
+    WHEN 'first_merge' THEN time_s >= 0 AND coalesce(time_before_s < first_s, true)
+    WHEN 'both_merges' THEN time_s >= 0 AND both_s IS NOT NULL
+        AND coalesce(time_before_s < both_s, true)
+    WHEN 'end' THEN time_s >= 0
+    ELSE true END
+GROUP BY ALL);
+
+-- One row a trial. What a trial has no value for is NULL: gaps, speed deviations and joint are
+-- those of finished trials (arXiv 2604.09609, sec. II-G).
+CREATE OR REPLACE VIEW trial_metrics AS
+WITH distances AS (
+    SELECT trial_id, spec_hash,
+        abs(left_before_m - right_before_m
+            + (first_s - time_before_s) / (time_s - time_before_s)
+            * (left_m - left_before_m - right_m + right_before_m)) AS merge_m
+    FROM vehicle_pairs JOIN merge_times USING (trial_id, spec_hash)
+    WHERE time_before_s < first_s AND first_s <= time_s
+), sampled_distances AS (
+    SELECT trial_id, spec_hash,
+        arg_min(abs(left_m - right_m), step)
+            FILTER (greatest(left_m, right_m) >= point_m) AS first_sample_m,
+        arg_min(abs(left_m - right_m), step)
+            FILTER (left_m + right_m >= 2 * point_m) AS mean_at_merge_m,
+        max(hardest_mps2) FILTER (time_s > 0) AS max_acceleration_mps2
+    FROM (SELECT *, coalesce(merge_point_m, merge_point_m()) AS point_m
+        FROM vehicle_pairs LEFT JOIN geometry USING (spec_hash)) GROUP BY ALL
+), collision_times AS (
+    SELECT trial_id, spec_hash, min((abs(left_m - right_m) - length_m) / closing_mps) AS min_ttc_s
+    FROM (
+        SELECT *, if(left_m > right_m, right_mps - left_mps, left_mps - right_mps) AS closing_mps
+        FROM vehicle_pairs JOIN geometry USING (spec_hash)
+        WHERE greatest(left_m, right_m) >= merge_point_m
+    )
+    WHERE closing_mps > 0 AND abs(left_m - right_m) > length_m
+    GROUP BY ALL
+), resolutions AS (
+    SELECT trial_id, spec_hash, min(time_s) AS conflict_resolution_s
+    FROM vehicle_pairs JOIN geometry USING (spec_hash)
+    WHERE time_s >= 0 AND NOT (
+        on_course(contact_m, contact_m, contact_high_m, left_m, left_mps, right_m, right_mps)
+        OR on_course(contact_m, contact_m, contact_high_m, right_m, right_mps, left_m, left_mps)
+        OR on_course(merge_point_m, merge_low_m, merge_high_m,
+            left_m, left_mps, right_m, right_mps)
+        OR on_course(merge_point_m, merge_low_m, merge_high_m,
+            right_m, right_mps, left_m, left_mps)
+        OR on_course(end_m, end_m - length_m, end_m + length_m,
+            left_m, left_mps, right_m, right_mps)
+        OR on_course(end_m, end_m - length_m, end_m + length_m,
+            right_m, right_mps, left_m, left_mps))
+    GROUP BY ALL
+)
+SELECT
+    trials.trial_id,
+    trials.spec_hash,
+    if(finished, merge_m - length_m, NULL) AS gap_m,
+    if(finished, first_sample_m - length_m, NULL) AS gap_first_sample_m,
+    if(finished, mean_at_merge_m - length_m, NULL) AS gap_mean100_m,
+    rmse_left_mps,
+    rmse_right_mps,
+    rmse_mps,
+    joint,
+    first_s AS time_to_merge_s,
+    if(finished, abs(left_s - right_s), NULL) AS merge_interval_s,
+    -- from when the first vehicle's rear has left the merge point to when the second's front is there
+    if(finished, if(left_s < right_s, right_front_s - left_rear_s, left_front_s - right_rear_s), NULL)
+        AS post_encroachment_s,
+    min_ttc_s,
+    max_acceleration_mps2,
+    if(status = 'collided', NULL, conflict_resolution_s) AS conflict_resolution_s
+FROM (SELECT *, status = 'finished' AS finished FROM trials) AS trials
+LEFT JOIN merge_times USING (trial_id, spec_hash)
+LEFT JOIN geometry USING (spec_hash)
+LEFT JOIN distances USING (trial_id, spec_hash)
+LEFT JOIN sampled_distances USING (trial_id, spec_hash)
+LEFT JOIN (FROM speed_deviations WHERE time_window = 'first_merge') USING (trial_id, spec_hash)
+LEFT JOIN collision_times USING (trial_id, spec_hash)
+LEFT JOIN resolutions USING (trial_id, spec_hash);

@@ -1,0 +1,37 @@
+"""The scenarios that a sweep can play."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, get_args
+
+from merge_runner.config import USUAL_SCENARIO, CollisionRule, ScenarioConfig
+from merge_runner.registry import Registry
+from merge_runner.scenarios.base import Scenario
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import World
+
+SCENARIOS = Registry[Scenario]("scenario")
+SCENARIOS.register(
+    USUAL_SCENARIO,
+    Scenario(
+        track=TRACK,
+        conditions=tuple(HUMAN_CONDITIONS),
+        collision_rules=get_args(CollisionRule),
+        make_world=World,
+    ),
+)
+
+
+def task_of(config: ScenarioConfig) -> dict[str, Any]:
+    """What a spec holds of the task: the knobs, and the track where it is not the experiment's.
+
+    With it the measures of a database need no package that registered its scenario, and a spec of
+    another track is another spec.
+    """
+    track = SCENARIOS[config.name].track
+    return {
+        "scenario": config.model_dump(),
+        **({} if track == TRACK else {"track": asdict(track)}),
+    }

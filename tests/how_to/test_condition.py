@@ -1,0 +1,74 @@
+"""The page on adding a condition: played where it is installed, read where it is not."""
+
+from __future__ import annotations
+
+import pytest
+
+from merge_runner.errors import UsageError
+from merge_runner.results.store import query
+from merge_runner.scenarios.merge.conditions import Condition
+from tests.harness import FAST, how_to, plugin
+
+CHOSEN = ("--reps", 1, "--conditions", "N_0_0,far,fast-tie")
+
+
+async def test_conditions_from_outside_go_through_every_command(merge_runner, tmp_path):
+    env = plugin(tmp_path / "installed", how_to("add-a-condition"))
+
+    async def installed(*arguments):
+        process = await merge_runner.start(*arguments, **env)
+        out, err = await process.communicate()
+        assert process.returncode == 0, err.decode()
+        return out.decode()
+
+    await installed("sweep", "baseline", *CHOSEN, *FAST)
+    await installed("recording", "export", "own.parquet")
+    await installed("sweep", "baseline", *CHOSEN, "--model", "projected-order")
+    assert "not derived anew" not in await installed("audit")
+    again = ("replay", "baseline", *CHOSEN, "--recording", "own.parquet", "--db", "again.duckdb")
+    await installed(*again, "--cache", "empty")
+
+    # From here on the package is not there.
+    read = {
+        command[0]: await merge_runner(*command)
+        for command in (
+            ("tables", "conflict-resolution", "who-first"),
+            ("figures", "--out", "figures"),
+            ("report", "--out", "report.html"),
+            ("view", "--export", "pages"),
+            ("audit",),
+        )
+    }
+    assert {name: run.code for name, run in read.items()} == dict.fromkeys(read, 0)
+    assert "projected-order/baseline: no human drove fast-tie, far (2 trials)" in (
+        read["tables"].out
+    )
+    rows = [line.split()[:2] for line in read["tables"].out.splitlines()]
+    assert ["far", "projected-order"] in rows
+    assert ["far", "human"] not in rows
+    assert "not derived anew in 2 trials" in read["audit"].out
+    assert "no human drove" in (tmp_path / "report.html").read_text()
+    assert "No human drove fast-tie, far." in (tmp_path / "pages/humans.html").read_text()
+
+    # Who keeps a speed of 15 m/s deviates from it by nothing.
+    rmse = "SELECT least(rmse_left_mps, rmse_right_mps) FROM trial_metrics JOIN trials "
+    rmse += "USING (trial_id, spec_hash) WHERE condition = 'fast-tie' AND source = 'driver'"
+    assert query(tmp_path / "results/merge.duckdb", rmse)[1] == [(0.0,)]
+    assert (await merge_runner("digest", "--db", "again.duckdb")).out.endswith("3 trials\n")
+
+
+async def test_a_condition_that_cannot_be_played_is_refused_before_any_call(merge_runner, tmp_path):
+    source = how_to("add-a-condition") + "\nCONDITIONS.register('too far', Condition(8.0, 0.0))"
+    source += "\nCONDITIONS.register('beyond', Condition(60.0, 0.0))"
+    env = plugin(tmp_path / "installed", source)
+    for name, reason in (("beyond", "at the merge point"), ("too far", "needs a name of letters")):
+        process = await merge_runner.start("sweep", "baseline", "--conditions", name, **env)
+        _, err = await process.communicate()
+        assert process.returncode == 2
+        assert reason in err.decode()
+
+
+@pytest.mark.parametrize("numbers", [(0.0, 3.0, 1.5), (0.0, -3.0, 1.0), (float("nan"), 0.0, 10.0)])
+def test_both_vehicles_drive_forwards(numbers):
+    with pytest.raises(UsageError, match="must drive forwards"):
+        Condition(*numbers)

@@ -1,0 +1,132 @@
+"""A driver from outside, with a rate of its own, from the sweep to the explorer."""
+
+from __future__ import annotations
+
+import json
+
+import duckdb
+import pytest
+
+from tests.harness import how_to, plugin
+
+FINE = """
+conditions = ["L_4_0", "N_0_0"]
+[repetitions]
+baseline = 2
+[scenario]
+step_s = 0.05
+plan_step_s = 0.2
+control_start = "own_exit"
+"""
+PAIRS = ("hesitant+impulsive", "emulator+impulsive")
+RATES = {"emulator": 1, "hesitant": 5, "impulsive": 20}
+
+
+@pytest.fixture
+def installed(tmp_path):
+    (tmp_path / "fine.toml").write_text(FINE)
+    return plugin(tmp_path / "installed", how_to("add-a-driver"))
+
+
+@pytest.fixture
+async def played(run, installed):
+    """Both pairs in one database."""
+    for pair in PAIRS:
+        done = await run("sweep", "fine.toml", "--model", pair, **installed)
+        assert done.code == 0, done.err
+    return installed
+
+
+async def test_a_driver_decides_at_its_own_rate_and_is_drawn_from_its_seed(run, played, tmp_path):
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
+        rows = connection.execute(
+            "SELECT if(side = 'left', model_left, model_right), decision, time_s, len(applied), "
+            "len(plan) FROM decisions JOIN trials USING (trial_id, spec_hash)"
+        ).fetchall()
+        seen = connection.execute(
+            "SELECT count(DISTINCT prompt), max(len(split(regexp_extract(prompt, "
+            "'other car \\(m/s\\): \\[([^]]*)', 1), ','))) FROM decisions WHERE prompt IS NOT NULL"
+        ).fetchone()
+    assert {name for name, *_ in rows} == set(RATES)
+    for name, number, time_s, applied, plan in rows:
+        assert time_s == pytest.approx(number / RATES[name])
+        # An action of a program lasts a step of the world, one of the model's plan 0.2 s.
+        in_a_second = 5 if name == "emulator" else 20
+        assert applied == in_a_second / RATES[name]
+        assert plan == 4 * in_a_second
+    assert seen[0] > 20
+    assert seen[1] == 10  # the histories are those of a plan's steps
+
+    other = ("--db", "other.duckdb")
+    for pair in PAIRS:
+        assert (await run("replay", "fine.toml", "--model", pair, *other, **played)).code == 0
+    digests = {(await run("digest", *db, **played)).out for db in ((), other)}
+    assert len(digests) == 1
+    assert digests.pop().strip()
+
+
+async def test_it_is_in_every_command_that_reads(run, played, tmp_path):
+    audit = await run("audit", "--json", **played)
+    assert (audit.code, "not derived" in audit.out) == (0, False), audit.out
+    export = await run("recording", "export", "r.parquet", **played)
+    assert export.code == 0, export.err
+    for command in (
+        ("recording", "import", "r.parquet", "--cache", "again"),
+        ("audit", "--recording", "r.parquet"),
+        ("tables",),
+        ("figures", "--out", "figures"),
+        ("report", "--out", "report.html"),
+        ("view", "--export", "pages"),
+    ):
+        done = await run(*command, **played)
+        assert done.code == 0, f"{command}: {done.err}"
+    replayed = ("--model", PAIRS[1], "--cache", "again", "--db", "again.duckdb")
+    assert (await run("replay", "fine.toml", *replayed, **played)).code == 0
+    tables = await run("tables", "ablation-quantitative", "--format", "csv", **played)
+    for name in PAIRS:
+        assert name in tables.out
+    assert "impulsive" in (tmp_path / "report.html").read_text()
+    pages = [page.read_text() for page in (tmp_path / "pages").rglob("*") if page.is_file()
+             and page.suffix in {".html", ".js", ".json"}]  # fmt: skip
+    assert any("impulsive decision" in page or "hesitant+impulsive" in page for page in pages)
+
+
+async def test_where_it_is_not_installed_the_rest_is_shown_and_checked(run, played, emulator_url):
+    audit = await run("audit", "--json", "--db", "results/merge.duckdb")
+    assert audit.code == 0
+    notes = [note for one in json.loads(audit.out)["audits"] for note in one["notes"]]
+    assert any(
+        "the decisions of 'impulsive', which is no driver here; valid: constant, projected-order "
+        "(install the package that registers it)" in note
+        for note in notes
+    ), notes
+    for command in (("tables",), ("view", "--export", "pages")):
+        done = await run(*command)
+        assert done.code == 0, done.err
+    asked = await run("sweep", "fine.toml", "--model", "impulsive")
+    assert asked.code == 2
+    assert "unknown model 'impulsive'; valid: " in asked.err
+    assert "constant, projected-order" in asked.err
+
+
+async def test_a_world_that_is_too_coarse_is_refused_with_what_to_type(run, installed):
+    done = await run("sweep", "baseline", "--model", "constant+impulsive", **installed)
+    assert (done.code, done.out) == (2, "")
+    assert done.err == (
+        "error: the driver impulsive cannot decide 20.0 times a second: the time between two "
+        "decisions = 0.05 s is no whole number of 0.2 s; set a step_s that fits under [scenario] "
+        "of the sweep's file, and beside it plan_step_s = 0.2 to leave a language model's plan as "
+        "it is\n"
+    )
+
+
+async def test_programs_are_listed_with_what_they_do(run, installed):
+    listed = (await run("models", **installed)).out.splitlines()
+    programs = [line.split() for line in listed if " program " in line]
+    assert [line[0] for line in programs] == [
+        "constant",
+        "projected-order",
+        "impulsive",
+        "hesitant",
+    ]
+    assert "(20 times a second)" in " ".join(programs[2])

@@ -1,0 +1,113 @@
+"""A prompt block from outside with two variants, from the sweep to the explorer."""
+
+from __future__ import annotations
+
+import json
+
+import duckdb
+import pytest
+
+from merge_runner.run.plan import Choice, make_plan
+from tests.harness import how_to, plugin
+
+VARIANTS = ("--variants", "baseline,A1,A8,A9", "--reps", 1, "--conditions", "L_4_0,N_0_0")
+WARNING = "Mind the speed of the other car: at "
+
+
+@pytest.fixture
+async def played(run, tmp_path):
+    installed = plugin(tmp_path / "installed", how_to("add-a-prompt-block"))
+    done = await run("sweep", "baseline", *VARIANTS, **installed)
+    assert done.code == 0, done.err
+    return installed
+
+
+def pages_of(folder):
+    return "".join(
+        page.read_text() for page in folder.rglob("*") if page.suffix in {".html", ".js", ".json"}
+    )
+
+
+async def test_a_block_is_in_the_variants_that_add_it_and_changes_no_other(run, played, tmp_path):
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
+        prompts = connection.execute(
+            "SELECT variant, distance_to, prompt FROM trials JOIN (SELECT *, "
+            "contains(prompt, 'Road type: merge') AS distance_to FROM decisions) "
+            "USING (trial_id, spec_hash)"
+        ).fetchall()
+        hashes = dict(
+            connection.execute("SELECT DISTINCT variant, spec_hash FROM trials").fetchall()
+        )
+    assert {variant for variant, *_ in prompts} == {"baseline", "A1", "A8", "A9"}
+    for variant, before_the_merge, prompt in prompts:
+        assert (WARNING in prompt) == (variant in {"A8", "A9"} and before_the_merge)
+        assert ("History of" in prompt) == (variant not in {"A1", "A9"})
+        assert prompt.split("\n\n")[-1].startswith("Output format:")
+    # As this process has them, where the block is not installed.
+    plan = make_plan(Choice("baseline", "emulator", 1, variants=("baseline", "A1")))
+    own = {spec.variant: spec.spec_hash for spec in plan.trial_specs({"emulator": "emulator"})}
+    assert own.items() < hashes.items()
+    assert len(set(hashes.values())) == 4
+
+
+async def test_it_is_in_every_command_that_reads(run, played, tmp_path):
+    for command in (
+        ("audit",),
+        ("recording", "export", "r.parquet"),
+        ("recording", "import", "r.parquet", "--cache", "again"),
+        ("audit", "--recording", "r.parquet"),
+        ("replay", "baseline", *VARIANTS, "--cache", "again", "--db", "again.duckdb"),
+        ("tables",),
+        ("figures", "--out", "figures"),
+        ("report", "--out", "report.html"),
+        ("view", "--export", "pages"),
+    ):
+        done = await run(*command, **played)
+        assert done.code == 0, f"{command}: {done.err}"
+        assert "not derived" not in done.out + done.err
+    text = pages_of(tmp_path / "pages")
+    assert "with C6: warning of speed" in text
+    assert "without C1: history and with C6: warning of speed" in text
+    table = await run("tables", "ablation-quantitative", "--format", "json", **played)
+    (rows,) = (one["rows"] for one in json.loads(table.out)["tables"])
+    assert "A8" in str(rows)
+
+
+async def test_where_it_is_not_installed_it_is_shown_by_name(run, played, tmp_path):
+    for command in (("audit",), ("tables",), ("view", "--export", "pages")):
+        done = await run(*command)
+        assert done.code == 0, f"{command}: {done.err}"
+    text = pages_of(tmp_path / "pages")
+    assert "with C6: no meaning is known here" in text
+    assert "without C1: history and with C6: no meaning is known here" in text
+    asked = await run("sweep", "baseline", *VARIANTS)
+    assert asked.code == 2
+    assert asked.err.startswith("error: unknown variant 'A8'; valid: baseline, A1, A2, ")
+
+
+@pytest.mark.parametrize(
+    ("made", "told"),
+    [
+        (
+            'Block("x", "The time is {time}.", None)',
+            "the block 'x' names {time} on the road merge; valid: vehicle_length, own_speed, ",
+        ),
+        ('Block("x", None, "To go: {distance_to_merge}.")', "{distance_to_merge} on the road str"),
+        ('Block("x", "An open {", None)', "a prompt block cannot be read"),
+        ('Block("x", "Text.", None, before="C9")', "the prompt block C6 stands before C9; valid: "),
+    ],
+)
+async def test_a_block_that_cannot_be_written_is_told_before_anything_is_asked(
+    run, tmp_path, made, told
+):
+    source = (
+        "from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant\n"
+        f'BLOCKS.register("C6", {made})\n'
+        'VARIANTS.register("A8", Variant(adds=frozenset({"C6"})))\n'
+    )
+    env = plugin(tmp_path / "installed", source)
+    done = await run("sweep", "baseline", "--variants", "A8", "--reps", 1, **env)
+    assert done.code == 2
+    assert done.err.startswith("error: ")
+    assert told in done.err
+    assert done.err.count("\n") == 1

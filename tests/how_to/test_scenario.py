@@ -1,0 +1,74 @@
+"""The scenario of the page on adding one: played where it is installed, read where it is not."""
+
+from __future__ import annotations
+
+import duckdb
+import pytest
+
+from analysis.explorer.details import read_trial
+from merge_runner.results.store import Store, query
+from merge_runner.scenarios.merge.geometry import Track
+from tests.harness import FAST, how_to, plugin
+
+FILE = """
+repetitions = { baseline = 1 }
+conditions = ["N_0_0", "L_4_8"]
+[scenario]
+name = "long-merge"
+"""
+# When a vehicle first passes 120 m, linear within the step.
+FIRST = """
+SELECT trial_id, min(before_s + (time_s - before_s) * (120 - before_m) / (position_m - before_m))
+FROM (SELECT *, lag(position_m) OVER vehicle AS before_m, lag(time_s) OVER vehicle AS before_s
+    FROM states WINDOW vehicle AS (PARTITION BY trial_id, side ORDER BY step))
+WHERE before_m < 120 AND position_m >= 120 GROUP BY ALL ORDER BY ALL
+"""
+MEASURED = "SELECT trial_id, time_to_merge_s FROM trial_metrics ORDER BY ALL"
+
+
+async def test_a_scenario_from_outside_goes_through_every_command(merge_runner, tmp_path):
+    env = plugin(tmp_path / "installed", how_to("add-a-scenario"))
+    (tmp_path / "long.toml").write_text(FILE)
+
+    async def installed(*arguments):
+        process = await merge_runner.start(*arguments, **env)
+        out, err = await process.communicate()
+        assert process.returncode == 0, err.decode()
+        return out.decode()
+
+    await installed("sweep", "long.toml", *FAST)
+    await installed("recording", "export", "own.parquet")
+    await installed("sweep", "long.toml", "--model", "projected-order")
+    assert "not derived anew" not in await installed("audit")
+    again = ("replay", "long.toml", "--recording", "own.parquet", "--db", "again.duckdb")
+    await installed(*again, "--cache", "empty")
+
+    # From here on the package is not there.
+    for command in (
+        ("tables",),
+        ("figures", "--out", "figures"),
+        ("report", "--out", "report.html"),
+        ("view", "--export", "pages"),
+        ("audit",),
+    ):
+        run = await merge_runner(*command)
+        assert run.code == 0, run.err
+    assert "not derived anew in 2 trials" in run.out
+    db = tmp_path / "results/merge.duckdb"
+    key = query(db, "SELECT trial_id, spec_hash FROM trials LIMIT 1")[1][0]
+    assert read_trial(db, *key).track == Track(merge_point_m=120.0, end_m=170.0)
+    assert query(db, MEASURED)[1] == [
+        (trial, pytest.approx(first_s)) for trial, first_s in query(db, FIRST)[1]
+    ]
+    refused = await merge_runner("sweep", "long.toml")
+    assert refused.code == 2
+    assert "unknown scenario 'long-merge'; valid: merge" in refused.err
+
+
+def test_a_database_with_older_measures_gets_those_of_the_program_when_it_is_written_to(tmp_path):
+    path = tmp_path / "t.duckdb"
+    Store(path)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("CREATE OR REPLACE VIEW trial_metrics AS SELECT 1 AS old")
+    Store(path)
+    assert "gap_m" in query(path, "FROM trial_metrics")[0]

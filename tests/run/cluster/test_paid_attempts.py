@@ -1,0 +1,122 @@
+"""What a worker holds of the coordinator's money, over a real connection, however it ends."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+
+import pytest
+from distributed.comm import connect, listen
+
+from merge_runner.llm.budget import Budget
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.claims import Claims
+from merge_runner.llm.ledger import Asked, Ledger
+from merge_runner.records import Attempt
+from merge_runner.run.clients import LocalServices
+from merge_runner.run.cluster.link import Link, LinkLost
+from merge_runner.run.cluster.remote import RemoteBudget, WorkerCache
+from merge_runner.run.cluster.session import Session
+
+WORST = Asked("o3", "L_4_0 rep 1 left, decision 3", 0.5)
+TRIAL = 1
+
+
+@pytest.fixture
+def cache(tmp_path):
+    opened = ResponseCache(tmp_path / "main")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def budget(cache):
+    return Budget(Ledger(cache, "sweep"), cap_usd=1.0, trial_usd=1.0)
+
+
+@pytest.fixture
+async def worker(cache, budget, tmp_path):
+    """The worker's end: its link, and the budget that it asks over it."""
+    claims = Claims(cache.folder)
+    run = SimpleNamespace(
+        services=LocalServices({}, budget, claims), cache=cache, claimed=set(), meters={}
+    )
+    sessions = []
+
+    async def serve(comm):
+        session = Session(run, comm)
+        session.trials = {TRIAL: None}
+        sessions.append(asyncio.current_task())
+        await session.serve()
+
+    listener = listen("tcp://127.0.0.1:0", serve)
+    await listener.start()
+    link = Link(await connect(listener.contact_address), {})
+    serving = asyncio.create_task(link.serve())
+    own = WorkerCache(tmp_path / "own", link)
+
+    async def dies():
+        link.abort()
+        await asyncio.gather(serving, *sessions)
+
+    yield SimpleNamespace(link=link, budget=RemoteBudget(link, own), dies=dies)
+    await dies()
+    listener.stop()
+    own.close()
+    claims.close()
+
+
+def money(budget):
+    """What is held in memory, set aside in the ledger, and spent."""
+    spending = budget.ledger.read()
+    return budget._queued_usd, spending.reserved_usd, spending.spent_usd
+
+
+async def test_a_worker_that_dies_before_it_sends_gives_its_money_back(worker, budget):
+    async with worker.budget.attempt(TRIAL, "key", WORST) as paid:
+        assert (paid.aside_usd, money(budget)) == (0.5, (0.5, 0, 0))
+        await worker.dies()
+        with pytest.raises(LinkLost):
+            await paid.begin([])
+    assert (budget._in_flight, money(budget)) == (0, (0, 0, 0))
+
+
+async def test_what_a_dead_worker_had_in_flight_stays_set_aside(worker, budget):
+    async with worker.budget.attempt(TRIAL, "key", WORST) as paid:
+        await paid.begin([])
+        assert money(budget) == (0, 0.5, 0)
+        await worker.dies()
+        with pytest.raises(LinkLost):
+            await paid.settle([Attempt(1, "timeout")])
+    assert (budget._in_flight, money(budget)) == (0, (0, 0.5, 0))
+
+
+async def test_who_gives_up_waiting_for_money_holds_none(worker, budget):
+    async with worker.budget.attempt(TRIAL, "key", WORST):
+
+        async def second():
+            async with worker.budget.attempt(TRIAL + 1, "other", WORST):
+                raise AssertionError("one is in flight, and two more do not fit")
+
+        waiting = asyncio.create_task(second())
+        await asyncio.sleep(0.1)
+        waiting.cancel()
+        await asyncio.gather(waiting, return_exceptions=True)
+        assert waiting.cancelled()
+    await worker.link.ask("leave", TRIAL)  # all that was told before it has been heard
+    assert (budget._in_flight, money(budget)) == (0, (0, 0, 0))
+
+
+async def test_who_gives_up_when_the_answer_is_under_way_holds_no_money(worker, budget):
+    async def attempt():
+        async with worker.budget.attempt(TRIAL, "key", WORST):
+            await asyncio.Event().wait()
+
+    # At every stage of the question and its answer, which travel for a few milliseconds.
+    for milliseconds in range(12):
+        asking = asyncio.create_task(attempt())
+        await asyncio.sleep(milliseconds / 1000)
+        asking.cancel()
+        await asyncio.gather(asking, return_exceptions=True)
+    await worker.link.ask("leave", TRIAL)  # all that was told before it has been heard
+    assert (budget._in_flight, money(budget)) == (0, (0, 0, 0))
