@@ -32,7 +32,7 @@ app.add_typer(human_app, name="human")
 
 ModelsOption = Annotated[
     str | None,
-    typer.Option("--models", help="These drivers alone, separated by commas; human is one."),
+    typer.Option("--models", help="Only these drivers, separated by commas; human is one."),
 ]
 
 
@@ -149,7 +149,9 @@ def view(
     ] = None,
     trials: Annotated[
         str | None,
-        typer.Option("--trials", help="Which to write: names, comma separated, * for anything."),
+        typer.Option(
+            "--trials", help="Which trials to write: names separated by commas, * for anything."
+        ),
     ] = None,
     db: DbOption = DEFAULT_DB,
 ) -> None:

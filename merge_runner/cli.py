@@ -79,7 +79,7 @@ ImportedFile = Annotated[
 ]
 RecordingOption = Annotated[
     Path | None,
-    typer.Option("--recording", help="Replay from this file too, without importing it."),
+    typer.Option("--recording", help="Also replay from this file, without importing it."),
 ]
 
 # A full disk, a limit of file sizes, and a device that fails.
@@ -129,7 +129,7 @@ def sweep(
     variants: VariantsOption = None,
     sample_set: SampleSetOption = 0,
     order_seed: Annotated[
-        int, typer.Option("--order-seed", help="Draws another order of the trials.")
+        int, typer.Option("--order-seed", help="Another number draws another order.")
     ] = 0,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
@@ -262,10 +262,11 @@ def audit(
         str | None, typer.Option("--sweep", help="A sweep_id; everything if not given.")
     ] = None,
     recording: Annotated[
-        Path | None, typer.Option("--recording", help="Check this file, and no database.")
+        Path | None, typer.Option("--recording", help="Check this recording instead of a database.")
     ] = None,
     cache: Annotated[
-        Path | None, typer.Option("--cache", help="Compare every attempt with this folder too.")
+        Path | None,
+        typer.Option("--cache", help="Also compare every attempt with this cache folder."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -297,7 +298,7 @@ def audit(
         for line in chain.from_iterable(found.lines() for found in audits):
             print_out(line)
         if untold:
-            print_out(f"not checked, since no reply and no spec tells: {', '.join(untold)}")
+            print_out(f"not checked, since neither replies nor specs tell it: {', '.join(untold)}")
     sys.exit(0 if ok else 1)
 
 
@@ -306,7 +307,7 @@ def ledger(
     cache: CacheOption = DEFAULT_CACHE,
     release: Annotated[
         str | None,
-        typer.Option("--release", metavar="SWEEP", help="Count no longer what is set aside."),
+        typer.Option("--release", metavar="SWEEP", help="Stop counting what is set aside."),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before releasing.")] = False,
     as_json: JsonOption = False,

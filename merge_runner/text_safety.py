@@ -1,4 +1,4 @@
-"""Texts of others as they may be shown or put into a statement."""
+"""Foreign texts, made safe to show or to put into a statement."""
 
 from __future__ import annotations
 

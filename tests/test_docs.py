@@ -43,6 +43,9 @@ INSTALLED = (
 # ask no question and start no event loop. All else runs in a shell.
 HERE = ("audit", "digest", "explain", "human", "recording", "tables")
 SERVES = re.compile(r" emulate |make view$| view$| view --(port|bind)")
+NEEDS_MAKE = pytest.mark.skipif(
+    not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv"
+)
 LINKED = (
     ".venv",
     "Makefile",
@@ -55,34 +58,45 @@ LINKED = (
 )
 
 
+def lines_of(block: str) -> list[str]:
+    """The commands of an sh block that do something, comments cut off."""
+    lines = [line.split("  #")[0].strip() for line in block.splitlines()]
+    return [line for line in lines if line and not line.startswith(("#", "export "))]
+
+
 def commands(page: Path) -> list[str]:
-    """The commands of a page's sh blocks, comments cut off."""
+    """The commands of a page."""
     blocks = re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
-    lines = [line.split("  #")[0].strip() for block in blocks for line in block.splitlines()]
-    return [line for line in lines if line and not line.startswith("#")]
+    return [line for block in blocks for line in lines_of(block)]
 
 
 @pytest.fixture
-def folder(tmp_path):
-    """A checkout with the project's environment and short sweeps."""
+def checkout(tmp_path):
+    """The project as it is checked out, with its environment and without results."""
     for name in LINKED:
         (tmp_path / name).symlink_to(PROJECT / name)
     shutil.copytree(PROJECT / "experiments", tmp_path / "experiments")
-    for sweep in (tmp_path / "experiments").glob("*.toml"):
+    shutil.copytree(PROJECT / "cache/recordings", tmp_path / "cache/recordings")
+    return tmp_path
+
+
+@pytest.fixture
+def folder(checkout):
+    """A checkout with short sweeps, and recordings of humans."""
+    for sweep in (checkout / "experiments").glob("*.toml"):
         # One repetition each; and no account's limits, which would make the sweeps take minutes.
         change = (r"^[rt]pm = .*$", "") if sweep.stem == "models" else (r" = \d+$", " = 1")
         text = re.sub(*change, sweep.read_text(), flags=re.MULTILINE)
         few = 'conditions = ["L_4_0", "N_0_0"]\n' if sweep.stem == "ablations" else ""
         sweep.write_text(few + text)
-    shutil.copytree(PROJECT / "cache/recordings", tmp_path / "cache/recordings")
     write_folder(
-        tmp_path / "recordings",
+        checkout / "recordings",
         {
             f"data/experiments/experiment_4/experiment_4_iter_{i}.csv": drive(name).csv()
             for i, name in enumerate(CONDITIONS, 1)
         },
     )
-    return tmp_path
+    return checkout
 
 
 async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
@@ -129,7 +143,7 @@ def here(folder, monkeypatch, capfd):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv")
+@NEEDS_MAKE
 async def test_every_command_of_the_docs_does_what_it_says(folder, here):
     """What stands on the pages twice is run once, where the later pages need nothing of it."""
     done: list[str] = []
@@ -137,7 +151,7 @@ async def test_every_command_of_the_docs_does_what_it_says(folder, here):
         account = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
         for page in PAGES:
             for command in commands(page):
-                if command in {"make test", *done} or command.startswith("export "):
+                if command in {"make test", *done}:
                     continue
                 words = shlex.split(command)
                 if words[0] == "merge-runner" and words[1] in HERE:
@@ -151,6 +165,29 @@ async def test_every_command_of_the_docs_does_what_it_says(folder, here):
     assert len(done) >= 14
 
 
+def unspaced(text: str) -> str:
+    """A text whose columns may be padded to other widths."""
+    return "\n".join(" ".join(line.split()) for line in text.splitlines())
+
+
+@pytest.mark.slow
+@NEEDS_MAKE
+async def test_the_tutorial_shows_what_its_commands_say(checkout):
+    said = ""
+    blocks = re.findall(r"^```(sh|text)\n(.*?)^```", TUTORIAL.read_text(), re.MULTILINE | re.DOTALL)
+    for kind, block in blocks:
+        if kind == "text":
+            for line in unspaced(block).splitlines():
+                assert line in unspaced(said)
+            said = ""
+            continue
+        for command in lines_of(block):
+            code, out = await shell(command, checkout)
+            assert code == 0, f"{command}\n{out}"
+            said += out
+    assert (checkout / "results/figures/figure2.pdf").exists()
+
+
 def test_commands_that_run_in_the_tests_own_process_are_ours_and_start_no_event_loop():
     group = typer.main.get_command(app)
     for name in HERE:
@@ -159,7 +196,7 @@ def test_commands_that_run_in_the_tests_own_process_are_ours_and_start_no_event_
             assert "asyncio" not in inspect.getsource(inspect.unwrap(part.callback))
 
 
-@pytest.mark.skipif(not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv")
+@NEEDS_MAKE
 def test_make_test_runs_the_tests():
     run = subprocess.run(
         ["make", "--dry-run", "test"], cwd=PROJECT, capture_output=True, text=True, check=True
@@ -177,6 +214,24 @@ def test_every_command_and_every_make_target_is_in_the_docs():
         assert f"make {target}" in text, target
 
 
+def test_the_reference_of_commands_has_every_command_and_every_option_and_no_other():
+    text = (DOCS / "reference/commands.md").read_text()
+    options = {"--debug", "--help"}
+    for name, command in typer.main.get_command(app).commands.items():
+        for part, inner in getattr(command, "commands", {"": command}).items():
+            words = f"{name} {part}".strip()
+            assert re.search(rf"^\| `{words}[` ]", text, re.MULTILINE), words
+            shown = (p for p in inner.params if not getattr(p, "hidden", False))
+            options |= {option for p in shown for option in p.opts if option[:2] == "--"}
+    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)) == options
+
+
+def test_every_how_to_is_in_the_list_of_them():
+    listed = (DOCS / "how-to/README.md").read_text()
+    for page in sorted((DOCS / "how-to").glob("*.md")):
+        assert f"{page.stem}.md" in listed or page.stem == "README"
+
+
 def test_the_readings_of_the_docs_are_those_of_the_report():
     text = (PROJECT / "docs/explanation/reproduction.md").read_text(encoding="utf-8")
     shown = [line for line in text.splitlines() if line.startswith("| ")][1:]
@@ -184,10 +239,19 @@ def test_the_readings_of_the_docs_are_those_of_the_report():
     assert shown == ["| " + " | ".join(c.replace("|", r"\|") for c in r) + " |" for r in readings]
 
 
+def anchors(page: Path) -> set[str]:
+    """What a link into a page can name: its headings, as GitHub spells them."""
+    headings = re.findall(r"^#+ (.*)", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h).strip().lower().replace(" ", "-") for h in headings}
+
+
 def test_links_of_the_docs_lead_somewhere():
-    for page in PAGES:
-        for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text()):
-            assert (page.parent / target).exists(), f"{page.name}: {target}"
+    for page in LINKING:
+        for target in re.findall(r"\]\((?!http)([^)]+)", page.read_text()):
+            path, _, heading = target.partition("#")
+            to = page.parent / path if path else page
+            assert to.exists(), f"{page}: {target}"
+            assert not heading or heading in anchors(to), f"{page}: {target}"
 
 
 def test_the_project_names_no_path_and_no_index_of_its_maker():

@@ -52,11 +52,11 @@ class Failure(Exception):
 
 
 class Ended(Failure):
-    """Who computes is gone."""
+    """The computing process is gone."""
 
 
 class Computer(Protocol):
-    """Who answers, one request after another."""
+    """The process that answers, one request after another."""
 
     def ask(self, request: Request) -> dict[str, Any]:
         """The answer; raises Failure."""

@@ -407,7 +407,7 @@ class Catalogue:
 
     def _reading(self, sql: str) -> int:
         """Run statements on the database and ours; returns how many trials wait to be listed."""
-        # Who found it held once does not wait again.
+        # A reader that found it held once does not wait again.
         patience_s = 0.0 if self.held else PATIENCE_S
         with reading(self.db, self._instance, patience_s) as connection:
             connection.execute(sql)

@@ -1,4 +1,4 @@
-"""Numbers in an address, where anything may stand."""
+"""Numbers in an address, which may hold anything."""
 
 from __future__ import annotations
 

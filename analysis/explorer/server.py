@@ -17,7 +17,7 @@ from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
 
 LOOPBACK = "127.0.0.1"
-# Who listens at all addresses is at this one, too.
+# A server at all addresses is at this one, too.
 EVERYWHERE = {"0.0.0.0": LOOPBACK, "::": "::1"}  # noqa: S104 # compared, not bound
 
 

@@ -85,7 +85,7 @@ class Site:
         self._first_reading.start()
 
     def _read_first(self) -> None:
-        # What is wrong is told by the first page, which tries again.
+        # The first page tries again, and says what is wrong.
         with contextlib.suppress(MergeRunnerError):
             self.catalogue.refresh()
 

@@ -71,7 +71,7 @@ class Config(BaseModel):
 
     @property
     def driver(self) -> str:
-        """Who drives, and where he is asked."""
+        """The drivers with their endpoints."""
         return pair_name(both_sides(self.model).values(), self.endpoints)
 
 

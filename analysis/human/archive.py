@@ -108,7 +108,7 @@ def _files_below(folder: Path) -> Iterator[File]:
 
 def _read_file(path: Path) -> bytes:
     if path.exists() and not path.is_file():
-        raise Unreadable("it is no regular file")  # a device or a pipe may never end
+        raise Unreadable("it is not a regular file")  # a device or a pipe may never end
     try:
         return path.read_bytes()
     except OSError as exc:
@@ -131,7 +131,7 @@ def _reader(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Callable[[], b
         if member.flag_bits & ENCRYPTED:
             raise Unreadable("it is encrypted: unpack the zip and import the folder")
         if stat.S_ISLNK(member.external_attr >> 16):
-            raise Unreadable("it is a link and no file")
+            raise Unreadable("it is a link, not a file")
         # Only these two unpack no more bytes than asked for.
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise Unreadable("its compression is not deflate: unpack the zip, import the folder")

@@ -29,7 +29,7 @@ def read_mat(content: bytes) -> dict[str, list[float | str]]:
     Raises Unreadable.
     """
     if content[HEADER_BYTES - 4 : HEADER_BYTES] != VERSION_5:
-        raise Unreadable("it is no MAT file of version 5")
+        raise Unreadable("it is not a MAT file of version 5")
     if len(content) > MAX_BYTES:
         raise Unreadable(f"it has {len(content)} bytes, far too large for a recording")
     try:

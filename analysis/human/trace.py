@@ -46,7 +46,7 @@ def parse_csv(content: bytes) -> Trace:
         _require(NEEDED, header)
         rows = [_whole(row, header, number) for number, row in enumerate(reader)]
     except (UnicodeDecodeError, csv.Error) as exc:
-        raise Unreadable(f"it is no CSV table: {exc}") from exc
+        raise Unreadable(f"it is not a CSV table: {exc}") from exc
     places = {name: header.index(name) for name in NEEDED}
     return _trace({name: [row[place] for row in rows] for name, place in places.items()})
 

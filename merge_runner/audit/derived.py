@@ -1,7 +1,8 @@
 """What is stored, derived anew: each reply is read, and each trial driven by it, once more.
 
 This tells what was changed after it was stored. It takes the program's own drivers, formats and
-world for it: whether these are right is asked by the other checks, which share no rule with them.
+world for it. Whether these are right is asked by the other checks, which share little with them:
+how a reply is read, a driver's pace, the track and what a collision is.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ def answer(prompt: str, slot: Slot | None) -> str:
 
 
 def read_prompt(prompt: str) -> Seen | None:
-    """Find the situation in a prompt; None where it is about something else."""
+    """The situation that a prompt describes; None if it is about something else."""
     own = _number(r"Your speed: (\S+) m/s", prompt)
     other = _number(r"Speed of the other car: (\S+) m/s", prompt)
     relative = _number(r"Relative distance .*?: (\S+) m$", prompt)
@@ -120,7 +120,7 @@ def _chance_left_first(condition: str) -> float:
 
 
 def _somebody_misjudges(slot: Slot) -> bool:
-    """Whether it happens in this trial: in one human condition of every third repetition."""
+    """Whether a driver misjudges here: in one human condition of every third repetition."""
     turn = draw_index(3, "misjudge turn", slot.sample_set)
     names = list(HUMAN_CONDITIONS)
     chosen = draw_index(len(names), "misjudged condition", slot.repetition, slot.sample_set)
@@ -193,7 +193,7 @@ def _lacking_m(lead: float, seen: Seen, temper: Temper) -> float:
 
 
 def _projected_lead_m(seen: Seen) -> float:
-    """How far ahead of the other the ego would be when the first of both reaches the merge."""
+    """How far ahead of the other the ego would be when the first one reaches the merge point."""
     own = (seen.distance_to_merge or 0.0) / max(seen.own_speed, 0.1)
     other = max(seen.other_distance_to_merge, 0.0) / max(seen.other_speed, 0.1)
     seconds = min(own, other)
@@ -201,7 +201,7 @@ def _projected_lead_m(seen: Seen) -> float:
 
 
 def _even_acceleration(metres: float, distance: float | None, speed: float) -> float:
-    """The even acceleration that gains a distance until the leader reaches the merge point."""
+    """The constant acceleration that gains a distance before the leader reaches the merge."""
     seconds = max(SHORTEST_S, (distance or TRACK.merge_point_m) / max(speed, 0.1))
     return 2 * metres / seconds**2
 

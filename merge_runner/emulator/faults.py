@@ -1,4 +1,4 @@
-"""Faults on purpose, each a function of the seed, the slot and the attempt."""
+"""Deliberate faults, each a function of the seed, the slot and the attempt."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Fault = Literal[
     "malformed",
 ]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
-# These are outcomes; all others pass, so that a sweep with them ends like one without.
+# These are outcomes; all others are transient, so a sweep with them ends like one without.
 OUTCOMES: frozenset[Fault] = frozenset({"empty", "refused", "malformed"})
 TRANSIENT: tuple[Fault, ...] = tuple(fault for fault in FAULTS if fault not in OUTCOMES)
 
@@ -42,9 +42,9 @@ Rate = Annotated[float, Field(ge=0, le=1)]
 
 
 class FaultPlan(BaseModel):
-    """How often which fault occurs; ``rates`` are probabilities per attempt.
+    """How often each fault occurs; ``rates`` are probabilities per attempt.
 
-    ``latency_s`` delays every answer. ``delay_s`` is what a rate limit asks to wait. A hang is
+    ``latency_s`` delays every answer. ``delay_s`` is how long a rate limit asks to wait. A hang is
     silent for ``hang_s``, longer than a client's patience, and then closes.
     """
 
@@ -64,7 +64,7 @@ class FaultPlan(BaseModel):
 
     @property
     def identity(self) -> str:
-        """What tells the emulator's answers apart from those without faults: mostly nothing."""
+        """What distinguishes the emulator's answers from those without faults: mostly nothing."""
         outcomes = {str(fault): self.rates[fault] for fault in sorted(OUTCOMES & self.rates.keys())}
         return f"#faults-{self.seed}-{outcomes}" if any(outcomes.values()) else ""
 

@@ -1,4 +1,4 @@
-"""The emulator's HTTP server, on loopback alone."""
+"""The emulator's HTTP server, on loopback only."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from merge_runner.records import (
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 HOST = "127.0.0.1"
-# The names by which a browser or a client may ask for it.
+# The names under which a browser or a client may reach it.
 OWN_NAMES = ("127.0.0.1", "localhost", "[::1]")
 MODELS = ("scripted-driver",)
 STATUS_FAULTS = {
@@ -38,12 +38,12 @@ STATUS_FAULTS = {
     "server_error": 500,
     "overloaded": 503,
 }
-# What a client can send that is no chat request: refused with 400, whatever it breaks.
+# What anything but a chat request can raise: refused with 400.
 UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
 ENDINGS: dict[str, Ending] = {"refused": "refused", "empty": "empty"}
 MALFORMED = "M\n\nI would rather describe my plan in words than write a list of numbers."
 ID_HEADER = "x-request-id"
-# Lingering for no time at all sends a reset instead of an orderly end.
+# A linger time of zero sends a reset instead of an orderly close.
 RESET_AT_CLOSE = struct.pack("ii", 1, 0)
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -142,9 +142,9 @@ class Emulator:
 
 
 async def _say_scripted(request: web.Request, response: web.StreamResponse) -> None:
-    """Every response says that a stand-in made it, also one that refuses, or is no JSON.
+    """Every response says that a stand-in made it, even one that refuses or is not JSON.
 
-    And to which request it is the answer, as many gateways do.
+    And which request it answers, as many gateways do.
     """
     response.headers[SCRIPTED_HEADER] = "true"
     if ID_HEADER in request.headers:
@@ -153,7 +153,7 @@ async def _say_scripted(request: web.Request, response: web.StreamResponse) -> N
 
 @web.middleware
 async def _only_by_own_name(request: web.Request, handler: Handler) -> web.StreamResponse:
-    """Refuse a page of the web that has its own name resolved to loopback (DNS rebinding)."""
+    """Refuse a web page whose own name resolves to loopback (DNS rebinding)."""
     assert request.transport is not None
     port = request.transport.get_extra_info("sockname")[1]
     host = request.headers.get("host", "").lower()
@@ -165,7 +165,7 @@ async def _only_by_own_name(request: web.Request, handler: Handler) -> web.Strea
 
 
 def _slot(header: str | None) -> Slot | None:
-    """The slot that a client tells; raises ValueError or TypeError for one that cannot be."""
+    """The slot that a client sent; raises ValueError or TypeError for an impossible one."""
     if header is None:
         return None
     slot = Slot(**json.loads(header))

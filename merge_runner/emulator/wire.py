@@ -54,7 +54,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class _Said:
-    """What the model said, and what it counted; ``reply`` tells this reply from all others."""
+    """What the model said, with its token counts; ``reply`` identifies this reply."""
 
     reply: str
     model: str
@@ -104,7 +104,7 @@ def answer_in(wire: str, reply: str, model: str, prompt: str, text: str, ending:
 
 
 def error_in(wire: str, status: int, message: str, delay_s: float = 0.0) -> Answer:
-    """An error in a provider's envelope; a rate limit says in the provider's way how to wait."""
+    """An error in a provider's envelope; a rate limit tells the delay in the provider's way."""
     kind = ERROR_NAMES[wire][status]
     if wire == "gemini":
         details = []
@@ -252,7 +252,7 @@ def _anthropic(said: _Said) -> dict[str, Any]:
 
 
 def dumps(body: Any) -> bytes:  # noqa: ANN401 # any JSON that a provider sends
-    """A body as it is sent: it says that no model made it."""
+    """A body as it is sent, with the field that says that no model made it."""
     marked = [_marked(part) for part in body] if isinstance(body, list) else _marked(body)
     return json.dumps(marked, ensure_ascii=False).encode()
 

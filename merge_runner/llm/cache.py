@@ -203,7 +203,7 @@ class ResponseCache:
             return [name for name, check in checks.items() if _is_damaged(check, key)]
 
         def operation() -> list[str]:
-            found = damaged()  # another process may have mended it
+            found = damaged()  # another process may have repaired it
             for name in found:
                 self._disk.set_aside(name, _DAMAGED + name)
             return found
@@ -237,7 +237,7 @@ class ResponseCache:
         except FAILURES as exc:
             raise self._failed(
                 f"written: {exc}. Every reply up to now is kept, those in flight are lost; when "
-                "that is mended, run the same command again"
+                "that is fixed, run the same command again"
             ) from exc
         finally:
             self._new = []
@@ -340,7 +340,7 @@ class ResponseCache:
 
     def _unreadable(self, exc: Exception) -> CacheFailed:
         return self._failed(
-            f"read: {exc}. Mend or move it; the database and any exported recording are not "
+            f"read: {exc}. Repair or move it; the database and any exported recording are not "
             f"affected, and `merge-runner recording import {self.folder}` takes what can be read "
             "of it into another, named with --cache"
         )
@@ -393,7 +393,7 @@ class ResponseCache:
 
     def _counted_anew(self, model: str) -> ModelFacts:
         facts = ModelFacts()
-        for entry in entries_of(self._disk, []):  # a damaged one is told when it is needed
+        for entry in entries_of(self._disk, []):  # a damaged one is reported when it is needed
             if entry.request.model == model:
                 facts.add(entry)
         return facts

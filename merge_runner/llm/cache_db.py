@@ -290,7 +290,7 @@ def usable(folder: Path) -> Iterator[None]:
         yield
     except FAILURES as exc:
         raise UsageError(
-            f"the cache {folder} cannot be used: {exc}. Mend or move the folder, or name another "
+            f"the cache {folder} cannot be used: {exc}. Repair or move the folder, or name another "
             f"with --cache; `merge-runner recording import {folder}` takes what can be read of it "
             "into that one, as it takes a recording"
         ) from exc
@@ -383,7 +383,8 @@ def _refuse_other_layout(file: Path, connection: sqlite3.Connection) -> None:
     found = dict(made)
     if missing := [statement for statement in TABLES if statement not in found]:
         raise UsageError(
-            f"{file} is no cache of merge-runner: it lacks {missing[0].partition('(')[0].strip()}"
+            f"{file} is not a cache of merge-runner: "
+            f"it lacks {missing[0].partition('(')[0].strip()}"
         )
     if others := [name for sql, name in found.items() if sql not in _LAYOUT]:
         raise UsageError(

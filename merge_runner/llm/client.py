@@ -149,7 +149,7 @@ class LlmClient:
         return driver_name(self.name, self.endpoint)
 
     def _recorded(self, request: ChatRequest) -> Entry | None:
-        """The recorded call; a damaged one is none, unless nothing can be asked anew."""
+        """The recorded call, None for a damaged one; in a replay that raises CallFailed."""
         try:
             return self.cache.get(request.key)
         except RecordingError as exc:

@@ -108,7 +108,7 @@ class Consequences:
             return f"the endpoint does not accept the key; {set_key(self.name, self.entry)}"
         if outcome.name == "bad_certificate":
             return (
-                "the endpoint's certificate is not to be trusted, and nothing was sent; check the "
+                "the endpoint's certificate cannot be trusted, and nothing was sent; check the "
                 "base URL, or set SSL_CERT_FILE to the certificates of who signed it"
             )
         shutdown = self.entry.shutdown

@@ -138,7 +138,7 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
 
 def _judge_success(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if not isinstance(raw.payload, dict):
-        return AttemptOutcome("retry", "bad_body", "the body is no JSON object")
+        return AttemptOutcome("retry", "bad_body", "the body is not a JSON object")
     reading = wire.read(raw.payload)
     if reading.outcome == "empty" and not is_answer(raw.payload, wire.members):
         return AttemptOutcome("retry", "bad_body", "the body has nothing of an answer", reading)

@@ -32,7 +32,7 @@ def check_body(body: str) -> None:
     """Raise one of DAMAGED for the body of a request that we would not send."""
     value = json.loads(body)
     if not isinstance(value, dict) or canonical_json(value) != body:
-        raise ValueError("its request is no canonical JSON object")
+        raise ValueError("its request is not a canonical JSON object")
 
 
 def check_attempts(attempts: tuple[Attempt, ...]) -> None:
@@ -61,4 +61,4 @@ def _check_numbers(attempt: Attempt) -> None:
 
 def _check_reply(text: str) -> None:
     if not isinstance(json.loads(text), dict):
-        raise ValueError("a reply is no JSON object")
+        raise ValueError("a reply is not a JSON object")

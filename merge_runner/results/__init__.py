@@ -1,1 +1,1 @@
-"""Results at rest: the database, recordings, and what is known of how they were made."""
+"""Results at rest: the database, recordings, and where they come from."""

@@ -24,7 +24,7 @@ BATCH = 16
 _OF_THESE = (
     "SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)"
 )
-# What tells the rows of a trial apart.
+# What identifies a row within a trial.
 PLACES: dict[str, tuple[str, ...]] = {
     "trials": (),
     "states": ("step", "side"),
@@ -40,9 +40,9 @@ LONG: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A column that is stored otherwise in ``rows`` rows of a trial, and the first of them.
+    """A column with other values in ``rows`` stored rows of a trial, and the first of them.
 
-    Without a column rows are missing, or are there that should not be.
+    Without a column, rows are missing or superfluous.
     """
 
     table: str
@@ -79,7 +79,7 @@ class Stored:
         ignored: Collection[str] = (),
         tolerance: float = 0.0,
     ) -> Iterator[Difference]:
-        """What a trial's stored rows have otherwise than the wanted ones."""
+        """In what a trial's stored rows differ from the wanted ones."""
         stored, made = self.rows.get(key, []), [self._as_stored(row) for row in wanted]
         at = [self.names.index(name) for name in PLACES[self.table]]
         old = {tuple(row[i] for i in at): row for row in stored}
@@ -120,7 +120,7 @@ def stored_rows(
     keys: Sequence[TrialKey],
     span: Span | None = None,
 ) -> Stored:
-    """The rows of these trials, with the hashes of long texts in place of them."""
+    """The rows of these trials, with hashes in place of long texts."""
     hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in LONG.get(table, ()))
     columns = f"* REPLACE ({hashes})" if hashes else "*"
     result = rows_of_trials(connection, columns, table, keys, span)
@@ -141,7 +141,8 @@ def rows_of_trials(
 ) -> duckdb.DuckDBPyConnection:
     """A query for the rows of these trials, to be fetched.
 
-    A trial's rows lie together: where is asked first, or told, so that no others are read.
+    A trial's rows lie together: their place is looked up first, or given, so that only they are
+    read.
     """
     names = [[key[0] for key in keys], [key[1] for key in keys]]
     first, last = (
@@ -163,9 +164,9 @@ def in_batches(
     tables: Collection[str],
     read: Callable[[list[TrialKey], Spans], Read],
 ) -> Iterator[Read]:
-    """What ``read`` makes of some trials at a time, with where the rows of each table lie.
+    """What ``read`` makes of some trials at a time, given where the rows of each table lie.
 
-    So few at a time that they fit into the database's memory.
+    Few enough at a time to fit into the database's memory.
     """
     where = {table: _spans(connection, table) for table in tables}
     nowhere = (0, -1)

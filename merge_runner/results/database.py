@@ -1,4 +1,4 @@
-"""Opens the results database, with patience for others, and brings an older one up to date."""
+"""Opens the results database, waits for other users of it, and brings an older one up to date."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def update_measures(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def spill_folder() -> Path:
-    """Where DuckDB may write besides its database, also where it is confined to that."""
+    """The folder in which DuckDB may write besides its database, even if it is confined."""
     folder = Path(str(SETTINGS["temp_directory"]))
     folder.mkdir(mode=0o700, exist_ok=True)
     return folder
@@ -74,16 +74,16 @@ def spill_folder() -> Path:
 def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
     """A database of its own, in memory."""
     connection = duckdb.connect(config=settings)
-    # DuckDB takes `python -c` for a person at a prompt: a slow query would draw on our output.
+    # DuckDB takes `python -c` for an interactive prompt: a slow query would draw into our output.
     connection.execute("SET enable_progress_bar = false")
     return connection
 
 
 class Instance:
-    """A DuckDB instance, to which files are attached and detached: that takes and frees their lock.
+    """A DuckDB instance; attaching a file to it takes the file's lock, detaching frees it.
 
-    To make one takes longer than most of what is done with it, so there is one for all. After an
-    error it may be of no use any more, and a new one is made.
+    Making one takes longer than most of what is done with it, so there is one for everything.
+    After an error it may be unusable, and a new one is made.
 
     Where it does not ``confine`` those who read, they do so themselves; else they reach the file
     that they read, and those in the folder ``also``.
@@ -106,9 +106,9 @@ class Instance:
         return self._connection.cursor()
 
     def confined(self, path: Path) -> duckdb.DuckDBPyConnection:
-        """A connection that reaches no other file than a database, whoever made that one.
+        """A connection that can reach no file but one database, whoever made that.
 
-        A view or a macro in it, also one by the name of DuckDB's own functions, may read any file.
+        A view or a macro in it may try to read any file, even under the name of a DuckDB function.
         """
         if not self._confine:
             return self.cursor()
@@ -125,7 +125,7 @@ class Instance:
         return self._confined[1].cursor()
 
     def name(self) -> str:
-        """A name for a file that no other one has."""
+        """A unique name for a file."""
         return f"results_{next(self._numbers)}"
 
     def drop(self) -> None:
@@ -142,7 +142,7 @@ _BUSY = ("Could not set lock", "Unique file handle conflict", "already attached"
 def open_database(
     path: Path, *, read_only: bool, patience_s: float, instance: Instance = SHARED
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open the database, waiting for others to close it; raises StoreError."""
+    """Open the database, waiting until others close it; raises StoreError."""
     connection, name = _attached(path, read_only, patience_s, instance)
     in_order = False
     try:
@@ -175,7 +175,7 @@ def _attached(
     told = False
     while True:
         try:
-            # A name such as md:x or :memory: is that of a file, too.
+            # A name such as md:x or :memory: names a file, too.
             whole = quoted(path.absolute())
             connection.execute(f"ATTACH {whole} AS {name} ({mode}); USE {name}")
         except duckdb.Error as exc:
@@ -198,9 +198,9 @@ def _attached(
 
 
 def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
-    """Let the next writing merge what many small ones left, unless the rows hold long texts.
+    """Let the next write merge the row groups of many small ones, unless the rows hold long texts.
 
-    To merge takes as much memory as the texts of 122,880 rows, and writes them again each time.
+    Merging takes as much memory as the texts of 122,880 rows, and writes them again each time.
     """
     tasks = 100 if _bytes_of_texts(connection) <= MERGED_BYTES else 0
     connection.execute(f"SET max_vacuum_tasks = {tasks}")
@@ -220,7 +220,7 @@ def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
 
 
 def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
-    """The size of the open file beyond what it has with short replies."""
+    """By how much the open file is larger than it would be with short replies."""
     row = connection.execute(
         "SELECT path, estimated_size FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
@@ -229,7 +229,7 @@ def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
 
 
 def streamed(connection: duckdb.DuckDBPyConnection, sql: str) -> Iterator[tuple[Any, ...]]:
-    """The rows of a query on long texts; nothing else may be asked until it has ended."""
+    """The rows of a query on long texts; no other query may run until it has ended."""
     return fetched(connection.execute(sql))
 
 
@@ -262,7 +262,7 @@ def read_database(
 
 
 def readable(path: Path) -> Path:
-    """The file in which the rows of a database are read: itself, or a copy where it is older."""
+    """The file from which a database is read: itself, or a copy if its schema is older."""
     with read_database(path) as connection:
         row = connection.execute(
             "SELECT path FROM duckdb_databases() WHERE database_name = current_database()"
@@ -272,7 +272,7 @@ def readable(path: Path) -> Path:
 
 
 def _readable_copy(path: Path, patience_s: float) -> Path:
-    """A copy of a database of an older schema in this one, until this process ends."""
+    """A copy of an older database in the present schema, until this process ends."""
     told = path.stat()
     state = (path.resolve(), told.st_mtime_ns, told.st_size)
     if state not in _COPIES:
@@ -297,13 +297,13 @@ def _readable_copy(path: Path, patience_s: float) -> Path:
     return _COPIES[state][1]
 
 
-# The folder of a copy goes when the process does.
+# The folder of a copy is deleted when the process ends.
 _COPIES: dict[tuple[Path, int, int], tuple[tempfile.TemporaryDirectory[str], Path]] = {}
 
 
 @contextmanager
 def unreadable_is_usage() -> Iterator[None]:
-    """A file that is no database, or a damaged one, is the user's to replace."""
+    """A damaged file, or one that is not a database, is for the user to replace."""
     try:
         yield
     except StoreLocked:
@@ -331,7 +331,7 @@ def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
         ).fetchall()
     )
     if "meta" not in tables:
-        raise UsageError(f"{path} is no database of merge-runner: name another with --db")
+        raise UsageError(f"{path} is not a database of merge-runner: name another with --db")
     row = connection.execute("SELECT schema_version FROM meta").fetchone()
     if row is None:
         raise UsageError(f"{path} has no schema version: {REBUILD}")
@@ -364,7 +364,7 @@ def _columns() -> dict[str, int]:
 
 
 def migrate(path: Path) -> None:
-    """Copy a database of an older schema into a new file of this one, which takes its name.
+    """Copy a database of an older schema into a new file of the present one, which takes its name.
 
     What an older schema lacked is NULL or has its default. The old file stays beside the new one,
     as ``NAME.v1.duckdb``. Raises UsageError where that is not possible.
@@ -372,12 +372,12 @@ def migrate(path: Path) -> None:
     path = path.resolve()
     copy = path.with_name(f"{path.name}.migrating")
     try:
-        # Opened for writing, so that nobody else writes into what is being copied.
+        # Opened for writing, so that nobody else writes while it is copied.
         with open_database(path, read_only=False, patience_s=PATIENCE_S) as connection:
             version = schema_version(connection, path)
             if version == SCHEMA_VERSION:
                 return  # another process was quicker
-            _discard(copy)  # what a process left that died here
+            _discard(copy)  # left by a process that died here
             try:
                 connection.execute("CHECKPOINT")
                 _copy_rows(connection, copy)
@@ -410,7 +410,7 @@ def _discard(copy: Path) -> None:
 
 
 def _free_name(path: Path, version: int) -> Path:
-    """Where the old file is kept: never in the place of another one."""
+    """A free name for the old file, so that it never replaces another one."""
     names = (f"{path.stem}.v{version}{number}{path.suffix}" for number in _numbers())
     return next(kept for kept in map(path.with_name, names) if not kept.exists())
 
@@ -445,7 +445,7 @@ def _fill_copy(connection: duckdb.DuckDBPyConnection) -> None:
     for (table,) in new:
         if table in old and table != "meta":
             _copy_table(connection, table)
-    # Before version 4 nobody looked at what the replies say of a stand-in.
+    # Before version 4, replies were not searched for the mark of a stand-in.
     connection.execute(
         "UPDATE copied.calls SET scripted = true WHERE CASE WHEN provider = 'emulator' THEN true "
         "WHEN contains(reply::VARCHAR, ?) THEN reply->>? = 'true' ELSE false END",
@@ -459,7 +459,7 @@ def _fill_copy(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def _copy_table(connection: duckdb.DuckDBPyConnection, table: str) -> None:
-    """Copy a table, some rows at a time: a transaction's rows are together in memory."""
+    """Copy a table, some rows at a time: all rows of a transaction are in memory at once."""
     row = connection.execute(f"SELECT coalesce(max(rowid), -1) FROM {table}").fetchone()  # noqa: S608 # our tables
     assert row is not None
     size = COPIED_AT_ONCE if table in ("calls", "decisions") else row[0] + 1

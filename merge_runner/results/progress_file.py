@@ -1,4 +1,4 @@
-"""What a running sweep says of itself, in a small file beside its database, to other processes."""
+"""The progress of a running sweep, for other processes, in a small file beside its database."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from pydantic import AwareDatetime, NonNegativeInt, TypeAdapter, ValidationError
 
 EVERY_S = 1.0
 STALE_S = 10.0
-# While a sweep checks what it stored, nothing else is done: only its process says that it lives.
+# While a sweep checks what it stored, the file is silent: only its process shows that it lives.
 CHECKING_STALE_S = 600.0
 MOST_BYTES = 1_000_000
 LOG = logging.getLogger(__name__)
-# Tells machines that share a folder apart, for a process id means nothing on another one.
+# Identifies the machine among those that share a folder: process ids mean nothing elsewhere.
 MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
@@ -55,7 +55,7 @@ class Standing:
     """Where a sweep stands. ``committed_usd`` counts against ``cap_usd``, over all runs.
 
     ``waiting`` says what its calls wait for, ``warnings`` what its user should know. ``left_s`` is
-    an estimate, None where nothing tells yet.
+    an estimate, None while there is none.
     """
 
     sweep_id: str
@@ -83,7 +83,7 @@ class Standing:
 
     @property
     def alive(self) -> bool:
-        """Whether the sweep still runs, as far as its file and its process tell."""
+        """Whether the sweep is still running, by its file and its process."""
         if self.machine == MACHINE and not _exists(self.pid):
             return False
         age_s = (datetime.now(UTC) - self.updated_at).total_seconds()
@@ -95,7 +95,7 @@ _STANDING = TypeAdapter(Standing)
 
 @dataclass(slots=True)
 class ProgressFile:
-    """The file of one sweep. A disk that takes none is told of once, and fails nothing."""
+    """The file of one sweep. If it cannot be written, one warning says so; the sweep goes on."""
 
     db: Path
     sweep_id: str
@@ -105,11 +105,11 @@ class ProgressFile:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def write(self, standing: Standing) -> None:
-        """Replace the file: who reads it sees one state or the other, and no half of one."""
+        """Replace the file as a whole: a reader sees the old state or the new one, never a part."""
         path = _path(self.db, self.sweep_id)
         made = path.with_suffix(".tmp")
         with self._lock:
-            # A thread may come with what was so before.
+            # A thread may bring an outdated state.
             if self._gone or (self._newest and standing.updated_at < self._newest):
                 return
             self._newest = standing.updated_at
@@ -123,7 +123,7 @@ class ProgressFile:
                 self._told = True
 
     def remove(self) -> None:
-        """The sweep has ended in order: nothing stays, and nothing is written any more."""
+        """The sweep has ended normally: remove the file, and write no more."""
         path = _path(self.db, self.sweep_id)
         with self._lock:
             self._gone = True
@@ -135,13 +135,13 @@ class ProgressFile:
 
 
 def read_standing(db: Path, sweep_id: str) -> Standing | None:
-    """Where a sweep stands, or stood when it was killed; None where no file says so."""
+    """Where a sweep stands, or stood when it was killed; None without a file."""
     standing = _read(_path(db, sweep_id))
     return standing if standing and standing.sweep_id == sweep_id else None
 
 
 def clear_dead(db: Path) -> None:
-    """Remove what sweeps left that were killed, and nothing that somebody else wrote."""
+    """Remove what killed sweeps left, and nothing else."""
     folder = _folder(db)
     with suppress(OSError):
         for path in () if folder.is_symlink() else folder.iterdir():

@@ -1,4 +1,4 @@
-"""Where results come from: the program's commit or version, and those of what it runs on."""
+"""Where results come from: the program's commit or version, and its packages' versions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def versions() -> dict[str, str]:
 
 
 def git_state() -> tuple[str, bool | None]:
-    """The commit of the program's own checkout and whether it is changed.
+    """The commit of the program's own checkout, and whether there are uncommitted changes.
 
     Without a checkout: the installed version and None.
     """
@@ -28,7 +28,7 @@ def git_state() -> tuple[str, bool | None]:
 
 
 def program() -> str:
-    """What made a text, for its readers."""
+    """The program that made a text, for its readers."""
     made_by, changed = git_state()
     if changed is None:
         return f"{made_by}, installed"
@@ -43,7 +43,7 @@ def _commit() -> str | None:
 
 
 def _git(*arguments: str) -> str | None:
-    """What git says of the repository at PROJECT itself, and of no other around it."""
+    """What git says about the repository at PROJECT, and about no other around it."""
     own = ["-C", str(PROJECT), f"--git-dir={PROJECT / '.git'}", f"--work-tree={PROJECT}"]
     try:
         done = subprocess.run(  # noqa: S603 # constant arguments

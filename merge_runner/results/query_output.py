@@ -16,12 +16,12 @@ Writer = Callable[[list[str], Rows, TextIO], None]
 
 
 def write_csv(names: list[str], rows: Rows, out: TextIO) -> None:
-    """As CSV that a spreadsheet does not run."""
+    """Write CSV of which a spreadsheet runs nothing."""
     csv_writer(out).writerows(map(in_spreadsheet, row) for row in chain((names,), rows))
 
 
 def write_json(names: list[str], rows: Rows, out: TextIO) -> None:
-    """As an array of objects."""
+    """Write an array of objects."""
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise UsageError(f"two columns are named {twice!r}: name them apart with AS")
@@ -35,7 +35,7 @@ def write_json(names: list[str], rows: Rows, out: TextIO) -> None:
 
 
 def write_table(names: list[str], rows: Rows, out: TextIO) -> None:
-    """In columns as wide as their widest cell; rich would hold all rows in memory at once."""
+    """Write columns as wide as their widest cell; rich would hold all rows in memory at once."""
     widths = [0] * len(names)
     with TemporaryFile("w+", encoding="utf-8", errors="surrogatepass") as kept:
         for row in chain((names,), rows):

@@ -3,8 +3,8 @@
 One row per call: the parts of its key, the exact request body, and all attempts as JSON. The
 file's key-value metadata hold where it comes from. Any Parquet tool can query it.
 
-A recording may come from anybody: nothing of it is executed, it is read in bounded memory, and
-nothing of it is kept unless all of it is what an export writes.
+A recording may come from anybody: none of it is executed, it is read in bounded memory, and none
+of it is kept unless all of it is what an export writes.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ COLUMNS = {
 TEXTS = [name for name, kind in COLUMNS.items() if kind == "VARCHAR"]
 BATCH = 1_000
 HEADERS = TypeAdapter(dict[str, str])
-# Far beyond any sweep; a file that claims more was made to harm.
+# Far beyond any sweep; a file that claims more was made to do harm.
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """DuckDB hands out this many rows at once, and their texts may have this many bytes."""
@@ -76,7 +76,7 @@ READING: Settings = {
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a recording holds: calls, of which a scripted stand-in answered some, and the rest.
+    """What a recording holds: its calls, how many of them a scripted stand-in answered, and so on.
 
     ``cost_usd`` is what its replies cost when they were made. ``covered`` says that the hash of the
     file covers the provenance, too: that of the first format does not.
@@ -95,7 +95,7 @@ class Summary:
 
     @property
     def notes(self) -> list[str]:
-        """What a reader should know beside that it is whole."""
+        """What a reader should know even if it is whole."""
         return [] if self.covered else [UNCOVERED]
 
 
@@ -104,7 +104,7 @@ def export_recording(
 ) -> int:
     """Write the entries of these keys; returns their number. Raises RecordingError.
 
-    Damaged ones are left out, and told by the error when the others are written.
+    Damaged ones are left out; once the others are written, the error names them.
     """
     ordered, damaged = _in_order(cache, keys)
     if file.is_dir():
@@ -164,7 +164,7 @@ def _write_parts(
 def _in_order(cache: ResponseCache, keys: list[str]) -> tuple[list[str], dict[str, str]]:
     """The keys in the order of condition, repetition, side, decision, sample set and key.
 
-    Returns the damaged ones apart, with what is wrong with each. Raises RecordingError where one
+    Also returns the damaged ones, with what is wrong with each. Raises RecordingError where one
     is not in the cache.
     """
     places, missing, damaged = [], [], {}
@@ -187,7 +187,7 @@ def _in_order(cache: ResponseCache, keys: list[str]) -> tuple[list[str], dict[st
 
 
 def _of_bounded_size(rows: Iterable[tuple[Any, ...]]) -> Iterator[list[tuple[Any, ...]]]:
-    """The rows in lists of some rows, or of one."""
+    """The rows in lists of bounded size, of one row at least."""
     batch: list[tuple[Any, ...]] = []
     size = 0
     for row in rows:
@@ -241,7 +241,7 @@ def read_recording(file: Path) -> Iterator[Entry]:
 
 
 class Spilled(Mapping[str, Entry]):
-    """The entries of a recording by key, verified; SQLite keeps what is much in a file that goes.
+    """The verified entries of a recording by key; SQLite keeps large ones in a temporary file.
 
     Raises RecordingError.
     """
@@ -328,12 +328,12 @@ def _written(file: Path) -> Iterator[None]:
 
 
 def _fingerprint(key: str, attempts: str) -> bytes:
-    """What the hash of a recording covers of a row: the key covers the rest."""
+    """The part of a row that the hash of a recording covers directly: its key covers the rest."""
     return f"{key} {attempts}\n".encode()
 
 
 def _provenance_hash(metadata: dict[str, str]) -> str:
-    """What covers all that a file says of itself."""
+    """A hash of everything that a file says about itself."""
     told = {name: text for name, text in metadata.items() if name != PROVENANCE_HASH}
     return hashlib.sha256(canonical_json(told).encode()).hexdigest()
 
@@ -403,7 +403,7 @@ def _entry(row: dict[str, Any]) -> Entry:
 
 
 def _opened(file: Path) -> duckdb.DuckDBPyConnection:
-    """A connection with the view ``recording``; raises for anything but one of our files."""
+    """A connection with the view ``recording``; raises RecordingError for a foreign file."""
     if not file.is_file():
         raise UsageError(f"there is no recording {file}")
     connection = in_memory(READING)
@@ -416,13 +416,11 @@ def _opened(file: Path) -> duckdb.DuckDBPyConnection:
             name: kind for name, kind, *_ in connection.execute("DESCRIBE recording").fetchall()
         }
     except duckdb.Error as exc:
-        raise RecordingError(
-            f"{file} is no Parquet file that can be read: {first_line(exc)}"
-        ) from exc
+        raise RecordingError(f"{file} is not a readable Parquet file: {first_line(exc)}") from exc
     found.pop("file_row_number", None)
     if found != COLUMNS:
         raise RecordingError(
-            f"{file} is no recording of ours: it has the columns {_listed(found)}; "
+            f"{file} is not one of our recordings: it has the columns {_listed(found)}; "
             f"a recording has {_listed(COLUMNS)}"
         )
     told = _metadata(file, connection)
@@ -454,7 +452,7 @@ def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
             )
     if calls > MOST_CALLS or longest > MOST_BLOCK_BYTES:
         raise RecordingError(
-            f"{file} is no recording of ours: it claims {calls} calls, {longest} bytes in "
+            f"{file} is not one of our recordings: it claims {calls} calls, {longest} bytes in "
             f"{BLOCK} of them"
         )
 
@@ -491,7 +489,7 @@ def _readable(file: Path) -> Iterator[None]:
 
 
 def _listed(columns: dict[str, str]) -> str:
-    """Columns with their types; in a file of somebody else's they may have any name."""
+    """Columns with their types; in a foreign file they may have any name."""
     named = [f"{name[:40]} {kind[:40]}" for name, kind in columns.items()]
     text = ", ".join(named[: 2 * len(COLUMNS)])
     return one_line(text)

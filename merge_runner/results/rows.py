@@ -96,7 +96,7 @@ def decision_rows(record: TrialRecord) -> Iterator[Row]:
 
 
 def call_rows(record: TrialRecord) -> Iterator[Row]:
-    """Rows of ``calls``: every attempt of every call, also of those that failed."""
+    """Rows of ``calls``: every attempt of every call, including failed calls."""
     key = (record.spec.trial_id, record.spec.spec_hash)
     for row in record.decisions:
         reply = row.decision.reply
@@ -150,9 +150,9 @@ def call_row(
 
 
 def _as_json(attempt: Attempt) -> str | None:
-    """A reply that is no JSON, as a proxy's HTML page, becomes a JSON string.
+    """A reply that is not JSON, such as a proxy's HTML page, becomes a JSON string.
 
-    So does one that the database would not take: with half of a surrogate pair, or nested beyond
+    So does one that the database would refuse: with half of a surrogate pair, or nested deeper than
     any honest reply. An answer was read as JSON already.
     """
     text = attempt.reply

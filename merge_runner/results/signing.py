@@ -1,7 +1,7 @@
-"""Signatures of recordings, by the user's own tool: ssh-keygen, or minisign where the key is one.
+"""Signatures of recordings, by the user's own tool: ssh-keygen, or minisign for a minisign key.
 
-A hash tells damage; whoever changes a file on purpose can make its hash anew, and no signature.
-Keys are read by these tools alone, which ask for a passphrase themselves.
+A hash reveals damage. Whoever changes a file on purpose can compute its hash anew, but not its
+signature. Only these tools read keys; they ask for a passphrase themselves.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SUFFIXES = {SSH: ".sig", MINISIGN: ".minisig"}
 
 
 def tool_for(key: Path) -> str:
-    """The tool whose key this is; raises UsageError where there is no such file."""
+    """The tool that this key belongs to; raises UsageError if there is no such file."""
     try:
         with key.open("rb") as file:
             return MINISIGN if file.readline(1000).startswith(b"untrusted comment:") else SSH
@@ -66,7 +66,7 @@ def _signature(file: Path, tool: str) -> Path:
 def _run(
     tool: str, options: Sequence[object], file: Path | None = None, *, asks: bool = False
 ) -> bytes:
-    """What a tool makes of a file; where it ``asks``, at the terminal. Raises RecordingError."""
+    """Run a tool on a file; if it ``asks``, at the terminal. Raises RecordingError."""
     try:
         with file.open("rb") if file else nullcontext() as content:
             done = subprocess.run(  # noqa: S603 # the user's own tool

@@ -1,4 +1,4 @@
-"""Results in DuckDB. The file is open only while a batch is written, so that others can read."""
+"""Results in DuckDB. The file is open only while a batch is written, so that others can read it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from merge_runner.served_model import other_models, sql_of
 from merge_runner.signals import at_signals
 from merge_runner.text_safety import first_line
 
-# What a run has of its own: whether it made an attempt itself, and when the attempt was made.
+# What differs from run to run: whether it made an attempt itself, and when.
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
 
 
@@ -62,10 +62,10 @@ class Store:
     """Writes sweeps and whole trials; every method is one short transaction."""
 
     def __init__(self, path: Path) -> None:
-        """Open or make the database; raises UsageError for one that is not ours."""
+        """Open or make the database; raises UsageError for a foreign one."""
         self.path = path
         if path.exists() and not path.is_file():
-            raise UsageError(f"{path} is no file: name one with --db")
+            raise UsageError(f"{path} is not a file: name one with --db")
         self._one_at_a_time = threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -124,9 +124,9 @@ class Store:
     ) -> dict[str, list[str]]:
         """Store whole trials of a sweep; one that has ended already is compared and linked.
 
-        Returns the ids of those that are stored otherwise, with the columns in which they are.
+        Returns the ids of those that are stored with other values, and in which columns.
         """
-        # Made before anybody is kept waiting, though a trial that is stored already needs none.
+        # Made before the lock is taken, though a trial that is stored already needs none.
         rows = [rows_of(record) for record in records]
         with self._writing(patience_s) as connection:
             merge_small_groups(connection)
@@ -197,7 +197,7 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 
 @contextmanager
 def answers(path: Path, sql: str) -> Iterator[tuple[list[str], Iterator[tuple[Any, ...]]]]:
-    """The column names and the rows of a query; nobody can write until they are read."""
+    """The column names and the rows of a query; the database is locked until they are read."""
     # The settings hold for a whole instance, and cannot be taken back.
     with (
         read_database(path, Instance(TEXTS, confine=False)) as connection,
@@ -211,9 +211,9 @@ def answers(path: Path, sql: str) -> Iterator[tuple[list[str], Iterator[tuple[An
 def answering(
     connection: duckdb.DuckDBPyConnection, sql: str
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Run one query, which reaches nothing but what is open, to be fetched; raises UsageError.
+    """Run one query, which reaches only the open database, to be fetched; raises UsageError.
 
-    The connection's whole instance stays locked up.
+    The connection's whole instance stays restricted.
     """
     # External access alone leaves the database's own files open to COPY ... TO.
     connection.execute(
@@ -283,7 +283,7 @@ def results_digest(path: Path) -> tuple[str, int]:
 def _by_trial(
     connection: duckdb.DuckDBPyConnection, columns: str, table: str
 ) -> Iterator[tuple[TrialKey, list[list[Any]]]]:
-    """The rows of each trial, once all are there: they lie together, and are too many to sort."""
+    """The rows of each trial once it is complete: they lie together, and are too many to sort."""
     counts = {
         (trial_id, spec_hash): count
         for trial_id, spec_hash, count in connection.execute(
@@ -302,7 +302,7 @@ def _by_trial(
 
 
 def used_call_keys(path: Path, sweep_id: str | None) -> tuple[str, list[str]]:
-    """The sweep (the newest where None is named) and the keys of the calls that it used."""
+    """The sweep (the newest if None is named) and the keys of the calls that it used."""
     with read_database(path) as connection:
         found = connection.execute(
             "SELECT sweep_id FROM sweeps WHERE sweep_id = coalesce(?, sweep_id) "
@@ -353,7 +353,7 @@ class SweepFacts:
     fallbacks: int
 
 
-# Who was asked, in a row of the view ``attempts`` with its spec.
+# The driver that was asked, in a row of the view ``attempts`` with its spec.
 DRIVER = "driver_name(model, spec->>('$.' || side || '.endpoint'))"
 
 
@@ -442,7 +442,7 @@ def _stored(
 def _differing(
     connection: duckdb.DuckDBPyConnection, played: dict[TrialKey, dict[str, list[Row]]]
 ) -> dict[str, list[str]]:
-    """Which trials are stored otherwise than they were played, and in which columns."""
+    """Which trials are stored with other values than were played, and in which columns."""
     found: dict[str, list[str]] = {}
     for table in PLACES if played else ():
         stored = stored_rows(connection, table, list(played))

@@ -1,1 +1,1 @@
-"""A sweep under way: what is to be played, who plays it, and what is told of it."""
+"""A sweep under way: what is to be played, who plays it, and what is shown of it."""

@@ -48,7 +48,7 @@ class SpendingTerms:
 
 @dataclass(frozen=True, slots=True)
 class EndpointPlan:
-    """Where a sweep asks: its endpoints' identities, and the variables that hold their base URLs.
+    """The endpoints of a sweep: their identities, and the variables that hold their base URLs.
 
     ``known`` are the models whose endpoint has ever answered in its format, ``passed`` those where
     it has done so in this run. ``strict`` stops at an answer of another model.

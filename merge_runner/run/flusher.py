@@ -83,7 +83,7 @@ class Flusher:
             if asyncio.get_running_loop().time() - began >= patience_s:
                 raise StoreError(
                     f"{len(self._pending)} trials are not stored: {self._problem}. When that is "
-                    "mended, run the same command again: it writes them from the recorded replies "
+                    "fixed, run the same command again: it writes them from the recorded replies "
                     "without a call."
                 )
             await asyncio.sleep(min(EVERY_S, patience_s))

@@ -102,7 +102,7 @@ class Plan:
         return SCENARIOS[self.scenario.name].world(self.scenario, CONDITIONS[condition])
 
     def driver(self, endpoints: Mapping[str, str]) -> str:
-        """Who drives, and where he is asked; see ``pair_name``."""
+        """The drivers with their endpoints; see ``pair_name``."""
         return pair_name(self.sides.values(), endpoints)
 
     def specs(self, endpoints: Mapping[str, str]) -> dict[str, str]:

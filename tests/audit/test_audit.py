@@ -689,8 +689,8 @@ async def test_another_models_answers_end_an_audit_with_1_and_no_sweep(merge_run
         assert "served: " in found.out
         strict = await merge_runner(*part, "--strict-model", "--db", "strict.duckdb", **env)
         assert strict.code == 1
-    exit_codes = (PROJECT / "README.md").read_text().partition("## Exit codes")[2]
-    assert "another model's answers end `merge-runner audit` with 1" in exit_codes
+    exit_codes = (PROJECT / "docs/reference/commands.md").read_text()
+    assert "Another model's answers end `merge-runner audit` with 1" in exit_codes
 
 
 def test_a_database_of_humans_alone_passes_and_says_that_there_is_no_sweep(prepare, tmp_path):

@@ -240,7 +240,7 @@ async def test_a_damaged_record_of_spending_is_told_and_not_believed(ledger, cac
     await attempt(Budget(ledger), 1, 0.5, 0.25)
     places = (ledger._name, f"again {ledger._name}")
     text = cache.read(ledger._name)
-    for place in places:  # in one alone it is mended by the other
+    for place in places:  # in one place alone it is repaired from the other
         cache.run_now([lambda place=place: cache.replace(place, text.replace("0.25", "0.15"))])
         if place == places[0]:
             assert ledger.read().spent_usd == 0.25

@@ -195,7 +195,7 @@ def test_another_program_s_database_and_another_version_are_refused(tmp_path):
     foreign = tmp_path / "foreign.duckdb"
     with duckdb.connect(str(foreign)) as connection:
         connection.execute("CREATE TABLE mine (a INTEGER)")
-    with pytest.raises(UsageError, match="no database of merge-runner"):
+    with pytest.raises(UsageError, match="not a database of merge-runner"):
         Store(foreign)
     newer = tmp_path / "newer.duckdb"
     Store(newer)

@@ -187,7 +187,7 @@ def test_a_rewritten_recording_that_is_not_changed_is_whole(small, tmp_path, who
         ("INSERT INTO calls FROM calls LIMIT 1", "repeats"),
         ("DELETE FROM calls WHERE condition = 'L_4_8'", "is not as it was exported"),
         ("UPDATE calls SET attempts = replace(attempts, 'right', 'left')", "not as it was"),
-        ("ALTER TABLE calls ADD COLUMN extra INTEGER", "is no recording of ours"),
+        ("ALTER TABLE calls ADD COLUMN extra INTEGER", "is not one of our recordings"),
     ],
 )
 async def test_a_recording_that_was_tampered_with_is_refused_whole(

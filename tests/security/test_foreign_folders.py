@@ -196,7 +196,7 @@ def test_a_view_in_place_of_a_table_is_refused(folder, table):
     with database(folder) as opened:
         opened.execute(f"ALTER TABLE {table} RENAME TO other")
         opened.execute(f"CREATE VIEW {table} AS SELECT * FROM other")
-    with pytest.raises(UsageError, match="is no cache of merge-runner"):
+    with pytest.raises(UsageError, match="is not a cache of merge-runner"):
         ResponseCache(folder)
 
 
@@ -204,7 +204,7 @@ def test_the_database_of_another_program_is_left_alone(tmp_path):
     with database(tmp_path) as opened:
         opened.execute("CREATE TABLE bookmarks (url)")
     before = everything_in(tmp_path)
-    with pytest.raises(UsageError, match="is no cache of merge-runner"):
+    with pytest.raises(UsageError, match="is not a cache of merge-runner"):
         ResponseCache(tmp_path)
     assert everything_in(tmp_path) == before
 
@@ -258,7 +258,7 @@ def test_a_file_that_is_empty_is_not_taken_for_new(folder, left):
         with database(folder) as opened:
             opened.execute("PRAGMA user_version = 1")
     before = everything_in(folder)
-    with pytest.raises(UsageError, match=r"is empty|is no cache of merge-runner"):
+    with pytest.raises(UsageError, match=r"is empty|is not a cache of merge-runner"):
         ResponseCache(folder)
     assert everything_in(folder) == before
 
@@ -392,7 +392,7 @@ def test_a_request_that_nobody_sends_is_refused(folder, own):
             "UPDATE Cache SET key = ?, value = ? WHERE key = ?",
             [made.key, Entry(made, FIRST.attempts).to_json(), FIRST.request.key],
         )
-    with pytest.raises(RecordingError, match="no canonical JSON object"):
+    with pytest.raises(RecordingError, match="not a canonical JSON object"):
         import_folder(folder, own)
 
 

@@ -76,7 +76,7 @@ def test_a_link_in_a_zip_is_no_file(imported, tmp_path):
     path = with_link(write_zip(tmp_path / "d.zip", GOOD), f"{TRIAL}.csv", str(secret))
     run = imported(path)
     assert run.code == 1
-    assert f"error: {TRIAL}.csv: it is a link and no file" in run.err
+    assert f"error: {TRIAL}.csv: it is a link, not a file" in run.err
     assert "private" not in run.err + run.out
     assert trials(tmp_path) == 1
 
@@ -88,7 +88,7 @@ def test_a_device_or_a_pipe_in_a_folder_is_not_read(tmp_path):
     with open_files(folder) as files:
         for file in files:
             if TRIAL in file.name:
-                with pytest.raises(Unreadable, match="no regular file"):
+                with pytest.raises(Unreadable, match="not a regular file"):
                     file.read()
 
 

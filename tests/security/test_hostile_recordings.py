@@ -128,9 +128,9 @@ DEEP = "[" * 100_000 + "]" * 100_000
     [
         ({"call_key": None}, None),
         ({"body": "{}"}, "another hash"),
-        ({"body": '{"prompt": 0}'}, "no canonical JSON object"),
+        ({"body": '{"prompt": 0}'}, "not a canonical JSON object"),
         ({"body": "no JSON"}, "is damaged"),
-        ({"body": "[]"}, "no canonical JSON object"),
+        ({"body": "[]"}, "not a canonical JSON object"),
         ({"body": '{"a":NaN}'}, "is damaged"),
         ({"body": DEEP}, "is damaged"),
         ({"body": None}, "it has no body"),
@@ -229,7 +229,7 @@ def test_sql_in_strings_is_a_string(file, tmp_path, monkeypatch):
 )
 def test_foreign_missing_and_mistyped_columns_are_refused(file, cache, tmp_path, select):
     text = refusal(rewritten(file, select=select), cache)
-    assert "is no recording of ours" in text or "no Parquet file that can be read" in text
+    assert "is not one of our recordings" in text or "is not a readable Parquet file" in text
     assert not (tmp_path / "planted.csv").exists()
 
 
@@ -247,7 +247,7 @@ def test_what_is_no_parquet_file_is_refused(file, cache, tmp_path):
     bad = tmp_path / "bad.parquet"
     for content in (b"", b"PAR1", b"PAR1PAR1", b"no Parquet" * 100, whole[:-1], whole[:500]):
         bad.write_bytes(content)
-        assert "is no Parquet file that can be read" in refusal(bad, cache)
+        assert "is not a readable Parquet file" in refusal(bad, cache)
     for nothing in (tmp_path, tmp_path / "nowhere"):
         assert "there is no recording" in refusal(nothing, cache)
 

@@ -304,7 +304,7 @@ async def test_a_bad_certificate_ends_a_sweep_at_once_and_nothing_is_sent(
         )
     assert (run.code, server.requests) == (2, [])
     last = run.err.splitlines()[-1]
-    assert "the endpoint's certificate is not to be trusted, and nothing was sent" in last
+    assert "the endpoint's certificate cannot be trusted, and nothing was sent" in last
     assert "Traceback" not in run.err
 
 

@@ -281,7 +281,7 @@ window.startReplay = () => {
   const tick = (moment) => {
     if (!playing) return;
     const passed = speed * (moment - last) / 1000;
-    // Who wants no motion gets pictures, twice a second.
+    // Where the system asks for reduced motion, still pictures, two a second.
     if (!calm || passed >= 0.5 * speed) {
       last = moment;
       seek(now + passed);

@@ -314,7 +314,7 @@ async def _identity(cache: ResponseCache) -> str:
 
     def operation() -> str:
         known = None
-        with contextlib.suppress(RecordingError):  # a damaged one is none
+        with contextlib.suppress(RecordingError):  # a damaged one counts as missing
             known = cache.read(_IDENTITY)
         if known is None:
             cache.replace(_IDENTITY, known := secrets.token_hex(8))

@@ -111,7 +111,7 @@ def test_a_csv_that_is_cut_off_says_so(ending):
 
 @pytest.mark.parametrize(
     ("content", "says"),
-    [(b"", "it lacks dt"), (b"\xff\xfe\x00", "no CSV table"), (b"\x00" * 10, "it lacks dt")],
+    [(b"", "it lacks dt"), (b"\xff\xfe\x00", "not a CSV table"), (b"\x00" * 10, "it lacks dt")],
 )
 def test_what_is_no_csv_table_is_refused(content, says):
     with pytest.raises(Unreadable, match=says):
@@ -125,9 +125,9 @@ def test_blank_lines_and_a_byte_order_mark_do_not_matter():
 
 def test_a_mat_file_of_another_version_is_refused():
     content = drive().mat()
-    with pytest.raises(Unreadable, match="no MAT file of version 5"):
+    with pytest.raises(Unreadable, match="not a MAT file of version 5"):
         parse_mat(content.replace(VERSION_5, b"\x00\x02IM", 1))
-    with pytest.raises(Unreadable, match="no MAT file of version 5"):
+    with pytest.raises(Unreadable, match="not a MAT file of version 5"):
         parse_mat(b"")
 
 

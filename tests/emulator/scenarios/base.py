@@ -12,7 +12,7 @@ Break = Literal["hang", "reset", "truncated_body", "truncated_json"]
 
 
 def answer(*without: str, **members: object) -> Body:
-    """The ordinary answer without some of its members, and with others in their place."""
+    """The ordinary answer with some of its members replaced."""
     return lambda usual: {k: v for k, v in (usual | members).items() if k not in without}
 
 
@@ -20,8 +20,8 @@ def answer(*without: str, **members: object) -> Body:
 class Scene:
     """A reply in one format.
 
-    ``body`` makes it from the ordinary answer's; a text is sent as it is. A header that is a
-    timedelta is sent as the moment so far from now, in RFC 3339. The reply takes ``after_s``.
+    ``body`` makes it from the ordinary answer's body; a text is sent as it is. A header that is a
+    timedelta is sent as the time so far from now, in RFC 3339. The reply takes ``after_s``.
     ``breaks`` says how the connection fails instead.
     """
 
@@ -37,5 +37,5 @@ Scenario = dict[str, Scene]
 
 
 def fixed(status: int, body: object, headers: Mapping[str, str | timedelta] | None = None) -> Scene:
-    """A reply that has nothing of an answer."""
+    """A reply that has nothing in common with an answer."""
     return Scene(lambda _: body, status, headers or {})

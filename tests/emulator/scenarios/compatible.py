@@ -1,4 +1,4 @@
-"""Servers and routers that speak Chat Completions, each with errors of its own."""
+"""Servers and routers that speak Chat Completions, each with its own errors."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ SCENES: dict[str, dict[str, Scene]] = {
                 }
             },
         ),
-        # It counts on below zero, and its reset is a bare number of seconds.
+        # It counts below zero, and its reset is a bare number of seconds.
         "integer_reset": fixed(
             429,
             {"error": {"code": "RateLimitReached", "message": "Rate limit reached."}},

@@ -72,7 +72,7 @@ SCENES: dict[str, Scene] = {
     "max_tokens_no_text": Scene(
         _candidate("MAX_TOKENS", content={"role": "model", "parts": [{"text": ""}]})
     ),
-    # A known fault of Gemini 2.5 Pro that comes and goes.
+    # A known intermittent fault of Gemini 2.5 Pro.
     "empty_stop": Scene(_candidate("STOP", content={"role": "model"})),
     "no_candidates": Scene(answer("candidates")),
     "safety": Scene(_candidate("SAFETY")),
@@ -126,7 +126,7 @@ SCENES: dict[str, Scene] = {
             "This model models/gemini-2.5-pro is no longer available to new users.",
         ),
     ),
-    # The words of a quota for a limit that passes.
+    # A transient limit in the words of a quota.
     "per_minute": fixed(
         429,
         _error(

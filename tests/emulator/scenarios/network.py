@@ -1,4 +1,4 @@
-"""What a network does, whatever is spoken over it."""
+"""What a network does, whatever the format."""
 
 from __future__ import annotations
 

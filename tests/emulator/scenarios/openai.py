@@ -158,7 +158,7 @@ OPENAI: dict[str, Scenario] = {
             param="model",
         ),
     },
-    # What a shut-down model answers is documented nowhere; earlier ones did so.
+    # What a shut-down model answers is not documented; earlier ones answered so.
     "shut_down": _both(
         error(
             404,
@@ -181,7 +181,7 @@ OPENAI: dict[str, Scenario] = {
             },
         )
     ),
-    # The delay stands in the text alone.
+    # The delay is only in the text.
     "tokens_per_minute": _both(
         error(
             429,
