@@ -22,9 +22,7 @@ from pydantic import (
     ConfigDict,
     Field,
     JsonValue,
-    SerializerFunctionWrapHandler,
     ValidationError,
-    model_serializer,
     model_validator,
 )
 
@@ -97,7 +95,7 @@ class ScenarioConfig(Frozen):
     ``prompt_rate_hz`` is a language model's, and that of a program without a rate of its own.
     """
 
-    name: str = USUAL_SCENARIO
+    name: str = Field(default=USUAL_SCENARIO, exclude_if=lambda name: name == USUAL_SCENARIO)
     horizon_s: Positive = 4.0
     step_s: Positive = 0.2
     # Left out where it is not given, so that specs from before it keep their hashes.
@@ -144,13 +142,6 @@ class ScenarioConfig(Frozen):
     def timeout_steps(self) -> int:
         """The number of steps after which a trial is over."""
         return round(self.timeout_s / self.step_s)
-
-    @model_serializer(mode="wrap")
-    def _without_usual_name(self, write: SerializerFunctionWrapHandler) -> dict[str, JsonValue]:
-        told: dict[str, JsonValue] = write(self)
-        if self.name == USUAL_SCENARIO:
-            del told["name"]
-        return told
 
     @model_validator(mode="after")
     def _whole_steps(self) -> ScenarioConfig:

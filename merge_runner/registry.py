@@ -9,7 +9,10 @@ imported before the first look into any table; what it registers is then as good
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from merge_runner.errors import UsageError
@@ -18,6 +21,8 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 GROUP = "merge_runner"
+# What can stand in a trial's id, on the command line and in an address.
+NAME = re.compile(r"[A-Za-z0-9_.-]+")
 T = TypeVar("T")
 
 
@@ -30,7 +35,9 @@ class Registry(Mapping[str, T]):
         self._things: dict[str, T] = {}
 
     def register(self, name: str, thing: T) -> T:
-        """Add a thing, and return it; raises UsageError where the name is taken."""
+        """Add a thing, and return it; raises UsageError where the name is taken or odd."""
+        if not NAME.fullmatch(name):
+            raise UsageError(f"the {self.kind} {name!r} needs a name of letters, digits, _ - and .")
         if name in self._things:
             raise UsageError(f"there is a {self.kind} {name!r} already")
         self._things[name] = thing
@@ -59,6 +66,9 @@ class Registry(Mapping[str, T]):
         return len(self._things)
 
 
+# What the code of somebody else may raise while it is imported.
+FAULTS = (ArithmeticError, AttributeError, ImportError, LookupError, NameError, OSError,
+          RuntimeError, SyntaxError, TypeError, ValueError)  # fmt: skip
 _loaded: set[str] = set()
 
 
@@ -69,6 +79,15 @@ def plugins() -> list[EntryPoint]:
     return sorted(entry_points(group=GROUP), key=lambda point: (point.value, point.name))
 
 
+def plugin_sources() -> Iterator[Path]:
+    """The folder of each package that a plug-in is a part of, or the file of its module."""
+    for name in dict.fromkeys(point.module.partition(".")[0] for point in plugins()):
+        found = find_spec(name)
+        if found is not None:
+            folders = found.submodule_search_locations or [found.origin or ""]
+            yield from (Path(folder) for folder in folders if folder)
+
+
 def load_plugins() -> None:
     """Import what installed packages register, once; raises UsageError where that fails."""
     if GROUP in _loaded:
@@ -77,5 +96,5 @@ def load_plugins() -> None:
     for point in plugins():
         try:
             point.load()
-        except (ImportError, AttributeError, SyntaxError) as exc:
+        except FAULTS as exc:
             raise UsageError(f"the plug-in {point.name} = {point.value!r} fails: {exc}") from exc

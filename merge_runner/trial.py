@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
-from merge_runner.errors import CallFailed
+from merge_runner.errors import CallFailed, UsageError
 from merge_runner.records import (
     SIDES,
     Decision,
@@ -74,7 +74,15 @@ class _Seated:
         return step // self.driver.seat.pace.interval_steps
 
     def take(self, decision: Decision, step: int) -> int:
-        """Drive by a decision from now on; returns its number."""
+        """Drive by a decision from now on; returns its number. Raises UsageError for an odd one."""
+        seat = self.driver.seat
+        if len(decision.applied) != seat.pace.executed_actions or not all(
+            -1 <= action <= 1 for action in decision.applied
+        ):
+            raise UsageError(
+                f"the {seat.side} driver decided on {decision.applied}, and is to drive "
+                f"{seat.pace.executed_actions} actions from -1 to 1"
+            )
         self.decision, self.decided_at = decision, step
         return self.number(step)
 

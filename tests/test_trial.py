@@ -343,3 +343,15 @@ def test_a_seed_is_that_of_the_slot_and_of_no_driver():
 async def test_an_action_that_cannot_be_driven_is_refused():
     with pytest.raises(UsageError, match=r"^the left driver decided 1\.5: -1 to 1 can be driven$"):
         await play(Holding(1.5), Holding(0.0))
+
+
+class Short:
+    """Decides on less than is to be driven."""
+
+    async def decide(self, observation, number):
+        return Decision(plan=None, applied=(0.5,))
+
+
+async def test_a_decision_that_cannot_be_driven_is_refused_in_one_line():
+    with pytest.raises(UsageError, match=r"the left driver decided on \(0.5,\), and is to drive 5"):
+        await play(Short(), Short())

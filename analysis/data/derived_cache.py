@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 
 import duckdb
@@ -19,7 +18,7 @@ import duckdb
 import analysis
 import merge_runner
 from merge_runner.errors import StoreError
-from merge_runner.registry import plugins
+from merge_runner.registry import plugin_sources, plugins
 from merge_runner.results.database import (
     SCHEMA_VERSION,
     open_database,
@@ -72,21 +71,12 @@ def program() -> str:
     for point in plugins():
         release = f"{point.dist.name} {point.dist.version}" if point.dist else "of no distribution"
         digest.update(f"{release} {point.name} = {point.value}\n".encode())
-    for source in (*PACKAGES, *_sources_of_plugins()):
+    for source in (*PACKAGES, *plugin_sources()):
         for path in sorted(source.rglob("*")) if source.is_dir() else [source]:
             if path.suffix in {".py", ".sql", ".csv", ".html"}:
                 digest.update(f"{path.relative_to(source)}\n".encode())
                 digest.update(path.read_bytes())
     return digest.hexdigest()
-
-
-def _sources_of_plugins() -> Iterator[Path]:
-    """The folder of each package that a plug-in is a part of, or the file of its module."""
-    for name in dict.fromkeys(point.module.partition(".")[0] for point in plugins()):
-        found = find_spec(name)
-        if found is not None:
-            folders = found.submodule_search_locations or [found.origin or ""]
-            yield from (Path(folder) for folder in folders if folder)
 
 
 def state(connection: duckdb.DuckDBPyConnection) -> str:

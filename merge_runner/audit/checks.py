@@ -90,7 +90,7 @@ SELECT trial_id, side, decision, text FROM compared WHERE text IS NOT NULL
 """  # constants
 
 # After an invalid reply the last valid plan goes on where it was left or, by the other rule, at
-# its first action; 0 where it is exhausted or there is none (drivers/llm_driver.py).
+# its first action; 0 where it is exhausted or there is none (drivers/language_model.py).
 PLANS = """
 WITH numbered AS (
     SELECT *, row_number() OVER (
@@ -158,7 +158,7 @@ ANTI JOIN decisions USING (trial_id, spec_hash, side, decision)
 WHERE status <> 'failed'
 """
 
-# An empty answer may be asked for again (llm/client.py); any other answer is the last attempt.
+# An empty answer may be asked for again (llm/consequences.py); any other is the last attempt.
 ATTEMPTS = """
 WITH numbered AS (
     SELECT trial_id, side, decision, list(attempt ORDER BY attempt) AS numbers,

@@ -179,7 +179,10 @@ class _AsStored:
         side = self.seat.side
         if (side, number) not in self.plans:
             raise _NotStored(f"decision {number} on the {side} is not stored")
-        return self.plans[side, number]
+        decision = self.plans[side, number]
+        if len(decision.applied) != self.seat.pace.executed_actions:
+            raise _NotStored(f"decision {number} on the {side} has not the actions to drive")
+        return decision
 
 
 def check_derived(
@@ -288,10 +291,11 @@ def _seat(trial: _Trial, spec: Spec, paces: Mapping[Side, Pace]) -> set[str]:
     own = trial.spec if trial.prompts else replace(trial.spec, variant="baseline")
     for side, pace in paces.items():
         told = spec.driver(side)
-        name = told.get("program", "")
+        name = str(told.get("program", ""))
         program = PROGRAMS.get(name)
-        if spec.asks(side) or (program is not None and program.source == told.get("source")):
-            maker: MakeDriver = trial.model() if spec.asks(side) else PROGRAMS[name]
+        same = program is not None and program.told(name) == told
+        maker: MakeDriver | None = trial.model() if spec.asks(side) else program if same else None
+        if maker is not None:
             trial.drivers[side] = maker.make(trial.scenario, own, side)
             continue
         seat = take_seat(trial.scenario, own, side, pace)

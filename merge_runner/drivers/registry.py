@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec, resolve_name
+from math import inf, isfinite
 from pkgutil import iter_modules
 
 from merge_runner import drivers
@@ -34,6 +35,17 @@ class Program:
     meaning: str
     parameters: Mapping[str, float] = field(default_factory=dict)
     rate_hz: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raises UsageError for what can be no driver, or could not be told apart from another."""
+        if not isinstance(self.driver, type):
+            raise UsageError(f"the driver {self.driver!r} is no class: its source is not known")
+        if self.rate_hz is not None and not 0 < self.rate_hz < inf:
+            raise UsageError(f"the driver {self.driver.__qualname__} needs a rate_hz above 0")
+        if not all(isinstance(n, int | float) and isfinite(n) for n in self.parameters.values()):
+            raise UsageError(
+                f"the parameters of the driver {self.driver.__qualname__} must be finite numbers"
+            )
 
     @property
     def source(self) -> str:

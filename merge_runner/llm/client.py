@@ -15,7 +15,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import Any
 
-from merge_runner.config import ModelEntry, driver_name
+from merge_runner.config import ModelEntry
 from merge_runner.errors import (
     CallFailed,
     ModelSwapped,
@@ -146,7 +146,7 @@ class LlmClient:
     @property
     def driver(self) -> str:
         """Its name, with the endpoint where that is not the provider's own."""
-        return driver_name(self.name, self.endpoint)
+        return self._consequences.driver
 
     def _recorded(self, request: ChatRequest) -> Entry | None:
         """The recorded call, None for a damaged one; in a replay that raises CallFailed."""

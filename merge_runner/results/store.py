@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -37,6 +37,7 @@ from merge_runner.results.database import (
     update_measures,
 )
 from merge_runner.results.rows import Row, rows_of, state_rows, trial_row
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.served_model import other_models, sql_of
 from merge_runner.signals import at_signals
 from merge_runner.text_safety import first_line
@@ -110,9 +111,14 @@ class Store:
                 [ended_at, exit_code, sweep_id],
             )
 
-    def ended_trials(self, keys: Iterable[TrialKey]) -> set[TrialKey]:
-        """Which of these trials are stored and did not fail."""
+    def ended_trials(self, keys: Collection[TrialKey]) -> set[TrialKey]:
+        """Which of these trials are stored and did not fail.
+
+        Raises UsageError where a condition of theirs was another one: its numbers are no part of
+        the spec's hash.
+        """
         with self._writing() as connection:
+            _refuse_other_conditions(connection, list(keys))
             return {
                 key
                 for key, status in _statuses(connection, list(keys)).items()
@@ -421,6 +427,17 @@ def _rows_of(
         f"USING (trial_id, spec_hash) ORDER BY {order}",
         [[key[0] for key in keys], [key[1] for key in keys]],
     ).fetchall()
+
+
+def _refuse_other_conditions(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:
+    stored = "SELECT condition, projected_headway_m, relative_velocity_mps FROM trials"
+    for name, *numbers in set(_rows_of(connection, keys, stored)):
+        condition = CONDITIONS[name]
+        if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
+            raise UsageError(
+                f"the condition {name} is stored with a headway of {numbers[0]:g} m and a relative "
+                f"velocity of {numbers[1]:g} m/s: give the changed one a new name"
+            )
 
 
 def _statuses(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> dict[TrialKey, str]:

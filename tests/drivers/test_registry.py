@@ -1,9 +1,12 @@
 """The two drivers that need no model, from the first to the last step of every condition."""
 
+from functools import partial
+
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.errors import UsageError
 from merge_runner.records import SIDES, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
@@ -84,3 +87,24 @@ async def test_a_program_holds_one_action_over_a_whole_plan(driver):
         assert len(set(decision.plan)) == 1
         assert abs(decision.plan[0]) <= 1
         assert decision.prompt is None
+
+
+class Undecided:
+    def __init__(self, seat):
+        self.seat = seat
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: Program(partial(Undecided), "x"), "is no class"),
+        (lambda: Program(Undecided, "x", rate_hz=0), "needs a rate_hz above 0"),
+        (lambda: Program(Undecided, "x", rate_hz=float("inf")), "needs a rate_hz above 0"),
+        (lambda: Program(Undecided, "x", {"g": float("nan")}), "must be finite numbers"),
+        (lambda: Program(Undecided, "x", {"g": {1}}), "must be finite numbers"),
+        (lambda: PROGRAMS.register("a+b", PROGRAMS["constant"]), "needs a name of letters"),
+    ],
+)
+def test_what_can_be_no_driver_is_refused(made, said):
+    with pytest.raises(UsageError, match=said):
+        made()

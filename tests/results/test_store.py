@@ -177,6 +177,17 @@ def test_a_name_means_another_file_in_another_folder(tmp_path, monkeypatch):
     assert digests[0] == digests[1]
 
 
+def test_a_changed_condition_needs_another_name(store, path):
+    record = played()
+    store.write("s1", [record], patience_s=1)
+    key = (record.spec.trial_id, record.spec.spec_hash)
+    assert store.ended_trials([key]) == {key}
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE trials SET projected_headway_m = 3")
+    with pytest.raises(UsageError, match="is stored with a headway of 3 m .* a new name"):
+        store.ended_trials([key])
+
+
 def test_a_query_changes_nothing_and_reads_no_file(store, path, tmp_path):
     (tmp_path / "secret.csv").write_text("a\n1\n")
     for sql in (

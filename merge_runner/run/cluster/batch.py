@@ -11,6 +11,7 @@ from pathlib import Path
 import merge_runner
 from merge_runner.llm.cache import Entry
 from merge_runner.records import Attempt, TrialSpec
+from merge_runner.registry import plugin_sources
 from merge_runner.run.clients import EndpointPlan
 from merge_runner.run.plan import Plan
 
@@ -47,9 +48,9 @@ class KnownCall:
 
 @cache
 def fingerprint() -> str:
-    """The version and a hash of all source: who differs in it might play other trials."""
-    folder = Path(merge_runner.__file__).parent
+    """The version and a hash of all source, plug-ins too: who differs might play other trials."""
     code = hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
-        code.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
+    for source in (Path(merge_runner.__file__).parent, *plugin_sources()):
+        for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
+            code.update(f"{source.name}/{path.relative_to(source)}\0".encode() + path.read_bytes())
     return f"{merge_runner.__version__} ({code.hexdigest()[:12]})"

@@ -204,7 +204,7 @@ class Coordinator:
         if theirs != fingerprint():
             raise UsageError(
                 f"a Dask worker on {host} has merge-runner {theirs}, and this is {fingerprint()}: "
-                "install the same one for all"
+                "install the same one for all, with the same plug-ins"
             )
         self._refuse_unreachable_emulator(host)
         await self._room()
