@@ -89,7 +89,7 @@ class Metric:
     shown: frozenset[Place] = EVERYWHERE
 
     def __post_init__(self) -> None:
-        for wrong in self._mistakes():
+        if wrong := next(self._mistakes(), None):
             raise UsageError(f"the metric {self.name!r} {wrong}")
 
     def _mistakes(self) -> Iterator[str]:
@@ -97,7 +97,7 @@ class Metric:
         if not self.name.isidentifier():
             yield "needs a name of letters, digits and _"
         if unknown := self.shown - PLACES:
-            yield (f"is shown in {', '.join(sorted(unknown))}; valid: {', '.join(get_args(Place))}")
+            yield f"is shown in {', '.join(sorted(unknown))}; valid: {', '.join(get_args(Place))}"
         if self.rate and "criticality" in self.shown:
             yield "is a share, and criticality shows medians and quartiles"
         if self.value in JUDGED and self.trials != "ended":
