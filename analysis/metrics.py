@@ -5,7 +5,7 @@ Tables, figures, conclusions and pages ask this list, and name no metric that is
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -30,6 +30,8 @@ INTERVALS: dict[Estimator, str] = {
 # What the analysis finds out of each trial that no column of the database has: whether it collided
 # by the rule of its scenario, and by that of the human experiment.
 JUDGED = ("collided", "collided_boxes")
+# The fields of a sentence on a driver.
+TOLD = ("value", "subject", "estimator", "trials")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +59,9 @@ class Metric:
 
     ``label`` and ``unit`` head a column, ``meaning`` says what the number of one trial is, or of
     what a proportion is the share. ``word`` is how a list in a sentence names it, ``phrase`` what a
-    sentence has as its subject, and ``told`` is what the report says of a driver. ``lowest`` and
-    ``highest`` are ends that an axis always has.
+    sentence has as its subject, and ``told`` is what the report says of a driver, with the fields
+    TOLD. ``lowest`` and ``highest`` are ends that an axis always has. Raises UsageError where these
+    do not fit together.
 
     ``human`` is a published value beside those of the paper: ``paper_of_drivers`` and
     ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``. ``humans_from`` says
@@ -86,13 +89,23 @@ class Metric:
     shown: frozenset[Place] = EVERYWHERE
 
     def __post_init__(self) -> None:
+        if wrong := next(self._mistakes(), None):
+            raise UsageError(f"the metric {self.name!r} {wrong}")
+
+    def _mistakes(self) -> Iterator[str]:
+        """What is wrong with it, in words that follow its name."""
         if not self.name.isidentifier():
-            raise UsageError(f"the metric {self.name!r} needs a name of letters, digits and _")
+            yield "needs a name of letters, digits and _"
         if unknown := self.shown - PLACES:
-            raise UsageError(
-                f"the metric {self.name!r} is shown in {', '.join(sorted(unknown))}; valid: "
-                f"{', '.join(get_args(Place))}"
-            )
+            yield f"is shown in {', '.join(sorted(unknown))}; valid: {', '.join(get_args(Place))}"
+        if self.rate and "criticality" in self.shown:
+            yield "is a share, and criticality shows medians and quartiles"
+        if self.value in JUDGED and self.trials != "ended":
+            yield f"is {self.value}, which ended trials are judged by: it needs trials='ended'"
+        try:
+            self.told.format(**dict.fromkeys(TOLD, ""))
+        except (LookupError, ValueError, AttributeError):
+            yield f"is told as {self.told!r}; valid fields: {', '.join(TOLD)}"
 
     @property
     def heading(self) -> str:

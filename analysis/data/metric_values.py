@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import duckdb
@@ -14,36 +14,57 @@ from analysis.metrics import JUDGED, METRICS, Metric
 from merge_runner.errors import UsageError
 from merge_runner.text_safety import first_line
 
+Load = Callable[[Sequence[Metric]], pd.DataFrame]
+
 
 def trials_with_metrics(db: Path) -> pd.DataFrame:
     """The rows of ``load_trials`` with a column for each metric that is not JUDGED.
 
     Raises UsageError, also where the SQL of a metric fails.
     """
-    metrics = _selected(METRICS.values())
-    try:
-        found = _load(db, metrics)
-    except duckdb.Error:
-        for metric in metrics:
-            _try_alone(db, metric)
-        raise
-    return found.astype(_types(metrics))
+
+    def load(metrics: Sequence[Metric]) -> pd.DataFrame:
+        # Subqueries of the metrics may have changed the order.
+        rows = f"({TRIALS}) AS trials"
+        sql = f"SELECT *, {_columns(metrics)} FROM {rows} ORDER BY trial_id, spec_hash"  # noqa: S608 # ours
+        return load_each({"trials": sql}, db)["trials"]
+
+    return _loaded(load, METRICS.values(), "fails")
 
 
 def outcomes_with_metrics() -> pd.DataFrame:
-    """The published human outcomes with a column for each metric that they tell."""
+    """The published human outcomes with a column for each metric that they tell.
+
+    Raises UsageError where the SQL of a metric fails there.
+    """
     outcomes = human_outcomes()
-    metrics = _selected(one for one in METRICS.values() if one.humans_from == "outcomes")
-    with duckdb.connect() as connection:
-        connection.register("trials", outcomes.assign(number=outcomes.index))
-        sql = f"SELECT {_columns(metrics)} FROM trials ORDER BY number"  # noqa: S608 # ours
-        found = connection.sql(sql).df()
-    return outcomes.join(found.astype(_types(metrics)))
+
+    def load(metrics: Sequence[Metric]) -> pd.DataFrame:
+        with duckdb.connect() as connection:
+            connection.register("trials", outcomes.assign(number=outcomes.index))
+            sql = f"SELECT {_columns(metrics)} FROM trials ORDER BY number"  # noqa: S608 # ours
+            return connection.sql(sql).df()
+
+    told = (one for one in METRICS.values() if one.humans_from == "outcomes")
+    return outcomes.join(_loaded(load, told, "fails on the published human outcomes"))
 
 
-def _selected(metrics: Iterable[Metric]) -> list[Metric]:
-    """Those whose values SQL can select."""
-    return [metric for metric in metrics if metric.value not in JUDGED]
+def _loaded(load: Load, metrics: Iterable[Metric], fails: str) -> pd.DataFrame:
+    """The columns of the metrics that are not JUDGED; UsageError names one whose SQL fails."""
+    chosen = [metric for metric in metrics if metric.value not in JUDGED]
+    try:
+        return load(chosen).astype(_types(chosen))
+    except duckdb.Error:
+        for metric in chosen:
+            _try_alone(load, metric, fails)
+        raise
+
+
+def _try_alone(load: Load, metric: Metric, fails: str) -> None:
+    try:
+        load([metric])
+    except duckdb.Error as exc:
+        raise UsageError(f"the SQL of the metric {metric.name} {fails}: {first_line(exc)}") from exc
 
 
 def _columns(metrics: Iterable[Metric]) -> str:
@@ -52,17 +73,3 @@ def _columns(metrics: Iterable[Metric]) -> str:
 
 def _types(metrics: Iterable[Metric]) -> dict[str, str]:
     return {metric.column: "boolean" if metric.rate else "float" for metric in metrics}
-
-
-def _load(db: Path, metrics: Iterable[Metric]) -> pd.DataFrame:
-    # Subqueries of the metrics may have changed the order.
-    rows = f"({TRIALS}) AS trials"
-    sql = f"SELECT *, {_columns(metrics)} FROM {rows} ORDER BY trial_id, spec_hash"  # noqa: S608 # ours
-    return load_each({"trials": sql}, db)["trials"]
-
-
-def _try_alone(db: Path, metric: Metric) -> None:
-    try:
-        _load(db, [metric])
-    except duckdb.Error as exc:
-        raise UsageError(f"the SQL of the metric {metric.name} fails: {first_line(exc)}") from exc

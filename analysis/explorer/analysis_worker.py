@@ -183,14 +183,15 @@ def human_panels(study: Study) -> dict[str, Any]:
 
 
 def _in_condition(group: Group, condition: str) -> dict[str, Any]:
-    """The trials of a group in one condition: counts, and estimates with 95 % intervals."""
-    from analysis.stats.measures import counts, estimate, known
+    """The metrics of a group in one condition: estimates with 95 % intervals, and counts."""
+    from analysis.stats.measures import counts, estimate, known, trials_of
 
     part = group.part(lambda trials: trials["condition"] == condition)
-    found: dict[str, Any] = {"all": len(part.outcomes), "ended": len(part.ended_outcomes)}
+    found: dict[str, Any] = {}
     for metric in shown_in("humans"):
         if known(group, metric):
             found[metric.name] = asdict(estimate(part, metric))
+            found[metric.name]["all"] = len(trials_of(part, metric))
             if metric.rate:
                 found[metric.name]["k"] = counts(part, metric)[0]
     return found

@@ -32,8 +32,10 @@ from analysis.figures.drawing import (
     wrapped,
 )
 from analysis.figures.panels import (
+    HUMAN_VELOCITIES_MPS,
     Point,
     deviations,
+    farthest_headway_m,
     gaps,
     left_first,
     left_traces,
@@ -58,6 +60,7 @@ SETTINGS: Any = {
     "axes.spines.right": False,
     "axes.linewidth": 0.6,
     "pdf.fonttype": 42,
+    "text.parse_math": False,  # a dollar in a name is a dollar
     "svg.hashsalt": "merge-runner",
     "savefig.dpi": 300,
 }
@@ -76,10 +79,12 @@ def figure_2(study: Study) -> Figure:
     _curves(axes[1], groups, gaps, velocities, "D", "gap at merge (m)")
     _curves(axes[2], groups, deviations, velocities, "E", "RMSE of speed (m/s)")
     axes[0, 0].set_ylim(-0.05, 1.05)
+    unmeasured = study.human in groups and not study.human.measured
     for column, velocity in enumerate(velocities):
         axes[0, column].set_title(f"Δv = {velocity_text(velocity)}")
         axes[2, column].set_xlabel("projected headway (m)")
-        if study.human in groups and not study.human.measured:
+        axes[2, column].set_xticks(np.linspace(-1, 1, 5) * farthest_headway_m(study))
+        if unmeasured and velocity in HUMAN_VELOCITIES_MPS:
             axes[1, column].plot(*published_gap_line(velocity), color="black", ls="--", lw=0.8)
             axes[2, column].margins(y=0.3)
             say(axes[2, column], MISSING, 0.99)
@@ -145,7 +150,9 @@ def _distribution(axis: Axes, row: int, group: Group, metric: Metric, colour: st
         return
     found = values(group, metric).to_numpy(float)
     if not len(found):
-        axis.annotate("no finished trial", (0.02, row), xycoords=("axes fraction", "data"))
+        there = group.ended if metric.trials == "ended" else group.finished
+        text = "no trial has it" if len(there) else f"no {metric.trials} trial"
+        axis.annotate(text, (0.02, row), xycoords=("axes fraction", "data"))
         return
     # Spread by rank, not by chance: the same trials give the same picture.
     spread = row + 0.36 * (np.arange(len(found)) % 7 / 6 - 0.5)
@@ -278,7 +285,6 @@ def _curves(
             # Side by side, so that intervals do not hide each other.
             shift = 0.16 * (index - (len(groups) - 1) / 2)
             draw_points(axis, found, shift, _style(groups, group))
-        axis.set_xticks([-4, -2, 0, 2, 4])
 
 
 def _legend(figure: SubFigure, study: Study, groups: list[Group]) -> None:

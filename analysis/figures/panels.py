@@ -32,6 +32,11 @@ def velocities_mps(study: Study) -> list[float]:
     return sorted({*HUMAN_VELOCITIES_MPS, *(velocity for _, velocity in study.conditions.values())})
 
 
+def farthest_headway_m(study: Study) -> float:
+    """The largest projected headway, to either side, that the panels show."""
+    return max(abs(headway_m) for headway_m, _ in study.conditions.values())
+
+
 def left_first(group: Group, velocity_mps: float) -> list[Point]:
     """Panel C: how often the left vehicle merges first, of finished trials."""
     return [
@@ -64,8 +69,12 @@ def deviations(group: Group, velocity_mps: float) -> list[Point]:
 
 
 def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
-    """The human regression of the gap as the paper prints it: headways and gaps in m."""
-    headway = np.linspace(-4, 4, 81)
+    """The human regression of the gap as the paper prints it: headways and gaps in m.
+
+    It reaches as far as the humans' conditions do, whatever else was driven.
+    """
+    farthest_m = max(abs(one.projected_headway_m) for one in HUMAN_CONDITIONS.values())
+    headway = np.linspace(-farthest_m, farthest_m, 81)
     terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
     return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
 

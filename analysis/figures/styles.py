@@ -6,6 +6,7 @@ with words for a screen reader, and an exported page draws nothing else; both ta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 # The palette of Okabe and Ito (2008), safe for the colour-blind.
@@ -41,6 +42,11 @@ HUMAN_STYLE = Style("#000000", "circle")
 
 
 def driver_style(number: int) -> Style:
-    """The style of a driver, counted from 0; a seventh has the first colour with another shape."""
-    turn = number + number // len(COLOURS)
-    return Style(COLOURS[number % len(COLOURS)], SHAPES[turn % len(SHAPES)])
+    """The style of a driver, counted from 0."""
+    return turned(number, COLOURS, SHAPES)
+
+
+def turned(number: int, colours: Sequence[str], shapes: Sequence[str]) -> Style:
+    """A style, counted from 0; once the colours are used up, each comes with another shape."""
+    turn = number + number // len(colours)
+    return Style(colours[number % len(colours)], shapes[turn % len(shapes)])

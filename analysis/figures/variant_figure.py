@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -28,6 +27,7 @@ from analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     Point,
     deviations,
+    farthest_headway_m,
     gaps,
     left_first,
     left_traces,
@@ -42,6 +42,7 @@ from analysis.figures.styles import (
     SKY_BLUE,
     VERMILION,
     Style,
+    turned,
 )
 from analysis.stats.intervals import Estimate
 from analysis.tables.formats import VARIANTS
@@ -52,7 +53,7 @@ LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = LABEL_IN + 0.35, 0.08, 0.4, 0.62
 BETWEEN_ROWS_IN, BETWEEN_COLUMNS_IN = 0.16, 0.3
 # Those of the humans' relative velocities in their order, and what is left for others.
 STYLES = (Style(BLUE, "down"), Style(GREEN, "circle"), Style(VERMILION, "triangle"))
-OTHER_STYLES = (Style(PURPLE, "square"), Style(SKY_BLUE, "diamond"), Style(ORANGE, "plus"))
+OTHER_COLOURS, OTHER_SHAPES = (PURPLE, SKY_BLUE, ORANGE), ("square", "diamond", "plus")
 Styles = dict[float, Style]
 HEADINGS = (
     "left first:\nv left (m/s)",
@@ -93,7 +94,8 @@ def _styles(study: Study) -> Styles:
     """Colour and marker of each relative velocity in m/s."""
     humans = dict(zip(HUMAN_VELOCITIES_MPS, STYLES, strict=True))
     others = [velocity for velocity in velocities_mps(study) if velocity not in humans]
-    return dict(sorted({**humans, **dict(zip(others, cycle(OTHER_STYLES), strict=False))}.items()))
+    own = {velocity: turned(i, OTHER_COLOURS, OTHER_SHAPES) for i, velocity in enumerate(others)}
+    return dict(sorted({**humans, **own}.items()))
 
 
 def _panels(rows: int, row_in: float) -> tuple[Figure, NDArray[np.object_]]:
@@ -180,7 +182,7 @@ def _scales(axes: NDArray[np.object_], groups: list[Group], study: Study) -> Non
         found = [p.estimate for g in groups for v in velocities_mps(study) for p in points(g, v)]
         if found:
             axis.set_ylim(*_limits(found, lines if points is gaps else []))
-    farthest_m = max(abs(headway_m) for headway_m, _ in study.conditions.values())
+    farthest_m = farthest_headway_m(study)
     for axis in axes[0, 2:]:
         axis.set_xlim(-farthest_m - 1, farthest_m + 1)
         axis.set_xticks([-farthest_m, 0, farthest_m])

@@ -117,7 +117,7 @@ def _marks(study: Study, group: Group) -> list[str]:
     ]
     texts = [f"{group.driver} shows, by both rules: {_listed(agreed)}."] if agreed else []
     texts += [
-        f"{group.driver} does not show that {NAMES[name]}: {_weight(found, name)}."
+        f"{group.driver} does not show that {NAMES[name]}: {_weight(group, found, name)}."
         for name in failed
     ]
     if mixed:
@@ -125,7 +125,7 @@ def _marks(study: Study, group: Group) -> list[str]:
     return texts
 
 
-def _weight(found: Score, name: str) -> str:
+def _weight(group: Group, found: Score, name: str) -> str:
     """What the lack of a mark says, from how often humans have it in studies of this size.
 
     Who has it by neither rule lacks also the one that humans pass more often.
@@ -140,10 +140,18 @@ def _weight(found: Score, name: str) -> str:
     ]
     strength = _strength(max(judging))
     return (
-        f"{100 * robust:.0f} % of human data sets of this size do by the robust tests, "
+        f"{100 * robust:.0f} % of human data sets of {_size(group)} do by the robust tests, "
         f"{100 * paper:.0f} % by the paper's, so that this is {strength} evidence against the "
         "driver"
     )
+
+
+def _size(group: Group) -> str:
+    """The size of the human data sets that a driver is weighed by."""
+    alike = sum(group.sizes)
+    if alike == len(group.ended):
+        return "this size"
+    return f"the size of its {_trials(alike)} in the humans' conditions"
 
 
 def _strength(share: float) -> str:
@@ -197,10 +205,12 @@ def _of_humans(study: Study, group: Group, metric: Metric) -> str:
         value = _number(metric, found.value)
         return f"humans {value} as published, over all {len(HUMAN_CONDITIONS)} conditions"
     human = estimate(_alike(study.human, group), metric)
+    published = metric.humans_from == "outcomes" and not study.complete
+    origin = "published" if published else "imported"
     if human.value is None:
-        return "humans have none in the imported trials of these conditions"
+        return f"humans have none in the {origin} trials of these conditions"
     value, conditions = _number(metric, human.value), _conditions(group)
-    return f"humans {value} in {human.n} imported trials of the same {conditions}"
+    return f"humans {value} in {human.n} {origin} trials of the same {conditions}"
 
 
 def _number(metric: Metric, value: float) -> str:
@@ -223,7 +233,7 @@ def _conditions(group: Group) -> str:
 
 def _limits(study: Study, group: Group) -> list[str]:
     found, texts = score(study, group), []
-    if len(group.finished):
+    if len(group.finished) and sum(group.sizes):
         texts.append(
             f"{group.driver}: of human data sets with as many trials in each condition "
             f"({sum(group.sizes)} in all), {100 * found.ceiling.paper['I1-I4']:.0f} % pass I1 to "

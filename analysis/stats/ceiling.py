@@ -79,7 +79,12 @@ def imported_humans(trials: pd.DataFrame) -> Population:
 
 @cache
 def ceiling(humans: Population, sizes: tuple[int, ...]) -> Ceiling:
-    """The human ceiling for ``sizes`` trials per condition, in the order of HUMAN_CONDITIONS."""
+    """The human ceiling for ``sizes`` trials per condition, in the order of HUMAN_CONDITIONS.
+
+    Without a trial there is nothing to draw, and no share.
+    """
+    if not sum(sizes):
+        return Ceiling({}, {})
     draws = drawn(humans, sizes)
     ols, hc3 = gap_fits(draws)
     return Ceiling(

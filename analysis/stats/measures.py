@@ -8,16 +8,20 @@ from scipy import stats
 
 from analysis.data.reference_data import citation, human_outcomes, published
 from analysis.data.study import Group
-from analysis.metrics import BOXES, HumanReference, Metric
+from analysis.metrics import BOXES, JUDGED, HumanReference, Metric
 from analysis.stats.intervals import LEVEL, Estimate, mean, proportion
 
 PAPER = "paper_ablation_quantitative"
 
 
+def trials_of(group: Group, metric: Metric) -> pd.DataFrame:
+    """The trials that a metric is found in, of humans perhaps the published outcomes."""
+    return group.outcomes if metric.humans_from == "outcomes" else group.trials
+
+
 def values(group: Group, metric: Metric) -> pd.Series:
     """The values of the trials that count. Everything that counts trials counts these."""
-    trials = group.outcomes if metric.humans_from == "outcomes" else group.trials
-    return trials[metric.column].dropna()
+    return trials_of(group, metric)[metric.column].dropna()
 
 
 def counts(group: Group, metric: Metric) -> tuple[int, int]:
@@ -61,11 +65,11 @@ def undecided(group: Group, metric: Metric) -> str:
     """How many trials are left out of a collision rate, since their traces leave it open."""
     if not (metric.rate and metric.trials == "ended" and known(group, metric)):
         return ""
-    ended = group.ended_outcomes if metric.humans_from == "outcomes" else group.ended
-    left_open = len(ended) - len(values(group, metric))
+    ended = int((trials_of(group, metric)["status"] != "failed").sum())
+    left_open = ended - len(values(group, metric))
     if not left_open:
         return ""
-    return f"{metric.heading}: {left_open} of {len(ended)} trials end undecided and are left out"
+    return f"{metric.heading}: {left_open} of {ended} trials end undecided and are left out"
 
 
 def known(group: Group, metric: Metric) -> bool:
@@ -96,9 +100,13 @@ def estimate_or_reference(group: Group, metric: Metric) -> Estimate | HumanRefer
 
 def no_human_value(metric: Metric) -> str:
     """Why the humans have no value of a metric before their recordings are imported."""
-    if metric.humans_from == "all recordings":
+    if metric.value in JUDGED:
         return f"{metric.heading}: published human collisions are boxes that overlap"
-    return f"{metric.heading}: no human value is published, and no human traces are imported"
+    if metric.humans_from == "all recordings":
+        imported = "not all human recordings are imported"
+    else:
+        imported = "no human traces are imported"
+    return f"{metric.heading}: no human value is published, and {imported}"
 
 
 def outcomes_note(group: Group) -> str:

@@ -21,7 +21,13 @@ from analysis.tables.indicators import (
     verdict_values,
 )
 from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import ceiling_notes, intermittency_notes, listed, sample_notes
+from analysis.tables.notes import (
+    ceiling_notes,
+    intermittency_notes,
+    listed,
+    no_ceiling,
+    sample_notes,
+)
 
 # Columns that rest on who merged first.
 OF_OUTCOMES = tuple(
@@ -141,15 +147,16 @@ def _qualitative_row(study: Study, group: Group) -> Row:
     values |= {
         "score_paper": score_text(found.paper),
         "score_robust": score_text(found.robust),
-        "ceiling_paper": percent(found.ceiling.paper["I1-I4"]),
-        "ceiling_robust": percent(found.ceiling.robust["I1-I4"]),
+        "ceiling_paper": percent(found.ceiling.paper.get("I1-I4")),
+        "ceiling_robust": percent(found.ceiling.robust.get("I1-I4")),
     }
     of_both = outcomes_note(group)
     if of_both:
         values |= {"ceiling_paper": None, "ceiling_robust": None}
         of_both += "; no ceiling: the indicators rest on different trials"
-    notes = filter(None, (verdict_note(found, *INDICATORS), score_note(found), of_both))
-    return Row(group.id, (group.id,), values, "; ".join(notes), published=("n", *OF_OUTCOMES))
+    remarks = (verdict_note(found, *INDICATORS), score_note(found), of_both, no_ceiling(group))
+    note = "; ".join(filter(None, remarks))
+    return Row(group.id, (group.id,), values, note, published=("n", *OF_OUTCOMES))
 
 
 def _quantitative_row(group: Group) -> Row:

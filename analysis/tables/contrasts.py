@@ -13,6 +13,7 @@ from analysis.stats.measures import (
     human_reference,
     known,
     outcomes_note,
+    trials_of,
     undecided,
     values,
 )
@@ -148,7 +149,7 @@ def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
     if metric.rate:
         first, second = counts(group, metric), _rate(other, metric)
         return contrast_rates(first, second) if first[1] and second[1] else None
-    return contrast_means(group.trials, other.trials, metric.column)
+    return contrast_means(trials_of(group, metric), trials_of(other, metric), metric.column)
 
 
 def _rate(group: Group, metric: Metric) -> tuple[int, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from analysis.data.study import Group, Study
 from analysis.metrics import RULES_NOTE, HumanReference, Metric, shown_in
 from analysis.stats.group_scores import PAPER_RULE, ROBUST_RULE, Score, score, total, unjudged
-from analysis.stats.indicators import INDICATORS, Verdict
+from analysis.stats.indicators import INDICATORS, TESTED, Verdict
 from analysis.stats.likeness import gains
 from analysis.stats.measures import (
     estimate_or_reference,
@@ -14,7 +14,7 @@ from analysis.stats.measures import (
     undecided,
 )
 from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import ceiling_notes, intermittency_notes, sample_notes
+from analysis.tables.notes import ceiling_notes, intermittency_notes, no_ceiling, sample_notes
 from analysis.tables.profiles import gain_values
 
 # The indicators that rest on who merged first, and all columns of their rows.
@@ -133,6 +133,12 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
     trials = group.outcomes if of_outcomes else group.trials
     # A ceiling is drawn with as many trials as there are outcomes.
     drawn = of_outcomes or not outcomes_note(group)
+    remarks = (
+        verdict_note(found, name),
+        _inaction(study, group, name),
+        outcomes_note(group),
+        no_ceiling(group) if name in TESTED else "",
+    )
     return Row(
         f"{group.id}/{name}",
         (group.id,),
@@ -145,12 +151,7 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
             "ceiling_robust": percent(found.ceiling.robust.get(name)) if drawn else None,
             "n": int((trials["status"] == "finished").sum()),
         },
-        "; ".join(
-            filter(
-                None,
-                (verdict_note(found, name), _inaction(study, group, name), outcomes_note(group)),
-            )
-        ),
+        "; ".join(filter(None, remarks)),
         published=EVERY if of_outcomes else (),
     )
 
@@ -172,11 +173,11 @@ def _total_row(study: Study, group: Group) -> Row:
             "driver": group.label,
             "paper": score_text(found.paper),
             "robust": score_text(found.robust),
-            "ceiling_paper": None if of_both else percent(found.ceiling.paper["I1-I4"]),
-            "ceiling_robust": None if of_both else percent(found.ceiling.robust["I1-I4"]),
+            "ceiling_paper": None if of_both else percent(found.ceiling.paper.get("I1-I4")),
+            "ceiling_robust": None if of_both else percent(found.ceiling.robust.get("I1-I4")),
             "n": len(group.finished),
         },
-        "; ".join(filter(None, (score_note(found), of_both))),
+        "; ".join(filter(None, (score_note(found), of_both, no_ceiling(group)))),
     )
 
 

@@ -77,6 +77,14 @@ def _human_notes(study: Study, pooled: bool) -> tuple[str, ...]:
     )
 
 
+def no_ceiling(group: Group) -> str:
+    """Why a group has no human ceiling; empty where it has one."""
+    if sum(group.sizes):
+        return ""
+    played = len(group.ended_outcomes)
+    return f"{'no human drove its conditions' if played else 'no trial ended'}: no ceiling"
+
+
 def ceiling_notes(study: Study) -> list[str]:
     """What the human ceiling is drawn from."""
     source = (

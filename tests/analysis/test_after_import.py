@@ -108,7 +108,8 @@ def test_the_panels_have_published_outcomes_and_imported_gaps(imported):
     human = found["groups"][0]
     assert human["driver"] == "humans (66 of 990 imported)"
     tie = human["conditions"]["N_0_0"]
-    assert (tie["all"], tie["ended"], tie["collided_boxes_percent"]["k"]) == (90, 90, 5)
+    boxes = tie["collided_boxes_percent"]
+    assert (boxes["all"], boxes["n"], boxes["k"]) == (90, 90, 5)
     assert "collided_percent" not in tie
     assert tie["gap_m"]["n"] <= 6
     assert "66 imported trials" in found["caveat"]

@@ -6,9 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from scipy import stats
 
+from analysis.data.metric_values import outcomes_with_metrics
 from analysis.data.study import Study
+from analysis.explorer.analysis_worker import human_panels
+from analysis.explorer.pages.humans import collisions
+from analysis.figures.gallery import distributions
+from analysis.human.archive import open_files
+from analysis.human.load import import_trials, sort_files
 from analysis.metrics import (
     BOXES,
     COLLISIONS,
@@ -22,9 +29,21 @@ from analysis.metrics import (
     register,
     shown_in,
 )
-from analysis.stats.measures import counts, estimate, human_reference, median, values
+from analysis.report.conclusions import shown
+from analysis.stats.contrasts import contrast_means
+from analysis.stats.measures import (
+    counts,
+    estimate,
+    human_reference,
+    median,
+    no_human_value,
+    values,
+)
 from analysis.tables import make_tables
 from merge_runner.errors import UsageError
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding
 
 
@@ -46,6 +65,20 @@ def db(tmp_path_factory):
     return write_study(tmp_path_factory.mktemp("metrics") / "t.duckdb", drives)
 
 
+@pytest.fixture(scope="module")
+def partly(tmp_path_factory):
+    """o3 beside one pair of humans, once in every condition."""
+    folder = tmp_path_factory.mktemp("partly")
+    files = {
+        f"experiment_4/experiment_4_iter_{number}.csv": drive(name).csv()
+        for number, name in enumerate(CONDITIONS, 1)
+    }
+    path = write_study(folder / "t.duckdb", yielding("o3", reps=1))
+    with open_files(write_folder(folder / "recordings", files)) as found:
+        import_trials(sort_files(found).trials, Store(path))
+    return path
+
+
 def test_places_show_the_metrics_in_the_order_of_the_list():
     assert shown_in("tables") == [COLLISIONS, BOXES, GAP, RMSE, JOINT]
     assert shown_in("fallbacks") == [COLLISIONS, BOXES, LEFT_FIRST, GAP, RMSE, JOINT]
@@ -58,6 +91,78 @@ def test_a_metric_needs_a_name_for_a_column_and_places_that_there_are(added):
         added(name="a_m", shown=frozenset({"nowhere"}))
     with pytest.raises(UsageError, match="there is a metric 'gap_m' already"):
         register(GAP)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"shown": frozenset({"criticality"}), "estimator": "proportion"}, "is a share"),
+        ({"value": "collided", "estimator": "proportion"}, "it needs trials='ended'"),
+        ({"told": "keeps {valu}"}, "valid fields: value, subject, estimator, trials"),
+        ({"told": "keeps {}"}, "valid fields"),
+        ({"told": "keeps {value:.2f}"}, "valid fields"),
+        ({"told": "keeps {value"}, "valid fields"),
+    ],
+)
+def test_a_metric_whose_parts_do_not_fit_together_is_refused(added, changes, words):
+    with pytest.raises(UsageError, match=f"^the metric 'a_m' .*{words}"):
+        added(name="a_m", **changes)
+
+
+def test_a_metric_that_the_published_outcomes_cannot_tell_is_named(added):
+    added(name="fine", value="1.0", humans_from="outcomes")
+    added(name="odd_m", value="gap_m", humans_from="outcomes")
+    with pytest.raises(UsageError, match="the metric odd_m fails on the published human outcomes"):
+        outcomes_with_metrics()
+
+
+# The share of trials in which the left vehicle merges first, as a mean.
+LEFT_AS_MEAN = {"value": "(merged_first = 'left')::DOUBLE", "humans_from": "outcomes"}
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_a_mean_of_published_outcomes_is_compared_with_these_after_a_part_of_an_import(
+    added, partly
+):
+    left = added(name="left_first_mean", **LEFT_AS_MEAN)
+    study = Study(partly)
+    (table,) = make_tables(study, ["contrasts"])
+    (row,) = (row for row in table.rows if row.id.endswith("/human/left_first_mean"))
+    o3, human = study.models[0], study.human
+    found = contrast_means(o3.trials, human.published_outcomes, left.column)
+    assert row.values["n_reference"] == 962
+    assert row.values["difference"] == found.value
+    assert found.value != contrast_means(o3.trials, human.trials, left.column).value
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_a_sentence_on_published_outcomes_does_not_call_them_imported(added, partly):
+    added(name="left_first_mean", shown=frozenset({"conclusions"}), **LEFT_AS_MEAN)
+    said = " ".join(shown(Study(partly)))
+    assert " in 962 published trials of the same 11 conditions" in said
+    assert " in 11 imported trials of the same 11 conditions" in said, "the gap"
+
+
+def test_the_trials_of_a_share_are_those_that_it_is_found_in(added, partly):
+    added(name="driven_percent", estimator="proportion", trials="ended", value="end_time_s > 0")
+    groups = human_panels(Study(partly))["groups"]
+    assert collisions(groups, "driven_percent")[0]["total"] == (11, 11, 11)
+    assert collisions(groups, BOXES.name)[0]["total"] == (28, 990, 990)
+
+
+def test_why_humans_have_no_value_is_told_of_collisions_alone_by_their_rule(added):
+    whole = added(name="a_mps", label="a", humans_from="all recordings")
+    assert no_human_value(COLLISIONS).endswith("published human collisions are boxes that overlap")
+    assert no_human_value(whole) == (
+        "a (m/s): no human value is published, and not all human recordings are imported"
+    )
+
+
+def test_a_metric_that_no_trial_has_is_not_said_to_lack_finished_trials(added, db):
+    added(name="none_m", value="NULL")
+    texts = [text.get_text() for text in distributions(Study(db)).findobj(Text)]
+    assert texts.count("no trial has it") == 2
+    assert "no finished trial" not in texts
 
 
 def test_trials_whose_value_is_missing_or_no_finite_number_do_not_count(added, db):

@@ -306,8 +306,8 @@ def test_a_failed_trial_is_in_one_denominator_alone(tmp_path):
     found = Numbers(write_study(tmp_path / "t.duckdb", drives)).answer(["humans"])
     (o3,) = (group for group in found["groups"] if group["id"] == "o3/baseline")
     condition = o3["conditions"][drives[0].condition]
-    assert (condition["all"], condition["ended"]) == (1, 0)
-    assert condition["collided_percent"]["value"] is None
+    collided = condition["collided_percent"]
+    assert (collided["all"], collided["n"], collided["value"]) == (1, 0, None)
 
 
 @pytest.mark.parametrize("address", ["/tables/attempts", "/ablations", "/humans", "/tables"])

@@ -157,7 +157,7 @@ def collisions(groups: Sequence[Mapping[str, Any]], rule: str) -> list[dict[str,
     rows = []
     for group in groups:
         cells: dict[str, tuple[int, int, int]] = {
-            name: (found[rule]["k"], found[rule]["n"], found["all"])
+            name: (found[rule]["k"], found[rule]["n"], found[rule]["all"])
             for name, found in group["conditions"].items()
             if rule in found
         }

@@ -16,12 +16,19 @@ from analysis.data.load import load
 from analysis.data.study import Study
 from analysis.figures.drawing import PAGE_IN
 from analysis.figures.gallery import FIGURES, SETTINGS, figure_2, rendered, write_figures
-from analysis.figures.panels import HUMAN_VELOCITIES_MPS, deviations, gaps, left_first, left_traces
+from analysis.figures.panels import (
+    HUMAN_VELOCITIES_MPS,
+    deviations,
+    gaps,
+    left_first,
+    left_traces,
+    published_gap_line,
+)
 from analysis.figures.variant_figure import figure_2_variants
 from analysis.stats.intervals import mean, proportion
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from tests.analysis.studies import Drive, write_study, yielding
+from tests.analysis.studies import Drive, changed, write_study, yielding
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +121,41 @@ def test_before_an_import_the_figure_says_what_is_missing_and_draws_the_publishe
     heights = dict(zip(*lines[1].get_data(), strict=True))
     assert heights[0] == pytest.approx(3.54)
     assert heights[4] == pytest.approx(3.54 + 4 * 0.17)
+
+
+OWN = (
+    "UPDATE trials SET condition = 'own_' || rep, projected_headway_m = 8, "
+    "relative_velocity_mps = 10 + rep WHERE condition = 'L_4_8'"
+)
+
+
+def test_where_no_human_drove_no_human_line_is_drawn_and_none_is_missed(tmp_path):
+    figure = figure_2(changed(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)), OWN))
+    curves = figure.subfigs[1].axes
+    dashed = [[x for x in axis.lines if x.get_linestyle() == "--"] for axis in curves[4:8]]
+    assert [len(lines) for lines in dashed] == [1, 1, 1, 0]
+    texts = [" ".join(text.get_text() for text in axis.texts) for axis in curves[8:]]
+    assert ["not imported" in text for text in texts] == [True, True, True, False]
+
+
+def test_panels_reach_as_far_as_the_conditions_and_the_published_line_as_the_humans(tmp_path):
+    db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1))
+    for study, farthest in ((Study(db), 4), (changed(db, OWN), 8)):
+        axes = figure_2(study).subfigs[1].axes
+        ticks = [-farthest, -farthest / 2, 0, farthest / 2, farthest]
+        assert [list(axis.get_xticks()) for axis in axes] == [ticks] * len(axes)
+    assert published_gap_line(0)[0][[0, -1]] == pytest.approx([-4, 4])
+
+
+def test_no_two_relative_velocities_look_alike(tmp_path):
+    study = changed(write_study(tmp_path / "t.duckdb", yielding("o3", reps=7)), OWN)
+    keys = figure_2_variants(study).legends[0].legend_handles[:-1]
+    assert len(keys) == len({(key.get_color(), key.get_marker()) for key in keys}) == 3 + 7
+
+
+def test_a_dollar_in_a_name_is_no_formula(tmp_path):
+    study = Study(write_study(tmp_path / "t.duckdb", yielding(r"a$\b$", reps=1)[:2]))
+    assert rendered(study, "distributions", "svg")
 
 
 LONG = "gemini-2.5-pro-preview-05-06+constant"

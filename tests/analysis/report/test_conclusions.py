@@ -69,6 +69,22 @@ def test_a_missing_mark_weighs_by_how_often_humans_have_it(
     )
 
 
+def test_a_missing_mark_weighs_by_as_many_human_trials_as_lie_in_the_humans_conditions(tmp_path):
+    db = write_study(tmp_path / "t.duckdb", level("o3"))
+    said, _ = texts(Study(db))
+    assert " % of human data sets of this size do by the robust tests" in said
+    said, _ = texts(changed(db, "UPDATE trials SET condition = 'own' WHERE rep > 4"))
+    assert " % of human data sets of the size of its 44 trials in the humans' conditions do" in said
+    assert "of this size" not in said
+
+
+def test_nothing_is_said_of_a_ceiling_where_no_human_drove(tmp_path):
+    db = write_study(tmp_path / "t.duckdb", level("o3"))
+    said, limits = texts(changed(db, "UPDATE trials SET condition = 'own_' || condition"))
+    assert "how often humans would in a study of this size is not known" in said
+    assert "human data sets" not in said + limits
+
+
 def level(driver):
     """A driver who goes by headway and, where level, by turns, whatever the relative velocity."""
     drives = yielding(driver, reps=10)

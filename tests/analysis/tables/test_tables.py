@@ -25,7 +25,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from tests.analysis.studies import Drive, write_study, yielding
+from tests.analysis.studies import Drive, changed, write_study, yielding
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "tables"
 CRASH = (0.0,)
@@ -226,6 +226,18 @@ def test_trouble_gives_tables_with_a_stated_reason(case, tmp_path, recwarn):
         if form is not TableFormat.CSV:
             assert reason in text.replace("\\_", "_")
     assert [str(w.message) for w in recwarn.list] == []
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_where_no_human_drove_there_is_no_ceiling_but_a_note(tmp_path):
+    db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
+    study = changed(db, "UPDATE trials SET condition = 'own_' || condition")
+    five, six = make_tables(study, ["indicators", "ablation-qualitative"])
+    rows = {row.id: row for row in (*five.rows, *six.rows)}
+    for name in ("o3/baseline/I1", "o3/baseline/I4", "o3/baseline/score", "o3/baseline"):
+        assert rows[name].values["ceiling_paper"] is rows[name].values["ceiling_robust"] is None
+        assert "no human drove its conditions: no ceiling" in rows[name].note
+    assert "no ceiling" not in rows["o3/baseline/I5"].note + rows["human"].note
 
 
 def test_a_model_under_two_specs_makes_two_rows_that_tell_themselves_apart(tmp_path):
