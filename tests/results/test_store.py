@@ -184,7 +184,7 @@ def test_a_changed_condition_needs_another_name(store, path):
     assert store.ended_trials([key]) == {key}
     with duckdb.connect(str(path)) as connection:
         connection.execute("UPDATE trials SET projected_headway_m = 3")
-    with pytest.raises(UsageError, match="is stored with a headway of 3 m .* a new name"):
+    with pytest.raises(UsageError, match=r"is stored with a headway of 3 m .* a new name"):
         store.ended_trials([key])
 
 
