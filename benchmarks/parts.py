@@ -23,7 +23,7 @@ from merge_runner.records import SIDES, Attempt, ChatReply, Slot, TrialRecord, T
 from merge_runner.results.database import schema_sql
 from merge_runner.results.rows import rows_of
 from merge_runner.results.store import Store
-from merge_runner.run.plan import Choice, make_plan
+from merge_runner.run.plan import make_plan
 from merge_runner.trial import play_trial
 
 WAITERS, LIMIT, WINDOW_S = 2_000, 500, 1.0
@@ -58,7 +58,7 @@ async def limiter() -> dict[str, float]:
 
 def records(count: int) -> list[TrialRecord]:
     """Trials of a model that always yields, with prompts and replies of the usual length."""
-    plan = make_plan(Choice(sweep="baseline", model="emulator"))
+    plan = make_plan(sweep="baseline", model="emulator")
     entry = load_models()["emulator"]
     text = f"Y\n{'I keep my distance. ' * 80}\n```python\n{[-0.4] * 20}\n```"
     payload = {"id": "ID", "choices": [{"message": {"content": text}, "finish_reason": "stop"}]}
@@ -79,7 +79,7 @@ def records(count: int) -> list[TrialRecord]:
 
     async def play() -> list[TrialRecord]:
         task, model = plan.scenario, LanguageModel(ask)
-        specs = list(plan.trial_specs({"emulator": "benchmark"}))
+        specs = plan.trial_specs()
         return [
             await play_trial(spec, task, {side: model.make(task, spec, side) for side in SIDES})
             for spec in specs[:count]

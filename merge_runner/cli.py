@@ -23,8 +23,8 @@ from merge_runner.text_safety import printable
 if TYPE_CHECKING:
     from merge_runner.emulator.faults import FaultPlan
     from merge_runner.run.estimate import Estimate
-    from merge_runner.run.plan import Choice, Plan
-    from merge_runner.run.sweep import Options, Sweep
+    from merge_runner.run.plan import Options, Plan
+    from merge_runner.run.sweep import Sweep
 
 
 app = typer.Typer(
@@ -163,8 +163,7 @@ def sweep(
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
-    from merge_runner.run.plan import Choice, Limits
-    from merge_runner.run.sweep import Options
+    from merge_runner.run.plan import Options, make_plan
 
     if max_cost is not None and not math.isfinite(max_cost):
         raise UsageError("--max-cost is a number of USD")
@@ -176,7 +175,9 @@ def sweep(
         db=db,
         cache=cache,
         in_flight=in_flight,
-        limits=Limits(rpm=rpm, tpm=tpm, max_cost_usd=max_cost, connections=2 * in_flight),
+        rpm=rpm,
+        tpm=tpm,
+        max_cost_usd=max_cost,
         replay=replay,
         recording=recording,
         emulator_options=_emulator_options(fault_rate, faults, seed),
@@ -184,16 +185,19 @@ def sweep(
         strict_model=strict_model,
         dask=dask,
     )
-    choice = Choice(
-        sweep=name,
-        model=model,
-        repetitions=reps,
-        conditions=listed(conditions),
-        variants=listed(variants),
+    plan = make_plan(
+        name,
+        model,
+        reps,
+        listed(conditions),
+        listed(variants),
         sample_set=sample_set,
         order_seed=order_seed,
     )
-    _run(choice, options, dry_run=dry_run, yes=yes, as_json=as_json)
+    if dry_run:
+        _print_estimate(_dry_run(plan, options), as_json=as_json)
+    else:
+        _run(plan, options, yes=yes, as_json=as_json)
 
 
 @app.command()
@@ -481,31 +485,26 @@ def recording_info(file: RecordingFile) -> None:
     print_out(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
 
 
-def _run(choice: Choice, options: Options, *, dry_run: bool, yes: bool, as_json: bool) -> None:
+def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> None:
     import asyncio
 
-    from merge_runner.run.plan import make_plan
-    from merge_runner.run.summary import Summary
+    from merge_runner.run import summary
     from merge_runner.run.sweep import INTERRUPTED, Sweep
 
-    plan = make_plan(choice)
-    if dry_run:
-        _print_estimate(_dry_run(plan, options), as_json=as_json)
-        return
     prepared = Sweep(plan, options, say=say)
     expected = None
     if not options.replay and prepared.trials_to_play:
-        expected = _confirm(plan, prepared, options, yes=yes)
+        expected = _confirm(plan, prepared, yes=yes)
     try:
         outcome = asyncio.run(prepared.run())
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
         sys.exit(INTERRUPTED)
-    summary = Summary(plan, outcome, options, expected)
     if as_json:
-        print_out(json.dumps(summary.as_dict(), ensure_ascii=False))
+        whole = summary.as_dict(outcome, options, expected)
+        print_out(json.dumps(whole, ensure_ascii=False))
     else:
-        for line in summary.lines():
+        for line in summary.as_lines(outcome, options, expected):
             print_out(line)
     for message in outcome.messages:
         say(f"error: {message}")
@@ -518,7 +517,6 @@ def _dry_run(plan: Plan, options: Options) -> Estimate:
     from dataclasses import replace
 
     from merge_runner.results.database import readable
-    from merge_runner.run.estimate import estimate
     from merge_runner.run.sweep import Sweep
 
     with tempfile.TemporaryDirectory() as folder:
@@ -526,17 +524,16 @@ def _dry_run(plan: Plan, options: Options) -> Estimate:
         recorded = (options.cache / "cache.db").is_file()
         cache = options.cache if recorded else Path(folder) / "responses"
         prepared = Sweep(plan, replace(options, db=db, cache=cache), say=say)
-        missing = asyncio.run(prepared.rehearse())
+        expected = asyncio.run(prepared.estimate())
         prepared.close()
-    return estimate(plan, missing, options.limits)
+    return expected
 
 
-def _confirm(plan: Plan, prepared: Sweep, options: Options, *, yes: bool) -> Estimate | None:
+def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
     """Check the keys, say what a live run of a paid model will cost, and ask once."""
     import asyncio
 
     from merge_runner.config import resolve_endpoint
-    from merge_runner.run.estimate import estimate
 
     for name, entry in plan.entries.items():
         resolve_endpoint(name, entry)
@@ -544,7 +541,7 @@ def _confirm(plan: Plan, prepared: Sweep, options: Options, *, yes: bool) -> Est
             say(f"note: {name} ({entry.id}) is announced to shut down on {entry.shutdown}")
     if all(entry.price == "free" for entry in plan.entries.values()):
         return None
-    expected = estimate(plan, asyncio.run(prepared.rehearse()), options.limits)
+    expected = asyncio.run(prepared.estimate())
     cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
     say(
         f"{expected.driver}: {expected.trials} trials, about {expected.calls} calls that are not "

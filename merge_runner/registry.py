@@ -26,6 +26,14 @@ NAME = re.compile(r"[A-Za-z0-9_.-]+")
 T = TypeVar("T")
 
 
+def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
+    """The thing of this name; raises UsageError, which lists those that there are."""
+    if name not in things:
+        valid = ", ".join(things) + (f" ({hint})" if hint else "")
+        raise UsageError(f"unknown {kind} {name!r}; valid: {valid}")
+    return things[name]
+
+
 class Registry(Mapping[str, T]):
     """The things of one kind by name, in the order in which they were registered."""
 
@@ -44,11 +52,8 @@ class Registry(Mapping[str, T]):
         return thing
 
     def require(self, name: str, hint: str = "") -> T:
-        """The thing of this name; raises UsageError, which lists those that there are."""
-        if name not in self:
-            valid = ", ".join(self) + (f" ({hint})" if hint else "")
-            raise UsageError(f"unknown {self.kind} {name!r}; valid: {valid}")
-        return self[name]
+        """See ``require``."""
+        return require(self, self.kind, name, hint)
 
     def __getitem__(self, name: str) -> T:
         """The thing of this name; raises KeyError."""

@@ -28,33 +28,20 @@ from merge_runner.llm.prices import pricing
 from merge_runner.llm.shared_limits import SharedLimits, limits_file
 from merge_runner.llm.shared_services import SharedServices
 from merge_runner.llm.transport import SealedTransport
-from merge_runner.run.plan import Limits
+from merge_runner.run.estimate import worst_trial_usd
+from merge_runner.run.plan import Options, Plan
 
 SPARE_FILES = 64
 
 
 @dataclass(frozen=True, slots=True)
-class SpendingTerms:
-    """What a sweep may send and spend.
-
-    ``ledger`` holds its spending, over all its runs; ``trial_usd`` is the worst case of a whole
-    trial.
-    """
-
-    limits: Limits
-    ledger: Ledger
-    trial_usd: float
-
-
-@dataclass(frozen=True, slots=True)
 class EndpointPlan:
-    """The endpoints of a sweep: their identities, and the variables that hold their base URLs.
+    """How the endpoints of a sweep are asked; ``urls`` are variables that hold their base URLs.
 
     ``known`` are the models whose endpoint has ever answered in its format, ``passed`` those where
     it has done so in this run. ``strict`` stops at an answer of another model.
     """
 
-    endpoints: Mapping[str, str]
     urls: Mapping[str, str]
     strict: bool = False
     known: frozenset[str] = frozenset()
@@ -71,70 +58,58 @@ class LocalServices:
 
 
 def sealed_clients(
-    entries: Mapping[str, ModelEntry],
-    endpoints: Mapping[str, str],
-    cache: ResponseCache,
-    transport: SealedTransport,
+    plan: Plan, cache: ResponseCache, transport: SealedTransport
 ) -> dict[str, LlmClient]:
     """Clients that answer from recordings alone: no key, no connection."""
     return {
         name: LlmClient(
             name=name,
             entry=entry,
-            endpoint=endpoints[name],
+            endpoint=plan.endpoints[name],
             cache=cache,
             transport=transport,
             limiter=Limiter(),
             pricing=pricing(entry),
             sealed=True,
         )
-        for name, entry in entries.items()
+        for name, entry in plan.entries.items()
     }
 
 
 def open_services(
-    entries: Mapping[str, ModelEntry],
-    endpoints: Mapping[str, str],
-    cache: ResponseCache,
-    terms: SpendingTerms,
-    stack: AsyncExitStack,
+    plan: Plan, options: Options, cache: ResponseCache, ledger: Ledger, stack: AsyncExitStack
 ) -> LocalServices:
     """The services of a run; its claims are given up with ``stack``.
 
     Raises UsageError where a cap could not hold.
     """
-    limits = terms.limits
-    for name, entry in entries.items():
-        if limits.max_cost_usd is not None and not pricing(entry).known:
+    for name, entry in plan.entries.items():
+        if options.max_cost_usd is not None and not pricing(entry).known:
             raise UsageError(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
             )
-    if any(entry.price != "free" for entry in entries.values()):
-        terms.ledger.read()
+    if any(entry.price != "free" for entry in plan.entries.values()):
+        ledger.read()  # raises where it is damaged, before anything is spent
     claims = Claims(cache.folder)
     stack.callback(claims.close)
-    pauses: dict[str, Pause] = {}
-    return LocalServices(
-        limiters={
-            name: Limiter(
-                rpm=limits.rpm or entry.rpm,
-                tpm=limits.tpm or entry.tpm,
-                pause=pauses.setdefault(endpoints[name], Pause()),
-                shared=_shared_limits(name, entry, limits, stack),
-            )
-            for name, entry in entries.items()
-        },
-        budget=Budget(terms.ledger, cap_usd=limits.max_cost_usd, trial_usd=terms.trial_usd),
-        claims=claims,
-    )
+    # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
+    pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
+    limiters = {}
+    for name, entry in plan.entries.items():
+        rpm, tpm = options.rates(entry)
+        shared = _shared_limits(name, entry, rpm, tpm, stack)
+        limiters[name] = Limiter(
+            rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]], shared=shared
+        )
+    budget = Budget(ledger, cap_usd=options.max_cost_usd, trial_usd=worst_trial_usd(plan))
+    return LocalServices(limiters=limiters, budget=budget, claims=claims)
 
 
 def _shared_limits(
-    name: str, entry: ModelEntry, limits: Limits, stack: AsyncExitStack
+    name: str, entry: ModelEntry, rpm: int | None, tpm: int | None, stack: AsyncExitStack
 ) -> SharedLimits | None:
     """What all sweeps of this user with one key keep together; our own emulator has no key."""
-    rpm, tpm = limits.rpm or entry.rpm, limits.tpm or entry.tpm
     own_emulator = entry.provider == "emulator" and running_emulator_url() is None
     if own_emulator or (rpm is None and tpm is None):
         return None
@@ -161,7 +136,7 @@ async def start_endpoints(
 
 
 def live_clients(
-    entries: Mapping[str, ModelEntry],
+    plan: Plan,
     endpoint_plan: EndpointPlan,
     cache: ResponseCache,
     services: SharedServices,
@@ -174,7 +149,7 @@ def live_clients(
 
     _allow_open_files(connections + SPARE_FILES)
     clients = {}
-    for name, entry in entries.items():
+    for name, entry in plan.entries.items():
         endpoint = resolve_endpoint(name, entry, with_base_urls(endpoint_plan.urls))
         check_network(endpoint.base_url)
         transport = HttpTransport(
@@ -184,7 +159,7 @@ def live_clients(
         clients[name] = LlmClient(
             name=name,
             entry=entry,
-            endpoint=endpoint_plan.endpoints[name],
+            endpoint=plan.endpoints[name],
             cache=cache,
             transport=transport,
             limiter=services.limiters[name],

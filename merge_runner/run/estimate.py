@@ -12,25 +12,10 @@ from merge_runner.llm.cache import CallTotals
 from merge_runner.llm.prices import pricing
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
-from merge_runner.run.plan import Limits, Plan
+from merge_runner.run.plan import Options, Plan
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
 PROMPT_MARGIN = 1.25
-
-
-@dataclass(frozen=True, slots=True)
-class Missing:
-    """What a live run has yet to do.
-
-    ``trials`` have ended nowhere; ``calls`` are about how many each model has yet to answer;
-    ``facts`` is what the cache knows of each model's earlier answers to requests like these, at
-    its endpoint.
-    """
-
-    trials: int
-    calls: Mapping[str, float]
-    facts: Mapping[str, CallTotals]
-    endpoints: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,32 +45,44 @@ class _PerCall:
     measured: bool
 
 
-def estimate(plan: Plan, missing: Missing, limits: Limits) -> Estimate:
-    """The estimate for what is missing of a plan."""
-    calls = input_tokens = output_tokens = 0
+def estimate(
+    plan: Plan,
+    options: Options,
+    *,
+    trials: int,
+    calls: Mapping[str, float],
+    facts: Mapping[str, CallTotals],
+) -> Estimate:
+    """The estimate for what a live run of a plan has yet to do.
+
+    ``trials`` have ended nowhere; ``calls`` are about how many each model has yet to answer;
+    ``facts`` is what the cache knows of each model's earlier answers to requests like these, at
+    its endpoint.
+    """
+    all_calls = input_tokens = output_tokens = 0
     cost: float | None = 0.0
     slowest_s = 0.0
     measured = []
     for name, entry in plan.entries.items():
-        made = round(missing.calls[name])
-        each = _per_call(plan, entry, missing.facts[name])
+        made = round(calls[name])
+        each = _per_call(plan, entry, facts[name])
         price = pricing(entry).cost_usd(each.usage)
         tokens_in, tokens_out = each.usage.input_tokens or 0, each.usage.output_tokens or 0
-        calls += made
+        all_calls += made
         input_tokens += made * tokens_in
         output_tokens += made * tokens_out
         cost = None if cost is None or price is None else cost + made * price
-        measured += [driver_name(name, missing.endpoints[name])] if each.measured else []
-        at_once = min(limits.connections, 2 * max(missing.trials, 1))
+        measured += [driver_name(name, plan.endpoints[name])] if each.measured else []
+        at_once = min(options.connections, 2 * max(trials, 1))
         slowest_s = max(
             slowest_s,
             math.ceil(made / at_once) * each.latency_s,
-            _limited_s(entry, limits, made, each),
+            _limited_s(options, entry, made, each),
         )
     return Estimate(
-        driver=plan.driver(missing.endpoints),
-        trials=missing.trials,
-        calls=calls,
+        driver=plan.driver,
+        trials=trials,
+        calls=all_calls,
         input_tokens=input_tokens,
         output_tokens=output_tokens,
         cost_usd=None if cost is None else round(cost, 2),
@@ -122,13 +119,13 @@ def _per_call(plan: Plan, entry: ModelEntry, facts: CallTotals) -> _PerCall:
     return _PerCall(usage, entry.typical_latency_s, False)
 
 
-def _limited_s(entry: ModelEntry, limits: Limits, calls: int, each: _PerCall) -> float:
+def _limited_s(options: Options, entry: ModelEntry, calls: int, each: _PerCall) -> float:
     """How long the limits stretch the calls, in s.
 
     Within a minute's window a call counts with its output cap until its reply is in, and with
     its actual tokens from then on.
     """
-    rpm, tpm = limits.rpm or entry.rpm, limits.tpm or entry.tpm
+    rpm, tpm = options.rates(entry)
     waiting = min(each.latency_s / 60, 1.0)
     tokens = (each.usage.input_tokens or 0) + (
         waiting * entry.max_output_tokens + (1 - waiting) * (each.usage.output_tokens or 0)

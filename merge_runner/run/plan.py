@@ -1,10 +1,11 @@
-"""What a sweep consists of: its trials in order, their readable ids, and what their hash covers."""
+"""What a sweep consists of: its trials in order, their ids and what their hash covers."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from merge_runner.config import (
@@ -13,6 +14,7 @@ from merge_runner.config import (
     ScenarioConfig,
     SweepFile,
     both_sides,
+    endpoint_identity,
     load_sweep,
     pair_name,
 )
@@ -24,46 +26,60 @@ from merge_runner.llm.keys import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import Side, TrialSpec
+from merge_runner.registry import require
 from merge_runner.scenarios.base import World
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.registry import SCENARIOS, task_of
 
-# It stands in ids, lists and names of files.
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 PROMPTS_PER_DRIVER = 10.5
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
-    """What a user asks for on top of the sweep's file; None keeps the file's value."""
+class Options:
+    """How a sweep runs; nothing here changes a result.
 
-    sweep: str
-    model: str
-    repetitions: int | None = None
-    conditions: Sequence[str] | None = None
-    variants: Sequence[str] | None = None
-    sample_set: int = 0
-    order_seed: int = 0
+    ``rpm`` and ``tpm`` replace those of the registry. ``dask`` names the cluster that plays; None:
+    this process does. ``faults_identity`` distinguishes the answers of an emulator that is asked
+    for bad answers from those of the usual one.
+    """
 
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What bounds the calls; ``rpm`` and ``tpm`` replace those of the registry."""
-
+    db: Path
+    cache: Path
+    in_flight: int = 200
     rpm: int | None = None
     tpm: int | None = None
     max_cost_usd: float | None = None
-    connections: int = 400
+    replay: bool = False
+    recording: Path | None = None
+    emulator_options: Sequence[str] = ()
+    faults_identity: str = ""
+    strict_model: bool = False
+    dask: str | None = None
+
+    @property
+    def connections(self) -> int:
+        """How many connections a model may need: both drivers of a trial may ask at once."""
+        return 2 * self.in_flight
+
+    def rates(self, entry: ModelEntry) -> tuple[int | None, int | None]:
+        """The requests and tokens a minute that a model may get; None: as many as there are."""
+        return self.rpm or entry.rpm, self.tpm or entry.tpm
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A sweep before it runs. ``entries`` are the language models on either side."""
+    """A sweep before it runs.
+
+    ``entries`` are the language models on either side, ``endpoints`` the identities of their
+    endpoints (see ``config.Endpoint``).
+    """
 
     name: str
     model: str
     sides: dict[Side, str]
     entries: dict[str, ModelEntry]
+    endpoints: dict[str, str]
     scenario: ScenarioConfig
     repetitions: dict[str, int]
     conditions: tuple[str, ...]
@@ -99,11 +115,12 @@ class Plan:
         """The world of a new trial."""
         return SCENARIOS[self.scenario.name].world(self.scenario, CONDITIONS[condition])
 
-    def driver(self, endpoints: Mapping[str, str]) -> str:
+    @property
+    def driver(self) -> str:
         """The drivers with their endpoints; see ``pair_name``."""
-        return pair_name(self.sides.values(), endpoints)
+        return pair_name(self.sides.values(), self.endpoints)
 
-    def specs(self, endpoints: Mapping[str, str]) -> dict[str, str]:
+    def specs(self) -> dict[str, str]:
         """Variant to the canonical JSON that its spec hash covers."""
         return {
             variant: canonical_json(
@@ -111,21 +128,21 @@ class Plan:
                     "spec_version": SPEC_VERSION,
                     **task_of(self.scenario),
                     "prompt_blocks": block_digests(variant) if self.entries else {},
-                    "left": self._driver(self.sides["left"], endpoints),
-                    "right": self._driver(self.sides["right"], endpoints),
+                    "left": self._driver(self.sides["left"]),
+                    "right": self._driver(self.sides["right"]),
                     "sample_set": self.sample_set,
                 }
             )
             for variant in self.repetitions
         }
 
-    def trial_specs(self, endpoints: Mapping[str, str]) -> list[TrialSpec]:
+    def trial_specs(self) -> list[TrialSpec]:
         """All trials, repetition by repetition, so that what is finished is balanced.
 
         Within a repetition the order is random, by the order seed, so that no condition or variant
         is always asked first: a service that drifts over hours does so for all alike.
         """
-        hashes = {variant: spec_hash(text) for variant, text in self.specs(endpoints).items()}
+        hashes = {variant: spec_hash(text) for variant, text in self.specs().items()}
         cells = [
             (repetition, variant, condition)
             for repetition in range(1, max(self.repetitions.values()) + 1)
@@ -152,29 +169,29 @@ class Plan:
             for order, (repetition, variant, condition) in enumerate(cells)
         ]
 
-    def config(self, endpoints: Mapping[str, str]) -> dict[str, object]:
+    def config(self) -> dict[str, object]:
         """The sweep's configuration for its row in the database."""
         entries = {name: entry.model_dump(mode="json") for name, entry in self.entries.items()}
         prompt_blocks = {variant: block_digests(variant) for variant in self.repetitions}
         return {
             "model": self.model,
             "models": entries,
-            "endpoints": dict(endpoints),
+            "endpoints": self.endpoints,
             "scenario": self.scenario.model_dump(),
-            "repetitions": dict(self.repetitions),
+            "repetitions": self.repetitions,
             "conditions": list(self.conditions),
             "sample_set": self.sample_set,
             "order_seed": self.order_seed,
             "prompt_blocks": prompt_blocks,
         }
 
-    def _driver(self, name: str, endpoints: Mapping[str, str]) -> dict[str, object]:
+    def _driver(self, name: str) -> dict[str, object]:
         entry = self.entries.get(name)
         if entry is None:
             return PROGRAMS[name].told(name)
         sent = FORMATS[entry.format].request(entry, "")
         return {
-            "endpoint": endpoints[name],
+            "endpoint": self.endpoints[name],
             "path": sent.path,
             "headers": sent.headers,
             "body": sent.body,
@@ -186,17 +203,28 @@ def _lot(*what: object) -> str:
     return hashlib.sha256("/".join(map(str, what)).encode()).hexdigest()
 
 
-def make_plan(choice: Choice) -> Plan:
-    """Resolve a choice against the sweep's file and the registry; raises UsageError."""
-    name, file = load_sweep(choice.sweep)
+def make_plan(
+    sweep: str,
+    model: str,
+    repetitions: int | None = None,
+    conditions: Sequence[str] | None = None,
+    variants: Sequence[str] | None = None,
+    *,
+    sample_set: int = 0,
+    order_seed: int = 0,
+) -> Plan:
+    """The plan of a sweep's file and what a user asks for; None keeps the file's value.
+
+    Raises UsageError.
+    """
+    name, file = load_sweep(sweep)
     models = load_models()
-    sides = both_sides(choice.model)
-    valid = (*models, *PROGRAMS)
+    sides = both_sides(model)
     for driver in sides.values():
-        _require(driver, valid, "model", "two joined by + drive left and right")
+        require({**models, **PROGRAMS}, "model", driver, "two joined by + drive left and right")
     for driver in {*sides.values()} - {*models}:
         pace_of(file.scenario, PROGRAMS[driver].told(driver))
-    if choice.sample_set < 0:
+    if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
     scenario = SCENARIOS.require(file.scenario.name)
     if file.scenario.collision_rule not in scenario.collision_rules:
@@ -204,23 +232,27 @@ def make_plan(choice: Choice) -> Plan:
             f"the scenario {file.scenario.name} has no collision_rule "
             f"{file.scenario.collision_rule!r}; valid: {', '.join(scenario.collision_rules)}"
         )
+    entries = {driver: models[driver] for driver in sides.values() if driver in models}
     return Plan(
         name=name,
         model="+".join(dict.fromkeys(sides.values())),
         sides=sides,
-        entries={driver: models[driver] for driver in sides.values() if driver in models},
+        entries=entries,
+        endpoints={driver: endpoint_identity(entry) for driver, entry in entries.items()},
         scenario=file.scenario,
-        repetitions=_repetitions(name, file, choice),
-        conditions=_conditions(file, choice),
-        sample_set=choice.sample_set,
-        order_seed=choice.order_seed,
+        repetitions=_repetitions(name, file, variants, repetitions),
+        conditions=_conditions(
+            file.scenario, file.conditions if conditions is None else conditions
+        ),
+        sample_set=sample_set,
+        order_seed=order_seed,
     )
 
 
-def _conditions(file: SweepFile, choice: Choice) -> tuple[str, ...]:
+def _conditions(file: SweepFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
     scenario = SCENARIOS[file.scenario.name]
-    wanted = choice.conditions if choice.conditions is not None else file.conditions
-    conditions = tuple(dict.fromkeys(scenario.conditions if wanted is None else wanted))
+    wanted = next(c for c in (chosen, file.conditions, scenario.conditions) if c is not None)
+    conditions = tuple(dict.fromkeys(wanted))
     if not conditions:
         raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
     for name in conditions:
@@ -229,14 +261,16 @@ def _conditions(file: SweepFile, choice: Choice) -> tuple[str, ...]:
     return conditions
 
 
-def _repetitions(name: str, file: SweepFile, choice: Choice) -> dict[str, int]:
-    for variant in (*file.repetitions, *(choice.variants or ())):
+def _repetitions(
+    name: str, file: SweepFile, variants: Sequence[str] | None, chosen: int | None
+) -> dict[str, int]:
+    for variant in (*file.repetitions, *(variants or ())):
         blocks_of(variant)
-    if choice.repetitions is not None and not 1 <= choice.repetitions <= MOST_REPETITIONS:
+    if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
     wanted: dict[str, int] = {}
-    for variant in file.repetitions if choice.variants is None else choice.variants:
-        repetitions = choice.repetitions or file.repetitions.get(variant)
+    for variant in file.repetitions if variants is None else variants:
+        repetitions = chosen or file.repetitions.get(variant)
         if repetitions is None:
             raise UsageError(
                 f"the sweep {name} has no variant {variant}; it has {', '.join(file.repetitions)}. "
@@ -246,9 +280,3 @@ def _repetitions(name: str, file: SweepFile, choice: Choice) -> dict[str, int]:
     if not wanted:
         raise UsageError(f"the sweep {name} has no variant; valid: {', '.join(VARIANTS)}")
     return wanted
-
-
-def _require(name: str, valid: Sequence[str], what: str, hint: str = "") -> None:
-    if name not in valid:
-        listed = ", ".join(valid) + (f" ({hint})" if hint else "")
-        raise UsageError(f"unknown {what} {name!r}; valid: {listed}")

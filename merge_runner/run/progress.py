@@ -6,7 +6,7 @@ import asyncio
 import os
 import sys
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -25,6 +25,7 @@ from merge_runner.results.progress_file import (
     Standing,
     clear_dead,
 )
+from merge_runner.run.plan import PROMPTS_PER_DRIVER, Plan
 from merge_runner.text_safety import printable
 
 if TYPE_CHECKING:
@@ -43,118 +44,125 @@ REASONS_SHOWN = 3
 class Progress:
     """Where a sweep stands; ``runner`` plays its trials.
 
-    ``expected_calls`` is about how many calls all trials take: trials that run in step all end
-    late, so the calls tell the time left better than the trials do. ``worst_stall_s`` is by how
-    much the event loop was late at worst. ``planned``, ``stored`` before this run, and ``by_cell``,
-    how this run's trials ended, are told to other processes alone.
+    ``planned`` and ``stored`` count trials by prompt variant and condition: all of them, and those
+    that were stored before this run. ``by_cell`` counts how those of this run ended, in one of the
+    ways of a Status or ``suspended``, which wait for money. ``worst_stall_s`` is by how much the
+    event loop was late at worst.
     """
 
-    title: str
-    total: int
-    expected_calls: int = 0
-    runner: TrialRunner | None = None
-    cap_usd: float | None = None
-    ledger: Ledger | None = None
-    done: Counter[str] = field(default_factory=Counter)
-    stored_before: int = 0
-    started: float = field(default_factory=time.monotonic)
-    worst_stall_s: float = 0.0
-    name: str = ""
-    model: str = ""
-    planned: dict[Cell, int] = field(default_factory=dict)
+    plan: Plan
+    planned: Counter[Cell]
+    runner: TrialRunner
+    ledger: Ledger
     stored: Counter[Cell] = field(default_factory=Counter)
-    by_cell: dict[Cell, Counter[str]] = field(default_factory=dict)
+    cap_usd: float | None = None
+    by_cell: defaultdict[Cell, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    started: float = field(default_factory=time.monotonic)
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+    worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
 
-    def count(self, cell: Cell, status: str) -> None:
-        """A trial has ended, or waits for money: ``suspended``."""
-        self.by_cell.setdefault(cell, Counter())[status] += 1
-        if status != "suspended":
-            self.done[status] += 1
+    @property
+    def title(self) -> str:
+        """What is played, and by whom."""
+        stand_in = " (scripted stand-in)" if self.plan.scripted else ""
+        return f"{self.plan.name}: {self.plan.driver}{stand_in}"
+
+    @property
+    def ways(self) -> Counter[str]:
+        """How the trials of this run ended so far, and how many are suspended."""
+        return sum(self.by_cell.values(), Counter[str]())
+
+    @property
+    def total(self) -> int:
+        """How many trials this run has to play."""
+        return self.planned.total() - self.stored.total()
 
     @property
     def ended(self) -> int:
         """How many trials of this run have ended, in whatever way."""
-        return self.done.total()
+        ways = self.ways
+        return ways.total() - ways["suspended"]
 
     def fields(self) -> list[tuple[str, str]]:
         """Name and text of every figure that is shown."""
         elapsed = time.monotonic() - self.started
-        meters = self.meters
-        live = sum(meter.calls_live for meter in meters)
-        cached = sum(meter.calls_cached for meter in meters)
-        rates = [meter.last_minute() for meter in meters]
+        rates = [meter.last_minute() for meter in self.meters]
         requests, tokens = (sum(rate[i] for rate in rates) for i in (0, 1))
-        cost = sum(meter.cost_usd for meter in meters)
-        left_s = self._left_s(elapsed, live + cached)
+        left_s = self._left_s()
         left = "" if left_s is None else f", about {left_s:.0f} s left"
         window = min(60.0, max(elapsed, 1.0)) / 60
-        before = f" (+{self.stored_before} stored before)" if self.stored_before else ""
-        running = self.runner.running if self.runner else 0
+        stored = self.stored.total()
+        before = f" (+{stored} stored before)" if stored else ""
+        running = f"{self.runner.running} running{self._on()}"
         return [
             *(("WARNING", text) for text in self._warnings()),
-            ("trials", f"{self.ended}/{self.total} ended{before}, {running} running{self._on()}"),
-            ("failed", str(self.done["failed"])),
-            ("calls", f"{live} live, {cached} from recordings"),
+            ("trials", f"{self.ended}/{self.total} ended{before}, {running}"),
+            ("failed", str(self.ways["failed"])),
+            ("calls", f"{self._calls_live} live, {self._calls_cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
-            ("cost", f"{cost:.2f} USD{self._spent()}"),
-            *(("calls waiting", "; ".join(texts)) for texts in [_waiting(self._waits)] if texts),
+            ("cost", f"{self._cost_usd:.2f} USD{self._spent()}"),
+            *(("calls waiting", "; ".join(texts)) for texts in [self._waiting()] if texts),
             ("time", f"{elapsed:.0f} s{left}"),
         ]
 
     def standing(self, sweep_id: str) -> Standing:
         """The same for other processes, cell by cell."""
-        meters, runner = self.meters, self.runner
-        live = sum(meter.calls_live for meter in meters)
-        cached = sum(meter.calls_cached for meter in meters)
         return Standing(
             sweep_id=sweep_id,
-            name=self.name,
-            model=self.model,
+            name=self.plan.name,
+            model=self.plan.driver,
             pid=os.getpid(),
             machine=MACHINE,
             started_at=self.began_at,
             updated_at=datetime.now(UTC),
             doing=self.doing,
-            trials=self.total + self.stored_before,
-            stored_before=self.stored_before,
-            running=runner.running if runner else 0,
-            workers=runner.workers if runner else None,
+            trials=self.planned.total(),
+            stored_before=self.stored.total(),
+            running=self.runner.running,
+            workers=self.runner.workers,
             cells=tuple(map(self._cell, self.planned)),
-            calls_live=live,
-            calls_cached=cached,
-            cost_usd=sum(meter.cost_usd for meter in meters),
+            calls_live=self._calls_live,
+            calls_cached=self._calls_cached,
+            cost_usd=self._cost_usd,
             cap_usd=self.cap_usd,
-            committed_usd=self.ledger.spending.committed_usd if self.ledger else None,
-            left_s=self._left_s(time.monotonic() - self.started, live + cached),
+            committed_usd=self.ledger.spending.committed_usd,
+            left_s=self._left_s(),
             worst_stall_s=self.worst_stall_s,
-            waiting=tuple(map(printable, _waiting(self._waits))),
+            waiting=tuple(map(printable, self._waiting())),
             warnings=tuple(map(printable, self._warnings())),
         )
 
     @property
     def meters(self) -> Sequence[Meter]:
         """One for each model."""
-        return tuple(self.runner.meters.values()) if self.runner else ()
+        return tuple(self.runner.meters.values())
 
     @property
-    def _waits(self) -> Sequence[Wait]:
-        return self.runner.waits if self.runner else ()
+    def _calls_live(self) -> int:
+        return sum(meter.calls_live for meter in self.meters)
+
+    @property
+    def _calls_cached(self) -> int:
+        return sum(meter.calls_cached for meter in self.meters)
+
+    @property
+    def _cost_usd(self) -> float:
+        return sum(meter.cost_usd for meter in self.meters)
 
     def _on(self) -> str:
-        workers = self.runner.workers if self.runner else None
+        workers = self.runner.workers
         return "" if workers is None else f" on {workers or 'no'} worker{'s' * (workers != 1)}"
 
     def _spent(self) -> str:
         """What counts against the cap: all runs of the sweep, and what is set aside."""
-        if self.cap_usd is None or self.ledger is None:
+        if self.cap_usd is None:
             return ""
         return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
 
     def _cell(self, cell: Cell) -> CellStanding:
-        playing = self.runner.playing if self.runner else {}
-        ways = self.by_cell.get(cell, Counter())
+        playing = self.runner.playing
+        ways = self.by_cell[cell]
         return CellStanding(
             *cell,
             planned=self.planned[cell],
@@ -169,18 +177,39 @@ class Progress:
 
     def _warnings(self) -> list[str]:
         others = sum((meter.mismatches for meter in self.meters), Counter[str]())
-        meters = self.runner.meters.items() if self.runner else ()
+        meters = self.runner.meters.items()
         return [
             *(f"another model answers: {pair}" for pair in sorted(others)),
             *(f"a scripted stand-in answers, not {name}" for name, m in meters if m.stand_ins),
         ]
 
-    def _left_s(self, elapsed: float, calls: int) -> float | None:
-        if self.ended == self.total or not (self.ended or calls):
+    def _left_s(self) -> float | None:
+        """The time left in s, None while nothing tells it.
+
+        Trials that run in step all end late, so that early in a run the calls tell more of it.
+        """
+        ended, total = self.ended, self.total
+        if ended == total:
             return None
-        by_calls = min(calls / self.expected_calls, 0.99) if self.expected_calls else 0.0
-        part = max(self.ended / self.total, by_calls)
+        calls = self._calls_live + self._calls_cached
+        expected_calls = total * self.plan.llm_sides * PROMPTS_PER_DRIVER
+        by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
+        part = max(ended / total, by_calls)
+        elapsed = time.monotonic() - self.started
         return elapsed / part - elapsed if part else None
+
+    def _waiting(self) -> list[str]:
+        """How many calls wait for what, and until when at the latest, where that is known."""
+        alike: dict[str, list[Wait]] = {}
+        for wait in self.runner.waits:
+            alike.setdefault(wait.what, []).append(wait)
+        texts = []
+        for what, those in sorted(alike.items(), key=lambda item: -len(item[1])):
+            ends = [wait.until for wait in those if wait.until is not None]
+            until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
+            texts.append(f"{len(those)} {what}{until}")
+        more = [f"{len(texts) - REASONS_SHOWN} other reasons"] * (len(texts) > REASONS_SHOWN)
+        return texts[:REASONS_SHOWN] + more
 
 
 @asynccontextmanager
@@ -274,20 +303,6 @@ def _notes(progress: Progress) -> list[str]:
     lines = [printable(note) for note in notes]
     more = [f"... and {len(lines) - NOTES_SHOWN} more like these"] * (len(lines) > NOTES_SHOWN)
     return lines[:NOTES_SHOWN] + more
-
-
-def _waiting(waits: Sequence[Wait]) -> list[str]:
-    """How many calls wait for what, and until when at the latest, where that is known."""
-    alike: dict[str, list[Wait]] = {}
-    for wait in waits:
-        alike.setdefault(wait.what, []).append(wait)
-    texts = []
-    for what, those in sorted(alike.items(), key=lambda item: -len(item[1])):
-        ends = [wait.until for wait in those if wait.until is not None]
-        until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
-        texts.append(f"{len(those)} {what}{until}")
-    more = [f"{len(texts) - REASONS_SHOWN} other reasons"] * (len(texts) > REASONS_SHOWN)
-    return texts[:REASONS_SHOWN] + more
 
 
 async def _stopped(stop: asyncio.Event, seconds: float) -> bool:

@@ -7,13 +7,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
 
 from merge_runner.audit import Audit, audit_sweep
-from merge_runner.config import ModelEntry, endpoint_identity
+from merge_runner.config import ModelEntry
 from merge_runner.errors import (
     MergeRunnerError,
     ProviderDown,
@@ -22,10 +21,11 @@ from merge_runner.errors import (
     TrialSuspended,
     UsageError,
 )
-from merge_runner.llm.cache import CallTotals, Entry, ResponseCache
+from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import canonical_json, manner, spec_hash
 from merge_runner.llm.ledger import Ledger, Spending
+from merge_runner.llm.meter import Meter
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
@@ -35,16 +35,15 @@ from merge_runner.results.recording import Spilled
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     EndpointPlan,
-    SpendingTerms,
     live_clients,
     open_services,
     sealed_clients,
     start_endpoints,
 )
-from merge_runner.run.estimate import Missing, worst_trial_usd
+from merge_runner.run.estimate import Estimate, estimate
 from merge_runner.run.flusher import Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
-from merge_runner.run.plan import PROMPTS_PER_DRIVER, Limits, Plan
+from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain, misses_of
 from merge_runner.signals import on_interrupt
@@ -55,52 +54,25 @@ FAILURES_IN_A_ROW = 10
 FROM_RECORDINGS = 16
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """How a sweep runs; nothing here changes a result.
-
-    ``dask`` names the cluster that plays; None: this process does. ``faults_identity`` tells the
-    answers of an emulator that is asked for bad answers from those of the usual one.
-    """
-
-    db: Path
-    cache: Path
-    in_flight: int = 200
-    limits: Limits = field(default_factory=Limits)
-    replay: bool = False
-    recording: Path | None = None
-    emulator_options: Sequence[str] = ()
-    faults_identity: str = ""
-    strict_model: bool = False
-    dask: str | None = None
-
-
 @dataclass(slots=True)
 class Outcome:
-    """What a run did.
+    """What a run of a plan did.
 
     ``stored_before`` trials were not played because they are stored; ``suspended`` ones wait for
-    money, with their replies kept. ``spending`` is that of the sweep over all its runs, and
-    ``cache_cost_usd`` what all replies in the cache cost when they were made. ``damaged`` lists
-    the keys of recorded replies that could not be read. ``facts`` are those of the database over
-    all trials of the sweep, and ``audit`` what was checked there, None where they are not stored.
-    ``playing_s`` is how long the trials took, ``worst_stall_s`` by how much the event loop was late
-    at worst.
+    money, with their replies kept. ``meter`` counts the calls of this run, ``spending`` is that of
+    the sweep over all its runs, and ``cache_cost_usd`` what all replies in the cache cost when they
+    were made. ``facts`` are those of the database over all trials of the sweep, and ``audit`` what
+    was checked there, None where they are not stored. ``playing_s`` is how long the trials took,
+    ``worst_stall_s`` by how much the event loop was late at worst.
     """
 
+    plan: Plan
     sweep_id: str
-    driver: str
-    trials: int
     stored_before: int
     exit_code: int = 0
     messages: list[str] = field(default_factory=list)
-    calls_live: int = 0
-    calls_cached: int = 0
-    cost_usd: float = 0.0
-    calls_of_unknown_cost: int = 0
-    attempts: dict[str, int] = field(default_factory=dict)
+    meter: Meter = field(default_factory=Meter)
     suspended: int = 0
-    damaged: list[str] = field(default_factory=list)
     spending: Spending = field(default_factory=Spending)
     cache_cost_usd: float = 0.0
     facts: SweepFacts | None = None
@@ -114,28 +86,19 @@ class Outcome:
         self.messages.append(message)
 
 
-@dataclass(slots=True)
-class FailureStreak:
-    """How many trials a model failed since it gave its last of so many answers."""
-
-    answers: int = 0
-    trials: int = 0
-
-
 class Sweep:
     """One run of a plan. Making it opens the cache and the database, and nothing else."""
 
     def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
         """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
-        self._plan = plan
         self._options = options
         self._say = say
-        self._cache = ResponseCache(options.cache, overlay=partial(_overlay, options.recording))
-        self._endpoints = {name: self._endpoint(name, e) for name, e in plan.entries.items()}
+        recorded = partial(Spilled, options.recording) if options.recording else None
+        self._cache = ResponseCache(options.cache, overlay=recorded)
+        endpoints = {name: self._endpoint(plan, name) for name in plan.entries}
+        self._plan = plan = replace(plan, endpoints=endpoints)
         self._store = Store(options.db)
-        specs = {
-            (spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs(self._endpoints)
-        }
+        specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
         with unreadable_is_usage():
             ended = set() if options.replay else self._store.ended_trials(specs)
@@ -144,20 +107,16 @@ class Sweep:
         self._sealed = SealedTransport()
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
-        self._failure_streaks: dict[str, FailureStreak] = {}
-        self._suspended: list[TrialSuspended] = []
-        driver = plan.driver(self._endpoints)
+        # By a model and how many calls it had answered: an answer begins a new count.
+        self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
+        self._suspended: TrialSuspended | None = None
         self._progress = Progress(
-            title=f"{plan.name}: {driver}" + (" (scripted stand-in)" if plan.scripted else ""),
-            total=len(self._todo),
-            expected_calls=round(len(self._todo) * plan.llm_sides * PROMPTS_PER_DRIVER),
-            cap_usd=options.limits.max_cost_usd,
-            ledger=self._ledger,
-            stored_before=len(self._stored),
-            name=plan.name,
-            model=driver,
+            plan=plan,
             planned=Counter(spec.cell for spec in specs.values()),
             stored=Counter(specs[key].cell for key in self._stored),
+            runner=LocalRunner(plan, {}, in_flight=0),  # nobody plays yet
+            ledger=self._ledger,
+            cap_usd=options.max_cost_usd,
         )
 
     @property
@@ -179,12 +138,7 @@ class Sweep:
 
     async def _run(self, sweep_id: str) -> Outcome:
         """Play what is missing and store it."""
-        outcome = Outcome(
-            sweep_id,
-            self._plan.driver(self._endpoints),
-            self._plan.trials,
-            len(self._stored),
-        )
+        outcome = Outcome(self._plan, sweep_id, len(self._stored))
         async with AsyncExitStack() as stack:
             stack.callback(self._cache.close)
             runner = await self._runner(stack)
@@ -208,51 +162,45 @@ class Sweep:
                 else:
                     outcome.fail(exc.exit_code, str(exc))
         for meter in runner.meters.values():
-            outcome.damaged += meter.damaged
-            outcome.calls_live += meter.calls_live
-            outcome.calls_cached += meter.calls_cached
-            outcome.cost_usd += meter.cost_usd
-            outcome.calls_of_unknown_cost += meter.cost_unknown
-            for name, count in meter.outcomes.items():
-                outcome.attempts[name] = outcome.attempts.get(name, 0) + count
+            outcome.meter.add(meter)
+        ways = self._progress.ways
+        outcome.suspended = ways["suspended"]
         if self._suspended:
-            outcome.suspended = len(self._suspended)
             outcome.fail(
                 TrialSuspended.exit_code,
-                f"{len(self._suspended)} trials wait for money: {self._suspended[-1]}. Their "
+                f"{outcome.suspended} trials wait for money: {self._suspended}. Their "
                 "replies are kept: raise --max-cost and run the same command again",
             )
-        if self._progress.done["failed"] and not self._misses:
-            outcome.fail(1, f"{self._progress.done['failed']} trials failed")
+        if ways["failed"] and not self._misses:
+            outcome.fail(1, f"{ways['failed']} trials failed")
         return outcome
 
-    async def rehearse(self) -> Missing:
-        """Play from the recorded replies alone, store nothing, and count what is missing."""
-        clients = sealed_clients(
-            self._plan.entries, self._endpoints, self._cache, SealedTransport()
-        )
+    async def estimate(self) -> Estimate:
+        """What a live run takes: plays from recorded replies alone, and counts what is missing."""
+        plan = self._plan
         trials = 0
-        calls = dict.fromkeys(self._plan.entries, 0.0)
+        calls = dict.fromkeys(plan.entries, 0.0)
 
         def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             nonlocal trials
             if isinstance(record, TrialSuspended) or record.status != "failed":
                 return
             trials += 1
-            for side, name in self._plan.sides.items():
+            for side, name in plan.sides.items():
                 if name in calls:
                     answered = sum(row.side == side for row in record.decisions)
                     calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
 
-        await LocalRunner(self._plan, clients, in_flight=1).play(self._todo, ended)
-        facts = {name: self._measured(name, entry) for name, entry in self._plan.entries.items()}
-        return Missing(trials, calls, facts, self._endpoints)
+        clients = sealed_clients(plan, self._cache, SealedTransport())
+        await LocalRunner(plan, clients, in_flight=1).play(self._todo, ended)
+        facts = {name: self._measured(name, entry) for name, entry in plan.entries.items()}
+        return estimate(plan, self._options, trials=trials, calls=calls, facts=facts)
 
     def _measured(self, name: str, entry: ModelEntry) -> CallTotals:
         """What is known of answers to requests like those of this sweep."""
         sent = FORMATS[entry.format].request(entry, "")
         asked = manner(sent.path, canonical_json(sent.body))
-        return self._cache.facts(entry.id).of(self._endpoints[name], asked)
+        return self._cache.facts(entry.id).of(self._plan.endpoints[name], asked)
 
     def close(self) -> None:
         """Close what was opened, where the sweep is not run."""
@@ -274,8 +222,7 @@ class Sweep:
         started_at = datetime.now(UTC).replace(tzinfo=None)
         sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
         commit, dirty = git_state()
-        config = self._plan.config(self._endpoints)
-        config["max_cost_usd"] = self._options.limits.max_cost_usd
+        config = {**self._plan.config(), "max_cost_usd": self._options.max_cost_usd}
         self._store.begin_sweep(
             SweepRow(
                 sweep_id=sweep_id,
@@ -286,7 +233,7 @@ class Sweep:
                 git_dirty=dirty,
                 versions=canonical_json(versions()),
             ),
-            {spec_hash(text): text for text in self._plan.specs(self._endpoints).values()},
+            {spec_hash(text): text for text in self._plan.specs().values()},
             self._stored,
         )
         return sweep_id
@@ -295,25 +242,24 @@ class Sweep:
         """Who plays: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if options.replay or not self._todo or not plan.entries:
-            clients = sealed_clients(plan.entries, self._endpoints, self._cache, self._sealed)
+            clients = sealed_clients(plan, self._cache, self._sealed)
             # Recorded replies are there at once: more in flight only take more memory.
             return LocalRunner(plan, clients, min(options.in_flight, FROM_RECORDINGS))
-        terms = SpendingTerms(options.limits, self._ledger, worst_trial_usd(plan))
-        services = open_services(plan.entries, self._endpoints, self._cache, terms, stack)
+        services = open_services(plan, options, self._cache, self._ledger, stack)
         urls = await start_endpoints(plan.entries, options.emulator_options, stack)
         known = frozenset(
             name
             for name, entry in plan.entries.items()
-            if self._endpoints[name] in self._cache.facts(entry.id).totals
+            if plan.endpoints[name] in self._cache.facts(entry.id).totals
         )
-        endpoint_plan = EndpointPlan(self._endpoints, urls, options.strict_model, known)
+        endpoint_plan = EndpointPlan(urls, options.strict_model, known)
         if options.dask is None:
             clients = live_clients(
-                plan.entries,
+                plan,
                 endpoint_plan,
                 self._cache,
                 services,
-                connections=options.limits.connections,
+                connections=options.connections,
                 stack=stack,
             )
             return LocalRunner(plan, clients, options.in_flight)
@@ -331,10 +277,10 @@ class Sweep:
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             if isinstance(record, TrialSuspended):
-                self._progress.count(spec.cell, "suspended")
-                self._suspended.append(record)
+                self._progress.by_cell[spec.cell]["suspended"] += 1
+                self._suspended = record
                 return
-            self._progress.count(spec.cell, record.status)
+            self._progress.by_cell[spec.cell][record.status] += 1
             self._misses += misses_of(record, self._sealed)
             flusher.add(record)
             self._watch_for_outage(record, runner)
@@ -398,21 +344,19 @@ class Sweep:
         if self._options.replay:
             return
         for name in {self._plan.sides[failed.side] for failed in record.failed_calls}:
-            streak = self._failure_streaks.setdefault(name, FailureStreak())
-            answers = runner.answers(name)
-            if answers > streak.answers:
-                streak.answers, streak.trials = answers, 0
-            streak.trials += 1
-            if streak.trials >= FAILURES_IN_A_ROW:
+            since = name, runner.answers(name)
+            self._failures_in_a_row[since] += 1
+            failed = self._failures_in_a_row[since]
+            if failed >= FAILURES_IN_A_ROW:
                 raise ProviderDown(
-                    f"the last {streak.trials} trials with {name} failed and no call was answered "
+                    f"the last {failed} trials with {name} failed and no call was answered "
                     f"in between ({record.error}): the rest is not tried. When the service answers "
                     "again, run the same command to go on"
                 )
 
-    def _endpoint(self, name: str, entry: ModelEntry) -> str:
+    def _endpoint(self, plan: Plan, name: str) -> str:
         """The endpoint's identity: in a replay, the one under which the model is recorded."""
-        configured = endpoint_identity(entry)
+        entry, configured = plan.entries[name], plan.endpoints[name]
         if entry.provider == "emulator":
             configured += self._options.faults_identity
         if not self._options.replay:
@@ -438,7 +382,3 @@ async def _drained(runner: TrialRunner, work: asyncio.Task[None]) -> None:
     """When the work has ended, in whatever way, save the calls that are in flight."""
     await asyncio.wait([work])
     await runner.drain()
-
-
-def _overlay(recording: Path | None) -> Mapping[str, Entry]:
-    return {} if recording is None else Spilled(recording)

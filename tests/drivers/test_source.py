@@ -9,7 +9,7 @@ import pytest
 
 from merge_runner.drivers.registry import PROGRAMS, source_digest
 from merge_runner.errors import UsageError
-from merge_runner.run.plan import Choice, make_plan
+from merge_runner.run.plan import make_plan
 from tests.harness import PROJECT
 
 PACKAGE = {
@@ -88,10 +88,10 @@ def test_programs_have_a_source_of_their_own_and_share_what_both_rest_on(monkeyp
 
 @pytest.mark.parametrize("model", ["constant", "projected-order", "emulator+constant"])
 def test_the_trials_of_an_edited_program_are_other_trials(monkeypatch, model):
-    plan = make_plan(Choice("baseline", model))
-    before = {spec.spec_hash for spec in plan.trial_specs({"emulator": "emulator"})}
+    plan = make_plan("baseline", model)
+    before = {spec.spec_hash for spec in plan.trial_specs()}
     monkeypatch.setattr("merge_runner.drivers.registry.source_digest", lambda _: "edited")
-    assert not before & {spec.spec_hash for spec in plan.trial_specs({"emulator": "emulator"})}
+    assert not before & {spec.spec_hash for spec in plan.trial_specs()}
 
 
 async def test_an_edited_program_is_played_anew(merge_runner, tmp_path):

@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import os
+from collections import Counter
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import pytest
 
+from merge_runner.llm.ledger import Spending
 from merge_runner.results.progress_file import ProgressFile, clear_dead, read_standing
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.plan import Choice, make_plan
+from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.progress import Progress
-from merge_runner.run.sweep import Options, Sweep
+from merge_runner.run.sweep import Sweep
 
 NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
+LEDGER = SimpleNamespace(spending=Spending())
 SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm", 100)
 
 
 def standing(sweep_id="s", **changes):
-    plain = Progress("t", 2, planned={("baseline", "N_0_0"): 2}).standing(sweep_id)
+    plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0"])
+    planned = Counter({("baseline", "N_0_0"): 2})
+    plain = Progress(plan, planned, LocalRunner(plan, {}, 0), LEDGER).standing(sweep_id)
     return replace(plain, **changes)
 
 
@@ -64,7 +70,7 @@ async def test_the_last_word_of_a_sweep_is_that_it_checks_what_each_cell_came_to
 ):
     said = []
     monkeypatch.setattr(ProgressFile, "write", lambda _, standing: said.append(standing))
-    plan = make_plan(Choice("baseline", "constant", repetitions=2, conditions=["N_0_0", "L_4_0"]))
+    plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0", "L_4_0"])
     await Sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print).run()
     first, last = said[0], said[-1]
     assert (first.doing, last.doing) == ("playing", "checking")
@@ -158,12 +164,12 @@ def test_a_file_that_is_none_of_ours_says_nothing(tmp_path, text):
 
 def test_trials_are_told_cell_by_cell():
     cells = [("baseline", "N_0_0"), ("A1", "N_0_0")]
-    runner = LocalRunner(None, {}, 1)
+    plan = make_plan("baseline", "constant")
+    runner = LocalRunner(plan, {}, 1)
     runner.playing[cells[1]] += 1
-    progress = Progress("t", 5, planned=dict.fromkeys(cells, 3), runner=runner)
+    progress = Progress(plan, Counter(dict.fromkeys(cells, 3)), runner, LEDGER)
     progress.stored[cells[0]] = 1
-    for status in ("collided", "failed", "suspended"):
-        progress.count(cells[0], status)
+    progress.by_cell[cells[0]].update(collided=1, failed=1, suspended=1)
     first, second = progress.standing("s").cells
     assert (first.ended, first.failed, first.suspended, first.running) == (2, 1, 1, 0)
     assert (second.ended, second.running) == (0, 1)

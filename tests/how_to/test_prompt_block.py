@@ -7,7 +7,7 @@ import json
 import duckdb
 import pytest
 
-from merge_runner.run.plan import Choice, make_plan
+from merge_runner.run.plan import make_plan
 from tests.harness import how_to, plugin
 
 VARIANTS = ("--variants", "baseline,A1,A8,A9", "--reps", 1, "--conditions", "L_4_0,N_0_0")
@@ -44,8 +44,8 @@ async def test_a_block_is_in_the_variants_that_add_it_and_changes_no_other(run, 
         assert ("History of" in prompt) == (variant not in {"A1", "A9"})
         assert prompt.split("\n\n")[-1].startswith("Output format:")
     # As this process has them, where the block is not installed.
-    plan = make_plan(Choice("baseline", "emulator", 1, variants=("baseline", "A1")))
-    own = {spec.variant: spec.spec_hash for spec in plan.trial_specs({"emulator": "emulator"})}
+    plan = make_plan("baseline", "emulator", 1, variants=("baseline", "A1"))
+    own = {spec.variant: spec.spec_hash for spec in plan.trial_specs()}
     assert own.items() < hashes.items()
     assert len(set(hashes.values())) == 4
 

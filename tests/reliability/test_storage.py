@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from merge_runner.results.store import results_digest
-from merge_runner.run.plan import Choice, make_plan
+from merge_runner.run.plan import make_plan
 from tests.harness import watched
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
@@ -196,7 +196,7 @@ async def test_one_bit_that_makes_no_text_blocks_nothing_else(merge_runner, tmp_
 async def test_a_damaged_record_of_spending_stops_no_replay(merge_runner, tmp_path, stock):
     part = ("baseline", "--reps", 1, "--conditions", "N_0_0", "--json")
     assert (await merge_runner("sweep", *part)).code == 0
-    plan = make_plan(Choice("baseline", "emulator"))
+    plan = make_plan("baseline", "emulator")
     with stock(tmp_path / "cache/responses") as cache:
         cache[f"spent {plan.ledger}"] = "damaged"
     assert (await merge_runner("sweep", *part, "--dry-run", "--db", "new")).code == 0

@@ -94,7 +94,7 @@ class _Worker:
                 claims=RemoteClaims(link, cache),
             )
             clients = live_clients(
-                batch.plan.entries,
+                batch.plan,
                 batch.endpoint_plan,
                 cache,
                 services,
