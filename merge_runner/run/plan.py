@@ -241,9 +241,7 @@ def make_plan(
         endpoints={driver: endpoint_identity(entry) for driver, entry in entries.items()},
         scenario=file.scenario,
         repetitions=_repetitions(name, file, variants, repetitions),
-        conditions=_conditions(
-            file.scenario, file.conditions if conditions is None else conditions
-        ),
+        conditions=_conditions(file, conditions),
         sample_set=sample_set,
         order_seed=order_seed,
     )
