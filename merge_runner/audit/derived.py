@@ -247,7 +247,11 @@ def _trials(
             continue
         known = all(side in wires for side in SIDES if spec.asks(side))
         same_rules = spec.content.get("spec_version") == SPEC_VERSION
-        if not (same_rules and known and spec.track == scenario.track):
+        same_world = (spec.track, spec.content.get("world_source")) == (
+            scenario.track,
+            scenario.source,
+        )
+        if not (same_rules and known and same_world):
             found.left_out[OTHER_RULES] += 1
             continue
         calls, decisions = tables["calls"].named(key), tables["decisions"].named(key)

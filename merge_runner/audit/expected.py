@@ -110,7 +110,7 @@ class Spec:
         """The track, None where it cannot be read."""
         try:
             return track_of(self.content)
-        except ValidationError:
+        except UsageError:
             return None
 
     def driver(self, side: str) -> dict[str, Any]:

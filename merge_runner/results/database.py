@@ -56,12 +56,25 @@ def schema_sql() -> str:
 
 def update_measures(connection: duckdb.DuckDBPyConnection) -> None:
     """Define the measures anew where another version of the program did."""
+    if not _has_these_measures(connection):
+        connection.execute(measures_sql())
+
+
+def _has_these_measures(connection: duckdb.DuckDBPyConnection) -> bool:
     found = connection.execute(
         "SELECT comment FROM system.main.duckdb_views() WHERE view_name = 'trial_metrics' "
         "AND database_name = system.main.current_database()"
     ).fetchall()
-    if found != [(measures_version(),)]:
-        connection.execute(measures_sql())
+    return found == [(measures_version(),)]
+
+
+@cache  # once for a file, which a page may read a hundred times
+def _warn_of_other_measures(path: Path) -> None:
+    LOG.warning(
+        "another version of the program defined the measures (trial_metrics and its views) of %s, "
+        "and they are read as they are; `merge-runner sweep` into it brings them up to date",
+        path,
+    )
 
 
 def spill_folder() -> Path:
@@ -251,6 +264,8 @@ def read_database(
         open_database(path, read_only=True, patience_s=patience_s, instance=instance) as connection,
     ):
         if schema_version(connection, path) == SCHEMA_VERSION:
+            if not _has_these_measures(connection):
+                _warn_of_other_measures(path)
             yield connection
             return
     with unreadable_is_usage():

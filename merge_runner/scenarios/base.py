@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from inspect import isclass, isfunction
 from typing import Protocol
 
 from merge_runner.config import CollisionRule, ScenarioConfig
+from merge_runner.errors import UsageError
 from merge_runner.records import Observation, Side, StateRow, Status
 from merge_runner.scenarios.merge.conditions import Condition
 from merge_runner.scenarios.merge.geometry import Track
+from merge_runner.source import source_digest
 
 
 class World(Protocol):
@@ -57,13 +60,28 @@ class Scenario:
 
     ``conditions`` are those that a sweep plays which names none. ``track`` is what worlds are made
     on, pictures are drawn on and measures are computed with. ``collision_rules`` are those that its
-    worlds know.
+    worlds know. Raises UsageError where the source of ``make_world`` could not be told.
     """
 
     track: Track
     conditions: tuple[str, ...]
     collision_rules: tuple[CollisionRule, ...]
     make_world: MakeWorld
+
+    def __post_init__(self) -> None:
+        if not (isclass(self.make_world) or isfunction(self.make_world)):
+            raise UsageError(
+                f"{self.make_world!r} is no class or function: its source is not known"
+            )
+
+    @property
+    def source(self) -> str | None:
+        """The hash of the source of its worlds; None for the program's own.
+
+        Their rules are covered by the version of the spec.
+        """
+        own = self.make_world.__module__.startswith(f"{__name__.partition('.')[0]}.")
+        return None if own else source_digest(self.make_world)
 
     def world(self, config: ScenarioConfig, condition: Condition) -> World:
         """The world of a new trial; see MakeWorld."""

@@ -25,13 +25,14 @@ SCENARIOS.register(
 
 
 def task_of(config: ScenarioConfig) -> dict[str, Any]:
-    """What a spec holds of the task: the knobs, and the track where it is not the experiment's.
+    """What a spec holds of the task: the knobs, and what is not the experiment's.
 
-    With it the measures of a database need no package that registered its scenario, and a spec of
-    another track is another spec.
+    The track, so that the measures of a database need no package that registered its scenario; and
+    the hash of the source of a world from outside, so that one that is edited is another scenario.
     """
-    track = SCENARIOS[config.name].track
+    scenario = SCENARIOS[config.name]
     return {
         "scenario": config.model_dump(),
-        **({} if track == TRACK else {"track": asdict(track)}),
+        **({} if scenario.track == TRACK else {"track": asdict(scenario.track)}),
+        **({} if scenario.source is None else {"world_source": scenario.source}),
     }

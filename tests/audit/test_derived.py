@@ -168,7 +168,7 @@ def test_an_answer_that_is_said_to_have_come_with_an_error_is_found(db):
 
 
 def test_a_program_that_is_another_one_by_now_is_said_and_only_driven(db, monkeypatch):
-    monkeypatch.setattr("merge_runner.drivers.registry.source_digest", lambda _: "edited")
+    monkeypatch.setattr("merge_runner.drivers.registry.source_digest", lambda *_, **__: "edited")
     (audit, _) = audit_database(db)
     assert audit.findings == ()
     assert audit.notes == (

@@ -7,9 +7,10 @@ from importlib.machinery import SourceFileLoader
 
 import pytest
 
-from merge_runner.drivers.registry import PROGRAMS, source_digest
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.run.plan import make_plan
+from merge_runner.source import source_digest
 from tests.harness import PROJECT
 
 PACKAGE = {
@@ -67,7 +68,7 @@ def test_a_driver_without_its_source_is_refused(digest, monkeypatch):
     digest()
     monkeypatch.setattr(SourceFileLoader, "get_source", lambda self, name: None)
     mine = type("Mine", (), {"__module__": "plugged.driver"})
-    with pytest.raises(UsageError, match="whose source is not there"):
+    with pytest.raises(UsageError, match=r"the source of plugged\.driver is not there"):
         source_digest(mine)
 
 
@@ -90,7 +91,7 @@ def test_programs_have_a_source_of_their_own_and_share_what_both_rest_on(monkeyp
 def test_the_trials_of_an_edited_program_are_other_trials(monkeypatch, model):
     plan = make_plan("baseline", model)
     before = {spec.spec_hash for spec in plan.trial_specs()}
-    monkeypatch.setattr("merge_runner.drivers.registry.source_digest", lambda _: "edited")
+    monkeypatch.setattr("merge_runner.drivers.registry.source_digest", lambda *_, **__: "edited")
     assert not before & {spec.spec_hash for spec in plan.trial_specs()}
 
 

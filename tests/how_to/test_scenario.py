@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+from functools import partial
+
 import duckdb
 import pytest
 
 from analysis.explorer.details import read_trial
+from merge_runner.errors import UsageError
 from merge_runner.results.store import Store, query
 from merge_runner.scenarios.merge.geometry import Track
+from merge_runner.scenarios.merge.world import World
+from merge_runner.scenarios.registry import SCENARIOS
 from tests.harness import FAST, how_to, plugin
 
 FILE = """
@@ -65,10 +72,53 @@ async def test_a_scenario_from_outside_goes_through_every_command(merge_runner, 
     assert "unknown scenario 'long-merge'; valid: merge" in refused.err
 
 
-def test_a_database_with_older_measures_gets_those_of_the_program_when_it_is_written_to(tmp_path):
+WORLD = """
+from dataclasses import replace
+
+from merge_runner.scenarios.merge.world import World
+from merge_runner.scenarios.registry import SCENARIOS
+
+class Mine(World):
+    '''The merge, with rules of one's own.'''
+
+SCENARIOS.register("mine", replace(SCENARIOS["merge"], make_world=Mine))
+"""
+
+
+async def test_trials_of_a_world_whose_source_is_edited_are_other_trials(merge_runner, tmp_path):
+    (tmp_path / "mine.toml").write_text(FILE.replace("long-merge", "mine"))
+
+    async def installed(folder, source, *arguments):
+        process = await merge_runner.start(*arguments, **plugin(tmp_path / folder, source))
+        return (await process.communicate())[0].decode()
+
+    played = ("sweep", "mine.toml", "--model", "constant", "--json")
+    edited = WORLD.replace("of one's own", "that were edited")
+    runs = [(folder, source, await installed(folder, source, *played))
+            for folder, source in (("a", WORLD), ("b", WORLD), ("c", edited))]  # fmt: skip
+    stored_before = [json.loads(out)["trials"]["stored_before"] for *_, out in runs]
+    assert stored_before == [0, 2, 0]
+    audit = await installed("d", edited, "audit")
+    assert "not derived anew in 2 trials: anything, since another version" in audit
+
+
+def test_a_world_whose_source_cannot_be_told_is_refused():
+    with pytest.raises(UsageError, match="its source is not known"):
+        replace(SCENARIOS["merge"], make_world=partial(World))
+
+
+async def test_older_measures_are_told_to_a_reader_and_replaced_when_the_database_is_written_to(
+    merge_runner, tmp_path
+):
     path = tmp_path / "t.duckdb"
     Store(path)
     with duckdb.connect(str(path)) as connection:
         connection.execute("CREATE OR REPLACE VIEW trial_metrics AS SELECT 1 AS old")
+    asked = ("sql", "FROM trial_metrics", "--db", path)
+    told = await merge_runner(*asked)
+    assert (told.code, told.out.split()[0]) == (0, "old")
+    assert told.err.count("another version of the program defined the measures") == 1
+    assert "`merge-runner sweep` into it brings them up to date" in told.err
     Store(path)
     assert "gap_m" in query(path, "FROM trial_metrics")[0]
+    assert (await merge_runner(*asked)).err == ""

@@ -7,13 +7,12 @@ branch leaves the centreline at the angle whose sine is half their distance over
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from math import sqrt
 from typing import Any
 
-from pydantic import TypeAdapter
-
+from merge_runner.errors import UsageError
 from merge_runner.records import Side
 
 
@@ -72,9 +71,25 @@ class Track:
 
 TRACK = Track()
 """The human experiment's."""
-_READ = TypeAdapter(Track)
 
 
 def track_of(spec: Mapping[str, Any]) -> Track:
-    """The track of a stored spec, the human experiment's where it tells none; raises ValueError."""
-    return _READ.validate_python(spec["track"]) if "track" in spec else TRACK
+    """The track of a stored spec, the human experiment's where it tells none.
+
+    Raises UsageError, which names the field that is odd.
+    """
+    if "track" not in spec:
+        return TRACK
+    told = spec["track"] if isinstance(spec["track"], dict) else {}
+    names = [field.name for field in fields(Track)]
+    for name in (*names, *told):
+        number = told.get(name)
+        if name not in names or isinstance(number, bool) or not isinstance(number, int | float):
+            raise UsageError(
+                f"a stored spec has no track: track.{name} is {number!r}, and its numbers are "
+                + ", ".join(names)
+            )
+    try:
+        return Track(**told)
+    except ValueError as exc:
+        raise UsageError(f"a stored spec has no track: {exc}") from exc
