@@ -294,14 +294,11 @@ class Endpoint:
         return f"Endpoint({self.provider}, {self.identity})"
 
 
-def resolve_endpoint(
-    name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None
-) -> Endpoint:
+def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.environ) -> Endpoint:
     """The endpoint of a model, from its entry and the environment.
 
     Raises UsageError where a key is needed and none is set.
     """
-    env = os.environ if environment is None else environment
     provider = PROVIDERS.require(entry.provider)
     key_envs = (entry.key_env,) if entry.key_env else provider.key_envs
     key = next((env[variable] for variable in key_envs if env.get(variable)), None)
@@ -323,9 +320,8 @@ def resolve_endpoint(
     )
 
 
-def endpoint_identity(entry: ModelEntry, environment: Mapping[str, str] | None = None) -> str:
+def endpoint_identity(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
     """What stands for the endpoint in cache keys; see Endpoint."""
-    env = os.environ if environment is None else environment
     provider = PROVIDERS.require(entry.provider)
     base_url = _base_url(entry, provider, env)
     if entry.provider == "emulator":
@@ -355,13 +351,13 @@ def pair_name(sides: Iterable[str], endpoints: Mapping[str, str]) -> str:
 
 
 def key_status(
-    name: str, entry: ModelEntry, environment: Mapping[str, str] | None = None
+    name: str, entry: ModelEntry, env: Mapping[str, str] = os.environ
 ) -> Literal["set", "missing", "not needed"]:
     """Whether the environment holds the key that a live run of the model needs."""
     if not PROVIDERS.require(entry.provider).key_needed:
         return "not needed"
     try:
-        resolve_endpoint(name, entry, environment)
+        resolve_endpoint(name, entry, env)
     except UsageError:
         return "missing"
     return "set"
@@ -408,12 +404,11 @@ def is_host(name: str) -> bool:
     return len(name) <= LONGEST_HOST and all(map(_LABEL.fullmatch, labels))
 
 
-def check_network(base_url: str, environment: Mapping[str, str] | None = None) -> None:
+def check_network(base_url: str, env: Mapping[str, str] = os.environ) -> None:
     """Raise UsageError where a variable keeps an endpoint from being reached.
 
     Loopback never goes through a proxy, so that theirs do not matter there.
     """
-    env = os.environ if environment is None else environment
     if urlsplit(base_url).hostname not in LOOPBACK:
         for variable, value in env.items():
             if variable.lower() in PROXY_VARIABLES and value:
@@ -440,19 +435,17 @@ def _check_proxy(variable: str, value: str) -> None:
         raise UsageError(f"{variable} is no URL of a proxy: set it to http://HOST:PORT or unset it")
 
 
-def runtime_folder(environment: Mapping[str, str] | None = None) -> Path:
+def runtime_folder(env: Mapping[str, str] = os.environ) -> Path:
     """Where a user's processes share what a session needs: XDG_RUNTIME_DIR, else among temporaries.
 
     Nothing there outlives the machine's next start.
     """
-    env = os.environ if environment is None else environment
     named = Path(env.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
     return named if named.is_dir() else Path(tempfile.gettempdir())
 
 
-def running_emulator_url(environment: Mapping[str, str] | None = None) -> str | None:
+def running_emulator_url(env: Mapping[str, str] = os.environ) -> str | None:
     """The URL of an emulator that already runs (EMULATOR_BASE_URL), or None."""
-    env = os.environ if environment is None else environment
     return env.get("EMULATOR_BASE_URL") or None
 
 

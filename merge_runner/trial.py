@@ -20,15 +20,14 @@ from merge_runner.records import (
     TrialSpec,
 )
 from merge_runner.scenarios.base import World
-from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.registry import SCENARIOS
+from merge_runner.scenarios.registry import new_world
 
 
 async def play_trial(
     spec: TrialSpec, scenario: ScenarioConfig, drivers: Mapping[Side, Driver]
 ) -> TrialRecord:
     """Play a trial to its end, or until a call fails."""
-    world = SCENARIOS[scenario.name].world(scenario, CONDITIONS[spec.condition])
+    world = new_world(scenario, spec.condition)
     seats = {side: _Seated(drivers[side]) for side in SIDES}
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}

@@ -12,9 +12,7 @@ from merge_runner.prompts.parse import ParsedReply, parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import ChatReply, Decision, Observation, Side, Slot, TrialSpec
 
-Ask = Callable[[str, int], Awaitable[ChatReply]]
-"""Asks the model with a prompt, for a decision number; raises CallFailed."""
-AskFor = Callable[[str, Slot, TrialSpec], Awaitable[ChatReply]]
+Ask = Callable[[str, Slot, TrialSpec], Awaitable[ChatReply]]
 """Asks the model with a prompt, for a slot of a trial; raises CallFailed."""
 
 
@@ -22,17 +20,11 @@ AskFor = Callable[[str, Slot, TrialSpec], Awaitable[ChatReply]]
 class LanguageModel:
     """Makes drivers that ask one model."""
 
-    ask: AskFor
+    ask: Ask
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> LlmDriver:
         """See MakeDriver."""
-
-        async def ask(prompt: str, number: int) -> ChatReply:
-            slot = Slot(spec.condition, spec.repetition, side, number, spec.sample_set)
-            return await self.ask(prompt, slot, spec)
-
-        assert spec.variant is not None, "only human trials have no prompt variant"
-        return LlmDriver(ask, spec.variant, take_seat(scenario, spec, side, model_pace(scenario)))
+        return LlmDriver(self.ask, spec, take_seat(scenario, spec, side, model_pace(scenario)))
 
 
 @dataclass(slots=True)
@@ -40,18 +32,20 @@ class LlmDriver:
     """Keeps the plan between prompts; everything else is in the prompt."""
 
     ask: Ask
-    variant: str
+    spec: TrialSpec
     seat: Seat
     _plan: tuple[float, ...] | None = None
     _executed: int = 0
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Ask the model and drive its plan, or go on with the last valid one."""
-        scenario = self.seat.scenario
+        scenario, spec = self.seat.scenario, self.spec
+        assert spec.variant is not None, "only human trials have no prompt variant"
         prompt = render_prompt(
-            observation, self._remaining(), variant=self.variant, scenario=scenario
+            observation, self._remaining(), variant=spec.variant, scenario=scenario
         )
-        reply = await self.ask(prompt, number)
+        slot = Slot(spec.condition, spec.repetition, self.seat.side, number, spec.sample_set)
+        reply = await self.ask(prompt, slot, spec)
         # A refusal or a truncated answer is an outcome of its own; it is not searched for a plan.
         parsed = (
             parse_reply(reply.text, scenario.plan_actions)

@@ -13,6 +13,7 @@ from merge_runner.llm.prices import pricing
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
 from merge_runner.run.plan import Options, Plan
+from merge_runner.scenarios.registry import new_world
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
 PROMPT_MARGIN = 1.25
@@ -135,7 +136,7 @@ def _limited_s(options: Options, entry: ModelEntry, calls: int, each: _PerCall) 
 
 def _typical_prompt(plan: Plan) -> str:
     """The longest variant's prompt in the midst of an approach."""
-    world = plan.world(plan.conditions[0])
+    world = new_world(plan.scenario, plan.conditions[0])
     rest = (0.25,) * (plan.scenario.plan_actions - plan.scenario.executed_actions)
     prompts = (
         render_prompt(world.observe("left"), rest, variant=variant, scenario=plan.scenario)

@@ -46,8 +46,8 @@ class Flusher:
         self._say = say
         self._pending: list[TrialRecord] = []
         self._bytes = 0
-        self._problem = ""
-        self._locked = self._stuck = False
+        self._problem: StoreError | None = None
+        self._said = ""
         self._closing = False
         self._awake, self._tried = asyncio.Event(), asyncio.Event()
         self._task = asyncio.create_task(self._run())
@@ -66,7 +66,7 @@ class Flusher:
             await self._tried.wait()
 
     def _is_full(self) -> bool:
-        if self._stuck:
+        if self._problem is not None:
             return self._bytes > MOST_STUCK_BYTES
         return len(self._pending) > MOST_PENDING or self._bytes > MOST_PENDING_BYTES
 
@@ -79,7 +79,8 @@ class Flusher:
         while self._pending:
             if await self._flush():
                 continue
-            patience_s = LAST_LOCK_PATIENCE_S if self._locked else LAST_PATIENCE_S
+            locked = isinstance(self._problem, StoreLocked)
+            patience_s = LAST_LOCK_PATIENCE_S if locked else LAST_PATIENCE_S
             if asyncio.get_running_loop().time() - began >= patience_s:
                 raise StoreError(
                     f"{len(self._pending)} trials are not stored: {self._problem}. When that is "
@@ -107,14 +108,14 @@ class Flusher:
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
             )
         except StoreError as exc:
-            self._stuck, self._locked = True, isinstance(exc, StoreLocked)
+            self._problem = exc
             self._pending = batch + self._pending
-            if str(exc) != self._problem:
-                self._problem = str(exc)
+            if str(exc) != self._said:  # it is tried again every second
+                self._said = str(exc)
                 self._say(f"waiting to store {len(self._pending)} trials: {exc}")
             return False
         else:
-            self._stuck = False
+            self._problem = None
             self._bytes -= sum(map(size_of, batch))
             return True
         finally:

@@ -27,9 +27,8 @@ from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import Side, TrialSpec
 from merge_runner.registry import require
-from merge_runner.scenarios.base import World
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.registry import SCENARIOS, task_of
+from merge_runner.scenarios.registry import SCENARIOS, new_world, task_of
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 PROMPTS_PER_DRIVER = 10.5
@@ -110,10 +109,6 @@ class Plan:
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
         return any(entry.provider == "emulator" for entry in self.entries.values())
-
-    def world(self, condition: str) -> World:
-        """The world of a new trial."""
-        return SCENARIOS[self.scenario.name].world(self.scenario, CONDITIONS[condition])
 
     @property
     def driver(self) -> str:
@@ -254,8 +249,7 @@ def _conditions(file: SweepFile, chosen: Sequence[str] | None) -> tuple[str, ...
     if not conditions:
         raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
     for name in conditions:
-        condition = CONDITIONS.require(name)
-        scenario.world(file.scenario, condition)  # raises where it cannot be played
+        new_world(file.scenario, name)  # raises where it cannot be played
     return conditions
 
 

@@ -82,7 +82,3 @@ class Scenario:
         """
         own = self.make_world.__module__.startswith(f"{__name__.partition('.')[0]}.")
         return None if own else source_digest(self.make_world)
-
-    def world(self, config: ScenarioConfig, condition: Condition) -> World:
-        """The world of a new trial; see MakeWorld."""
-        return self.make_world(config, condition, self.track)

@@ -7,10 +7,10 @@ from typing import Any, get_args
 
 from merge_runner.config import USUAL_SCENARIO, CollisionRule, ScenarioConfig
 from merge_runner.registry import Registry
-from merge_runner.scenarios.base import Scenario
-from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner.scenarios.base import Scenario, World
+from merge_runner.scenarios.merge import world as merge
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.scenarios.merge.world import World
 
 SCENARIOS = Registry[Scenario]("scenario")
 SCENARIOS.register(
@@ -19,7 +19,7 @@ SCENARIOS.register(
         track=TRACK,
         conditions=tuple(HUMAN_CONDITIONS),
         collision_rules=get_args(CollisionRule),
-        make_world=World,
+        make_world=merge.World,
     ),
 )
 
@@ -36,3 +36,9 @@ def task_of(config: ScenarioConfig) -> dict[str, Any]:
         **({} if scenario.track == TRACK else {"track": asdict(scenario.track)}),
         **({} if scenario.source is None else {"world_source": scenario.source}),
     }
+
+
+def new_world(config: ScenarioConfig, condition: str) -> World:
+    """The world of a new trial; raises UsageError where the condition cannot be played."""
+    scenario = SCENARIOS.require(config.name)
+    return scenario.make_world(config, CONDITIONS.require(condition), scenario.track)

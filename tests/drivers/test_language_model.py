@@ -6,7 +6,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.drivers.pace import model_pace
-from merge_runner.records import ChatReply, ChatRequest, Observation, Slot
+from merge_runner.records import ChatReply, ChatRequest, Observation, Slot, TrialSpec
 
 PLAN = tuple(round(0.01 * k, 2) for k in range(1, 21))  # 0.01 to 0.20, no two alike
 OTHER_PLAN = tuple(-a for a in PLAN)
@@ -38,13 +38,14 @@ async def decide(*replies, seen=SEEN, variant="baseline", **scenario):
     """One decision per reply, a text or a ChatReply, and what the model was asked with."""
     asked = []
 
-    async def ask(prompt, number):
-        asked.append((prompt, number))
-        reply = replies[number]
+    async def ask(prompt, slot, _):
+        asked.append((prompt, slot.decision))
+        reply = replies[slot.decision]
         return chat_reply(reply) if isinstance(reply, str) else reply
 
     scenario = ScenarioConfig(**scenario)
-    driver = LlmDriver(ask, variant, Seat(scenario, "left", model_pace(scenario), 0))
+    spec = TrialSpec("t", "s", "llm", "m", "m", variant, "N_0_0", 1, 0, 0)
+    driver = LlmDriver(ask, spec, Seat(scenario, "left", model_pace(scenario), 0))
     decisions = [await driver.decide(seen, number) for number in range(len(replies))]
     assert [prompt for prompt, _ in asked] == [decision.prompt for decision in decisions]
     assert [number for _, number in asked] == list(range(len(replies)))

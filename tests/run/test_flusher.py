@@ -89,5 +89,5 @@ async def test_what_cannot_be_stored_fills_the_memory_up_to_a_limit():
     await asyncio.sleep(0.01)
     flusher._task.cancel()
     await asyncio.gather(flusher._task, return_exceptions=True)
-    assert flusher._stuck
+    assert flusher._problem
     assert flusher._is_full()
