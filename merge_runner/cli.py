@@ -88,7 +88,7 @@ OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
 
 def main() -> None:
     """Run the command line and exit with the contract's code."""
-    # What a sweep makes lives as long as its trial: frequent collections find next to nothing.
+    # The objects of a trial live until it ends: frequent collections would find next to nothing.
     gc.set_threshold(20_000, 10, 100)
     debug = "--debug" in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != "--debug"]
@@ -242,12 +242,12 @@ def sql(
     from merge_runner.results.store import answers
 
     writers = {Format.TEXT: write_table, Format.CSV: write_csv, Format.JSON: write_json}
-    # Who reads the output may take their time: until then nobody could write into the database.
-    with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as kept:
+    # The reader of a pipe may take its time, and would keep every sweep from writing meanwhile.
+    with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as spooled:
         with answers(db, query) as (names, rows):
-            writers[output](names, rows, kept)
-        kept.seek(0)
-        shutil.copyfileobj(kept, sys.stdout)
+            writers[output](names, rows, spooled)
+        spooled.seek(0)
+        shutil.copyfileobj(spooled, sys.stdout)
 
 
 @app.command()

@@ -77,8 +77,8 @@ def whole_steps(name: str, seconds: float, step_s: float) -> int:
 class ScenarioConfig(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
-    ``name``: a registered scenario; where it is ``merge`` it is not written, as it was not before
-    there were others, so that the hashes of specs stay.
+    ``name``: a registered scenario. ``merge`` is left out of a spec, as it was before there were
+    others, so that specs keep their hashes.
     ``collision_rule``: ``euclid2d`` (centres closer than a vehicle length), ``rectangle`` (the
     vehicles' oriented boxes overlap, as in the human experiment) or ``shared_lane``
     (|s_L - s_R| below a vehicle length once either has passed the merge point).
@@ -216,8 +216,8 @@ class SweepFile(Frozen):
 class Provider:
     """Where a provider is reached, which variables configure it, and how it takes a key.
 
-    ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are those that the
-    provider documents for all of its errors, so that what lacks one may be a gateway's.
+    ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are the members that
+    every error of the provider has, by its documentation: one without them may be a gateway's.
     """
 
     base_url: str
@@ -366,7 +366,7 @@ def key_status(
 def normalised_url(url: str) -> str:
     """A base URL in one spelling: lower-case scheme and host, no default port, no last slash."""
     url = url.strip()
-    # What may be a secret is not shown, and the registry's entry is stored.
+    # A URL with a user name may hold a password, which must not be shown.
     shown = "what stands there" if "@" in url else repr(url[:60])
     if len(url) > LONGEST_URL or not (url.isascii() and url.isprintable()) or " " in url:
         raise UsageError(
@@ -407,7 +407,7 @@ def is_host(name: str) -> bool:
 def check_network(base_url: str, env: Mapping[str, str] = os.environ) -> None:
     """Raise UsageError where a variable keeps an endpoint from being reached.
 
-    Loopback never goes through a proxy, so that theirs do not matter there.
+    Calls to loopback never go through a proxy, so the proxy variables do not matter there.
     """
     if urlsplit(base_url).hostname not in LOOPBACK:
         for variable, value in env.items():
@@ -436,9 +436,9 @@ def _check_proxy(variable: str, value: str) -> None:
 
 
 def runtime_folder(env: Mapping[str, str] = os.environ) -> Path:
-    """Where a user's processes share what a session needs: XDG_RUNTIME_DIR, else among temporaries.
+    """The folder in which a user's processes share what need not outlive the machine's next start.
 
-    Nothing there outlives the machine's next start.
+    It is XDG_RUNTIME_DIR, or else the folder of temporary files.
     """
     named = Path(env.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
     return named if named.is_dir() else Path(tempfile.gettempdir())

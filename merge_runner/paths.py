@@ -1,4 +1,4 @@
-"""Where things lie by default, and what may be written where something lies already."""
+"""Default paths, and a check before a file is overwritten."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DEFAULT_CACHE = Path("cache/responses")
 
 
 def refuse_another_kind(file: Path, begins: bytes, kind: str) -> None:
-    """Raise UsageError where a file is there that does not begin as those that we write."""
+    """Raise UsageError where a file exists and does not begin like those of this kind."""
     if not file.is_file():
         return
     with file.open("rb") as there:

@@ -17,14 +17,14 @@ Cell = tuple[str, str]
 ANSWERS = ("ok", "refusal", "truncated", "empty")
 SIDES: tuple[Side, Side] = ("left", "right")
 
-# Tell the slot and the attempt to our own emulator, and to nobody else.
+# Headers that tell the slot and the attempt to our own emulator, and to nobody else.
 SLOT_HEADER = "x-merge-runner-slot"
 ATTEMPT_HEADER = "x-merge-runner-attempt"
 # A scripted stand-in says what it is in every reply: by this header, and by this field of the body.
 SCRIPTED_HEADER = "x-merge-runner-scripted"
 SCRIPTED_FIELD = "merge_runner_scripted"
-# And to what it answers, so that an exchanged answer is known: the hash of the request's body, and
-# the slot if it was told one.
+# By this field it says what it answers, so that a swapped answer is noticed: the hash of the
+# request's body, and the slot if the request named one.
 ANSWERED_FIELD = "merge_runner_request"
 
 
@@ -259,7 +259,7 @@ class TrialRecord:
 def is_scripted(request: ChatRequest, attempt: Attempt) -> bool:
     """Whether a scripted stand-in answered, whatever base URL or model name was used.
 
-    The body of a reply tells it also where a recording has lost what its header said.
+    The body says so even where a recording has lost the header.
     """
     return attempt.scripted or request.provider == "emulator" or says_scripted(attempt.reply or "")
 

@@ -31,7 +31,10 @@ def csv_writer(file: TextIO) -> Any:  # noqa: ANN401 # the library does not name
 
 
 class _Lines:
-    """Ends each row with LF alone; told to do so itself, the library would not quote a CR."""
+    """Ends each row with LF alone.
+
+    The csv module can do so by itself, but would then leave a CR within a value unquoted.
+    """
 
     def __init__(self, file: TextIO) -> None:
         self._file = file

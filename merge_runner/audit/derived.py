@@ -297,7 +297,7 @@ def _seat(trial: _Trial, spec: Spec, paces: Mapping[Side, Pace]) -> set[str]:
         told = spec.driver(side)
         name = str(told.get("program", ""))
         program = PROGRAMS.get(name)
-        same = program is not None and program.told(name) == told
+        same = program is not None and program.in_spec(name) == told
         maker: MakeDriver | None = trial.model() if spec.asks(side) else program if same else None
         if maker is not None:
             trial.drivers[side] = maker.make(trial.scenario, own, side)

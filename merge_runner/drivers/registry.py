@@ -58,7 +58,7 @@ class Program:
         pace = program_pace(scenario, self.rate_hz)
         return self.driver(take_seat(scenario, spec, side, pace))
 
-    def told(self, name: str) -> dict[str, object]:
+    def in_spec(self, name: str) -> dict[str, object]:
         """What the spec of its trials says of it."""
         own_rate = {} if self.rate_hz is None else {"rate_hz": self.rate_hz}
         return {

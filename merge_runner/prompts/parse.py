@@ -106,7 +106,7 @@ def _failure(array: tuple[float | str, ...], plan_actions: int) -> str | None:
 
 
 def _entries(inside: str) -> tuple[float | str, ...]:
-    """The entries of an array: numbers, and what is none as it is spelled."""
+    """The entries of an array: numbers, and as it is spelled what is not a number."""
     inside = inside.translate(_MINUSES)
     if _NUMBERS.fullmatch(inside):
         return tuple(map(float, inside.rstrip().removesuffix(",").split(",")))

@@ -62,12 +62,12 @@ def _fields(
 
 
 def _firsts(values: Sequence[float], every: int) -> Sequence[float]:
-    """One in so many of the world's samples, back from now; what is left over is oldest."""
+    """Each ``every``-th of the world's samples; the last of them is ``every`` before now."""
     return values if every == 1 else values[len(values) % every :: every]
 
 
 def _means(values: Sequence[float], every: int) -> Sequence[float]:
-    """The mean of each so many of the world's samples, back from now, likewise."""
+    """The means of ``every`` of the world's samples each, the last of which end now."""
     if every == 1:
         return values
     return [fmean(values[i : i + every]) for i in range(len(values) % every, len(values), every)]

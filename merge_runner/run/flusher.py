@@ -17,10 +17,11 @@ BATCH = 64
 """Trials in one transaction: few enough that a reader gets its turn soon."""
 MOST_PENDING = 4 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
-# What cannot be stored now, as while another program holds the file.
+# How much may wait while nothing can be stored, as while another program holds the file.
 MOST_STUCK_BYTES = 2**29
 LOCK_PATIENCE_S = 2.0
-# At the end: with a lock, which somebody will release, and with anything else, as a full disk.
+# How long the end waits for a lock, which somebody will release, and for anything else, such as
+# a full disk to have room again.
 LAST_LOCK_PATIENCE_S, LAST_PATIENCE_S = 60.0, 3.0
 
 
@@ -34,9 +35,9 @@ def size_of(record: TrialRecord) -> int:
 class Flusher:
     """Collects ended trials and stores them about once a second.
 
-    What cannot be stored waits in memory while the trials go on, up to a limit; where it is only
-    slow, they wait for it. ``differing`` names the trials that are stored already with other
-    values, and in which columns.
+    Trials that cannot be stored wait in memory, up to a limit, while others are played; where
+    storing is merely slow, new trials wait for it. ``differing`` names the trials that are stored
+    already with other values, and the columns.
     """
 
     def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:

@@ -21,9 +21,9 @@ from merge_runner.run.plan import Plan
 from merge_runner.run.scheduler import Gate, run_bounded
 from merge_runner.trial import play_trial
 
-# Told of each trial that ends; a suspended one has no money to go on.
+# Called with each trial that ends; a suspended one has no money to go on.
 Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]
-# Awaited before a trial begins: is there room to keep it until it is stored?
+# Awaited before a trial begins, until there is memory to keep it in until it is stored.
 Room = Callable[[], Awaitable[None]]
 
 
@@ -36,7 +36,7 @@ class TrialRunner(Protocol):
 
     @property
     def meters(self) -> Mapping[str, Meter]:
-        """What each model's calls came to, over all who play."""
+        """What each model's calls came to, over all workers."""
         ...
 
     @property

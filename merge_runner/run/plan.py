@@ -183,7 +183,7 @@ class Plan:
     def _driver(self, name: str) -> dict[str, object]:
         entry = self.entries.get(name)
         if entry is None:
-            return PROGRAMS[name].told(name)
+            return PROGRAMS[name].in_spec(name)
         sent = FORMATS[entry.format].request(entry, "")
         return {
             "endpoint": self.endpoints[name],
@@ -218,7 +218,7 @@ def make_plan(
     for driver in sides.values():
         require({**models, **PROGRAMS}, "model", driver, "two joined by + drive left and right")
     for driver in {*sides.values()} - {*models}:
-        pace_of(file.scenario, PROGRAMS[driver].told(driver))
+        pace_of(file.scenario, PROGRAMS[driver].in_spec(driver))
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
     scenario = SCENARIOS.require(file.scenario.name)

@@ -247,7 +247,7 @@ async def _publish(progress: Progress, file: ProgressFile) -> None:
 
 
 async def _feel_pulse(progress: Progress) -> None:
-    """Measure how late the event loop comes back to who waits for it."""
+    """Measure how late the event loop wakes a task that sleeps."""
     loop = asyncio.get_running_loop()
     while True:
         due = loop.time() + PULSE_S
@@ -295,7 +295,7 @@ def _line(progress: Progress) -> str:
 
 
 def _notes(progress: Progress) -> list[str]:
-    """What the clients had to say since the last look, equal lines once, not too many."""
+    """The clients' messages since the last call: each once, and the first NOTES_SHOWN."""
     notes: dict[str, None] = {}
     for meter in progress.meters:
         while meter.notes:

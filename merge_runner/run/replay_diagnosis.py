@@ -51,18 +51,18 @@ def explain(misses: list[Miss], recorded: Iterable[Entry]) -> list[str]:
     for miss in misses:
         text = _explained(miss, same_slot, same_place)
         alike.setdefault(_NUMBER.sub("0", text), []).append((miss, text))
-    return [_told(group) for group in alike.values()]
+    return [_as_line(group) for group in alike.values()]
 
 
-def _told(group: list[tuple[Miss, str]]) -> str:
+def _as_line(group: list[tuple[Miss, str]]) -> str:
     """The first of misses that differ alike, and how many there are."""
     (first, text), *others = group
     slot = first.request.slot
-    told = f"{first.trial_id}, {slot.side}, decision {slot.decision}: {text}"
+    line = f"{first.trial_id}, {slot.side}, decision {slot.decision}: {text}"
     if not others:
-        return told
+        return line
     trials = len({miss.trial_id for miss, _ in group})
-    return f"{told}; {len(group)} calls of {trials} trials differ like this"
+    return f"{line}; {len(group)} calls of {trials} trials differ like this"
 
 
 def _explained(

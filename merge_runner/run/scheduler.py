@@ -12,7 +12,7 @@ A_FEW = 16
 
 
 class Gate:
-    """Lets a few through each time the event loop comes round, so that it comes round soon.
+    """Lets a few through in each round of the event loop, so that each round stays short.
 
     Thousands of calls that are all ready at once would keep it from everything else.
     """

@@ -40,14 +40,14 @@ class Account:
             f"aside for {spending.open_attempts} attempts whose cost is not known"
         )
         for reason in self.reasons:
-            yield f"  {reason.usd:.4f} USD for {_told(reason)}"
+            yield f"  {reason.usd:.4f} USD for {_reason_text(reason)}"
         if spending.overrun_usd:
             yield (
                 f"  {spending.overrun_usd:.4f} of what is spent is what replies cost more than "
                 f"their worst case: {spending.dearest}"
             )
         for release in spending.releases:
-            yield f"  {release.usd:.4f} USD were released on {release.at}: {_all_told(release)}"
+            yield f"  {release.usd:.4f} USD were released on {release.at}: {_release_text(release)}"
 
 
 def accounts(folder: Path) -> list[Account]:
@@ -99,7 +99,7 @@ def _account(cache: ResponseCache, scope: str) -> Account:
     return Account(scope, ledger.read(), ledger.reasons())
 
 
-def _told(reason: Reason) -> str:
+def _reason_text(reason: Reason) -> str:
     what = MEANING.get(reason.outcome, reason.outcome)
     where = f" of {reason.driver}" if reason.driver else ""
     when = f", {reason.first} to {reason.last}" if reason.first else ""
@@ -107,5 +107,5 @@ def _told(reason: Reason) -> str:
     return f"{reason.attempts} attempts{where}: {what}{when}{slots}"
 
 
-def _all_told(release: Release) -> str:
-    return "; ".join(map(_told, release.reasons)) or "nothing"
+def _release_text(release: Release) -> str:
+    return "; ".join(map(_reason_text, release.reasons)) or "nothing"

@@ -50,6 +50,7 @@ from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
 SHOWN = 5
+# More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
 FROM_RECORDINGS = 16
 
@@ -243,7 +244,7 @@ class Sweep:
         plan, options = self._plan, self._options
         if options.replay or not self._todo or not plan.entries:
             clients = sealed_clients(plan, self._cache, self._sealed)
-            # Recorded replies are there at once: more in flight only take more memory.
+            # Recorded replies come at once: more trials in flight would only take more memory.
             return LocalRunner(plan, clients, min(options.in_flight, FROM_RECORDINGS))
         services = open_services(plan, options, self._cache, self._ledger, stack)
         urls = await start_endpoints(plan.entries, options.emulator_options, stack)

@@ -2,20 +2,39 @@
 
 from __future__ import annotations
 
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
 import pytest
 
-from tests.harness import Run
+from tests.harness import PROGRAM, Run, environment
 
 
-@pytest.fixture
-def run(merge_runner, emulator_url, tmp_path):
-    """Runs ``merge-runner`` in a process of its own, with these variables beside the usual ones."""
+@dataclass
+class Study:
+    """A folder with some trials; ``run`` takes the variables that a command gets beside the usual.
 
-    async def started(*arguments: object, **changes: str) -> Run:
-        process = await merge_runner.start(
-            *arguments, **{"EMULATOR_BASE_URL": emulator_url, **changes}
+    Each command is a process of its own, with its own imports.
+    """
+
+    folder: Path
+    emulator_url: str
+
+    def run(self, *arguments: object, **changes: str) -> Run:
+        done = subprocess.run(
+            [PROGRAM, *map(str, arguments)],
+            cwd=self.folder,
+            env=environment(**{"EMULATOR_BASE_URL": self.emulator_url, **changes}),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
         )
-        out, err = await process.communicate()
-        return Run(process.returncode, out.decode(), err.decode())
+        return Run(done.returncode, done.stdout, done.stderr)
 
-    return started
+
+@pytest.fixture(scope="module")
+def study(emulator_url, tmp_path_factory):
+    """One for all tests of a page."""
+    return Study(tmp_path_factory.mktemp("study"), emulator_url)

@@ -12,7 +12,7 @@ from tests.harness import how_to, plugin
 FINE = """
 conditions = ["L_4_0", "N_0_0"]
 [repetitions]
-baseline = 2
+baseline = 1
 [scenario]
 step_s = 0.05
 plan_step_s = 0.2
@@ -22,23 +22,23 @@ PAIRS = ("hesitant+impulsive", "emulator+impulsive")
 RATES = {"emulator": 1, "hesitant": 5, "impulsive": 20}
 
 
-@pytest.fixture
-def installed(tmp_path):
-    (tmp_path / "fine.toml").write_text(FINE)
-    return plugin(tmp_path / "installed", how_to("add-a-driver"))
+@pytest.fixture(scope="module")
+def installed(study):
+    (study.folder / "fine.toml").write_text(FINE)
+    return plugin(study.folder / "installed", how_to("add-a-driver"))
 
 
-@pytest.fixture
-async def played(run, installed):
+@pytest.fixture(scope="module")
+def played(study, installed):
     """Both pairs in one database."""
     for pair in PAIRS:
-        done = await run("sweep", "fine.toml", "--model", pair, **installed)
+        done = study.run("sweep", "fine.toml", "--model", pair, **installed)
         assert done.code == 0, done.err
     return installed
 
 
-async def test_a_driver_decides_at_its_own_rate_and_is_drawn_from_its_seed(run, played, tmp_path):
-    with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
+def test_a_driver_decides_at_its_own_rate_and_is_drawn_from_its_seed(study, played):
+    with duckdb.connect(str(study.folder / "results/merge.duckdb"), read_only=True) as connection:
         rows = connection.execute(
             "SELECT if(side = 'left', model_left, model_right), decision, time_s, len(applied), "
             "len(plan) FROM decisions JOIN trials USING (trial_id, spec_hash)"
@@ -59,40 +59,27 @@ async def test_a_driver_decides_at_its_own_rate_and_is_drawn_from_its_seed(run, 
 
     other = ("--db", "other.duckdb")
     for pair in PAIRS:
-        assert (await run("replay", "fine.toml", "--model", pair, *other, **played)).code == 0
-    digests = {(await run("digest", *db, **played)).out for db in ((), other)}
+        assert (study.run("replay", "fine.toml", "--model", pair, *other, **played)).code == 0
+    digests = {(study.run("digest", *db, **played)).out for db in ((), other)}
     assert len(digests) == 1
     assert digests.pop().strip()
 
 
-async def test_it_is_in_every_command_that_reads(run, played, tmp_path):
-    audit = await run("audit", "--json", **played)
+def test_it_is_in_every_command_that_reads(study, played):
+    audit = study.run("audit", "--json", **played)
     assert (audit.code, "not derived" in audit.out) == (0, False), audit.out
-    export = await run("recording", "export", "r.parquet", **played)
-    assert export.code == 0, export.err
-    for command in (
-        ("recording", "import", "r.parquet", "--cache", "again"),
-        ("audit", "--recording", "r.parquet"),
-        ("tables",),
-        ("figures", "--out", "figures"),
-        ("report", "--out", "report.html"),
-        ("view", "--export", "pages"),
-    ):
-        done = await run(*command, **played)
-        assert done.code == 0, f"{command}: {done.err}"
-    replayed = ("--model", PAIRS[1], "--cache", "again", "--db", "again.duckdb")
-    assert (await run("replay", "fine.toml", *replayed, **played)).code == 0
-    tables = await run("tables", "ablation-quantitative", "--format", "csv", **played)
+    done = study.run("view", "--export", "pages", **played)
+    assert done.code == 0, done.err
+    tables = study.run("tables", "ablation-quantitative", "--format", "csv", **played)
     for name in PAIRS:
         assert name in tables.out
-    assert "impulsive" in (tmp_path / "report.html").read_text()
-    pages = [page.read_text() for page in (tmp_path / "pages").rglob("*") if page.is_file()
+    pages = [page.read_text() for page in (study.folder / "pages").rglob("*") if page.is_file()
              and page.suffix in {".html", ".js", ".json"}]  # fmt: skip
     assert any("impulsive decision" in page or "hesitant+impulsive" in page for page in pages)
 
 
-async def test_where_it_is_not_installed_the_rest_is_shown_and_checked(run, played, emulator_url):
-    audit = await run("audit", "--json", "--db", "results/merge.duckdb")
+def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
+    audit = study.run("audit", "--json")
     assert audit.code == 0
     notes = [note for one in json.loads(audit.out)["audits"] for note in one["notes"]]
     assert any(
@@ -100,17 +87,16 @@ async def test_where_it_is_not_installed_the_rest_is_shown_and_checked(run, play
         "(install the package that registers it)" in note
         for note in notes
     ), notes
-    for command in (("tables",), ("view", "--export", "pages")):
-        done = await run(*command)
-        assert done.code == 0, done.err
-    asked = await run("sweep", "fine.toml", "--model", "impulsive")
+    done = study.run("view", "--export", "bare")
+    assert done.code == 0, done.err
+    asked = study.run("sweep", "fine.toml", "--model", "impulsive")
     assert asked.code == 2
     assert "unknown model 'impulsive'; valid: " in asked.err
     assert "constant, projected-order" in asked.err
 
 
-async def test_a_world_that_is_too_coarse_is_refused_with_what_to_type(run, installed):
-    done = await run("sweep", "baseline", "--model", "constant+impulsive", **installed)
+def test_a_world_that_is_too_coarse_is_refused_with_what_to_type(study, installed):
+    done = study.run("sweep", "baseline", "--model", "constant+impulsive", **installed)
     assert (done.code, done.out) == (2, "")
     assert done.err == (
         "error: the driver impulsive cannot decide 20.0 times a second: the time between two "
@@ -120,8 +106,8 @@ async def test_a_world_that_is_too_coarse_is_refused_with_what_to_type(run, inst
     )
 
 
-async def test_programs_are_listed_with_what_they_do(run, installed):
-    listed = (await run("models", **installed)).out.splitlines()
+def test_programs_are_listed_with_what_they_do(study, installed):
+    listed = (study.run("models", **installed)).out.splitlines()
     programs = [line.split() for line in listed if " program " in line]
     assert [line[0] for line in programs] == [
         "constant",

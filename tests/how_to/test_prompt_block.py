@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 
 import duckdb
 import pytest
 
+from merge_runner.errors import UsageError
+from merge_runner.prompts.blocks import Block
 from merge_runner.run.plan import make_plan
 from tests.harness import how_to, plugin
 
@@ -14,10 +17,10 @@ VARIANTS = ("--variants", "baseline,A1,A8,A9", "--reps", 1, "--conditions", "L_4
 WARNING = "Mind the speed of the other car: at "
 
 
-@pytest.fixture
-async def played(run, tmp_path):
-    installed = plugin(tmp_path / "installed", how_to("add-a-prompt-block"))
-    done = await run("sweep", "baseline", *VARIANTS, **installed)
+@pytest.fixture(scope="module")
+def played(study):
+    installed = plugin(study.folder / "installed", how_to("add-a-prompt-block"))
+    done = study.run("sweep", "baseline", *VARIANTS, **installed)
     assert done.code == 0, done.err
     return installed
 
@@ -28,8 +31,8 @@ def pages_of(folder):
     )
 
 
-async def test_a_block_is_in_the_variants_that_add_it_and_changes_no_other(run, played, tmp_path):
-    with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
+def test_a_block_is_in_the_variants_that_add_it_and_changes_no_other(study, played):
+    with duckdb.connect(str(study.folder / "results/merge.duckdb"), read_only=True) as connection:
         prompts = connection.execute(
             "SELECT variant, distance_to, prompt FROM trials JOIN (SELECT *, "
             "contains(prompt, 'Road type: merge') AS distance_to FROM decisions) "
@@ -50,64 +53,55 @@ async def test_a_block_is_in_the_variants_that_add_it_and_changes_no_other(run, 
     assert len(set(hashes.values())) == 4
 
 
-async def test_it_is_in_every_command_that_reads(run, played, tmp_path):
-    for command in (
-        ("audit",),
-        ("recording", "export", "r.parquet"),
-        ("recording", "import", "r.parquet", "--cache", "again"),
-        ("audit", "--recording", "r.parquet"),
-        ("replay", "baseline", *VARIANTS, "--cache", "again", "--db", "again.duckdb"),
-        ("tables",),
-        ("figures", "--out", "figures"),
-        ("report", "--out", "report.html"),
-        ("view", "--export", "pages"),
-    ):
-        done = await run(*command, **played)
+def test_it_is_in_every_command_that_reads(study, played):
+    for command in (("audit",), ("view", "--export", "pages")):
+        done = study.run(*command, **played)
         assert done.code == 0, f"{command}: {done.err}"
         assert "not derived" not in done.out + done.err
-    text = pages_of(tmp_path / "pages")
+    text = pages_of(study.folder / "pages")
     assert "with C6: warning of speed" in text
     assert "without C1: history and with C6: warning of speed" in text
-    table = await run("tables", "ablation-quantitative", "--format", "json", **played)
+    table = study.run("tables", "ablation-quantitative", "--format", "json", **played)
     (rows,) = (one["rows"] for one in json.loads(table.out)["tables"])
     assert "A8" in str(rows)
 
 
-async def test_where_it_is_not_installed_it_is_shown_by_name(run, played, tmp_path):
-    for command in (("audit",), ("tables",), ("view", "--export", "pages")):
-        done = await run(*command)
+def test_where_it_is_not_installed_it_is_shown_by_name(study, played):
+    for command in (("audit",), ("view", "--export", "bare")):
+        done = study.run(*command)
         assert done.code == 0, f"{command}: {done.err}"
-    text = pages_of(tmp_path / "pages")
+    text = pages_of(study.folder / "bare")
     assert "with C6: no meaning is known here" in text
     assert "without C1: history and with C6: no meaning is known here" in text
-    asked = await run("sweep", "baseline", *VARIANTS)
+    asked = study.run("sweep", "baseline", *VARIANTS)
     assert asked.code == 2
     assert asked.err.startswith("error: unknown variant 'A8'; valid: baseline, A1, A2, ")
 
 
 @pytest.mark.parametrize(
-    ("made", "told"),
+    ("templates", "told"),
     [
         (
-            'Block("x", "The time is {time}.", None)',
+            ("The time is {time}.", None),
             "the block 'x' names {time} on the road merge; valid: vehicle_length, own_speed, ",
         ),
-        ('Block("x", None, "To go: {distance_to_merge}.")', "{distance_to_merge} on the road str"),
-        ('Block("x", "An open {", None)', "a prompt block cannot be read"),
-        ('Block("x", "Text.", None, before="C9")', "the prompt block C6 stands before C9; valid: "),
+        ((None, "To go: {distance_to_merge}."), "{distance_to_merge} on the road straight"),
+        (("An open {", None), "a prompt block cannot be read"),
     ],
 )
-async def test_a_block_that_cannot_be_written_is_told_before_anything_is_asked(
-    run, tmp_path, made, told
-):
+def test_a_block_that_cannot_be_written_is_refused(templates, told):
+    with pytest.raises(UsageError, match=re.escape(told)):
+        Block("x", *templates)
+
+
+def test_a_block_with_no_place_is_told_before_anything_is_asked(study, tmp_path):
     source = (
         "from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant\n"
-        f'BLOCKS.register("C6", {made})\n'
+        'BLOCKS.register("C6", Block("x", "Text.", None, before="C9"))\n'
         'VARIANTS.register("A8", Variant(adds=frozenset({"C6"})))\n'
     )
     env = plugin(tmp_path / "installed", source)
-    done = await run("sweep", "baseline", "--variants", "A8", "--reps", 1, **env)
+    done = study.run("sweep", "baseline", "--variants", "A8", "--reps", 1, **env)
     assert done.code == 2
-    assert done.err.startswith("error: ")
-    assert told in done.err
+    assert done.err.startswith("error: the prompt block C6 stands before C9; valid: ")
     assert done.err.count("\n") == 1

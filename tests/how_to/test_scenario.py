@@ -44,11 +44,8 @@ async def test_a_scenario_from_outside_goes_through_every_command(merge_runner, 
         return out.decode()
 
     await installed("sweep", "long.toml", *FAST)
-    await installed("recording", "export", "own.parquet")
     await installed("sweep", "long.toml", "--model", "projected-order")
     assert "not derived anew" not in await installed("audit")
-    again = ("replay", "long.toml", "--recording", "own.parquet", "--db", "again.duckdb")
-    await installed(*again, "--cache", "empty")
 
     # From here on the package is not there.
     for command in (

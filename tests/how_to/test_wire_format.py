@@ -115,21 +115,9 @@ async def test_a_format_from_outside_goes_through_the_whole_house(run, tmp_path)
         ).fetchone() == (True,)
 
     assert (await run("audit")).code == 0
-    digest = (await run("digest")).out
-    for command in (
-        ("recording", "export", "told.parquet"),
-        ("recording", "verify", "told.parquet"),
-        ("recording", "import", "told.parquet", "--cache", "elsewhere"),
-        ("replay", "short", "--model", "talker-1", "--conditions", "N_0_0",
-         "--cache", "elsewhere", "--db", "replayed.duckdb"),
-        ("tables", "attempts"),
-        ("report", "--out", "report.html"),
-        ("view", "--export", "pages"),
-    ):  # fmt: skip
+    for command in (("tables", "attempts"), ("report", "--out", "report.html")):
         done = await run(*command, TALKER_BASE_URL=url)
         assert done.code == 0, f"{command}\n{done.err}"
-    assert (await run("digest", "--db", "replayed.duckdb")).out == digest
-    assert "talker-1" in (tmp_path / "pages/trials.html").read_text()
     sent = "for what was sent with it: at_most = 2000, engine = talker-1, temperature = 0.7."
     assert sent in (tmp_path / "report.html").read_text()
 

@@ -50,6 +50,7 @@ class Condition:
 
     def exit_times_s(self, track: Track) -> tuple[float, float]:
         """When (left, right) leave their tunnels at constant speed, from the start of the run."""
+        # In closed form: steps of 0.2 s would overshoot an exit by up to 2 m.
         (start_left, start_right), (speed_left, speed_right) = self.starts_m(track), self.speeds_mps
         return (track.tunnel_exit_m - start_left) / speed_left, (
             track.tunnel_exit_m - start_right
@@ -85,9 +86,9 @@ HUMAN_CONDITIONS: dict[str, Condition] = {
         "L_4_8",
     )
 }
-"""Those of the human experiment (Siebinga et al., 4TU 19550377), which the paper's tables mean."""
+"""Those of the human experiment (Siebinga et al., 4TU 19550377), which are the paper's, too."""
 
 CONDITIONS = Registry[Condition]("condition")
-"""All that a sweep can play. What is stored tells its own condition: see ``trials``."""
+"""All that a sweep can play. A stored trial holds the numbers of its own (table ``trials``)."""
 for _name, _condition in HUMAN_CONDITIONS.items():
     CONDITIONS.register(_name, _condition)
