@@ -224,13 +224,17 @@ class DecisionRow:
 
 @dataclass(frozen=True, slots=True)
 class FailedCall:
-    """A call without an answer, and what was tried, the first ``earlier`` times by earlier runs."""
+    """A call without an answer, and what was tried, the first ``earlier`` times by earlier runs.
+
+    ``missed`` says that a replay found no reply to it, and did not try.
+    """
 
     number: int
     side: Side
     request: ChatRequest
     attempts: tuple[Attempt, ...]
     earlier: int = 0
+    missed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

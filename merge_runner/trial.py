@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
-from merge_runner.errors import CallFailed, UsageError
+from merge_runner.errors import CallFailed, ReplayMiss, UsageError
 from merge_runner.records import (
     SIDES,
     Decision,
@@ -50,7 +50,14 @@ async def play_trial(
         states=world.states(),
         decisions=tuple(decisions),
         failed_calls=tuple(
-            FailedCall(seats[side].number(world.step), side, exc.request, exc.attempts, exc.earlier)
+            FailedCall(
+                seats[side].number(world.step),
+                side,
+                exc.request,
+                exc.attempts,
+                exc.earlier,
+                missed=isinstance(exc, ReplayMiss),
+            )
             for side, exc in failures.items()
         ),
     )

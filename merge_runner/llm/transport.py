@@ -38,14 +38,10 @@ class Transport(Protocol):
 
 
 class SealedTransport:
-    """Refuses every request and keeps what was asked for, so that a replay stays offline."""
-
-    def __init__(self) -> None:
-        self.misses: list[ChatRequest] = []
+    """Refuses every request, so that a replay stays offline."""
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Raise ReplayMiss."""
-        self.misses.append(request)
         raise ReplayMiss("no recorded reply", request)
 
     async def close(self) -> None:

@@ -31,6 +31,7 @@ from merge_runner.llm.transport import SealedTransport
 from merge_runner.run.estimate import worst_trial_usd
 from merge_runner.run.plan import Options, Plan
 
+# For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
 
 
@@ -57,9 +58,7 @@ class LocalServices:
     claims: Claims
 
 
-def sealed_clients(
-    plan: Plan, cache: ResponseCache, transport: SealedTransport
-) -> dict[str, LlmClient]:
+def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     """Clients that answer from recordings alone: no key, no connection."""
     return {
         name: LlmClient(
@@ -67,7 +66,7 @@ def sealed_clients(
             entry=entry,
             endpoint=plan.endpoints[name],
             cache=cache,
-            transport=transport,
+            transport=SealedTransport(),
             limiter=Limiter(),
             pricing=pricing(entry),
             sealed=True,
@@ -174,6 +173,7 @@ def live_clients(
 
 def _allow_open_files(wanted: int) -> None:
     """Raise this process's limit of open files to what the connections need."""
+    # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft >= wanted or soft == resource.RLIM_INFINITY:
         return

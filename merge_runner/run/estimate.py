@@ -115,7 +115,7 @@ def _per_call(plan: Plan, entry: ModelEntry, facts: CallTotals) -> _PerCall:
             output_tokens=round(facts.output_tokens / facts.measured),
         )
         return _PerCall(usage, facts.latency_s / facts.measured, True)
-    prompt_tokens = len(_typical_prompt(plan).encode()) // 4
+    prompt_tokens = len(_typical_prompt(plan).encode()) // 4  # English has about 4 bytes a token
     usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
     return _PerCall(usage, entry.typical_latency_s, False)
 

@@ -102,14 +102,17 @@ class Flusher:
     async def _flush(self) -> bool:
         """Write one batch; False if that did not work."""
         sizes = accumulate(map(size_of, self._pending[:BATCH]))
+        # At least one: a single trial may be larger than a batch should be.
         number = max(1, sum(size <= BATCH_BYTES for size in sizes))
         batch, self._pending = self._pending[:number], self._pending[number:]
+        # In a thread, since DuckDB waits for the file's lock and for the disk; the trials go on.
         try:
             self.differing |= await asyncio.to_thread(
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
             )
         except StoreError as exc:
             self._problem = exc
+            # In front, so that trials are stored in the order in which they ended.
             self._pending = batch + self._pending
             if str(exc) != self._said:  # it is tried again every second
                 self._said = str(exc)

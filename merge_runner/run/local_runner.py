@@ -133,7 +133,7 @@ class LocalRunner:
     async def _trial(
         self, spec: TrialSpec, room: Room
     ) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
-        await room()
+        await room()  # before any call: what is answered must also be stored
         scenario = self.plan.scenario
         drivers = {
             side: self.drivers[self.plan.sides[side]].make(scenario, spec, side) for side in SIDES
@@ -149,5 +149,5 @@ class LocalRunner:
                 client.leave(spec.order)
 
     async def _ask(self, model: str, prompt: str, slot: Slot, spec: TrialSpec) -> ChatReply:
-        await self.gate.enter()
+        await self.gate.enter()  # thousands of recorded replies would all be ready at once
         return await self.clients[model].ask(prompt, slot, order=spec.order)

@@ -8,8 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from merge_runner.llm.cache import Entry
-from merge_runner.llm.transport import SealedTransport
-from merge_runner.records import ChatRequest, Slot, TrialRecord
+from merge_runner.records import ChatRequest, Slot
 
 SHOWN = 70
 # Misses that differ in numbers alone have one cause.
@@ -22,14 +21,6 @@ class Miss:
 
     trial_id: str
     request: ChatRequest
-
-
-def misses_of(record: TrialRecord, sealed: SealedTransport) -> Iterator[Miss]:
-    """The calls of a trial that a sealed transport refused."""
-    refused = {request.key for request in sealed.misses} if record.failed_calls else set()
-    for failed in record.failed_calls:
-        if failed.request.key in refused:
-            yield Miss(record.spec.trial_id, failed.request)
 
 
 def explain(misses: list[Miss], recorded: Iterable[Entry]) -> list[str]:

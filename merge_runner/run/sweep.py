@@ -26,7 +26,6 @@ from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.keys import canonical_json, manner, spec_hash
 from merge_runner.llm.ledger import Ledger, Spending
 from merge_runner.llm.meter import Meter
-from merge_runner.llm.transport import SealedTransport
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.progress_file import ProgressFile
@@ -45,7 +44,7 @@ from merge_runner.run.flusher import Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
 from merge_runner.run.progress import Progress, display_progress, publish_progress
-from merge_runner.run.replay_diagnosis import Miss, explain, misses_of
+from merge_runner.run.replay_diagnosis import Miss, explain
 from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
@@ -105,7 +104,6 @@ class Sweep:
             ended = set() if options.replay else self._store.ended_trials(specs)
         self._stored = [key for key in specs if key in ended]
         self._todo = [spec for key, spec in specs.items() if key not in ended]
-        self._sealed = SealedTransport()
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
         # By a model and how many calls it had answered: an answer begins a new count.
@@ -192,7 +190,7 @@ class Sweep:
                     answered = sum(row.side == side for row in record.decisions)
                     calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
 
-        clients = sealed_clients(plan, self._cache, SealedTransport())
+        clients = sealed_clients(plan, self._cache)
         await LocalRunner(plan, clients, in_flight=1).play(self._todo, ended)
         facts = {name: self._measured(name, entry) for name, entry in plan.entries.items()}
         return estimate(plan, self._options, trials=trials, calls=calls, facts=facts)
@@ -243,7 +241,7 @@ class Sweep:
         """Who plays: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if options.replay or not self._todo or not plan.entries:
-            clients = sealed_clients(plan, self._cache, self._sealed)
+            clients = sealed_clients(plan, self._cache)
             # Recorded replies come at once: more trials in flight would only take more memory.
             return LocalRunner(plan, clients, min(options.in_flight, FROM_RECORDINGS))
         services = open_services(plan, options, self._cache, self._ledger, stack)
@@ -282,10 +280,15 @@ class Sweep:
                 self._suspended = record
                 return
             self._progress.by_cell[spec.cell][record.status] += 1
-            self._misses += misses_of(record, self._sealed)
+            self._misses += (
+                Miss(spec.trial_id, failed.request)
+                for failed in record.failed_calls
+                if failed.missed
+            )
             flusher.add(record)
             self._watch_for_outage(record, runner)
 
+        # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
         work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
         drain = asyncio.create_task(_drained(runner, work))
 
