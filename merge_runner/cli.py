@@ -283,26 +283,26 @@ def audit(
         audit_sweep,
     )
 
-    untold: list[str] = []
+    skipped: list[str] = []
     if recording is not None:
         if sweep_id is not None or cache is not None:
             raise UsageError("--recording is checked by itself: without --sweep and --cache")
         audits = [audit_recording(recording)]
     else:
         audits = audit_database(db) if sweep_id is None else [audit_sweep(db, sweep_id)]
-        untold = list(NOT_DERIVED)
+        skipped = list(NOT_DERIVED)
         if cache is not None:
             audits.append(audit_cache(db, cache, sweep_id))
-            untold = [name for name in untold if name == "calls.cached" or "calls" not in name]
+            skipped = [name for name in skipped if name == "calls.cached" or "calls" not in name]
     ok = all(found.ok for found in audits)
     if as_json:
-        whole = {"ok": ok, "not_derived": untold, "audits": [found.as_dict() for found in audits]}
+        whole = {"ok": ok, "not_derived": skipped, "audits": [found.as_dict() for found in audits]}
         print_out(json.dumps(whole, ensure_ascii=False))
     else:
         for line in chain.from_iterable(found.lines() for found in audits):
             print_out(line)
-        if untold:
-            print_out(f"not checked, since neither replies nor specs tell it: {', '.join(untold)}")
+        if skipped:
+            print_out(f"not checked, since neither replies nor specs tell it: {', '.join(skipped)}")
     sys.exit(0 if ok else 1)
 
 

@@ -1,0 +1,28 @@
+"""Which version of the measures a database has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from merge_runner.scenarios.merge import measures
+
+
+@pytest.fixture
+def version(monkeypatch):
+    """The version with some text added to the SQL."""
+    read = Path.read_text
+
+    def added(text):
+        monkeypatch.setattr(Path, "read_text", lambda self, **how: read(self, **how) + text)
+        measures._definitions.cache_clear()
+        return measures.measures_version()
+
+    yield added
+    measures._definitions.cache_clear()
+
+
+def test_a_remark_is_no_other_version_of_the_measures_and_a_definition_is(version):
+    assert version("") == version("-- A remark.\n") == version("    -- Another one.\n")
+    assert version("") != version("SELECT 1;\n")
