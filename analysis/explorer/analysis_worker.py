@@ -1,16 +1,12 @@
 """What the pages show of the analysis, computed in a process of its own.
 
 pandas and the fits hold a Python process for seconds, and no page may wait for another's numbers.
-Requests and answers are lines of JSON on standard input and output.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import queue
 import sys
-import threading
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -18,11 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.data.derived_cache import finished, keep_finished
+from analysis.explorer.child import serve
 from analysis.metrics import GAP, Metric, shown_in
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Table, from_text, options_text, to_text
-from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
@@ -227,27 +224,6 @@ def _published_gaps() -> dict[str, float]:
     return dict(zip(HUMAN_CONDITIONS, map(float, gaps), strict=True))
 
 
-def main(db: Path) -> None:
-    """Answer until standard input ends, also amid a computation: nobody waits for it any more."""
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a library prints is no answer
-    asked: queue.SimpleQueue[str] = queue.SimpleQueue()
-
-    def listen() -> None:
-        for line in sys.stdin:
-            asked.put(line)
-        os._exit(0)
-
-    threading.Thread(target=listen, daemon=True).start()
-    numbers = Numbers(db)
-    while True:
-        request = json.loads(asked.get())
-        try:
-            answer = numbers.answer(request)
-        except MergeRunnerError as exc:
-            answer = {"failure": str(exc)}
-        print(json.dumps(answer), file=answers, flush=True)
-
-
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    numbers = Numbers(Path(sys.argv[1]))
+    serve(lambda request: (numbers.answer(request), b""))

@@ -1,7 +1,6 @@
 """The process in which a query runs, or a copy is made: the explorer may kill it at any moment.
 
-It is told its job as JSON on stdin. What it says on stdout is a line of JSON, with ``error`` where
-there is one, and after it the CSV where that is asked for.
+The rows of a page are in the line of JSON of its answer, a CSV follows it.
 """
 
 from __future__ import annotations
@@ -9,11 +8,11 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import shutil
-import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any
 
 import duckdb
 
+from analysis.explorer.child import Answer, serve
 from merge_runner.errors import MergeRunnerError
 from merge_runner.results.database import Instance, read_database, readable
 from merge_runner.results.store import answering
@@ -37,7 +37,6 @@ CELL_COSTS = 30  # bytes of a cell of the page, beside its text
 LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
 # What Python is told in their place.
 INFINITE = {"9999-12-31 23:59:59.999999": "infinity", "0001-01-01 00:00:00": "-infinity"}
-MEMORY = "needed more memory"  # the explorer says how much there was
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,56 +52,44 @@ class Query:
     size: int
     """Bytes."""
     memory_mb: int
-    seconds: float
 
 
-@dataclass(frozen=True, slots=True)
-class Copying:
-    """A database, and the new file that gets all that is in it."""
-
-    database: str
-    copy: str
-
-
-def job_text(job: Query | Copying) -> str:
-    """A job as it is told."""
-    return json.dumps({type(job).__name__: asdict(job)})
-
-
-def main() -> None:
-    """Do the job of stdin."""
-    told: dict[str, Any] = json.load(sys.stdin)
-    body = b""
+def answer(told: dict[str, Any]) -> Answer:
+    """Make a copy or run a query: what is told are the fields of the one or the other."""
+    if "copy" in told:
+        return _copy(Path(told["database"]), Path(told["copy"])), b""
+    query = Query(**told)
     try:
-        if "Copying" in told:
-            said = _copy(Copying(**told["Copying"]))
-        else:
-            said, body = _run(Query(**told["Query"]))
-    except (MemoryError, duckdb.OutOfMemoryException):
-        said = {"error": MEMORY}
+        return _run(query)
+    except (MergeRunnerError, duckdb.Error, OSError, MemoryError) as exc:
+        memory = (MemoryError, duckdb.OutOfMemoryException)
+        if isinstance(exc, memory) or isinstance(exc.__cause__, memory):
+            return {"error": f"the query needed more than {query.memory_mb} MB"}, b""
+        return {"error": _one_line(exc)}, b""
+
+
+def _copy(database: Path, copy: Path) -> dict[str, Any]:
+    """Copy a database to a new file while it is open for reading here, so that nobody writes."""
+    try:
+        file = readable(database)
+        with read_database(file, Instance()):
+            # The database last: a process that closes a file loses all its locks on it.
+            for log in LOGS:
+                with contextlib.suppress(FileNotFoundError):
+                    shutil.copyfile(f"{file}{log}", f"{copy}{log}")
+            shutil.copyfile(file, copy)
+        with duckdb.connect(copy) as whole:  # the copy loses its name, and its log with it
+            whole.execute("CHECKPOINT")
     except (MergeRunnerError, duckdb.Error, OSError) as exc:
-        memory = isinstance(exc.__cause__, duckdb.OutOfMemoryException)
-        said = {"error": MEMORY if memory else _one_line(exc)}
-    sys.stdout.buffer.write(json.dumps(said, ensure_ascii=False).encode() + b"\n" + body)
-    sys.stdout.buffer.flush()
-
-
-def _copy(job: Copying) -> dict[str, Any]:
-    """Copy a database while it is open for reading here, so that nobody writes."""
-    copy = Path(job.copy)
-    database = readable(Path(job.database))
-    with read_database(database, Instance()):
-        # The database last: a process that closes a file loses all its locks on it.
-        for log in LOGS:
-            with contextlib.suppress(FileNotFoundError):
-                shutil.copyfile(f"{database}{log}", f"{copy}{log}")
-        shutil.copyfile(database, copy)
-    with duckdb.connect(copy) as whole:  # the copy loses its name, and its log with it
-        whole.execute("CHECKPOINT")
+        text = _one_line(exc)
+        # Where the files lie is not for everybody who may ask.
+        for path in (database, copy):
+            text = text.replace(f"{path.parent}{os.sep}", "")
+        return {"error": text}
     return {}
 
 
-def _run(query: Query) -> tuple[dict[str, Any], bytes]:
+def _run(query: Query) -> Answer:
     _confine(query)
     began = time.monotonic()
     with _opened(query) as connection, answering(connection, query.sql) as result:
@@ -141,8 +128,6 @@ def _confine(query: Query) -> None:
         return
     for kind, most in (
         (resource.RLIMIT_AS, (query.memory_mb + ADDRESSES_MB) << 20),
-        # Should the explorer die before it could kill this.
-        (resource.RLIMIT_CPU, int(query.seconds * THREADS) + 5),
         (resource.RLIMIT_FSIZE, 0),
         (resource.RLIMIT_CORE, 0),
     ):
@@ -174,9 +159,7 @@ def _cells(
     return cells, False
 
 
-def _csv(
-    names: list[str], rows: Iterator[tuple[Any, ...]], query: Query
-) -> tuple[dict[str, Any], bytes]:
+def _csv(names: list[str], rows: Iterator[tuple[Any, ...]], query: Query) -> Answer:
     content, lines = io.BytesIO(), io.StringIO()
     writer = csv_writer(lines)
     writer.writerow(map(in_spreadsheet, names))
@@ -240,4 +223,4 @@ def _one_line(exc: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    serve(answer)

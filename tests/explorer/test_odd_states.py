@@ -7,12 +7,13 @@ import shutil
 import socket
 import subprocess
 import sys
+from contextlib import closing
 
 import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.analysis_process import Child, Computing, Result
+from analysis.explorer.analysis_process import Computing, Result, worker
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
 
@@ -129,18 +130,16 @@ async def test_a_port_that_is_taken_is_said_in_a_line(merge_runner, study):
 def test_a_file_of_the_users_own_is_not_taken_for_ours(study, tmp_path, monkeypatch):
     (tmp_path / "analysis.py").write_text("print('MINE')")
     monkeypatch.chdir(tmp_path)
-    child = Child(study)
-    try:
-        assert child.ask(("tables", "attempts"))["counted"] > 0
-    finally:
-        child.close()
+    with closing(worker(study)) as child:
+        said, _ = child.ask(("tables", "attempts"), seconds=60, most_bytes=10**6)
+    assert said["counted"] > 0
 
 
 def test_a_fault_in_a_computation_does_not_stay(study):
-    answers = iter([ValueError("a fault"), {"counted": 1}])
+    answers = iter([ValueError("a fault"), ({"counted": 1}, b"")])
 
     class Faulty:
-        def ask(self, request):
+        def ask(self, request, **limits):
             answer = next(answers)
             if isinstance(answer, Exception):
                 raise answer

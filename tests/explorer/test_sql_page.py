@@ -14,8 +14,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
+from analysis.explorer.child import NoAnswer
 from analysis.explorer.examples import EXAMPLES
-from analysis.explorer.query_process import Caps, NoAnswer, Result
+from analysis.explorer.query_process import Caps, Result
 from analysis.explorer.schema import tables
 from analysis.explorer.site import Site
 from merge_runner.results.store import query

@@ -15,17 +15,10 @@ from starlette.testclient import TestClient
 
 from analysis.data.study import Study
 from analysis.explain import explain
-from analysis.explorer.analysis_process import (
-    Child,
-    Computing,
-    Ended,
-    Failed,
-    Failure,
-    Result,
-    Waiting,
-)
+from analysis.explorer.analysis_process import Computing, Result, Waiting, worker
 from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
+from analysis.explorer.child import Ended, NoAnswer
 from analysis.explorer.pages.ablations import ablations
 from analysis.explorer.pages.humans import kinds, scale
 from analysis.explorer.pages.tables import ABOUT
@@ -46,11 +39,11 @@ class InProcess:
     def __init__(self, db):
         self._numbers = Numbers(db)
 
-    def ask(self, request):
+    def ask(self, request, **limits):
         try:
-            return self._numbers.answer(request)
+            return self._numbers.answer(request), b""
         except MergeRunnerError as exc:
-            raise Failure(str(exc)) from exc
+            raise NoAnswer(str(exc)) from exc
 
     def close(self):
         pass
@@ -161,7 +154,7 @@ def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at
     asked = []
 
     class Counting(InProcess):
-        def ask(self, request):
+        def ask(self, request, **limits):
             asked.append(request)
             return super().ask(request)
 
@@ -181,8 +174,8 @@ def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_
     found = {(1, 1): {"absent": "no such row"}, (2, 2): {"value": "7"}}
 
     class Once(InProcess):
-        def ask(self, request):
-            return found[computing._state]
+        def ask(self, request, **limits):
+            return found[computing._state], b""
 
     computing = Computing(db, Once)
     cell, table = ("cell", "attempts", "o3/A9", "n"), ("tables", "attempts")
@@ -321,10 +314,10 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
     going, asked = threading.Event(), threading.Event()
 
     class Slow(InProcess):
-        def ask(self, request):
+        def ask(self, request, **limits):
             asked.set()
             going.wait(20)
-            raise Ended("it broke <off>")
+            raise NoAnswer("it broke <off>")
 
     site = Site(db)
     site.computing = Computing(db, Slow)
@@ -343,9 +336,9 @@ def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
     made = []
 
     class Counting(InProcess):
-        def ask(self, request):
+        def ask(self, request, **limits):
             made.append(request)
-            return {"counted": len(made)}
+            return {"counted": len(made)}, b""
 
     computing = Computing(db, Counting)
     first = computing.ask(("humans",), (1, 1), wait_s=5)
@@ -358,18 +351,21 @@ def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
 
 
 def test_a_process_of_its_own_answers_alike_and_its_end_is_a_failure(db):
-    computing = Computing(db, Child)
+    computing = Computing(db)
     request = ("tables", "attempts")
     while isinstance(found := computing.ask(request, (1, 1), wait_s=30), Waiting):
         pass
     assert found.content == Numbers(db).answer(request)
-    broken = computing.ask(("nothing",), (1, 1), wait_s=30)
-    assert broken == Failed("nothing answers ['nothing']")
+    with pytest.raises(NoAnswer, match=re.escape("nothing answers ['nothing']")):
+        computing.ask(("nothing",), (1, 1), wait_s=30)
+    computing._child.process.kill()
+    with pytest.raises(NoAnswer, match=r"without an answer \(exit code -9\)"):
+        computing.ask(("tables", "fallbacks"), (1, 1), wait_s=30)
     computing.close()
-    child = Child(db)
+    child = worker(db)
     child.close()
     with pytest.raises(Ended):
-        child.ask(request)
+        child.ask(request, seconds=1, most_bytes=1000)
 
 
 @pytest.mark.parametrize(

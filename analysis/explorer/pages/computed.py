@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
-from analysis.explorer.analysis_process import Request, Result, Waiting, about_s
+from analysis.explorer.analysis_process import LONGEST_S, Request, Result, Waiting, about_s
+from analysis.explorer.child import NoAnswer
 from analysis.explorer.query_params import seconds
 from analysis.explorer.site import NotThere, Site
 from analysis.explorer.urls import query_of
@@ -14,8 +15,6 @@ from analysis.explorer.urls import query_of
 # What is kept in the database comes within the first; the second is for a page that shows a clock.
 AT_ONCE_S = 0.3
 PATIENT_S = 4.0
-# A page that stands alone must hold the result.
-EXPORT_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +55,18 @@ def computed(
     """
     state = site.catalogue.state()
     if site.static:
-        wait_s = EXPORT_S
+        wait_s = LONGEST_S  # a page that stands alone must hold the result
     elif patient:
         wait_s = PATIENT_S
-    found = site.computing.ask(request, state, since=seconds(asked.get("since", "")), wait_s=wait_s)
+    since, failure = seconds(asked.get("since", "")), ""
+    found: Result | Waiting | None = None
+    try:
+        found = site.computing.ask(request, state, since=since, wait_s=wait_s)
+    except NoAnswer as exc:
+        failure = str(exc)
     result = found if isinstance(found, Result) else None
     if result is not None and "absent" in result.content:
         raise NotThere(result.content["absent"])
-    failure = "" if isinstance(found, Result | Waiting) else found.text
     later = {"since": f"{result.at + 0.001:.3f}"} if result else {}
     return Computed(
         result=result,

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from analysis.explorer.child import NoAnswer
 from analysis.explorer.display_text import visible
 from analysis.explorer.examples import EXAMPLES
-from analysis.explorer.query_process import DOWNLOADED_ROWS, LONGEST, NoAnswer, Result
+from analysis.explorer.query_process import DOWNLOADED_ROWS, LONGEST, Result
 from analysis.explorer.schema import tables, units
 from analysis.explorer.site import Site
 from merge_runner.errors import MergeRunnerError
