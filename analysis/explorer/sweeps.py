@@ -36,12 +36,11 @@ SELECT coalesce(variant, '') AS variant, condition,
     sum(invalid)::BIGINT AS invalid, sum(fallbacks)::BIGINT AS fallbacks
 FROM listed {OF_SWEEP} GROUP BY ALL ORDER BY ALL
 """  # noqa: S608 # constants
-TRIED = """
+TRIED = f"""
 SELECT requested, served, answered, outcome, sum(times)::BIGINT AS times,
     sum(unpriced)::BIGINT AS unpriced, answered AND (requested, served) IN (FROM others) AS other
-FROM tried SEMI JOIN (FROM planned WHERE sweep = ?) USING (trial_id, spec_hash)
-GROUP BY ALL ORDER BY ALL
-"""
+FROM tried {OF_SWEEP} GROUP BY ALL ORDER BY ALL
+"""  # noqa: S608 # constants
 CAUSES = f"""
 SELECT cause, count(*) AS trials, sum(times)::BIGINT AS times
 FROM causes {OF_SWEEP} WHERE NOT starts_with(cause, 'model: ')

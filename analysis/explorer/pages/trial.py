@@ -10,7 +10,6 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from analysis.explorer import views
-from analysis.explorer.catalogue import Filter
 from analysis.explorer.details import Decision, Trial, read_decisions, read_trial
 from analysis.explorer.display_text import shortened
 from analysis.explorer.query_params import whole
@@ -130,8 +129,7 @@ def alternatives(site: Site, row: Row) -> dict[str, list[Row]]:
 
     ``key`` names one in an address: by its name, and its spec where that name has several.
     """
-    same = Filter(condition=row["condition"])
-    found = site.catalogue.near(same, row, OFFERED)
+    found = site.catalogue.near(row, OFFERED)
     times = Counter(other["trial_id"] for other in found)
     kinds: dict[str, list[Row]] = {}
     for other in found:
