@@ -153,7 +153,7 @@ def human_panels(study: Study) -> dict[str, Any]:
     condition, as far as there are such, and a ``text`` that says what they are.
     """
     from analysis.data.load import SPECS, load
-    from analysis.data.reference_data import citation
+    from analysis.data.reference_data import HUMAN_TRIALS, citation
     from analysis.stats.measures import known, outcomes_note
     from analysis.tables.notes import sample_notes
 
@@ -163,6 +163,7 @@ def human_panels(study: Study) -> dict[str, Any]:
     return {
         "measured": study.human.measured,
         "outcomes_from": citation("human_outcomes"),
+        "published_trials": HUMAN_TRIALS,
         "published": {metric.name: _published(metric) for metric in unknown} if there else {},
         "conditions": study.conditions,
         "notes": sample_notes(study, study.baselines),

@@ -33,6 +33,10 @@ from merge_runner.errors import MergeRunnerError
 LOG = logging.getLogger(__name__)
 # A page that is to be asked for again, in s.
 AGAIN = {"refresh": "1"}
+FIRST_TIME = (
+    "The trials are read for the first time; ten thousand take about ten seconds. This page comes "
+    "back by itself."
+)
 STATIC = Path(__file__).with_name("static")
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 # Nothing in a reply runs, whatever a browser takes it for.
@@ -155,7 +159,7 @@ def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[
 
     def answer(request: Request) -> Response:
         if site.beginning:
-            return HTMLResponse(site.render("beginning.html", here=""), headers=AGAIN)
+            return HTMLResponse(_message(site, "Reading the trials", FIRST_TIME), headers=AGAIN)
         site.catalogue.refresh()
         try:
             rendered = render(request)
@@ -166,11 +170,15 @@ def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[
     return answer
 
 
+def _message(site: Site, heading: str, text: str) -> str:
+    return site.render("message.html", heading=heading, text=text, here="")
+
+
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
     """What is said where there is no page."""
 
     def said(heading: str, text: str, code: int) -> Response:
-        return HTMLResponse(site.render("message.html", heading=heading, text=text, here=""), code)
+        return HTMLResponse(_message(site, heading, text), code)
 
     def absent(_: Request, exc: Exception) -> Response:
         reply = said("Not there", str(exc), 404)

@@ -45,7 +45,7 @@ class Caps:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class QueryResult:
     """What a query found: names and types of columns, and texts; None is NULL.
 
     A text comes with how many of its characters are left out. With ``more`` there are more rows.
@@ -104,11 +104,11 @@ class Sandbox:
         default_factory=lambda: threading.Semaphore(AT_ONCE + WAITING)
     )
 
-    def result(self, sql: str) -> Result:
+    def result(self, sql: str) -> QueryResult:
         """What a query finds, as much of it as is shown; raises NoAnswer and UsageError."""
         said, _ = self._answer(sql, as_csv=False)
         columns = [(name, kind) for name, kind in said["columns"]]
-        return Result(columns, said["rows"], said["more"], said["seconds"])
+        return QueryResult(columns, said["rows"], said["more"], said["seconds"])
 
     def csv(self, sql: str) -> bytes:
         """All that a query finds; raises NoAnswer and UsageError."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -194,6 +194,7 @@ class Sweep:
     """One sweep with all that its page shows."""
 
     entry: ListedSweep
+    newest: ListedSweep = field(repr=False)  # of which the page shows little
     assessment: Assessment
     cells: dict[tuple[str, str], VariantCondition]
     rates: list[Rate]
@@ -202,49 +203,43 @@ class Sweep:
     unpriced: int
 
 
-def list_sweeps(catalogue: Catalogue) -> list[ListedSweep]:
+def list_sweeps(catalogue: Catalogue, *, refresh: bool = True) -> list[ListedSweep]:
     """All sweeps, the newest first. Raises what ``Catalogue.refresh`` does."""
-    before = {
-        row["sweep_id"]: read_standing(catalogue.db, row["sweep_id"])
-        for row in catalogue.ask(SWEEPS)
-        if row["ended_at"] is None
-    }
-    catalogue.refresh()
+    if refresh:
+        catalogue.refresh()
+    entries = _entries(catalogue)
+    # A sweep notes its end in the database before its file goes: one that seems to be lost may have
+    # ended since the database was read.
+    if refresh and any(entry.state == "lost" for entry in entries) and catalogue.refresh():
+        return _entries(catalogue)
+    return entries
+
+
+def _entries(catalogue: Catalogue) -> list[ListedSweep]:
     return [
         ListedSweep(
-            row, config_of(row["config"]), _newest(catalogue, row, before.get(row["sweep_id"]))
+            row,
+            config_of(row["config"]),
+            None if row["ended_at"] else read_standing(catalogue.db, row["sweep_id"]),
         )
         for row in catalogue.ask(SWEEPS)
     ]
 
 
-def _newest(catalogue: Catalogue, row: Row, before: Standing | None) -> Standing | None:
-    """What a sweep says of itself, read also before its row, and after it.
-
-    It notes its end in the database before its file goes; and to read the database takes a while.
-    """
-    if row["ended_at"] is not None:
-        return None
-    return read_standing(catalogue.db, row["sweep_id"]) or before
-
-
 def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> Sweep | None:
     """One sweep; None where there is none. Raises what ``Catalogue.refresh`` does."""
-    standing = read_standing(catalogue.db, sweep_id)
-    if refresh:
-        catalogue.refresh()
-    rows = catalogue.ask(SWEEPS)
-    place = next((i for i, row in enumerate(rows) if row["sweep_id"] == sweep_id), None)
+    entries = list_sweeps(catalogue, refresh=refresh)
+    place = next((i for i, entry in enumerate(entries) if entry.sweep_id == sweep_id), None)
     if place is None:
         return None
-    row = rows[place]
-    entry = ListedSweep(row, config_of(row["config"]), _newest(catalogue, row, standing))
+    entry = entries[place]
     stored = catalogue.ask(CELLS, sweep_id)
     tried = catalogue.ask(TRIED, sweep_id)
     mismatches = mismatches_of(tried)
     return Sweep(
         entry=entry,
-        assessment=assessment_of(entry, _later(entry, rows[:place]), sum(mismatches.values())),
+        newest=entries[0],
+        assessment=assessment_of(entry, _later(entry, entries[:place]), sum(mismatches.values())),
         cells=cells_of(entry, stored),
         rates=rates_of(stored, tried, mismatches, sweep_id),
         mismatches=mismatches,
@@ -397,11 +392,10 @@ def _again(entry: ListedSweep) -> str:
     return shlex.join(words)
 
 
-def _later(entry: ListedSweep, newer: list[Row]) -> str:
+def _later(entry: ListedSweep, newer: list[ListedSweep]) -> str:
     """The newest sweep that went on with the same trials."""
-    for row in newer:
-        config = config_of(row["config"])
-        same = (config.model, config.sample_set) == (entry.config.model, entry.config.sample_set)
-        if row["name"] == entry.row["name"] and same:
-            return str(row["sweep_id"])
-    return ""
+
+    def plays(sweep: ListedSweep) -> tuple[str, str, int]:
+        return sweep.row["name"], sweep.config.model, sweep.config.sample_set
+
+    return next((other.sweep_id for other in newer if plays(other) == plays(entry)), "")

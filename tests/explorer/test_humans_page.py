@@ -12,7 +12,8 @@ from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
-from analysis.explorer.pages.humans import HUMAN, chart, kinds, marker, marks
+from analysis.explorer.pages.humans import HUMAN, chart, kinds, marks
+from analysis.explorer.pictures import marker
 from analysis.explorer.site import Site
 from analysis.figures.styles import HUMAN_STYLE, MARKERS, driver_style
 from analysis.human.archive import open_files

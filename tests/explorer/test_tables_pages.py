@@ -20,10 +20,11 @@ from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
 from analysis.explorer.child import Ended, NoAnswer
 from analysis.explorer.pages.ablations import ablations
-from analysis.explorer.pages.humans import kinds, scale
+from analysis.explorer.pages.humans import kinds
 from analysis.explorer.pages.tables import ABOUT
+from analysis.explorer.pictures import ends_and_ticks
 from analysis.explorer.site import Site
-from analysis.metrics import shown_in
+from analysis.metrics import METRICS, shown_in
 from analysis.tables import TABLES, make_tables
 from merge_runner.errors import MergeRunnerError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -379,6 +380,7 @@ def test_a_process_of_its_own_answers_alike_and_its_end_is_a_failure(db):
     ],
 )
 def test_a_scale_holds_all_that_is_shown_and_0(kind, reached, ends):
-    low, high, ticks = scale(next(each for each in kinds() if each.name == kind), *reached)
+    metric = METRICS[kind]
+    low, high, ticks = ends_and_ticks(*reached, metric.lowest, metric.highest)
     assert (low, high) == ends
     assert {low, 0, high} <= {round(tick, 6) for tick in ticks}

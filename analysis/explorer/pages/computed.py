@@ -8,9 +8,8 @@ from datetime import datetime
 
 from analysis.explorer.analysis_process import LONGEST_S, Request, Result, Waiting, about_s
 from analysis.explorer.child import NoAnswer
-from analysis.explorer.query_params import seconds
 from analysis.explorer.site import NotThere, Site
-from analysis.explorer.urls import query_of
+from analysis.explorer.urls import query_of, seconds
 
 # What is kept in the database comes within the first; the second is for a page that shows a clock.
 AT_ONCE_S = 0.3

@@ -49,8 +49,7 @@ def sweeps_page(site: Site, seen: str = "") -> str:
 def sweep_page(site: Site, sweep_id: str, seen: str = "") -> str:
     """One sweep, and a newer one if there is; raises NotThere, and NothingNew as ``seen``."""
     sweep = _find(site, sweep_id)
-    newest = list_sweeps(site.catalogue)[0]
-    newer = newest if newest.sweep_id != sweep_id else None
+    newer = sweep.newest if sweep.newest.sweep_id != sweep_id else None
     state = (sweep, newer and (newer.sweep_id, newer.state))
     return site.render(
         "sweep.html", here="sweeps", newer=newer, seen=_news(state, seen), **_values(site, sweep)

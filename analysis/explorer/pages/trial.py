@@ -12,9 +12,10 @@ from markupsafe import Markup, escape
 from analysis.explorer import views
 from analysis.explorer.details import Decision, Trial, read_decisions, read_trial
 from analysis.explorer.display_text import shortened
-from analysis.explorer.query_params import whole
+from analysis.explorer.pictures import step_points
 from analysis.explorer.reading import Row
 from analysis.explorer.site import NotThere, Site
+from analysis.explorer.urls import whole
 from merge_runner.records import SIDES
 
 # So many trials of a kind are offered to compare with.
@@ -93,7 +94,7 @@ def rendered(site: Site, row: Row, trial: Trial, found: Decision) -> str:
         reply=None if body is None else {"text": text, "more": more},
         raw=site.at.raw(row, found.row["side"], found.row["decision"]),
         chart=views.plan_chart(found, trial),
-        points=views.step_points,
+        points=step_points,
         aftermath=views.aftermath(trial, found),
     )
 

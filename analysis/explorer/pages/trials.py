@@ -8,9 +8,9 @@ from typing import Any
 
 from analysis.explorer.catalogue import FACETS, PAGE, SORTS, Filter
 from analysis.explorer.pages.computed import computed
-from analysis.explorer.query_params import whole
+from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.site import NothingNew, NotThere, Site
-from analysis.explorer.views import sparkline, speed_scale
+from analysis.explorer.urls import whole
 from analysis.tables import TABLES
 from merge_runner.errors import StoreError
 
@@ -47,7 +47,7 @@ def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         totals=totals,
         trials=trials,
         rows=rows,
-        scale=speed_scale(rows),
+        scale=speed_range(rows),
         news=at_of(site, asked, seen=state),
         page=number,
         last_page=last,
