@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
@@ -20,7 +19,6 @@ from starlette.responses import (
     PlainTextResponse,
     RedirectResponse,
     Response,
-    StreamingResponse,
 )
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -69,21 +67,11 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
 
 
 def _sweep_routes(site: Site) -> list[Route]:
-    async def events(request: Request) -> Response:
-        sweep_id = request.path_params["sweep"]
-        await run_in_threadpool(sweep.require_sweep, site, sweep_id)
-        # Nothing between us and the browser may hold the stream back.
-        plain = {"x-accel-buffering": "no"}
-        return StreamingResponse(
-            sweep.sweep_events(site, sweep_id), media_type="text/event-stream", headers=plain
-        )
-
     page = partial(_page, site)
     one = page(lambda r: sweep.sweep_page(site, r.path_params["sweep"], _seen(r)))
     return [
         Route("/", page(lambda _: RedirectResponse(sweep.home(site)))),
         Route("/sweeps", page(lambda r: sweep.sweeps_page(site, _seen(r)))),
-        Route("/sweeps/{sweep:path}/events", events),
         Route("/sweeps/{sweep:path}", one),
     ]
 

@@ -33,7 +33,7 @@ def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
     hosts = [f"{name}:{port}" for name in names_of(bind, address)]
     say(f"http://{hosts[0]}/" + (f"?token={token}" if token else ""))
     config = uvicorn.Config(explorer(site, hosts, token), log_level="critical", ws="none")
-    _Server(config, site).run(sockets=[listener])
+    uvicorn.Server(config).run(sockets=[listener])
 
 
 def names_of(bind: str, address: str) -> list[str]:
@@ -52,19 +52,6 @@ def _program() -> str:
     typed = sys.argv[0]
     plain = Path(typed).name != "merge-runner" or shutil.which("merge-runner") == typed
     return "merge-runner" if plain else typed
-
-
-class _Server(uvicorn.Server):
-    """One that ends the streams when it ends: it waits for its connections otherwise."""
-
-    def __init__(self, config: uvicorn.Config, site: Site) -> None:
-        super().__init__(config)
-        self._site = site
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop serving."""
-        self._site.closing = True
-        await super().shutdown(sockets)
 
 
 def listen(bind: str, port: int) -> socket.socket:

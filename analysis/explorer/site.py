@@ -50,8 +50,6 @@ class Site:
     """What to type to run this program."""
     shared: dict[str, object] = field(default_factory=dict)
     """What else all templates see."""
-    closing: bool = False
-    """Whether the server ends: a stream must not keep it waiting."""
 
     def __post_init__(self) -> None:
         self._first_reading: threading.Thread | None = None

@@ -203,14 +203,13 @@ class Sweep:
     unpriced: int
 
 
-def list_sweeps(catalogue: Catalogue, *, refresh: bool = True) -> list[ListedSweep]:
+def list_sweeps(catalogue: Catalogue) -> list[ListedSweep]:
     """All sweeps, the newest first. Raises what ``Catalogue.refresh`` does."""
-    if refresh:
-        catalogue.refresh()
+    catalogue.refresh()
     entries = _entries(catalogue)
     # A sweep notes its end in the database before its file goes: one that seems to be lost may have
     # ended since the database was read.
-    if refresh and any(entry.state == "lost" for entry in entries) and catalogue.refresh():
+    if any(entry.state == "lost" for entry in entries) and catalogue.refresh():
         return _entries(catalogue)
     return entries
 
@@ -226,9 +225,9 @@ def _entries(catalogue: Catalogue) -> list[ListedSweep]:
     ]
 
 
-def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> Sweep | None:
+def find_sweep(catalogue: Catalogue, sweep_id: str) -> Sweep | None:
     """One sweep; None where there is none. Raises what ``Catalogue.refresh`` does."""
-    entries = list_sweeps(catalogue, refresh=refresh)
+    entries = list_sweeps(catalogue)
     place = next((i for i, entry in enumerate(entries) if entry.sweep_id == sweep_id), None)
     if place is None:
         return None

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import socket
-import subprocess
-import sys
 from contextlib import closing
 
 import duckdb
@@ -16,6 +13,7 @@ from starlette.testclient import TestClient
 from analysis.explorer.analysis_process import Computing, Result, worker
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
+from tests.explorer.serving import held
 
 HOST = "127.0.0.1:8700"
 TRIAL = "/trials/emulator/baseline/N_0_0/rep01"
@@ -96,25 +94,11 @@ def test_a_trial_that_failed_again_shows_its_new_error(db):
 def test_while_another_program_holds_the_database_the_last_list_is_shown(db):
     site = Site(db)
     assert "holds the database" not in ask(site, "/trials").text
-    holder = subprocess.Popen(
-        [
-            *(sys.executable, "-c"),
-            "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True);"
-            "sys.stdin.read()",
-            str(db),
-        ],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    )
-    assert holder.stdout.readline() == b"held\n"
-    os.utime(db)  # something has changed
-    try:
+    with held(db):
         for address in ("/trials", "/trials?condition=N_0_0", "/sweeps", "/tables"):
             reply = ask(site, address)
             assert reply.status_code == 200
             assert "Another program holds the database" in reply.text
-    finally:
-        holder.communicate()
     assert "holds the database" not in ask(site, "/trials").text
 
 
