@@ -24,9 +24,9 @@ MOST_BYTES = 2**30
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """An answer, the state of the database that it was made in, and when (s since 1970).
+    """An answer, the state of the database that it describes, and when it was made (s since 1970).
 
-    It may be that what is asked for is ``absent``.
+    ``content`` has ``absent`` where no table has what was asked for.
     """
 
     content: dict[str, Any]
@@ -65,8 +65,8 @@ class Computing:
     ) -> Result | Waiting:
         """An answer made at ``since`` (s since 1970) or later, waiting at most ``wait_s`` for it.
 
-        ``state`` is the present one; an answer of an earlier one will do, for it says so. Raises
-        NoAnswer.
+        ``state`` is the present one; an answer made in an earlier one will do, since it says which.
+        Raises NoAnswer.
         """
         with self._lock:
             found = self._results.get(request)
@@ -98,11 +98,11 @@ class Computing:
             self._child.close()
 
     def _stands(self, result: Result) -> bool:
-        """What is absent may be there in the state of another process."""
+        """Whether an answer still holds: what was absent may be there in another state."""
         return "absent" not in result.content or result.state == self._state
 
     def _run(self, request: Request, state: State, since: float) -> Result:
-        # A cell is counted in the state of its table, unless a later one is wanted.
+        # A cell is looked up in the state that its table shows, unless a later one is wanted.
         stays = self._state == state or (request[0] == "cell" and not since)
         if self._child is None or not stays:
             self._end()

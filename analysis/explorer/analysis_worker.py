@@ -38,8 +38,8 @@ class Numbers:
 
         Where no table has the cell, the answer says so as ``absent``.
 
-        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``, whatever
-        stands after it. Raises MergeRunnerError.
+        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``, and what
+        follows that is ignored. Raises MergeRunnerError.
         """
         match list(request):
             case ["tables", *names]:
@@ -78,14 +78,14 @@ class Numbers:
         return self._counted() | {"tables": [to_text(found[name]) for name in names]}
 
     def _finished(self, names: Sequence[str]) -> dict[str, Table]:
-        """Tables by name, kept ones where the database has them."""
+        """Tables by name; those that are kept in the database are not made again."""
         options = options_text(self.db, None)
         _, kept = finished(self.db, options, names)
         found = {name: from_text(text) for name, text in kept.items()}
         if missing := [name for name in names if name not in found]:
             study, state = self._read
             made = dict(zip(missing, make_tables(study, missing), strict=True))
-            # They are of the state in which the study was read; where it is past, nothing is kept.
+            # They show the state in which the study was read; if it is past, they are not kept.
             keep_finished(self.db, state, options, {name: to_text(made[name]) for name in missing})
             found |= made
         return found

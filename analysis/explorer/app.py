@@ -29,7 +29,7 @@ from analysis.explorer.site import NothingNew, NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
 LOG = logging.getLogger(__name__)
-# A page that is to be asked for again, in s.
+# The browser asks for the page again after this many s.
 AGAIN = {"refresh": "1"}
 FIRST_TIME = (
     "The trials are read for the first time; ten thousand take about ten seconds. This page comes "
@@ -133,12 +133,12 @@ def _computed_routes(site: Site) -> list[Route]:
 
 
 def _seen(request: Request) -> str:
-    """What a page has seen already, that looks for news."""
+    """What a page that looks for news has shown already."""
     return request.query_params.get("seen", "")
 
 
 def _patience(request: Request) -> dict[str, bool]:
-    """A script of ours asks for what a page has said to be on its way."""
+    """Whether a script asks again for a result that its page has said to be on its way."""
     return {"patient": request.headers.get("hx-request") == "true"}
 
 
@@ -163,7 +163,7 @@ def _message(site: Site, heading: str, text: str) -> str:
 
 
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
-    """What is said where there is no page."""
+    """The pages that say why there is no other."""
 
     def said(heading: str, text: str, code: int) -> Response:
         return HTMLResponse(_message(site, heading, text), code)
@@ -187,7 +187,7 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
 
 
 def _sql_routes(site: Site) -> list[Route]:
-    """A query runs for us alone: where another site leads to it, it is shown."""
+    """Only our own pages run a query; where another site leads to one, it is shown and not run."""
 
     def sql_query(request: Request) -> Response:
         run = not from_elsewhere(request.headers)

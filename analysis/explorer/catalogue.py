@@ -20,7 +20,7 @@ from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer
 
 PAGE = 100
-# Two are equal where the same trials are listed: unlike a stamp, it stands when tables are kept.
+# Equal where the same trials are listed; unlike a stamp it does not change when a table is kept.
 State = tuple[int, int]
 # Trials of a variant and of its driver's baseline in equal conditions and repetitions; ``fate`` is
 # what is compared.
@@ -59,8 +59,8 @@ CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, inv
     fallbacks BIGINT, flaws VARCHAR[]);
 CREATE TABLE called AS SELECT trial_id, spec_hash, attempts, cost_usd, posed, tried FROM listed;
 """
-# What each sweep has of them; what went wrong in a trial, and how often. Of an error stand the
-# words before its particulars.
+# The trials of each sweep, and how often what went wrong in a trial. Equal failures are counted
+# together: an error is named by its words before the particulars, without numbers and hashes.
 GROUPED = """
 CREATE OR REPLACE TABLE members AS
     SELECT sweep, number FROM planned JOIN listed USING (trial_id, spec_hash);
@@ -111,8 +111,8 @@ INSERT INTO memory.called BY NAME
         FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL
     ) GROUP BY ALL;
 """
-# After an invalid reply there is always a fallback, and no other time: the audit sees to that.
-# A sparkline has about 24 points, and its words the slowest and the fastest of all.
+# A fallback follows every invalid reply, and nothing else; the audit checks that.
+# A sparkline has about 24 points; its words give the slowest and the fastest of all samples.
 LIST = """
 INSERT INTO listed BY NAME
 SELECT trials.trial_id, trials.spec_hash, source, model_left, model_right,
@@ -148,13 +148,13 @@ LEFT JOIN (
 ) USING (trial_id, spec_hash);
 TRUNCATE trials; TRUNCATE states; TRUNCATE decided; TRUNCATE called;
 """
-# Trials of stand-ins that are not said to be: by the model asked for, and the sides it answered on.
+# Trials that a stand-in drove, without a note on it yet: by the models asked for, and its sides.
 UNNAMED = """
 SELECT model_left, model_right, posed, list(number)
 FROM listed WHERE scripted AND stand_in IS NULL GROUP BY ALL
 """
 FACETS = ("sweep", "model", "variant", "condition", "outcome", "validity", "cause")
-# Facets of which a trial may have several: their tables.
+# Facets of which a trial may have several values, and the tables that hold these.
 SEVERAL = {"sweep": "members", "cause": "causes"}
 SORTS = {
     "trial": "trial_id",
@@ -215,22 +215,6 @@ class Filter:
         return {name: value for name, value in named.items() if value}
 
 
-@dataclass(frozen=True, slots=True)
-class Totals:
-    """Counts over trials of a filter, and means over those that have the value."""
-
-    trials: int
-    collided: int
-    failed: int
-    ended: int
-    decisions: int
-    invalid: int
-    fallbacks: int
-    cost_usd: float
-    gap_m: float | None
-    rmse_mps: float | None
-
-
 @dataclass(slots=True)
 class Catalogue:
     """All trials of a database. Threads take turns.
@@ -243,9 +227,9 @@ class Catalogue:
     _connection: duckdb.DuckDBPyConnection | None = None
     _instance: Instance = field(default_factory=Instance)
     _file: int | None = None
-    """The file that is listed, and no other that took its place."""
+    """The inode of the file that is listed: another file may take its name."""
     _stamp: tuple[int, ...] | None = None
-    """What was read last, wholly."""
+    """The stamp of the database when it was last read to the end."""
     _lock: threading.RLock = field(default_factory=threading.RLock)
 
     def refresh(self) -> bool:
@@ -265,6 +249,7 @@ class Catalogue:
                 # What is forgotten is taken again before anybody else can hold the file.
                 waiting = self._reading(FORGET + TAKE)
                 while waiting:
+                    # With the file closed: measuring takes longer than copying.
                     self._memory.execute(LIST)
                     waiting = self._reading(TAKE)
             except StoreLocked:
@@ -297,8 +282,11 @@ class Catalogue:
             found[row["facet"]].append((row["value"], row["trials"]))
         return found
 
-    def totals(self, wanted: Filter) -> dict[str, Totals]:
-        """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``."""
+    def totals(self, wanted: Filter) -> dict[str, Row]:
+        """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``.
+
+        Counts over all of them, and means over those that have the value.
+        """
         where, values = wanted.where()
         rows = self.ask(
             "SELECT CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' "  # noqa: S608 # constants
@@ -312,7 +300,7 @@ class Catalogue:
             f"FROM listed WHERE {where} GROUP BY ALL ORDER BY ALL",
             *values,
         )
-        return {row.pop("who"): Totals(**row) for row in rows}
+        return {row["who"]: row for row in rows}
 
     def page(self, wanted: Filter, sort: str, number: int) -> list[Row]:
         """The trials of one page, counted from 1; ``-gap`` sorts the largest gap first."""
@@ -415,7 +403,7 @@ class Catalogue:
         return count
 
     def _name_stand_ins(self) -> None:
-        """Say of each trial that a stand-in drove for whom it stood."""
+        """Note for each trial that a stand-in drove which model it stood in for."""
         unnamed = self._memory.execute(UNNAMED).fetchall()
         for left, right, sides, numbers in unnamed:
             self._memory.execute(

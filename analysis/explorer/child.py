@@ -68,6 +68,7 @@ class Child:
             late.set()
             self.process.kill()
 
+        # A read from a pipe has no time limit of its own.
         clock = threading.Timer(seconds, stop)
         clock.start()
         try:
@@ -122,6 +123,7 @@ def serve(answer: Callable[[Any], Answer]) -> None:
             asked.put(line)
         os._exit(0)
 
+    # The main thread is busy with a request: only another one sees that the input has ended.
     threading.Thread(target=listen, daemon=True).start()
     while True:
         try:

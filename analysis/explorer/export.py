@@ -41,21 +41,21 @@ STYLES = ("vendor/uplot-1.6.32.min.css", "explorer.css")
 PLAIN = ("keys.js",)
 LISTING = ("keys.js", "unpacked.js", "listing.js")
 BUNDLE = ("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
-# Where a server would lead on, a file does not.
+# A link that only a server can follow.
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
-# What is taken for a secret wherever it stands, beside the values of this machine's keys.
+# What looks like a key, wherever it is from; the values of this machine's keys are looked for too.
 _KEYS = re.compile(
     r"\b(?:sk-[A-Za-z0-9_-]{16,}|AIza[A-Za-z0-9_-]{30,}|Bearer [A-Za-z0-9._-]{16,}"
     r"|gh[opsu]_[A-Za-z0-9]{30,}|github_pat_[A-Za-z0-9_]{30,}|hf_[A-Za-z0-9]{30,}"
     r"|xox[abp]-[A-Za-z0-9-]{16,}|A[KS]IA[A-Z0-9]{16})"
 )
 _SECRET_NAMES = ("_KEY", "_TOKEN", "_SECRET", "_PASSWORD")
-# Whoever's home it is.
+# A folder in anybody's home.
 _HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\]")
 SHORTEST_SECRET = 8
-# What an export is made of, and its names alone.
+# The names of an export's pages: those of an earlier one are deleted, and nothing else.
 _OURS = re.compile(rf"(?:index|{'|'.join(EXPORTED)}|(?:sweep|table|trials)-.*)\.html")
-# Packed data, which are searched before they are packed: their letters spell anything.
+# Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
     r'<script type="application/json" id="(?:bundle|cells)">.*?</script>', re.DOTALL
 )
@@ -71,7 +71,7 @@ class Inlined:
 
 
 Watch = Callable[[Sequence[Any], str], Iterable[Any]]
-"""Shows how far a loop is: gets what it goes through, and a name; gives the same to go through."""
+"""Shows how far a loop has come: takes its items and a name, and returns the items."""
 
 
 def unwatched(things: Sequence[Any], _: str) -> Iterable[Any]:
@@ -275,7 +275,7 @@ def _refuse_secrets_of(site: Site, pages: Mapping[str, str]) -> None:
 def _refuse_secrets(site: Site, where: str, texts: Sequence[str]) -> None:
     """Raises UsageError where a text holds a key, or a path of this machine."""
     folders = (Path.home(), Path.cwd(), site.db.resolve().parent, PROJECT, tempfile.gettempdir())
-    paths = {str(folder) for folder in folders} - {"/"}
+    paths = {str(folder) for folder in folders} - {"/"}  # in a container the home may be "/"
     secrets = {
         value: name
         for name, value in os.environ.items()

@@ -13,12 +13,12 @@ import threading
 import weakref
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from analysis.explorer.catalogue import stamp_of
 from analysis.explorer.child import Answer, Child, Ended, NoAnswer
-from analysis.explorer.query_worker import Query
+from analysis.explorer.query_worker import Caps, Query
 from merge_runner.paths import PROJECT
 
 AT_ONCE = 2
@@ -29,19 +29,6 @@ LONGEST = 10_000  # characters of a query
 DOWNLOADED_ROWS = 100_000
 DOWNLOADED_BYTES = 50_000_000
 SAID_BYTES = 1_000_000  # of errors, and around a result
-
-
-@dataclass(frozen=True, slots=True)
-class Caps:
-    """What a query may take, and how much of its result is shown."""
-
-    seconds: float = 10.0
-    memory_mb: int = 512
-    rows: int = 1_000
-    text: int = 2_000
-    """Characters of a cell."""
-    size: int = 5_000_000
-    """Bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +45,7 @@ class QueryResult:
 
 
 class Copy:
-    """A copy of a database, which has no name: it goes when nobody holds it any more.
+    """A copy of a database as an open file without a name: it is gone when nobody holds it.
 
     So nothing is left of it when the program is killed, and no query can say where it lies.
     """
@@ -92,10 +79,10 @@ class Copy:
 
 @dataclass
 class Sandbox:
-    """Queries of one database."""
+    """Runs queries on one database: a few at once, each in its process and within its caps."""
 
     db: Path
-    caps: Caps = Caps()
+    caps: Caps = field(default_factory=Caps)
     patience_s: float = PATIENCE_S
     _copy: Copy | None = None
     _copying: threading.Lock = field(default_factory=threading.Lock)
@@ -115,35 +102,28 @@ class Sandbox:
         return self._answer(sql, as_csv=True)[1]
 
     def close(self) -> None:
-        """Delete the copy, unless a query reads it: that one will."""
+        """Delete the copy; if a query reads it, it lasts until that has ended."""
         self._copy = None
 
     def _answer(self, sql: str, *, as_csv: bool) -> Answer:
         if len(sql) > LONGEST:
             raise NoAnswer(f"a query has up to {LONGEST:,} characters here, this one {len(sql):,}")
         caps = self.caps
-        size = DOWNLOADED_BYTES if as_csv else caps.size
+        if as_csv:
+            caps = replace(caps, rows=DOWNLOADED_ROWS, size=DOWNLOADED_BYTES)
         with self._turn():
             copy = self._current()
-            query = Query(
-                file=f"/dev/fd/{copy.fd}",
-                sql=sql,
-                as_csv=as_csv,
-                rows=DOWNLOADED_ROWS if as_csv else caps.rows,
-                text=caps.text,
-                size=size,
-                memory_mb=caps.memory_mb,
-            )
+            query = Query(f"/dev/fd/{copy.fd}", sql, as_csv, caps)
             try:
                 with closing(_worker(copy.fd)) as worker:
                     return worker.ask(
-                        asdict(query), seconds=caps.seconds, most_bytes=size + SAID_BYTES
+                        asdict(query), seconds=caps.seconds, most_bytes=caps.size + SAID_BYTES
                     )
             except Ended as exc:
                 raise NoAnswer(self._silence(exc)) from exc
 
     def _silence(self, ended: Ended) -> str:
-        """Why a process may have ended without a word."""
+        """Why a process may have ended without an answer."""
         if ended.late:
             return f"stopped after {self.caps.seconds:g} s"
         if ended.code < 0:  # a signal: of the system, or of a library in need
@@ -152,6 +132,7 @@ class Sandbox:
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
+        # Counted apart from the turns, so that whoever is one too many hears it at once.
         if not self._places.acquire(blocking=False):
             raise NoAnswer("too many queries are waiting: run it again in a moment")
         try:

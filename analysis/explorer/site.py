@@ -36,7 +36,7 @@ class NotThere(Exception):
 
 
 class NothingNew(Exception):
-    """What a page shows is what it would be now."""
+    """What was seen of a page is what it still shows."""
 
 
 @dataclass
@@ -78,7 +78,7 @@ class Site:
         )
 
     def begin(self) -> None:
-        """Read the trials for the first time, which may take a while, beside what else is done."""
+        """Read the trials for the first time in the background, since it may take a while."""
         self._first_reading = threading.Thread(target=self._read_first, daemon=True)
         self._first_reading.start()
 

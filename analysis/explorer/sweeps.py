@@ -84,7 +84,7 @@ class ListedSweep:
 
     @property
     def sweep_id(self) -> str:
-        """Its name, which no other sweep has."""
+        """The id, which no other sweep has."""
         return str(self.row["sweep_id"])
 
     @property
@@ -119,7 +119,7 @@ class ListedSweep:
 
     @property
     def planned(self) -> int:
-        """How many trials it wants; 0 where nobody says."""
+        """How many trials it wants; 0 where that is not known."""
         return sum(self.config.repetitions.values()) * len(self.config.conditions)
 
     @property
@@ -131,14 +131,14 @@ class ListedSweep:
 
     @property
     def failed(self) -> int:
-        """How many of its trials have none, and ended."""
+        """How many of its trials ended without one."""
         if self.live:
             return sum(cell.failed for cell in self.live.cells)
         return int(self.row["failed"])
 
     @property
     def last_word(self) -> datetime | None:
-        """When it ended, or was heard of last."""
+        """When it ended, or was last heard of."""
         told: datetime | None = self.row["ended_at"]
         return self.standing.updated_at if told is None and self.standing else told
 
@@ -181,7 +181,10 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Assessment:
-    """The answer in one sentence; ``command`` goes on, unless a ``later`` sweep already did."""
+    """Whether a sweep is finished and can be trusted, in a sentence.
+
+    ``command`` goes on with it, unless a ``later`` sweep already did.
+    """
 
     kind: str
     text: str
@@ -284,7 +287,7 @@ def cells_of(entry: ListedSweep, stored: list[Row]) -> dict[tuple[str, str], Var
 def rates_of(
     stored: list[Row], tried: list[Row], mismatches: dict[str, int], sweep_id: str
 ) -> list[Rate]:
-    """How often what happened that may cost trust, each with what it is counted over."""
+    """How often things happened that may cost trust, each with what it is counted over."""
     sums = Counter[str]()
     for row in stored:
         sums.update({name: value for name, value in row.items() if isinstance(value, int)})
@@ -292,7 +295,7 @@ def rates_of(
     for row in tried:
         outcomes[row["outcome"]] += row["times"]
     answers = sum(row["times"] for row in tried if row["answered"])
-    # A list is of one cause; several have theirs below, each in its own line.
+    # A list of trials has one cause: where there are several pairs, each has its own link below.
     pair = next(iter(mismatches)) if len(mismatches) == 1 else ""
     other = {"cause": f"model: {pair}"} if pair else {}
     played, attempts = sums["ended"] + sums["failed"], outcomes.total()
@@ -319,7 +322,7 @@ def rates_of(
 
 
 def mismatches_of(tried: list[Row]) -> dict[str, int]:
-    """Requested and served model, where another one answered, with how often."""
+    """How often another model answered, by the requested and the served one."""
     others = Counter[str]()
     for row in tried:
         if row["other"]:

@@ -18,8 +18,8 @@ import pytest
 from analysis.explorer import child, query_worker
 from analysis.explorer import query_process as sandbox
 from analysis.explorer.child import Ended, NoAnswer
-from analysis.explorer.query_process import Caps, Sandbox
-from analysis.explorer.query_worker import Query
+from analysis.explorer.query_process import Sandbox
+from analysis.explorer.query_worker import Caps, Query
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
 from merge_runner.results.database import open_database
@@ -59,10 +59,10 @@ def queries(study):
 @pytest.fixture
 def run(study, monkeypatch):
     """Runs a query as its process would, in this one: starting one takes longer than most."""
-    monkeypatch.setattr(query_worker, "_confine", lambda query: None)
+    monkeypatch.setattr(query_worker, "_confine", lambda caps: None)
 
     def answer(sql, *, as_csv=False, rows=1000, size=5_000_000):
-        query = Query(str(study), sql, as_csv, rows, 2000, size, memory_mb=512)
+        query = Query(str(study), sql, as_csv, Caps(rows=rows, size=size))
         said, content = query_worker._run(query)
         return content if as_csv and not said else said
 
@@ -256,7 +256,7 @@ def test_the_environment_of_a_query_holds_nothing_of_ours(monkeypatch):
 
 def test_a_query_ends_with_the_explorer_even_if_that_is_killed(queries):
     worker = sandbox._worker(queries._current().fd)
-    query = Query(f"/dev/fd/{queries._current().fd}", ENDLESS, False, 9, 9, 10**6, memory_mb=512)
+    query = Query(f"/dev/fd/{queries._current().fd}", ENDLESS, False, Caps())
     ended = []
 
     def ask():

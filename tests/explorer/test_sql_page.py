@@ -16,7 +16,8 @@ from starlette.testclient import TestClient
 from analysis.explorer.app import explorer
 from analysis.explorer.child import NoAnswer
 from analysis.explorer.pages.sql import EXAMPLES
-from analysis.explorer.query_process import Caps, QueryResult
+from analysis.explorer.query_process import QueryResult
+from analysis.explorer.query_worker import Caps
 from analysis.explorer.schema import tables
 from analysis.explorer.site import Site
 from merge_runner.results.store import query

@@ -27,12 +27,12 @@ SELECT variant, any_value(names) FROM trials JOIN (
     SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
 ) USING (spec_hash) WHERE len(names) > 0 GROUP BY ALL
 """
-# Rates are decided trial by trial, and differ in single trials. Collisions are outcomes.
+# Rates are decided trial by trial, so that single trials differ: by these columns.
 FATES = {COLLISIONS.name: "outcome", JOINT_RATE.name: "joint"}
 JOINT = {True: "joint", False: "not joint"}
-# What the rates count of it.
+# The value of the column that a rate counts.
 COUNTED: dict[str, str | bool] = {"outcome": "collided", "joint": True}
-# A difference is drawn so wide, in units of its picture.
+# The width of the picture of a difference.
 WIDTH = 120.0
 
 
@@ -201,6 +201,7 @@ def _reach(driver: DriverVariants) -> None:
             for limit in (difference.value, difference.low, difference.high)
             if limit is not None
         ]
+        # Where all differences are 0 any range shows them.
         driver.widest[measure] = max(reach, default=0.0) or 1.0
 
 
@@ -241,7 +242,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
         raise NotThere(f"pairs differ by {' or '.join(FATES.values())}")
     if not model or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
-    # A mark tells apart drivers that ran under several settings of the task.
+    # Tables mark the name of a driver that ran under several settings; its trials have no mark.
     name, found = model, site.catalogue.pairs(model, variant, fate)
     if not found:
         name = model.partition(" [")[0]

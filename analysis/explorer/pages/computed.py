@@ -66,6 +66,7 @@ def computed(
     result = found if isinstance(found, Result) else None
     if result is not None and "absent" in result.content:
         raise NotThere(result.content["absent"])
+    # Later than this one by the smallest step that an address shows.
     later = {"since": f"{result.at + 0.001:.3f}"} if result else {}
     return Computed(
         result=result,

@@ -19,7 +19,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 HUMAN = "human"
 SHAPE_WORDS = {"down": "triangle that points down"}
-# Of a picture, in its units.
+# Sizes in a picture, in its units.
 LEFT, TOP, HEIGHT, FOOT, STEP, LEAST, ARROW = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0, 3.0
 
 
@@ -131,7 +131,7 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
 
 
 def rule_text(group: Mapping[str, Any]) -> str:
-    """What is taken for a collision in the trials of a group, and how often it is looked for."""
+    """What counts as a collision in the trials of a group, and how often it is looked for."""
     source = HUMAN if group["id"] == HUMAN else ""
     scenario = scenario_of(source, group["scenario"])
     return f"{views.collision_text(scenario)}, looked for {1 / scenario.step_s:g} times a second"
@@ -153,7 +153,7 @@ def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
 def collisions(groups: Sequence[Mapping[str, Any]], rule: str) -> list[dict[str, Any]]:
     """Collided, decided and all trials of each group, by condition and together.
 
-    A group that this rule is not known of has no row.
+    A group for which this rule is not known has no row.
     """
     rows = []
     for group in groups:

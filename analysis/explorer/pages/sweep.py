@@ -92,7 +92,7 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
 
 
 def _condition_texts(site: Site, names: list[str]) -> dict[str, str]:
-    """Conditions in words; nothing is said of one that no human drove and no trial tells yet."""
+    """Conditions in words; empty for one that no human drove and that has no trial yet."""
     known = {
         name: (one.projected_headway_m, one.relative_velocity_mps)
         for name, one in HUMAN_CONDITIONS.items()

@@ -10,7 +10,7 @@ from analysis.tables import TABLES
 from analysis.tables.formats import table_view
 from analysis.tables.model import from_text
 
-# What stands in each, for the list of them: their titles are known once they are made.
+# What each shows, for the list: their own titles are known only when they are made.
 ABOUT = {
     "who-first": "Table III: who merges first, by headway and relative velocity",
     "gap": "Table IV: the gap, by headway and relative velocity",

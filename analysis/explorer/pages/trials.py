@@ -30,7 +30,7 @@ def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
             return site.render("behind.html", here="trials", cell=cell, computed=named)
         wanted = replace(wanted, trials=behind(named.result.content))
     totals = site.catalogue.totals(wanted)
-    trials = sum(part.trials for part in totals.values())
+    trials = sum(part["trials"] for part in totals.values())
     last = max(1, -(-trials // PAGE))
     number = min(page_of(asked), last)
     rows = site.catalogue.page(wanted, sort, number)
@@ -61,7 +61,7 @@ def at_of(site: Site, asked: Mapping[str, str], **state: str) -> str:
 
 
 def _news(site: Site, asked: Mapping[str, str], state: str) -> str:
-    """That other trials are there than were seen; raises NothingNew."""
+    """A note that the trials are no longer those that were seen; raises NothingNew."""
     if asked["seen"] == state:
         raise NothingNew
     (every,) = site.catalogue.ask("SELECT count(*) AS n FROM listed")
