@@ -102,7 +102,7 @@ def _trial_routes(site: Site) -> list[Route]:
     def page_of_all(request: Request) -> Response:
         return RedirectResponse(site.at.to("trials", **request.query_params))
 
-    listing = _page(site, lambda r: trials.trials_page(site, r.query_params, **_patience(r)))
+    listing = _page(site, lambda r: trials.trials_page(site, r.query_params))
     return [
         Route("/trials", listing),
         Route("/trials/", page_of_all),
@@ -116,30 +116,21 @@ def _trial_routes(site: Site) -> list[Route]:
 
 def _computed_routes(site: Site) -> list[Route]:
     def table(request: Request) -> str:
-        name, asked = request.path_params["name"], request.query_params
-        return tables.table_page(site, name, asked, **_patience(request))
-
-    def patient(render: Callable[..., str]) -> Callable[[Request], Response]:
-        return _page(site, lambda r: render(site, r.query_params, **_patience(r)))
+        return tables.table_page(site, request.path_params["name"], request.query_params)
 
     page = partial(_page, site)
     return [
         Route("/tables", page(lambda _: tables.tables_page(site))),
         Route("/tables/{name}", page(table)),
-        Route("/ablations", patient(ablations.ablations_page)),
+        Route("/ablations", page(lambda r: ablations.ablations_page(site, r.query_params))),
         Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),
-        Route("/humans", patient(humans.humans_page)),
+        Route("/humans", page(lambda r: humans.humans_page(site, r.query_params))),
     ]
 
 
 def _seen(request: Request) -> str:
     """What a page that looks for news has shown already."""
     return request.query_params.get("seen", "")
-
-
-def _patience(request: Request) -> dict[str, bool]:
-    """Whether a script asks again for a result that its page has said to be on its way."""
-    return {"patient": request.headers.get("hx-request") == "true"}
 
 
 def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[Request], Response]:

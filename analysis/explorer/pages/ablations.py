@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,7 +13,6 @@ from analysis.explorer import views
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pictures import Scale
-from analysis.explorer.reading import reading
 from analysis.explorer.site import NotThere, Site
 from analysis.metrics import COLLISIONS
 from analysis.metrics import JOINT as JOINT_RATE
@@ -23,7 +23,7 @@ from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
 BASELINE = "baseline"
 # The blocks of each prompt, as its spec names them; a program has none.
 STORED = """
-SELECT variant, any_value(names) FROM trials JOIN (
+SELECT variant, any_value(names) AS names FROM listed JOIN (
     SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
 ) USING (spec_hash) WHERE len(names) > 0 GROUP BY ALL
 """
@@ -90,9 +90,9 @@ class RateTrials:
     counted_alone: list[dict[str, Any]]
 
 
-def ablations_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
+def ablations_page(site: Site, asked: Mapping[str, str]) -> str:
     """All drivers with their variants."""
-    found = computed(site, ("tables", "ablation-quantitative", "contrasts"), asked, patient=patient)
+    found = computed(site, ("tables", "ablation-quantitative", "contrasts"), asked)
     values: dict[str, Any] = {"drivers": [], "alone": [], "measures": [], "notes": ()}
     if found.result is not None:
         quantitative, contrasts = map(from_text, found.result.content["tables"])
@@ -126,8 +126,7 @@ def left_out(site: Site, variant: str) -> str:
 
 def _as_stored(site: Site, variant: str) -> Variant | None:
     """What a variant that is not registered here changes, by the blocks that its specs name."""
-    with reading(site.db) as connection:
-        stored = dict(connection.execute(STORED).fetchall())
+    stored = {row["variant"]: row["names"] for row in site.catalogue.ask(STORED)}
     if variant not in stored:
         return None
     own, baseline = frozenset(stored[variant]), frozenset(blocks_of(BASELINE))
@@ -251,10 +250,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
     own = {(pair["trial_id"], pair["spec_hash"]) for pair in pairs}
     base = {(pair["base_id"], pair["base_hash"]) for pair in pairs}
     differing = [pair for pair in pairs if pair["fate"] != pair["base_fate"]]
-    kinds: dict[tuple[str, str], int] = {}
-    for pair in differing:
-        kind = (_fate(pair["base_fate"]), _fate(pair["fate"]))
-        kinds[kind] = kinds.get(kind, 0) + 1
+    kinds = Counter((_fate(pair["base_fate"]), _fate(pair["fate"])) for pair in differing)
     return site.render(
         "discordant.html",
         here="ablations",
@@ -291,12 +287,8 @@ def side_of(
 
 def of_equal_tasks(site: Site, pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The pairs whose two specs differ in nothing but the prompt."""
-    hashes = list({pair[name] for pair in pairs for name in ("spec_hash", "base_hash")})
-    with reading(site.db) as connection:
-        rows = connection.execute(
-            "SELECT spec_hash, spec FROM specs WHERE list_contains(?, spec_hash)", [hashes]
-        ).fetchall()
-    tasks = {spec_hash: _task(spec) for spec_hash, spec in rows}
+    specs = site.catalogue.ask("SELECT spec_hash, spec FROM specs")
+    tasks = {row["spec_hash"]: _task(row["spec"]) for row in specs}
     return [pair for pair in pairs if tasks.get(pair["spec_hash"]) == tasks.get(pair["base_hash"])]
 
 

@@ -11,9 +11,8 @@ from analysis.explorer.child import NoAnswer
 from analysis.explorer.site import NotThere, Site
 from analysis.explorer.urls import query_of, seconds
 
-# What is kept in the database comes within the first; the second is for a page that shows a clock.
+# What is kept in the database comes within this time; what takes longer is asked for again.
 AT_ONCE_S = 0.3
-PATIENT_S = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,18 +44,12 @@ def computed(
     request: Request,
     asked: Mapping[str, str],
     *,
-    patient: bool = False,
     wait_s: float = AT_ONCE_S,
 ) -> Computed:
-    """Ask for something; a ``patient`` page has said already that it takes a while.
-
-    Raises NotThere where the tables do not hold it.
-    """
+    """Ask for something, and wait for it for a moment; raises NotThere where no table holds it."""
     state = site.catalogue.state()
     if site.static:
         wait_s = LONGEST_S  # a page that stands alone must hold the result
-    elif patient:
-        wait_s = PATIENT_S
     since, failure = seconds(asked.get("since", "")), ""
     found: Result | Waiting | None = None
     try:

@@ -81,11 +81,11 @@ class Mark:
         return SHAPE_WORDS.get(self.style.shape, self.style.shape)
 
 
-def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
+def humans_page(site: Site, asked: Mapping[str, str]) -> str:
     """Small multiples over the conditions, one row a measure, and the differences."""
     # Before and after an import of humans it is another page, and not an older one.
     (humans,) = site.catalogue.ask("SELECT count(*) AS n FROM listed WHERE source = 'human'")
-    found = computed(site, ("humans", str(humans["n"])), asked, patient=patient)
+    found = computed(site, ("humans", str(humans["n"])), asked)
     values: dict[str, Any] = {"own": []}
     if found.result is not None:
         content = found.result.content

@@ -37,11 +37,11 @@ def tables_page(site: Site) -> str:
     return site.render("tables.html", here="tables", about=ABOUT)
 
 
-def table_page(site: Site, name: str, asked: Mapping[str, str], *, patient: bool = False) -> str:
+def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """One table; raises NotThere."""
     if name not in TABLES:
         raise NotThere(f"there is no table {name}; there are {', '.join(TABLES)}")
-    found = computed(site, ("tables", name), asked, patient=patient)
+    found = computed(site, ("tables", name), asked)
     shown = None
     if found.result is not None:
         shown = table_view(

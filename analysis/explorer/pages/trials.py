@@ -17,15 +17,15 @@ from merge_runner.errors import StoreError
 EXPORT_WAIT_S = 300.0
 
 
-def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
-    """One page of the trials that an address asks for; ``patient``: an answer may take a while."""
+def trials_page(site: Site, asked: Mapping[str, str]) -> str:
+    """One page of the trials that an address asks for."""
     state = "-".join(map(str, site.catalogue.state()))
     if "seen" in asked:
         return _news(site, asked, state)
     wanted, sort = filter_of(asked), sort_of(asked)
     cell, named = asked.get("cell", ""), None
     if cell:
-        named = computed(site, cell_request(cell), asked, patient=patient)
+        named = computed(site, cell_request(cell), asked)
         if named.result is None:
             return site.render("behind.html", here="trials", cell=cell, computed=named)
         wanted = replace(wanted, trials=behind(named.result.content))
