@@ -153,7 +153,6 @@ UNNAMED = """
 SELECT model_left, model_right, posed, list(number)
 FROM listed WHERE scripted AND stand_in IS NULL GROUP BY ALL
 """
-FACETS = ("sweep", "model", "variant", "condition", "outcome", "validity", "cause")
 # Facets of which a trial may have several values, and the tables that hold these.
 SEVERAL = {"sweep": "members", "cause": "causes"}
 SORTS = {
@@ -211,8 +210,10 @@ class Filter:
     @property
     def chosen(self) -> dict[str, str]:
         """What is asked for, by name."""
-        named = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "trials"}
-        return {name: value for name, value in named.items() if value}
+        return {name: value for name in (*FACETS, "q") if (value := getattr(self, name))}
+
+
+FACETS = tuple(f.name for f in fields(Filter) if f.name not in {"q", "trials"})
 
 
 @dataclass(slots=True)

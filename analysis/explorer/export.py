@@ -229,7 +229,7 @@ def _opened(
     db: Path, wanted: Sequence[str], links: StaticLinks
 ) -> Iterator[tuple[Site, list[Row]]]:
     """A site of files and the wanted trials, by name; raises UsageError where there is none."""
-    site = Site(db, links, static=True, shared={"inlined": inlined(PLAIN)})
+    site = Site(db, links, shared={"inlined": inlined(PLAIN)})
     site.catalogue.refresh()
     every = site.catalogue.every(Filter())
     rows = [
