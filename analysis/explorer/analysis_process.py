@@ -42,7 +42,7 @@ class Waiting:
 
 
 def worker(db: Path) -> Child:
-    """The process that computes; raises OSError."""
+    """The process that computes; raises NoAnswer."""
     return Child("analysis.explorer.analysis_worker", str(db))
 
 
@@ -107,10 +107,7 @@ class Computing:
         if self._child is None or not stays:
             self._end()
             # Another process for another state: all that was made of the old one ends with it.
-            try:
-                self._child, self._state = self.start(self.db), state
-            except OSError as exc:
-                raise NoAnswer(f"no process can be started to compute: {exc}") from exc
+            self._child, self._state = self.start(self.db), state
         if self._closed:
             self._end()
             raise NoAnswer("the explorer ends")

@@ -45,20 +45,24 @@ class Child:
         files: Sequence[int] = (),
         quiet: bool = False,
     ) -> None:
-        """Start it. It gets these open ``files``; a ``quiet`` one prints no errors.
+        """Start it, in our own ``environment`` if none is given; raises NoAnswer.
 
-        ``None`` gives it our own environment. Raises OSError.
+        It gets these open ``files``; a ``quiet`` one prints no errors.
         """
-        self.process = subprocess.Popen(  # noqa: S603 # our own program
-            # -P: no file of the working folder is taken for one of our modules.
-            [sys.executable, "-P", "-X", "utf8", "-m", module, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL if quiet else None,
-            env=environment,
-            pass_fds=files,
-            start_new_session=True,  # Ctrl-C is for the server, which then ends its children
-        )
+        # -P: no file of the working folder is taken for one of our modules.
+        command = [sys.executable, "-P", "-X", "utf8", "-m", module, *arguments]
+        try:
+            self.process = subprocess.Popen(  # noqa: S603 # our own program
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL if quiet else None,
+                env=environment,
+                pass_fds=files,
+                start_new_session=True,  # Ctrl-C is for the server, which then ends its children
+            )
+        except OSError as exc:
+            raise NoAnswer(f"no process can be started: {exc.strerror}") from exc
 
     def ask(self, request: object, *, seconds: float, most_bytes: int) -> Answer:
         """The answer; raises NoAnswer where it is an error or too large, and Ended."""

@@ -159,7 +159,7 @@ class Sandbox:
 
 
 def _worker(*files: int) -> Child:
-    """A process for one job, which knows as little of us as it can."""
+    """A process for one job, which knows as little of us as it can; raises NoAnswer."""
     environment = {name: os.environ[name] for name in ("TZ", "TMPDIR") if name in os.environ}
     # An arena for each thread would take addresses that a query could use.
     environment |= {"PYTHONPATH": str(PROJECT), "MALLOC_ARENA_MAX": "1"}

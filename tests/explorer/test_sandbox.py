@@ -254,6 +254,12 @@ def test_the_environment_of_a_query_holds_nothing_of_ours(monkeypatch):
     assert "ours" not in options["env"].values()
 
 
+def test_a_process_that_cannot_be_started_is_said_in_a_line(queries, monkeypatch):
+    queries._current()
+    monkeypatch.setattr("sys.executable", "/nowhere/python")
+    assert refusal(queries, "SELECT 1") == "no process can be started: No such file or directory"
+
+
 def test_a_query_ends_with_the_explorer_even_if_that_is_killed(queries):
     worker = sandbox._worker(queries._current().fd)
     query = Query(f"/dev/fd/{queries._current().fd}", ENDLESS, False, Caps())

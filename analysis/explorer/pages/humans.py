@@ -71,7 +71,6 @@ def kinds() -> list[Kind]:
 class Mark:
     """How a group is drawn."""
 
-    group: str
     style: Style
     label: str
 
@@ -146,7 +145,7 @@ def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
         if group["id"] != HUMAN:
             style = driver_style(models)
             models += 1
-        found[group["id"]] = Mark(group["id"], style, group["driver"])
+        found[group["id"]] = Mark(style, group["driver"])
     return found
 
 
