@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from analysis.explorer.catalogue import State
+from analysis.explorer.child import Child, Ended, NoAnswer
 
 Request = tuple[str, ...]
 REMEMBERED = 100
 # What the fits of these tables take on their own, in s on a slow machine.
 LONG_S = {"who-first": 8, "gap": 13, "indicators": 15, "ablation-qualitative": 15}
+# Nobody has to wait for more; an export waits so long.
+LONGEST_S = 3600.0
+MOST_BYTES = 2**30
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """An answer, the state of the database that it was made in, and when (s since 1970).
+    """An answer, the state of the database that it describes, and when it was made (s since 1970).
 
-    It may be that what is asked for is ``absent``.
+    ``content`` has ``absent`` where no table has what was asked for.
     """
 
     content: dict[str, Any]
@@ -40,93 +41,32 @@ class Waiting:
     elapsed_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """There will be no answer; ``text`` says why."""
-
-    text: str
-
-
-class Failure(Exception):
-    """A computation has failed."""
-
-
-class Ended(Failure):
-    """The computing process is gone."""
-
-
-class Computer(Protocol):
-    """The process that answers, one request after another."""
-
-    def ask(self, request: Request) -> dict[str, Any]:
-        """The answer; raises Failure."""
-
-    def close(self) -> None:
-        """End, whatever is under way."""
-
-
-class Child:
-    """A process that computes; it ends with this one."""
-
-    def __init__(self, db: Path) -> None:
-        # In a session of its own: an interrupt is for the server, which then ends it. Not even a
-        # file of our modules' names in the working folder is run (-P).
-        self._process = subprocess.Popen(  # noqa: S603 # our own program
-            [sys.executable, "-P", "-m", "analysis.explorer.analysis_worker", str(db)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            encoding="utf-8",
-            start_new_session=True,
-        )
-
-    def ask(self, request: Request) -> dict[str, Any]:
-        """The answer; raises Failure, also where the process has ended."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        try:
-            self._process.stdin.write(json.dumps(request) + "\n")
-            self._process.stdin.flush()
-            line = self._process.stdout.readline()
-        except (OSError, ValueError):
-            line = ""
-        if not line.endswith("\n"):
-            code = self._process.wait()
-            raise Ended(
-                f"the computation ended without an answer (exit code {code}); what it said stands "
-                "where `merge-runner view` was started"
-            )
-        answer: dict[str, Any] = json.loads(line)
-        if "failure" in answer:
-            raise Failure(answer["failure"])
-        return answer
-
-    def close(self) -> None:
-        """End it."""
-        self._process.kill()
-        self._process.wait()
+def worker(db: Path) -> Child:
+    """The process that computes; raises NoAnswer."""
+    return Child("analysis.explorer.analysis_worker", str(db))
 
 
 class Computing:
     """Answers by request. One computation goes on at a time, the others wait for it."""
 
-    def __init__(self, db: Path, start: Callable[[Path], Computer] = Child) -> None:
+    def __init__(self, db: Path, start: Callable[[Path], Child] = worker) -> None:
         self.db = db
         self.start = start
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._results: dict[Request, Result] = {}
         self._jobs: dict[Request, tuple[Future[Result], float]] = {}
-        self._computer: Computer | None = None
+        self._child: Child | None = None
         self._state: State | None = None
         self._closed = False
 
     def ask(
         self, request: Request, state: State, *, since: float = 0.0, wait_s: float = 0.0
-    ) -> Result | Waiting | Failed:
+    ) -> Result | Waiting:
         """An answer made at ``since`` (s since 1970) or later, waiting at most ``wait_s`` for it.
 
-        ``state`` is the present one; an answer of an earlier one will do, for it says so.
+        ``state`` is the present one; an answer made in an earlier one will do, since it says which.
+        Raises NoAnswer.
         """
         with self._lock:
             found = self._results.get(request)
@@ -137,14 +77,12 @@ class Computing:
                 self._jobs[request] = (made, time.monotonic())
             future, began = self._jobs[request]
         try:
-            failed = future.exception(timeout=wait_s)
+            future.exception(timeout=wait_s)
         except TimeoutError:
             return Waiting(time.monotonic() - began)
         with self._lock:
             if self._jobs.get(request, (None,))[0] is future:
                 del self._jobs[request]
-            if isinstance(failed, Failure):
-                return Failed(str(failed))
             result = future.result()
             self._results.pop(request, None)
             self._results[request] = result
@@ -156,39 +94,39 @@ class Computing:
         """Stop computing."""
         self._closed = True
         self._pool.shutdown(wait=False, cancel_futures=True)
-        if self._computer is not None:
-            self._computer.close()
+        if self._child is not None:
+            self._child.close()
 
     def _stands(self, result: Result) -> bool:
-        """What is absent may be there in the state of another process."""
+        """Whether an answer still holds: what was absent may be there in another state."""
         return "absent" not in result.content or result.state == self._state
 
     def _run(self, request: Request, state: State, since: float) -> Result:
-        # A cell is counted in the state of its table, unless a later one is wanted.
+        # A cell is looked up in the state that its table shows, unless a later one is wanted.
         stays = self._state == state or (request[0] == "cell" and not since)
-        if self._computer is None or not stays:
+        if self._child is None or not stays:
             self._end()
             # Another process for another state: all that was made of the old one ends with it.
-            try:
-                self._computer, self._state = self.start(self.db), state
-            except OSError as exc:
-                raise Failure(f"no process can be started to compute: {exc}") from exc
+            self._child, self._state = self.start(self.db), state
         if self._closed:
             self._end()
-            raise Failure("the explorer ends")
+            raise NoAnswer("the explorer ends")
         assert self._state is not None
         made_in = self._state
         try:
-            content = self._computer.ask(request)
-        except Ended:
+            content, _ = self._child.ask(request, seconds=LONGEST_S, most_bytes=MOST_BYTES)
+        except Ended as exc:
             self._end()
-            raise
+            raise NoAnswer(
+                f"the computation ended without an answer ({exc}); what it said stands where "
+                "`merge-runner view` was started"
+            ) from exc
         return Result(content, made_in, time.time())
 
     def _end(self) -> None:
-        if self._computer is not None:
-            self._computer.close()
-        self._computer = self._state = None
+        if self._child is not None:
+            self._child.close()
+        self._child = self._state = None
 
 
 def about_s(request: Request, trials: int) -> int:

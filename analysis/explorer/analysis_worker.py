@@ -1,16 +1,12 @@
 """What the pages show of the analysis, computed in a process of its own.
 
 pandas and the fits hold a Python process for seconds, and no page may wait for another's numbers.
-Requests and answers are lines of JSON on standard input and output.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import queue
 import sys
-import threading
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -18,11 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.data.derived_cache import finished, keep_finished
+from analysis.explorer.child import serve
 from analysis.metrics import GAP, Metric, shown_in
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Table, from_text, options_text, to_text
-from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
@@ -41,8 +38,8 @@ class Numbers:
 
         Where no table has the cell, the answer says so as ``absent``.
 
-        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``, whatever
-        stands after it. Raises MergeRunnerError.
+        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``, and what
+        follows that is ignored. Raises MergeRunnerError.
         """
         match list(request):
             case ["tables", *names]:
@@ -81,14 +78,14 @@ class Numbers:
         return self._counted() | {"tables": [to_text(found[name]) for name in names]}
 
     def _finished(self, names: Sequence[str]) -> dict[str, Table]:
-        """Tables by name, kept ones where the database has them."""
+        """Tables by name; those that are kept in the database are not made again."""
         options = options_text(self.db, None)
         _, kept = finished(self.db, options, names)
         found = {name: from_text(text) for name, text in kept.items()}
         if missing := [name for name in names if name not in found]:
             study, state = self._read
             made = dict(zip(missing, make_tables(study, missing), strict=True))
-            # They are of the state in which the study was read; where it is past, nothing is kept.
+            # They show the state in which the study was read; if it is past, they are not kept.
             keep_finished(self.db, state, options, {name: to_text(made[name]) for name in missing})
             found |= made
         return found
@@ -156,7 +153,7 @@ def human_panels(study: Study) -> dict[str, Any]:
     condition, as far as there are such, and a ``text`` that says what they are.
     """
     from analysis.data.load import SPECS, load
-    from analysis.data.reference_data import citation
+    from analysis.data.reference_data import HUMAN_TRIALS, citation
     from analysis.stats.measures import known, outcomes_note
     from analysis.tables.notes import sample_notes
 
@@ -166,6 +163,7 @@ def human_panels(study: Study) -> dict[str, Any]:
     return {
         "measured": study.human.measured,
         "outcomes_from": citation("human_outcomes"),
+        "published_trials": HUMAN_TRIALS,
         "published": {metric.name: _published(metric) for metric in unknown} if there else {},
         "conditions": study.conditions,
         "notes": sample_notes(study, study.baselines),
@@ -227,27 +225,6 @@ def _published_gaps() -> dict[str, float]:
     return dict(zip(HUMAN_CONDITIONS, map(float, gaps), strict=True))
 
 
-def main(db: Path) -> None:
-    """Answer until standard input ends, also amid a computation: nobody waits for it any more."""
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a library prints is no answer
-    asked: queue.SimpleQueue[str] = queue.SimpleQueue()
-
-    def listen() -> None:
-        for line in sys.stdin:
-            asked.put(line)
-        os._exit(0)
-
-    threading.Thread(target=listen, daemon=True).start()
-    numbers = Numbers(db)
-    while True:
-        request = json.loads(asked.get())
-        try:
-            answer = numbers.answer(request)
-        except MergeRunnerError as exc:
-            answer = {"failure": str(exc)}
-        print(json.dumps(answer), file=answers, flush=True)
-
-
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    numbers = Numbers(Path(sys.argv[1]))
+    serve(lambda request: (numbers.answer(request), b""))

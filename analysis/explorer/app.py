@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
@@ -20,7 +19,6 @@ from starlette.responses import (
     PlainTextResponse,
     RedirectResponse,
     Response,
-    StreamingResponse,
 )
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -31,8 +29,12 @@ from analysis.explorer.site import NothingNew, NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
 LOG = logging.getLogger(__name__)
-# A page that is to be asked for again, in s.
+# The browser asks for the page again after this many s.
 AGAIN = {"refresh": "1"}
+FIRST_TIME = (
+    "The trials are read for the first time; ten thousand take about ten seconds. This page comes "
+    "back by itself."
+)
 STATIC = Path(__file__).with_name("static")
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 # Nothing in a reply runs, whatever a browser takes it for.
@@ -65,21 +67,11 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
 
 
 def _sweep_routes(site: Site) -> list[Route]:
-    async def events(request: Request) -> Response:
-        sweep_id = request.path_params["sweep"]
-        await run_in_threadpool(sweep.require_sweep, site, sweep_id)
-        # Nothing between us and the browser may hold the stream back.
-        plain = {"x-accel-buffering": "no"}
-        return StreamingResponse(
-            sweep.sweep_events(site, sweep_id), media_type="text/event-stream", headers=plain
-        )
-
     page = partial(_page, site)
     one = page(lambda r: sweep.sweep_page(site, r.path_params["sweep"], _seen(r)))
     return [
         Route("/", page(lambda _: RedirectResponse(sweep.home(site)))),
         Route("/sweeps", page(lambda r: sweep.sweeps_page(site, _seen(r)))),
-        Route("/sweeps/{sweep:path}/events", events),
         Route("/sweeps/{sweep:path}", one),
     ]
 
@@ -110,7 +102,7 @@ def _trial_routes(site: Site) -> list[Route]:
     def page_of_all(request: Request) -> Response:
         return RedirectResponse(site.at.to("trials", **request.query_params))
 
-    listing = _page(site, lambda r: trials.trials_page(site, r.query_params, **_patience(r)))
+    listing = _page(site, lambda r: trials.trials_page(site, r.query_params))
     return [
         Route("/trials", listing),
         Route("/trials/", page_of_all),
@@ -124,30 +116,21 @@ def _trial_routes(site: Site) -> list[Route]:
 
 def _computed_routes(site: Site) -> list[Route]:
     def table(request: Request) -> str:
-        name, asked = request.path_params["name"], request.query_params
-        return tables.table_page(site, name, asked, **_patience(request))
-
-    def patient(render: Callable[..., str]) -> Callable[[Request], Response]:
-        return _page(site, lambda r: render(site, r.query_params, **_patience(r)))
+        return tables.table_page(site, request.path_params["name"], request.query_params)
 
     page = partial(_page, site)
     return [
         Route("/tables", page(lambda _: tables.tables_page(site))),
         Route("/tables/{name}", page(table)),
-        Route("/ablations", patient(ablations.ablations_page)),
+        Route("/ablations", page(lambda r: ablations.ablations_page(site, r.query_params))),
         Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),
-        Route("/humans", patient(humans.humans_page)),
+        Route("/humans", page(lambda r: humans.humans_page(site, r.query_params))),
     ]
 
 
 def _seen(request: Request) -> str:
-    """What a page has seen already, that looks for news."""
+    """What a page that looks for news has shown already."""
     return request.query_params.get("seen", "")
-
-
-def _patience(request: Request) -> dict[str, bool]:
-    """A script of ours asks for what a page has said to be on its way."""
-    return {"patient": request.headers.get("hx-request") == "true"}
 
 
 def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[Request], Response]:
@@ -155,7 +138,7 @@ def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[
 
     def answer(request: Request) -> Response:
         if site.beginning:
-            return HTMLResponse(site.render("beginning.html", here=""), headers=AGAIN)
+            return HTMLResponse(_message(site, "Reading the trials", FIRST_TIME), headers=AGAIN)
         site.catalogue.refresh()
         try:
             rendered = render(request)
@@ -166,11 +149,15 @@ def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[
     return answer
 
 
+def _message(site: Site, heading: str, text: str) -> str:
+    return site.render("message.html", heading=heading, text=text, here="")
+
+
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
-    """What is said where there is no page."""
+    """The pages that say why there is no other."""
 
     def said(heading: str, text: str, code: int) -> Response:
-        return HTMLResponse(site.render("message.html", heading=heading, text=text, here=""), code)
+        return HTMLResponse(_message(site, heading, text), code)
 
     def absent(_: Request, exc: Exception) -> Response:
         reply = said("Not there", str(exc), 404)
@@ -191,7 +178,7 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
 
 
 def _sql_routes(site: Site) -> list[Route]:
-    """A query runs for us alone: where another site leads to it, it is shown."""
+    """Only our own pages run a query; where another site leads to one, it is shown and not run."""
 
     def sql_query(request: Request) -> Response:
         run = not from_elsewhere(request.headers)

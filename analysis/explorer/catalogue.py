@@ -11,7 +11,7 @@ from typing import Any
 import duckdb
 
 from analysis.explorer.query_worker import csv_cell
-from analysis.explorer.reading import PATIENCE_S, reading, records
+from analysis.explorer.reading import PATIENCE_S, Row, reading, records
 from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
@@ -20,7 +20,7 @@ from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer
 
 PAGE = 100
-# Two are equal where the same trials are listed: unlike a stamp, it stands when tables are kept.
+# Equal where the same trials are listed; unlike a stamp it does not change when a table is kept.
 State = tuple[int, int]
 # Trials of a variant and of its driver's baseline in equal conditions and repetitions; ``fate`` is
 # what is compared.
@@ -33,7 +33,9 @@ WHERE one.model = ? AND one.variant = ? AND base.variant = 'baseline' AND one.so
     AND one.{fate} IS NOT NULL AND base.{fate} IS NOT NULL
 ORDER BY one.trial_id, one.spec_hash, base.spec_hash
 """
-# What is said of each trial. Texts and prompts stay in the database.
+# What is known of each trial. Texts and prompts stay in the database. ``tried`` are its attempts,
+# counted where they are alike; ``flaws`` says of each invalid reply what is wrong with it, and
+# ``posed`` on which sides a stand-in answered.
 LISTED = """
 CREATE SEQUENCE numbers;
 CREATE TABLE listed (
@@ -46,20 +48,19 @@ CREATE TABLE listed (
     time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
     joint BOOLEAN, decisions BIGINT, invalid BIGINT, fallbacks BIGINT, attempts BIGINT,
     cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[], left_range_mps FLOAT[],
-    right_range_mps FLOAT[]
+    right_range_mps FLOAT[], flaws VARCHAR[], posed VARCHAR[],
+    tried STRUCT(requested VARCHAR, served VARCHAR, answered BOOLEAN, outcome VARCHAR,
+        unpriced BIGINT, times BIGINT)[]
 );
+CREATE VIEW tried AS SELECT number, unnest(tried, recursive := true) FROM listed;
 CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
-CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
-    fallbacks BIGINT);
-CREATE TABLE paid (trial_id VARCHAR, spec_hash VARCHAR, attempts BIGINT, cost_usd DOUBLE);
-CREATE TABLE tried (trial_id VARCHAR, spec_hash VARCHAR, requested VARCHAR, served VARCHAR,
-    answered BOOLEAN, outcome VARCHAR, unpriced BIGINT, times BIGINT);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
-CREATE TABLE posed (trial_id VARCHAR, spec_hash VARCHAR, side VARCHAR);
-CREATE TABLE flaws (trial_id VARCHAR, spec_hash VARCHAR, failure VARCHAR, times BIGINT);
+CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
+    fallbacks BIGINT, flaws VARCHAR[]);
+CREATE TABLE called AS SELECT trial_id, spec_hash, attempts, cost_usd, posed, tried FROM listed;
 """
-# What each sweep has of them; what went wrong in a trial, and how often. Of an error stand the
-# words before its particulars.
+# The trials of each sweep, and how often what went wrong in a trial. Equal failures are counted
+# together: an error is named by its words before the particulars, without numbers and hashes.
 GROUPED = """
 CREATE OR REPLACE TABLE members AS
     SELECT sweep, number FROM planned JOIN listed USING (trial_id, spec_hash);
@@ -68,24 +69,17 @@ SELECT number, 'trial: ' || left(regexp_replace(regexp_replace(split_part(
         regexp_replace(coalesce(error, 'no reason is known'), '^(left|right): ', ''), ' (', 1),
         '[0-9a-f]{16,}', '…', 'g'), '(^| )[0-9]+', '\\1…', 'g'), 70) AS cause, 1 AS times
 FROM listed WHERE status = 'failed'
-UNION ALL SELECT number, 'plan: ' || failure, times
-FROM flaws JOIN listed USING (trial_id, spec_hash)
-UNION ALL SELECT number, 'attempt: ' || tried.outcome, sum(times)::BIGINT
-FROM tried JOIN listed USING (trial_id, spec_hash) WHERE tried.outcome <> 'ok' GROUP BY ALL
+UNION ALL SELECT number, 'plan: ' || flaw, count(*)
+FROM (SELECT number, unnest(flaws) AS flaw FROM listed) GROUP BY ALL
+UNION ALL SELECT number, 'attempt: ' || outcome, sum(times)::BIGINT
+FROM tried WHERE outcome <> 'ok' GROUP BY ALL
 UNION ALL SELECT number, 'model: ' || requested || ' → ' || served, sum(times)::BIGINT
-FROM tried JOIN listed USING (trial_id, spec_hash) SEMI JOIN others USING (requested, served)
-WHERE answered GROUP BY ALL;
+FROM tried SEMI JOIN others USING (requested, served) WHERE answered GROUP BY ALL;
 """
 # A failed trial may be played anew, and fail again; a file may be put in the place of another.
 FORGET = """
 DELETE FROM memory.listed WHERE status = 'failed' OR (trial_id, spec_hash, status, end_time_s)
     NOT IN (SELECT (trial_id, spec_hash, status, end_time_s) FROM trials);
-DELETE FROM memory.tried WHERE (trial_id, spec_hash) NOT IN
-    (SELECT (trial_id, spec_hash) FROM memory.listed);
-DELETE FROM memory.posed WHERE (trial_id, spec_hash) NOT IN
-    (SELECT (trial_id, spec_hash) FROM memory.listed);
-DELETE FROM memory.flaws WHERE (trial_id, spec_hash) NOT IN
-    (SELECT (trial_id, spec_hash) FROM memory.listed);
 DELETE FROM memory.planned;
 INSERT INTO memory.planned SELECT DISTINCT * FROM sweep_trials;
 DELETE FROM memory.sweeps;
@@ -101,24 +95,24 @@ INSERT OR IGNORE INTO memory.specs
 INSERT INTO memory.states BY NAME
     FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
 INSERT INTO memory.decided
-    SELECT trial_id, spec_hash, count(*), count(*) FILTER (NOT valid), count(*) FILTER (fallback)
+    SELECT trial_id, spec_hash, count(*), count(*) FILTER (NOT valid), count(*) FILTER (fallback),
+        list(failure) FILTER (failure IS NOT NULL)
     FROM decisions SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
-INSERT INTO memory.paid
-    SELECT trial_id, spec_hash, count(*), sum(cost_usd)
-    FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
-INSERT INTO memory.tried
-    SELECT trial_id, spec_hash, model_requested, model_served, http_status = 200, outcome,
-        count(*) FILTER (cost_usd IS NULL), count(*)
-    FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
-INSERT INTO memory.posed
-    SELECT DISTINCT trial_id, spec_hash, side FROM calls
-    SEMI JOIN memory.trials USING (trial_id, spec_hash) WHERE scripted;
-INSERT INTO memory.flaws
-    SELECT trial_id, spec_hash, failure, count(*) FROM decisions
-    SEMI JOIN memory.trials USING (trial_id, spec_hash) WHERE failure IS NOT NULL GROUP BY ALL;
+INSERT INTO memory.called BY NAME
+    SELECT trial_id, spec_hash, sum(times) AS attempts, sum(cost_usd) AS cost_usd,
+        list(DISTINCT side ORDER BY side) FILTER (scripted) AS posed,
+        list({requested: requested, served: served, answered: answered, outcome: outcome,
+            unpriced: unpriced, times: times}) AS tried
+    FROM (
+        SELECT trial_id, spec_hash, side, scripted, model_requested AS requested,
+            model_served AS served, http_status = 200 AS answered, outcome,
+            count(*) FILTER (cost_usd IS NULL) AS unpriced, count(*) AS times,
+            sum(cost_usd) AS cost_usd
+        FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL
+    ) GROUP BY ALL;
 """
-# After an invalid reply there is always a fallback, and no other time: the audit sees to that.
-# A sparkline has about 24 points, and its words the slowest and the fastest of all.
+# A fallback follows every invalid reply, and nothing else; the audit checks that.
+# A sparkline has about 24 points; its words give the slowest and the fastest of all samples.
 LIST = """
 INSERT INTO listed BY NAME
 SELECT trials.trial_id, trials.spec_hash, source, model_left, model_right,
@@ -132,12 +126,12 @@ SELECT trials.trial_id, trials.spec_hash, source, model_left, model_right,
     time_to_merge_s, gap_m, rmse_mps, joint, coalesce(decisions, 0) AS decisions,
     coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
     coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps, left_range_mps,
-    right_range_mps
+    right_range_mps, flaws, posed, tried
 FROM trials
 JOIN trial_metrics USING (trial_id, spec_hash)
 JOIN trial_drivers USING (trial_id, spec_hash)
 LEFT JOIN decided USING (trial_id, spec_hash)
-LEFT JOIN paid USING (trial_id, spec_hash)
+LEFT JOIN called USING (trial_id, spec_hash)
 LEFT JOIN (
     SELECT trial_id, spec_hash,
         list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'left' AND drawn) AS left_mps,
@@ -152,18 +146,14 @@ LEFT JOIN (
             USING (trial_id, spec_hash))
     WHERE time_s >= 0 GROUP BY ALL
 ) USING (trial_id, spec_hash);
-TRUNCATE trials; TRUNCATE states; TRUNCATE decided; TRUNCATE paid;
+TRUNCATE trials; TRUNCATE states; TRUNCATE decided; TRUNCATE called;
 """
-# Trials of stand-ins that are not said to be: by the model asked for, and the sides it answered on.
+# Trials that a stand-in drove, without a note on it yet: by the models asked for, and its sides.
 UNNAMED = """
-SELECT model_left, model_right, sides, list(number)
-FROM listed LEFT JOIN (
-    SELECT trial_id, spec_hash, list_sort(list(side)) AS sides FROM posed GROUP BY ALL
-) USING (trial_id, spec_hash)
-WHERE scripted AND stand_in IS NULL GROUP BY ALL
+SELECT model_left, model_right, posed, list(number)
+FROM listed WHERE scripted AND stand_in IS NULL GROUP BY ALL
 """
-FACETS = ("sweep", "model", "variant", "condition", "outcome", "validity", "cause")
-# Facets of which a trial may have several: their tables.
+# Facets of which a trial may have several values, and the tables that hold these.
 SEVERAL = {"sweep": "members", "cause": "causes"}
 SORTS = {
     "trial": "trial_id",
@@ -174,8 +164,10 @@ SORTS = {
     "invalid": "invalid",
     "cost": "cost_usd",
 }
+SHOWN = "* EXCLUDE (flaws, posed, tried)"
 SPEEDS = "left_mps, right_mps, left_range_mps, right_range_mps"
-EXPORTED = f"* EXCLUDE (number, model_left, model_right, {SPEEDS})"
+WITHOUT_SPEEDS = f"* EXCLUDE (flaws, posed, tried, {SPEEDS})"
+EXPORTED = f"* EXCLUDE (flaws, posed, tried, number, model_left, model_right, {SPEEDS})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,24 +210,10 @@ class Filter:
     @property
     def chosen(self) -> dict[str, str]:
         """What is asked for, by name."""
-        named = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "trials"}
-        return {name: value for name, value in named.items() if value}
+        return {name: value for name in (*FACETS, "q") if (value := getattr(self, name))}
 
 
-@dataclass(frozen=True, slots=True)
-class Totals:
-    """Counts over trials of a filter, and means over those that have the value."""
-
-    trials: int
-    collided: int
-    failed: int
-    ended: int
-    decisions: int
-    invalid: int
-    fallbacks: int
-    cost_usd: float
-    gap_m: float | None
-    rmse_mps: float | None
+FACETS = tuple(f.name for f in fields(Filter) if f.name not in {"q", "trials"})
 
 
 @dataclass(slots=True)
@@ -250,9 +228,9 @@ class Catalogue:
     _connection: duckdb.DuckDBPyConnection | None = None
     _instance: Instance = field(default_factory=Instance)
     _file: int | None = None
-    """The file that is listed, and no other that took its place."""
+    """The inode of the file that is listed: another file may take its name."""
     _stamp: tuple[int, ...] | None = None
-    """What was read last, wholly."""
+    """The stamp of the database when it was last read to the end."""
     _lock: threading.RLock = field(default_factory=threading.RLock)
 
     def refresh(self) -> bool:
@@ -268,12 +246,12 @@ class Catalogue:
                 return False
             if self._connection is None or stamp[0] != self._file:
                 self._begin(stamp[0])
-            assert self._connection is not None
             try:
                 # What is forgotten is taken again before anybody else can hold the file.
                 waiting = self._reading(FORGET + TAKE)
                 while waiting:
-                    self._connection.execute(LIST)
+                    # With the file closed: measuring takes longer than copying.
+                    self._memory.execute(LIST)
                     waiting = self._reading(TAKE)
             except StoreLocked:
                 if self._stamp is None:
@@ -286,7 +264,7 @@ class Catalogue:
                 self._stamp, self.held = stamp, False
             self._note_others()
             self._name_stand_ins()
-            self._connection.execute(GROUPED)
+            self._memory.execute(GROUPED)
             return not self.held
 
     def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
@@ -297,95 +275,105 @@ class Catalogue:
             where, wants = wanted.where(leave_out=name)
             table = f"listed JOIN {SEVERAL[name]} USING (number)" if name in SEVERAL else "listed"
             counts.append(
-                f"SELECT '{name}', {name} AS value, count(*) FROM {table} "  # noqa: S608 # constants
+                f"SELECT '{name}' AS facet, {name} AS value, count(*) AS trials FROM {table} "  # noqa: S608 # constants
                 f"WHERE {where} AND value IS NOT NULL GROUP BY ALL"
             )
             values += wants
-        for name, value, count in self._rows(f"{' UNION ALL '.join(counts)} ORDER BY ALL", values):
-            found[name].append((value, count))
+        for row in self.ask(f"{' UNION ALL '.join(counts)} ORDER BY ALL", *values):
+            found[row["facet"]].append((row["value"], row["trials"]))
         return found
 
-    def totals(self, wanted: Filter) -> dict[str, Totals]:
-        """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``."""
+    def totals(self, wanted: Filter) -> dict[str, Row]:
+        """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``.
+
+        Counts over all of them, and means over those that have the value.
+        """
         where, values = wanted.where()
-        rows = self._rows(
+        rows = self.ask(
             "SELECT CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' "  # noqa: S608 # constants
             "ELSE 'drivers' END AS who, "
-            "count(*), count(*) FILTER (status = 'collided'), "
-            "count(*) FILTER (status = 'failed'), count(*) FILTER (status <> 'failed'), "
-            "coalesce(sum(decisions), 0), coalesce(sum(invalid), 0), coalesce(sum(fallbacks), 0), "
-            "coalesce(sum(cost_usd), 0), avg(gap_m), avg(rmse_mps) "
+            "count(*) AS trials, count(*) FILTER (status = 'collided') AS collided, "
+            "count(*) FILTER (status = 'failed') AS failed, "
+            "count(*) FILTER (status <> 'failed') AS ended, "
+            "coalesce(sum(decisions), 0) AS decisions, coalesce(sum(invalid), 0) AS invalid, "
+            "coalesce(sum(fallbacks), 0) AS fallbacks, coalesce(sum(cost_usd), 0) AS cost_usd, "
+            "avg(gap_m) AS gap_m, avg(rmse_mps) AS rmse_mps "
             f"FROM listed WHERE {where} GROUP BY ALL ORDER BY ALL",
-            values,
+            *values,
         )
-        return {who: Totals(*counts) for who, *counts in rows}
+        return {row["who"]: row for row in rows}
 
-    def page(self, wanted: Filter, sort: str, number: int) -> list[dict[str, Any]]:
+    def page(self, wanted: Filter, sort: str, number: int) -> list[Row]:
         """The trials of one page, counted from 1; ``-gap`` sorts the largest gap first."""
         where, values = wanted.where()
-        # The speeds of the page's trials alone are taken up.
         order = order_by(sort)
-        return self._records(
-            f"SELECT * FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
+        # Only the trials of the page are read with their speeds, which take the longest.
+        return self.ask(
+            f"SELECT {SHOWN} FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
             f"ORDER BY {order} LIMIT {PAGE} OFFSET ?) USING (number) ORDER BY {order}",
-            [*values, PAGE * (number - 1)],
+            *values,
+            PAGE * (number - 1),
         )
 
-    def every(self, wanted: Filter) -> list[dict[str, Any]]:
+    def every(self, wanted: Filter) -> list[Row]:
         """All trials of a filter, by name."""
         where, values = wanted.where()
-        return self._records(
-            f"SELECT * FROM listed WHERE {where} ORDER BY trial_id, spec_hash",  # noqa: S608 # constants
-            values,
+        return self.ask(
+            f"SELECT {SHOWN} FROM listed WHERE {where} ORDER BY trial_id, spec_hash",  # noqa: S608 # constants
+            *values,
         )
 
-    def find(self, trial_id: str, spec_hash: str | None = None) -> dict[str, Any] | None:
+    def find(self, trial_id: str, spec_hash: str | None = None) -> Row | None:
         """One trial; where its name stands for several, the one of that spec, or any."""
-        found = self._records(
-            "SELECT * FROM listed WHERE trial_id = ? AND spec_hash = coalesce(?, spec_hash) "
+        found = self.ask(
+            f"SELECT {SHOWN} FROM listed WHERE trial_id = ? AND spec_hash = coalesce(?, spec_hash) "  # noqa: S608 # constants
             "ORDER BY spec_hash LIMIT 1",
-            [trial_id, spec_hash],
+            trial_id,
+            spec_hash,
         )
         return found[0] if found else None
 
-    def near(self, wanted: Filter, row: dict[str, Any], limit: int) -> list[dict[str, Any]]:
-        """Some other trials of a filter to lay beside one: of each model and variant the first.
+    def near(self, row: Row, limit: int) -> list[Row]:
+        """Some trials to lay beside one, of its condition: of each model and variant the first.
 
         Equal repetitions come first, since they are the ones that are compared.
         """
-        where, values = wanted.where()
-        return self._records(
-            f"SELECT * EXCLUDE ({SPEEDS}) FROM listed "  # noqa: S608 # constants
-            f"WHERE {where} AND (trial_id, spec_hash) <> (?, ?) QUALIFY row_number() OVER ("
+        return self.ask(
+            f"SELECT {WITHOUT_SPEEDS} FROM listed "  # noqa: S608 # constants
+            "WHERE condition = ? AND (trial_id, spec_hash) <> (?, ?) QUALIFY row_number() OVER ("
             "PARTITION BY model, variant, spec_hash ORDER BY rep <> ?, trial_id) <= ? "
             "ORDER BY model, variant, trial_id, spec_hash",
-            [*values, row["trial_id"], row["spec_hash"], row["rep"], limit],
+            *(row["condition"], row["trial_id"], row["spec_hash"], row["rep"], limit),
         )
 
-    def pairs(self, model: str, variant: str, fate: str) -> list[dict[str, Any]]:
+    def pairs(self, model: str, variant: str, fate: str) -> list[Row]:
         """Trials of a variant beside those of the baseline; ``fate``: outcome or joint."""
-        return self._records(PAIRS.format(fate=fate), [model, variant])
+        return self.ask(PAIRS.format(fate=fate), model, variant)
 
     def state(self) -> State:
         """What is listed now, as a number of trials and a sum over their names and ends."""
-        (row,) = self._rows(
-            "SELECT count(*), coalesce(sum(hash(trial_id, spec_hash, status, end_time_s, error)), "
-            "0) FROM listed",
-            [],
+        (row,) = self.ask(
+            "SELECT count(*) AS trials, coalesce(sum(hash(trial_id, spec_hash, status, end_time_s, "
+            "error)), 0) AS sum FROM listed"
         )
-        return int(row[0]), int(row[1])
+        return int(row["trials"]), int(row["sum"])
 
-    def ask(self, sql: str, *values: object) -> list[dict[str, Any]]:
+    @property
+    def others(self) -> set[tuple[str, str]]:
+        """The models that were asked for, with the other ones that answered."""
+        return {(row["requested"], row["served"]) for row in self.ask("FROM others")}
+
+    def ask(self, sql: str, *values: object) -> list[Row]:
         """Rows of a query of ours on what is in memory."""
-        return self._records(sql, list(values))
+        with self._lock:
+            return records(self._memory, sql, values)
 
     def export(self, wanted: Filter, sort: str, form: str) -> bytes:
         """All trials of a filter as CSV or Parquet."""
         where, values = wanted.where()
         with tempfile.TemporaryDirectory(dir=spill_folder()) as folder, self._lock:
             path = Path(folder) / f"trials.{form}"
-            assert self._connection is not None, "it was never refreshed"
-            chosen = self._connection.sql(
+            chosen = self._memory.sql(
                 f"SELECT {EXPORTED} FROM listed WHERE {where} ORDER BY {order_by(sort)}",  # noqa: S608 # constants
                 params=values,
             )
@@ -416,38 +404,26 @@ class Catalogue:
         return count
 
     def _name_stand_ins(self) -> None:
-        """Say of each trial that a stand-in drove for whom it stood."""
-        assert self._connection is not None
-        unnamed = self._connection.execute(UNNAMED).fetchall()
+        """Note for each trial that a stand-in drove which model it stood in for."""
+        unnamed = self._memory.execute(UNNAMED).fetchall()
         for left, right, sides, numbers in unnamed:
-            self._connection.execute(
+            self._memory.execute(
                 "UPDATE listed SET stand_in = ? WHERE number IN (SELECT unnest(?))",
                 [stand_in({"left": left, "right": right}, sides or SIDES), numbers],
             )
 
     def _note_others(self) -> None:
         """Find out where another model answered, by the aliases of all sweeps."""
-        pairs = self._rows("SELECT DISTINCT requested, served FROM tried WHERE answered", [])
-        others = others_among(pairs, self._rows(ALIASES, []))
-        assert self._connection is not None
-        self._connection.execute("TRUNCATE others")
-        if others:
-            self._connection.executemany("INSERT INTO others VALUES (?, ?)", others)
+        answered = "SELECT DISTINCT requested, served FROM tried WHERE answered"
+        pairs, aliases = (self._memory.execute(sql).fetchall() for sql in (answered, ALIASES))
+        self._memory.execute("TRUNCATE others")
+        if others := others_among(pairs, aliases):
+            self._memory.executemany("INSERT INTO others VALUES (?, ?)", others)
 
     @property
-    def others(self) -> set[tuple[str, str]]:
-        """The models that were asked for, with the other ones that answered."""
-        return set(self._rows("FROM others", []))
-
-    def _rows(self, sql: str, values: list[Any]) -> list[Any]:
+    def _memory(self) -> duckdb.DuckDBPyConnection:
         assert self._connection is not None, "it was never refreshed"
-        with self._lock:
-            return self._connection.execute(sql, values).fetchall()
-
-    def _records(self, sql: str, values: list[Any]) -> list[dict[str, Any]]:
-        assert self._connection is not None, "it was never refreshed"
-        with self._lock:
-            return records(self._connection, sql, values)
+        return self._connection
 
 
 def order_by(sort: str) -> str:

@@ -33,7 +33,7 @@ FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) WHERE
 ORDER BY decision, side
 """  # noqa: S608 # constants
 TASK = f"SELECT source, spec FROM trials LEFT JOIN specs USING (spec_hash) WHERE {OF_TRIAL}"  # noqa: S608 # constants
-# A recording says nothing of its task: the human experiment judged by the boxes, at 20 Hz.
+# Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz.
 HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
 # Of one decision with the one before it, or of all.
 DECIDED = f"""

@@ -12,7 +12,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -27,11 +27,11 @@ from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
 from analysis.explorer.pages.tables import table_page, tables_page
 from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
+from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import list_sweeps
 from analysis.explorer.urls import EXPORTED, StaticLinks, bundle_name
-from analysis.explorer.views import sparkline, speed_scale
 from analysis.tables import TABLES
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
@@ -41,23 +41,21 @@ STYLES = ("vendor/uplot-1.6.32.min.css", "explorer.css")
 PLAIN = ("keys.js",)
 LISTING = ("keys.js", "unpacked.js", "listing.js")
 BUNDLE = ("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
-# A block of a prompt in a decision's panel: the same ones come again and again.
-_BLOCK = re.compile(r'<details class="block".*?</details>', re.DOTALL)
-# Where a server would lead on, a file does not.
+# A link that only a server can follow.
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
-# What is taken for a secret wherever it stands, beside the values of this machine's keys.
+# What looks like a key, wherever it is from; the values of this machine's keys are looked for too.
 _KEYS = re.compile(
     r"\b(?:sk-[A-Za-z0-9_-]{16,}|AIza[A-Za-z0-9_-]{30,}|Bearer [A-Za-z0-9._-]{16,}"
     r"|gh[opsu]_[A-Za-z0-9]{30,}|github_pat_[A-Za-z0-9_]{30,}|hf_[A-Za-z0-9]{30,}"
     r"|xox[abp]-[A-Za-z0-9-]{16,}|A[KS]IA[A-Z0-9]{16})"
 )
 _SECRET_NAMES = ("_KEY", "_TOKEN", "_SECRET", "_PASSWORD")
-# Whoever's home it is.
+# A folder in anybody's home.
 _HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\]")
 SHORTEST_SECRET = 8
-# What an export is made of, and its names alone.
+# The names of an export's pages: those of an earlier one are deleted, and nothing else.
 _OURS = re.compile(rf"(?:index|{'|'.join(EXPORTED)}|(?:sweep|table|trials)-.*)\.html")
-# Packed data, which are searched before they are packed: their letters spell anything.
+# Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
     r'<script type="application/json" id="(?:bundle|cells)">.*?</script>', re.DOTALL
 )
@@ -72,30 +70,8 @@ class Inlined:
     hashes: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Behind:
-    """The set of each cell of the tables by its name; sets of places in the list of trials."""
-
-    cells: dict[str, int]
-    sets: list[list[int]]
-
-
-@dataclass(slots=True)
-class Blocks:
-    """The blocks of all prompts of a page, each once."""
-
-    numbers: dict[str, int] = field(default_factory=dict)
-
-    def without(self, html: str) -> str:
-        """A panel with a number in the place of each block."""
-        return _BLOCK.sub(lambda found: f"\x01{self._number(found[0])};", html)
-
-    def _number(self, block: str) -> int:
-        return self.numbers.setdefault(block, len(self.numbers))
-
-
 Watch = Callable[[Sequence[Any], str], Iterable[Any]]
-"""Shows how far a loop is: gets what it goes through, and a name; gives the same to go through."""
+"""Shows how far a loop has come: takes its items and a name, and returns the items."""
 
 
 def unwatched(things: Sequence[Any], _: str) -> Iterable[Any]:
@@ -114,8 +90,8 @@ def export_folder(
     """
     links = StaticLinks(["trials"]) if wanted else StaticLinks()
     with _opened(db, wanted, links) as (site, rows):
-        behind = _Behind({}, []) if wanted else _behind(site, rows)
-        links.behind = behind.cells
+        behind = {"cells": {}, "sets": []} if wanted else _behind(site, rows)
+        links.behind = behind["cells"]
         pages = {site.at.to("trials"): _listing(site, rows, behind)}
         for condition in sorted({row["condition"] for row in rows}):
             mine = [row for row in rows if row["condition"] == condition]
@@ -160,22 +136,18 @@ def _index(pages: Mapping[str, str]) -> str:
 
 def bundle_page(site: Site, rows: Sequence[Row], name: str, watch: Watch) -> str:
     """A page with several trials, of which it shows one."""
-    blocks = Blocks()
-    trials = {
-        site.at.data(row): _packed(_trial(site, row, rows, blocks)) for row in watch(rows, name)
-    }
-    bundle = {"trials": trials, "blocks": _packed(list(blocks.numbers))}
+    trials = {site.at.data(row): _packed(_trial(site, row, rows)) for row in watch(rows, name)}
     return site.render(
         "bundle.html",
         here="trials",
         name=name,
         rows=rows,
-        bundle=embedded(bundle),
+        bundle=embedded(trials),
         inlined=inlined(BUNDLE),
     )
 
 
-def _trial(site: Site, row: Row, beside: Sequence[Row], blocks: Blocks) -> dict[str, object]:
+def _trial(site: Site, row: Row, beside: Sequence[Row]) -> dict[str, object]:
     """What the page needs of one trial."""
     trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
     found = read_decisions(site.db, row["trial_id"], row["spec_hash"])
@@ -192,25 +164,24 @@ def _trial(site: Site, row: Row, beside: Sequence[Row], blocks: Blocks) -> dict[
     }
     _refuse_secrets(site, row["trial_id"], [html, *panels.values(), values["data"] or ""])
     data = json.loads(values["data"]) if values["data"] else None
-    small = {at: blocks.without(panel) for at, panel in panels.items()}
-    return {"html": _LINK_TO_NOWHERE.sub(r"\1", html), "panels": small, "data": data}
+    return {"html": _LINK_TO_NOWHERE.sub(r"\1", html), "panels": panels, "data": data}
 
 
-def _behind(site: Site, rows: list[Row]) -> _Behind:
-    """Which trials of the list are behind the numbers of all tables."""
+def _behind(site: Site, rows: list[Row]) -> dict[str, Any]:
+    """The trials behind the numbers of all tables: each number's set, and places in the list."""
     found = computed(site, ("cells", *TABLES), {})
     if found.result is None:
-        return _Behind({}, [])  # the pages of the tables say why there are none
+        return {"cells": {}, "sets": []}  # the pages of the tables say why there are none
     places = {(row["trial_id"], row["spec_hash"]): i for i, row in enumerate(rows)}
     # A sweep may have stored more since the list was made.
     sets = [
         [places[trial, spec] for trial, spec in one if (trial, spec) in places]
         for one in found.result.content["sets"]
     ]
-    return _Behind(found.result.content["cells"], sets)
+    return {"cells": found.result.content["cells"], "sets": sets}
 
 
-def _listing(site: Site, rows: list[Row], behind: _Behind) -> str:
+def _listing(site: Site, rows: list[Row], behind: Mapping[str, Any]) -> str:
     """The list of trials, whose script filters them by what stands beside each."""
     of_row = [{name: [row[name]] for name in FACETS if name in row} for row in rows]
     for name, table in SEVERAL.items():
@@ -233,8 +204,8 @@ def _listing(site: Site, rows: list[Row], behind: _Behind) -> str:
         sort="",
         kept={},
         sparkline=sparkline,
-        scale=speed_scale(rows),
-        cells=embedded(_packed({"cells": behind.cells, "sets": behind.sets})),
+        scale=speed_range(rows),
+        cells=embedded(_packed(behind)),
         inlined=inlined(LISTING),
     )
 
@@ -258,7 +229,7 @@ def _opened(
     db: Path, wanted: Sequence[str], links: StaticLinks
 ) -> Iterator[tuple[Site, list[Row]]]:
     """A site of files and the wanted trials, by name; raises UsageError where there is none."""
-    site = Site(db, links, static=True, shared={"inlined": inlined(PLAIN)})
+    site = Site(db, links, shared={"inlined": inlined(PLAIN)})
     site.catalogue.refresh()
     every = site.catalogue.every(Filter())
     rows = [
@@ -304,7 +275,7 @@ def _refuse_secrets_of(site: Site, pages: Mapping[str, str]) -> None:
 def _refuse_secrets(site: Site, where: str, texts: Sequence[str]) -> None:
     """Raises UsageError where a text holds a key, or a path of this machine."""
     folders = (Path.home(), Path.cwd(), site.db.resolve().parent, PROJECT, tempfile.gettempdir())
-    paths = {str(folder) for folder in folders} - {"/"}
+    paths = {str(folder) for folder in folders} - {"/"}  # in a container the home may be "/"
     secrets = {
         value: name
         for name, value in os.environ.items()

@@ -30,10 +30,11 @@ HEADERS = {
 
 
 def from_elsewhere(headers: Headers) -> bool:
-    """Whether another site's page leads here.
+    """Whether another site's page led here.
 
-    Browsers say so to loopback alone, and older ones nowhere: what they say instead is the page
-    that leads here. Elsewhere the cookie with the token stays away.
+    Over HTTP browsers send ``sec-fetch-site`` to loopback alone, and older ones never: then
+    ``origin`` and ``referer`` tell. At other addresses the token is needed, whose cookie is not
+    sent from other sites.
     """
     site = headers.get("sec-fetch-site")
     if site is not None:
@@ -44,7 +45,7 @@ def from_elsewhere(headers: Headers) -> bool:
 
 
 def is_address(name: str) -> bool:
-    """Whether a host is an IP address, and no name that somebody's server resolves."""
+    """Whether a host is an IP address and not a name, which any server may resolve to ours."""
     try:
         ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
     except ValueError:
@@ -125,4 +126,5 @@ def _values(cookies: str, name: str) -> list[str]:
 
 
 def _equal(given: str, token: str) -> bool:
+    # In a time that does not tell how much of a guess is right.
     return hmac.compare_digest(given.encode(), token.encode())

@@ -6,22 +6,19 @@ A copy lasts as long as the file stays as it is.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
 import threading
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from analysis.explorer.catalogue import stamp_of
-from analysis.explorer.query_worker import MEMORY, Copying, Query, job_text
+from analysis.explorer.child import Answer, Child, Ended, NoAnswer
+from analysis.explorer.query_worker import Caps, Query
 from merge_runner.paths import PROJECT
 
 AT_ONCE = 2
@@ -34,25 +31,8 @@ DOWNLOADED_BYTES = 50_000_000
 SAID_BYTES = 1_000_000  # of errors, and around a result
 
 
-class NoAnswer(Exception):
-    """Why a query has no result, in a line."""
-
-
 @dataclass(frozen=True, slots=True)
-class Caps:
-    """What a query may take, and how much of its result is shown."""
-
-    seconds: float = 10.0
-    memory_mb: int = 512
-    rows: int = 1_000
-    text: int = 2_000
-    """Characters of a cell."""
-    size: int = 5_000_000
-    """Bytes."""
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
+class QueryResult:
     """What a query found: names and types of columns, and texts; None is NULL.
 
     A text comes with how many of its characters are left out. With ``more`` there are more rows.
@@ -65,7 +45,7 @@ class Result:
 
 
 class Copy:
-    """A copy of a database, which has no name: it goes when nobody holds it any more.
+    """A copy of a database as an open file without a name: it is gone when nobody holds it.
 
     So nothing is left of it when the program is killed, and no query can say where it lies.
     """
@@ -78,24 +58,31 @@ class Copy:
         except OSError as exc:
             raise NoAnswer(f"there is no room for a copy of the database: {exc.strerror}") from exc
         try:
-            copying = Copying(str(db.resolve()), f"{folder}/results.duckdb")
-            told = _asked(copying, COPYING_S, SAID_BYTES)
-            if told is None:
-                raise NoAnswer("the database could not be copied in a minute: is it being written?")
-            if "error" in told[0]:
-                raise NoAnswer(_without_folders(told[0]["error"], copying))
-            self.fd = os.open(copying.copy, os.O_RDONLY)
+            copy = f"{folder}/results.duckdb"
+            self._make({"database": str(db.resolve()), "copy": copy})
+            self.fd = os.open(copy, os.O_RDONLY)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
         weakref.finalize(self, os.close, self.fd)
 
+    def _make(self, job: dict[str, str]) -> None:
+        with closing(_worker()) as worker:
+            try:
+                worker.ask(job, seconds=COPYING_S, most_bytes=SAID_BYTES)
+            except Ended as exc:
+                if exc.late:
+                    why = "the database could not be copied in a minute: is it being written?"
+                else:
+                    why = f"the copy of the database failed: {exc}"
+                raise NoAnswer(why) from exc
+
 
 @dataclass
 class Sandbox:
-    """Queries of one database."""
+    """Runs queries on one database: a few at once, each in its process and within its caps."""
 
     db: Path
-    caps: Caps = Caps()
+    caps: Caps = field(default_factory=Caps)
     patience_s: float = PATIENCE_S
     _copy: Copy | None = None
     _copying: threading.Lock = field(default_factory=threading.Lock)
@@ -104,49 +91,48 @@ class Sandbox:
         default_factory=lambda: threading.Semaphore(AT_ONCE + WAITING)
     )
 
-    def result(self, sql: str) -> Result:
+    def result(self, sql: str) -> QueryResult:
         """What a query finds, as much of it as is shown; raises NoAnswer and UsageError."""
         said, _ = self._answer(sql, as_csv=False)
         columns = [(name, kind) for name, kind in said["columns"]]
-        return Result(columns, said["rows"], said["more"], said["seconds"])
+        return QueryResult(columns, said["rows"], said["more"], said["seconds"])
 
     def csv(self, sql: str) -> bytes:
         """All that a query finds; raises NoAnswer and UsageError."""
         return self._answer(sql, as_csv=True)[1]
 
     def close(self) -> None:
-        """Delete the copy, unless a query reads it: that one will."""
+        """Delete the copy; if a query reads it, it lasts until that has ended."""
         self._copy = None
 
-    def _answer(self, sql: str, *, as_csv: bool) -> tuple[dict[str, Any], bytes]:
+    def _answer(self, sql: str, *, as_csv: bool) -> Answer:
         if len(sql) > LONGEST:
             raise NoAnswer(f"a query has up to {LONGEST:,} characters here, this one {len(sql):,}")
         caps = self.caps
-        size = DOWNLOADED_BYTES if as_csv else caps.size
+        if as_csv:
+            caps = replace(caps, rows=DOWNLOADED_ROWS, size=DOWNLOADED_BYTES)
         with self._turn():
             copy = self._current()
-            query = Query(
-                file=f"/dev/fd/{copy.fd}",
-                sql=sql,
-                as_csv=as_csv,
-                rows=DOWNLOADED_ROWS if as_csv else caps.rows,
-                text=caps.text,
-                size=size,
-                memory_mb=caps.memory_mb,
-                seconds=caps.seconds,
-            )
-            told = _asked(query, caps.seconds, size + SAID_BYTES, copy.fd)
-        if told is None:
-            raise NoAnswer(f"stopped after {caps.seconds:g} s")
-        error = told[0].get("error")
-        if error == MEMORY:
-            raise NoAnswer(f"the query needed more than {caps.memory_mb} MB")
-        if error is not None:
-            raise NoAnswer(error)
-        return told
+            query = Query(f"/dev/fd/{copy.fd}", sql, as_csv, caps)
+            try:
+                with closing(_worker(copy.fd)) as worker:
+                    return worker.ask(
+                        asdict(query), seconds=caps.seconds, most_bytes=caps.size + SAID_BYTES
+                    )
+            except Ended as exc:
+                raise NoAnswer(self._silence(exc)) from exc
+
+    def _silence(self, ended: Ended) -> str:
+        """Why a process may have ended without an answer."""
+        if ended.late:
+            return f"stopped after {self.caps.seconds:g} s"
+        if ended.code < 0:  # a signal: of the system, or of a library in need
+            return f"the query needed more than {self.caps.memory_mb} MB, or DuckDB failed at it"
+        return f"the process of the query ended with code {ended.code}"
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
+        # Counted apart from the turns, so that whoever is one too many hears it at once.
         if not self._places.acquire(blocking=False):
             raise NoAnswer("too many queries are waiting: run it again in a moment")
         try:
@@ -172,73 +158,9 @@ class Sandbox:
             return self._copy
 
 
-def _asked(
-    job: Query | Copying, seconds: float, size: int, *files: int
-) -> tuple[dict[str, Any], bytes] | None:
-    """What a process says, up to so many bytes; None where it was killed for taking too long.
-
-    It is given the open ``files``. Raises NoAnswer where it ended without a word.
-    """
-    process = subprocess.Popen(
-        [sys.executable, "-s", "-X", "utf8", "-m", "analysis.explorer.query_worker"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        cwd=PROJECT,
-        env=_environment(),
-        pass_fds=files,
-    )
-    assert process.stdin is not None
-    assert process.stdout is not None
-    late = threading.Event()
-
-    def stop() -> None:
-        late.set()
-        process.kill()
-
-    clock = threading.Timer(seconds, stop)
-    clock.start()
-    try:
-        try:
-            process.stdin.write(job_text(job).encode())
-            process.stdin.close()
-        except BrokenPipeError:
-            pass  # it died: its silence says so
-        said = process.stdout.read(size + 1)
-    finally:
-        clock.cancel()
-        process.kill()
-        code = process.wait()
-        process.stdout.close()
-    if len(said) > size:
-        raise NoAnswer("the result is too large to be shown: select less of it")
-    head, found, body = said.partition(b"\n")
-    if found:
-        told: dict[str, Any] = json.loads(head)
-        return told, body
-    if late.is_set():
-        return None
-    raise NoAnswer(_silence(job, code))
-
-
-def _without_folders(text: str, job: Copying) -> str:
-    """What went wrong with a copy, for those whom the machine is no business of."""
-    for path in (job.database, job.copy):
-        text = text.replace(f"{Path(path).parent}{os.sep}", "")
-    return text
-
-
-def _silence(job: Query | Copying, code: int) -> str:
-    """Why a process may have ended without a word."""
-    if isinstance(job, Query) and code < 0:  # a signal: of the system, or of a library in need
-        return f"the query needed more than {job.memory_mb} MB, or DuckDB failed at it"
-    return f"the process of the query ended with code {code}"
-
-
-def _environment() -> dict[str, str]:
-    """Nothing of ours, among which there are keys, but the time zone.
-
-    An arena for each thread would take addresses that a query could use.
-    """
-    kept = {name: os.environ[name] for name in ("TZ", "TMPDIR") if name in os.environ}
-    return {**kept, "MALLOC_ARENA_MAX": "1"}
+def _worker(*files: int) -> Child:
+    """A process for one job, which knows as little of us as it can; raises NoAnswer."""
+    environment = {name: os.environ[name] for name in ("TZ", "TMPDIR") if name in os.environ}
+    # An arena for each thread would take addresses that a query could use.
+    environment |= {"PYTHONPATH": str(PROJECT), "MALLOC_ARENA_MAX": "1"}
+    return Child("analysis.explorer.query_worker", environment=environment, files=files, quiet=True)

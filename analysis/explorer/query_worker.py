@@ -1,7 +1,6 @@
 """The process in which a query runs, or a copy is made: the explorer may kill it at any moment.
 
-It is told its job as JSON on stdin. What it says on stdout is a line of JSON, with ``error`` where
-there is one, and after it the CSV where that is asked for.
+The rows of a page are in the line of JSON of its answer, a CSV follows it.
 """
 
 from __future__ import annotations
@@ -9,11 +8,11 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import shutil
-import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
@@ -21,12 +20,13 @@ from typing import Any
 
 import duckdb
 
+from analysis.explorer.child import Answer, serve
 from merge_runner.errors import MergeRunnerError
 from merge_runner.results.database import Instance, read_database, readable
 from merge_runner.results.store import answering
 from merge_runner.text_safety import csv_writer, in_spreadsheet, quoted
 
-# Python and DuckDB take addresses for more than they use, beside what the query may use.
+# Python and DuckDB reserve more addresses than they use; a query's memory comes on top.
 ADDRESSES_MB = 1024
 THREADS = 2
 BATCH = 64  # rows fetched at once: each may be large
@@ -35,85 +35,81 @@ NAME = 200
 PLAN_TEXT = 200_000  # characters: a part of a plan of execution says little
 CELL_COSTS = 30  # bytes of a cell of the page, beside its text
 LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
-# What Python is told in their place.
+# What Python gets for infinite timestamps.
 INFINITE = {"9999-12-31 23:59:59.999999": "infinity", "0001-01-01 00:00:00": "-infinity"}
-MEMORY = "needed more memory"  # the explorer says how much there was
+
+
+@dataclass(frozen=True, slots=True)
+class Caps:
+    """What a query may take, and how much of its result is shown."""
+
+    seconds: float = 10.0
+    memory_mb: int = 512
+    rows: int = 1_000
+    text: int = 2_000
+    """Characters of a cell of a page."""
+    size: int = 5_000_000
+    """Bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """What is to be run, and how much may come of it."""
+    """What is to be run, on which open file, and how much may come of it."""
 
     file: str
     sql: str
     as_csv: bool
-    rows: int
-    text: int
-    """Characters of a cell; of CSV, all."""
-    size: int
-    """Bytes."""
-    memory_mb: int
-    seconds: float
+    caps: Caps
 
 
-@dataclass(frozen=True, slots=True)
-class Copying:
-    """A database, and the new file that gets all that is in it."""
-
-    database: str
-    copy: str
-
-
-def job_text(job: Query | Copying) -> str:
-    """A job as it is told."""
-    return json.dumps({type(job).__name__: asdict(job)})
-
-
-def main() -> None:
-    """Do the job of stdin."""
-    told: dict[str, Any] = json.load(sys.stdin)
-    body = b""
+def answer(told: dict[str, Any]) -> Answer:
+    """Make a copy or run a query: what is told are the fields of the one or the other."""
+    if "copy" in told:
+        return _copy(Path(told["database"]), Path(told["copy"])), b""
+    query = Query(**{**told, "caps": Caps(**told["caps"])})
     try:
-        if "Copying" in told:
-            said = _copy(Copying(**told["Copying"]))
-        else:
-            said, body = _run(Query(**told["Query"]))
-    except (MemoryError, duckdb.OutOfMemoryException):
-        said = {"error": MEMORY}
+        return _run(query)
+    except (MergeRunnerError, duckdb.Error, OSError, MemoryError) as exc:
+        memory = (MemoryError, duckdb.OutOfMemoryException)
+        if isinstance(exc, memory) or isinstance(exc.__cause__, memory):
+            return {"error": f"the query needed more than {query.caps.memory_mb} MB"}, b""
+        return {"error": _one_line(exc)}, b""
+
+
+def _copy(database: Path, copy: Path) -> dict[str, Any]:
+    """Copy a database to a new file while it is open for reading here, so that nobody writes."""
+    try:
+        file = readable(database)
+        with read_database(file, Instance()):
+            # The database last: a process that closes a file loses all its locks on it.
+            for log in LOGS:
+                with contextlib.suppress(FileNotFoundError):
+                    shutil.copyfile(f"{file}{log}", f"{copy}{log}")
+            shutil.copyfile(file, copy)
+        with duckdb.connect(copy) as whole:  # the copy loses its name, and its log with it
+            whole.execute("CHECKPOINT")
     except (MergeRunnerError, duckdb.Error, OSError) as exc:
-        memory = isinstance(exc.__cause__, duckdb.OutOfMemoryException)
-        said = {"error": MEMORY if memory else _one_line(exc)}
-    sys.stdout.buffer.write(json.dumps(said, ensure_ascii=False).encode() + b"\n" + body)
-    sys.stdout.buffer.flush()
-
-
-def _copy(job: Copying) -> dict[str, Any]:
-    """Copy a database while it is open for reading here, so that nobody writes."""
-    copy = Path(job.copy)
-    database = readable(Path(job.database))
-    with read_database(database, Instance()):
-        # The database last: a process that closes a file loses all its locks on it.
-        for log in LOGS:
-            with contextlib.suppress(FileNotFoundError):
-                shutil.copyfile(f"{database}{log}", f"{copy}{log}")
-        shutil.copyfile(database, copy)
-    with duckdb.connect(copy) as whole:  # the copy loses its name, and its log with it
-        whole.execute("CHECKPOINT")
+        text = _one_line(exc)
+        # Where the files lie is not for everybody who may ask.
+        for path in (database, copy):
+            text = text.replace(f"{path.parent}{os.sep}", "")
+        return {"error": text}
     return {}
 
 
-def _run(query: Query) -> tuple[dict[str, Any], bytes]:
-    _confine(query)
+def _run(query: Query) -> Answer:
+    _confine(query.caps)
     began = time.monotonic()
     with _opened(query) as connection, answering(connection, query.sql) as result:
         columns = [(name, str(kind)) for name, kind, *_ in result.description or ()]
         rows = _fetched(result)
         if query.as_csv:
-            return _csv([name for name, _ in columns], rows, query)
+            return _csv([name for name, _ in columns], rows, query.caps)
         if len(columns) > COLUMNS:
             return {"error": f"the result has more than {COLUMNS} columns: name those to show"}, b""
         is_plan = bool(columns) and columns[0][0] == "explain_key"
-        cells, more = _cells(rows, replace(query, text=PLAN_TEXT) if is_plan else query)
+        caps = replace(query.caps, text=PLAN_TEXT) if is_plan else query.caps
+        cells, more = _cells(rows, caps)
     names = [[name[:NAME], kind[:NAME]] for name, kind in columns]
     seconds = time.monotonic() - began
     return {"columns": names, "rows": cells, "more": more, "seconds": seconds}, b""
@@ -121,9 +117,9 @@ def _run(query: Query) -> tuple[dict[str, Any], bytes]:
 
 @contextlib.contextmanager
 def _opened(query: Query) -> Iterator[duckdb.DuckDBPyConnection]:
-    """The database under a name of ours: its file's is that of an open file."""
+    """The database under a name of ours: the file has none, and is opened as ``/dev/fd/N``."""
     config: dict[str, str | bool | int | float | list[str]] = {
-        "memory_limit": f"{query.memory_mb}MB",
+        "memory_limit": f"{query.caps.memory_mb}MB",
         "threads": THREADS,
         "temp_directory": "",
         "python_enable_replacements": False,
@@ -133,16 +129,14 @@ def _opened(query: Query) -> Iterator[duckdb.DuckDBPyConnection]:
         yield connection
 
 
-def _confine(query: Query) -> None:
-    """What the process may use, where the system can be asked to see to it."""
+def _confine(caps: Caps) -> None:
+    """Limit what the process may use, where the system can do so."""
     try:
         import resource
     except ImportError:
         return
     for kind, most in (
-        (resource.RLIMIT_AS, (query.memory_mb + ADDRESSES_MB) << 20),
-        # Should the explorer die before it could kill this.
-        (resource.RLIMIT_CPU, int(query.seconds * THREADS) + 5),
+        (resource.RLIMIT_AS, (caps.memory_mb + ADDRESSES_MB) << 20),
         (resource.RLIMIT_FSIZE, 0),
         (resource.RLIMIT_CORE, 0),
     ):
@@ -156,7 +150,7 @@ def _fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
 
 
 def _cells(
-    rows: Iterator[tuple[Any, ...]], query: Query
+    rows: Iterator[tuple[Any, ...]], caps: Caps
 ) -> tuple[list[list[tuple[str, int] | None]], bool]:
     """The first rows, and whether there are more. A cell: its text, and how much is left out."""
     cells: list[list[tuple[str, int] | None]] = []
@@ -164,19 +158,17 @@ def _cells(
     for row in rows:
         texts = [text_of(value) for value in row]
         line = [
-            None if text is None else (text[: query.text], max(0, len(text) - query.text))
+            None if text is None else (text[: caps.text], max(0, len(text) - caps.text))
             for text in texts
         ]
         size += sum(CELL_COSTS + (len(cell[0].encode()) if cell else 0) for cell in line)
-        if len(cells) == query.rows or size > query.size:
+        if len(cells) == caps.rows or size > caps.size:
             return cells, True
         cells.append(line)
     return cells, False
 
 
-def _csv(
-    names: list[str], rows: Iterator[tuple[Any, ...]], query: Query
-) -> tuple[dict[str, Any], bytes]:
+def _csv(names: list[str], rows: Iterator[tuple[Any, ...]], caps: Caps) -> Answer:
     content, lines = io.BytesIO(), io.StringIO()
     writer = csv_writer(lines)
     writer.writerow(map(in_spreadsheet, names))
@@ -185,11 +177,11 @@ def _csv(
         content.write(lines.getvalue().encode())
         lines.seek(0)
         lines.truncate()
-        if number == query.rows or content.tell() > query.size:
+        if number == caps.rows or content.tell() > caps.size:
             # A file that ends early would be taken for the whole.
             return {
-                "error": f"a download holds up to {query.rows:,} rows and "
-                f"{query.size / 1e6:.0f} MB, and this result has more: narrow the query, or use "
+                "error": f"a download holds up to {caps.rows:,} rows and "
+                f"{caps.size / 1e6:.0f} MB, and this result has more: narrow the query, or use "
                 "`merge-runner sql --format csv`"
             }, b""
     content.write(lines.getvalue().encode())  # the names, where there is no row
@@ -240,4 +232,4 @@ def _one_line(exc: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    serve(answer)

@@ -21,7 +21,7 @@ from merge_runner.text_safety import first_line
 ALONE = threading.RLock()
 
 
-# A sweep that stores its trials holds the file for less; a page has no time for others.
+# A sweep that stores its trials holds the file for less; a page cannot wait for anybody else.
 PATIENCE_S = 2.0
 
 

@@ -17,7 +17,7 @@ _COLUMN = re.compile(r" {4}(\w+) [A-Z][^-]*(?:-- (.*))?")
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class SchemaColumn:
     """A column, its type, and what is said of it."""
 
     name: str
@@ -26,17 +26,17 @@ class Column:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class SchemaTable:
     """A table or a view."""
 
     name: str
     is_view: bool
     comment: str
-    columns: list[Column]
+    columns: list[SchemaColumn]
 
 
 @cache
-def tables() -> list[Table]:
+def tables() -> list[SchemaTable]:
     """Tables, then views, in the order of their definitions."""
     definitions = schema_sql()
     said = _comments(definitions)
@@ -49,11 +49,11 @@ def tables() -> list[Table]:
         ).fetchall()
     order = list(said)
     made = [
-        Table(
+        SchemaTable(
             name,
             is_view,
             said[name][""],
-            [Column(column, kind, said[name].get(column, "")) for column, kind in columns],
+            [SchemaColumn(column, kind, said[name].get(column, "")) for column, kind in columns],
         )
         for name, is_view, columns in found
     ]

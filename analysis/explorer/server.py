@@ -22,7 +22,7 @@ EVERYWHERE = {"0.0.0.0": LOOPBACK, "::": "::1"}  # noqa: S104 # compared, not bo
 
 
 def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
-    """Serve a database; ``say`` is told the address. Raises UsageError."""
+    """Serve a database; ``say`` gets the address to open. Raises UsageError."""
     site = Site(db, program=_program())
     with reading(db):
         pass  # what is wrong with it is said at once
@@ -33,11 +33,11 @@ def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
     hosts = [f"{name}:{port}" for name in names_of(bind, address)]
     say(f"http://{hosts[0]}/" + (f"?token={token}" if token else ""))
     config = uvicorn.Config(explorer(site, hosts, token), log_level="critical", ws="none")
-    _Server(config, site).run(sockets=[listener])
+    uvicorn.Server(config).run(sockets=[listener])
 
 
 def names_of(bind: str, address: str) -> list[str]:
-    """What a browser may call who listens at ``address``, as ``bind`` says; the first is shown."""
+    """The names by which a browser may reach ``address``, bound as ``bind``; the first is shown."""
     reached = EVERYWHERE.get(address, address)
     names = [bind if reached == address else reached, address]
     if reached in EVERYWHERE.values():
@@ -48,27 +48,14 @@ def names_of(bind: str, address: str) -> list[str]:
 
 
 def _program() -> str:
-    """What was typed to run this, by ``make`` too: the shell may not find the program elsewhere."""
+    """What to type to run this: its path where the shell does not find it, as under ``make``."""
     typed = sys.argv[0]
     plain = Path(typed).name != "merge-runner" or shutil.which("merge-runner") == typed
     return "merge-runner" if plain else typed
 
 
-class _Server(uvicorn.Server):
-    """One that ends the streams when it ends: it waits for its connections otherwise."""
-
-    def __init__(self, config: uvicorn.Config, site: Site) -> None:
-        super().__init__(config)
-        self._site = site
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop serving."""
-        self._site.closing = True
-        await super().shutdown(sockets)
-
-
 def listen(bind: str, port: int) -> socket.socket:
-    """A socket that listens, 0: at any free port; raises UsageError."""
+    """A listening socket; port 0 takes any free port. Raises UsageError."""
     family = socket.AF_INET6 if ":" in bind else socket.AF_INET
     try:
         listener = socket.create_server((bind, port), family=family)

@@ -14,7 +14,7 @@ from analysis.explorer.analysis_process import Computing
 from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.display_text import visible
 from analysis.explorer.query_process import Sandbox
-from analysis.explorer.urls import Links
+from analysis.explorer.urls import Links, StaticLinks
 from analysis.explorer.views import clock
 from analysis.metrics import METRICS
 from merge_runner.errors import MergeRunnerError
@@ -36,24 +36,22 @@ class NotThere(Exception):
 
 
 class NothingNew(Exception):
-    """What a page shows is what it would be now."""
+    """What was seen of a page is what it still shows."""
 
 
 @dataclass
 class Site:
-    """The explorer of one database; ``static`` pages stand alone, without a server."""
+    """The explorer of one database; pages with static links stand alone, without a server."""
 
     db: Path
     at: Links = field(default_factory=Links)
-    static: bool = False
     program: str = "merge-runner"
     """What to type to run this program."""
     shared: dict[str, object] = field(default_factory=dict)
     """What else all templates see."""
-    closing: bool = False
-    """Whether the server ends: a stream must not keep it waiting."""
 
     def __post_init__(self) -> None:
+        self.static = isinstance(self.at, StaticLinks)
         self._first_reading: threading.Thread | None = None
         self.catalogue = Catalogue(self.db)
         self.sandbox = Sandbox(self.db)
@@ -80,7 +78,7 @@ class Site:
         )
 
     def begin(self) -> None:
-        """Read the trials for the first time, which may take a while, beside what else is done."""
+        """Read the trials for the first time in the background, since it may take a while."""
         self._first_reading = threading.Thread(target=self._read_first, daemon=True)
         self._first_reading.start()
 

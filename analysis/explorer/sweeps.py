@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -36,12 +36,11 @@ SELECT coalesce(variant, '') AS variant, condition,
     sum(invalid)::BIGINT AS invalid, sum(fallbacks)::BIGINT AS fallbacks
 FROM listed {OF_SWEEP} GROUP BY ALL ORDER BY ALL
 """  # noqa: S608 # constants
-TRIED = """
+TRIED = f"""
 SELECT requested, served, answered, outcome, sum(times)::BIGINT AS times,
     sum(unpriced)::BIGINT AS unpriced, answered AND (requested, served) IN (FROM others) AS other
-FROM tried SEMI JOIN (FROM planned WHERE sweep = ?) USING (trial_id, spec_hash)
-GROUP BY ALL ORDER BY ALL
-"""
+FROM tried {OF_SWEEP} GROUP BY ALL ORDER BY ALL
+"""  # noqa: S608 # constants
 CAUSES = f"""
 SELECT cause, count(*) AS trials, sum(times)::BIGINT AS times
 FROM causes {OF_SWEEP} WHERE NOT starts_with(cause, 'model: ')
@@ -85,7 +84,7 @@ class ListedSweep:
 
     @property
     def sweep_id(self) -> str:
-        """Its name, which no other sweep has."""
+        """The id, which no other sweep has."""
         return str(self.row["sweep_id"])
 
     @property
@@ -120,7 +119,7 @@ class ListedSweep:
 
     @property
     def planned(self) -> int:
-        """How many trials it wants; 0 where nobody says."""
+        """How many trials it wants; 0 where that is not known."""
         return sum(self.config.repetitions.values()) * len(self.config.conditions)
 
     @property
@@ -132,14 +131,14 @@ class ListedSweep:
 
     @property
     def failed(self) -> int:
-        """How many of its trials have none, and ended."""
+        """How many of its trials ended without one."""
         if self.live:
             return sum(cell.failed for cell in self.live.cells)
         return int(self.row["failed"])
 
     @property
     def last_word(self) -> datetime | None:
-        """When it ended, or was heard of last."""
+        """When it ended, or was last heard of."""
         told: datetime | None = self.row["ended_at"]
         return self.standing.updated_at if told is None and self.standing else told
 
@@ -182,7 +181,10 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Assessment:
-    """The answer in one sentence; ``command`` goes on, unless a ``later`` sweep already did."""
+    """Whether a sweep is finished and can be trusted, in a sentence.
+
+    ``command`` goes on with it, unless a ``later`` sweep already did.
+    """
 
     kind: str
     text: str
@@ -195,6 +197,7 @@ class Sweep:
     """One sweep with all that its page shows."""
 
     entry: ListedSweep
+    newest: ListedSweep = field(repr=False)  # of which the page shows little
     assessment: Assessment
     cells: dict[tuple[str, str], VariantCondition]
     rates: list[Rate]
@@ -205,47 +208,40 @@ class Sweep:
 
 def list_sweeps(catalogue: Catalogue) -> list[ListedSweep]:
     """All sweeps, the newest first. Raises what ``Catalogue.refresh`` does."""
-    before = {
-        row["sweep_id"]: read_standing(catalogue.db, row["sweep_id"])
-        for row in catalogue.ask(SWEEPS)
-        if row["ended_at"] is None
-    }
     catalogue.refresh()
+    entries = _entries(catalogue)
+    # A sweep notes its end in the database before its file goes: one that seems to be lost may have
+    # ended since the database was read.
+    if any(entry.state == "lost" for entry in entries) and catalogue.refresh():
+        return _entries(catalogue)
+    return entries
+
+
+def _entries(catalogue: Catalogue) -> list[ListedSweep]:
     return [
         ListedSweep(
-            row, config_of(row["config"]), _newest(catalogue, row, before.get(row["sweep_id"]))
+            row,
+            config_of(row["config"]),
+            None if row["ended_at"] else read_standing(catalogue.db, row["sweep_id"]),
         )
         for row in catalogue.ask(SWEEPS)
     ]
 
 
-def _newest(catalogue: Catalogue, row: Row, before: Standing | None) -> Standing | None:
-    """What a sweep says of itself, read also before its row, and after it.
-
-    It notes its end in the database before its file goes; and to read the database takes a while.
-    """
-    if row["ended_at"] is not None:
-        return None
-    return read_standing(catalogue.db, row["sweep_id"]) or before
-
-
-def find_sweep(catalogue: Catalogue, sweep_id: str, *, refresh: bool = True) -> Sweep | None:
+def find_sweep(catalogue: Catalogue, sweep_id: str) -> Sweep | None:
     """One sweep; None where there is none. Raises what ``Catalogue.refresh`` does."""
-    standing = read_standing(catalogue.db, sweep_id)
-    if refresh:
-        catalogue.refresh()
-    rows = catalogue.ask(SWEEPS)
-    place = next((i for i, row in enumerate(rows) if row["sweep_id"] == sweep_id), None)
+    entries = list_sweeps(catalogue)
+    place = next((i for i, entry in enumerate(entries) if entry.sweep_id == sweep_id), None)
     if place is None:
         return None
-    row = rows[place]
-    entry = ListedSweep(row, config_of(row["config"]), _newest(catalogue, row, standing))
+    entry = entries[place]
     stored = catalogue.ask(CELLS, sweep_id)
     tried = catalogue.ask(TRIED, sweep_id)
     mismatches = mismatches_of(tried)
     return Sweep(
         entry=entry,
-        assessment=assessment_of(entry, _later(entry, rows[:place]), sum(mismatches.values())),
+        newest=entries[0],
+        assessment=assessment_of(entry, _later(entry, entries[:place]), sum(mismatches.values())),
         cells=cells_of(entry, stored),
         rates=rates_of(stored, tried, mismatches, sweep_id),
         mismatches=mismatches,
@@ -291,7 +287,7 @@ def cells_of(entry: ListedSweep, stored: list[Row]) -> dict[tuple[str, str], Var
 def rates_of(
     stored: list[Row], tried: list[Row], mismatches: dict[str, int], sweep_id: str
 ) -> list[Rate]:
-    """How often what happened that may cost trust, each with what it is counted over."""
+    """How often things happened that may cost trust, each with what it is counted over."""
     sums = Counter[str]()
     for row in stored:
         sums.update({name: value for name, value in row.items() if isinstance(value, int)})
@@ -299,7 +295,7 @@ def rates_of(
     for row in tried:
         outcomes[row["outcome"]] += row["times"]
     answers = sum(row["times"] for row in tried if row["answered"])
-    # A list is of one cause; several have theirs below, each in its own line.
+    # A list of trials has one cause: where there are several pairs, each has its own link below.
     pair = next(iter(mismatches)) if len(mismatches) == 1 else ""
     other = {"cause": f"model: {pair}"} if pair else {}
     played, attempts = sums["ended"] + sums["failed"], outcomes.total()
@@ -326,7 +322,7 @@ def rates_of(
 
 
 def mismatches_of(tried: list[Row]) -> dict[str, int]:
-    """Requested and served model, where another one answered, with how often."""
+    """How often another model answered, by the requested and the served one."""
     others = Counter[str]()
     for row in tried:
         if row["other"]:
@@ -398,11 +394,10 @@ def _again(entry: ListedSweep) -> str:
     return shlex.join(words)
 
 
-def _later(entry: ListedSweep, newer: list[Row]) -> str:
+def _later(entry: ListedSweep, newer: list[ListedSweep]) -> str:
     """The newest sweep that went on with the same trials."""
-    for row in newer:
-        config = config_of(row["config"])
-        same = (config.model, config.sample_set) == (entry.config.model, entry.config.sample_set)
-        if row["name"] == entry.row["name"] and same:
-            return str(row["sweep_id"])
-    return ""
+
+    def plays(sweep: ListedSweep) -> tuple[str, str, int]:
+        return sweep.row["name"], sweep.config.model, sweep.config.sample_set
+
+    return next((other.sweep_id for other in newer if plays(other) == plays(entry)), "")

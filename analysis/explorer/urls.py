@@ -1,10 +1,14 @@
-"""Addresses: every state of a page is one."""
+"""Addresses: every state of a page is one, and what is in one may be anything."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from typing import Any
 from urllib.parse import quote, urlencode
+
+# Without exponents and names: float() also reads "1e999" and "nan".
+_SECONDS = re.compile(r"[0-9]{1,12}(\.[0-9]{1,6})?")
 
 
 class Links:
@@ -112,3 +116,13 @@ def query_of(state: Mapping[str, Any]) -> str:
     """The part of an address after the path; what is empty is left out."""
     given = {name: value for name, value in state.items() if value is not None and value != ""}
     return f"?{urlencode(given)}" if given else ""
+
+
+def whole(text: str) -> int | None:
+    """A number of up to 7 digits; None for anything else."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 8 else None
+
+
+def seconds(text: str) -> float:
+    """A time in s since 1970; 0 for anything else."""
+    return float(text) if _SECONDS.fullmatch(text) else 0.0

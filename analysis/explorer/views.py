@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import ceil, floor
 from typing import Any
 
 from analysis.explorer.details import Decision, Trial
@@ -15,52 +14,15 @@ from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import Track
 
+# Vehicles touch up to some 13 m apart: halved so often, that is less than a millimetre.
 BISECTIONS = 14
 # What a picture shows of the plane around the track, in m.
 BEFORE_M, BEYOND_M, BESIDE_M = 3.0, 5.8, 4.5
 UNKNOWN = "no meaning is known here"
 
 
-Scale = tuple[int, int]
-
-
-def speed_scale(rows: Sequence[Row]) -> Scale:
-    """The whole m/s at the bottom and the top of all sparklines of these trials."""
-    ranges = [row[f"{side}_range_mps"] for row in rows if _drawn(row) for side in SIDES]
-    low = floor(min((low for low, _ in ranges), default=0.0))
-    return low, max(ceil(max((high for _, high in ranges), default=0.0)), low + 1)
-
-
-def _drawn(row: Row) -> bool:
-    return bool(row["left_mps"] and row["right_mps"])
-
-
-def sparkline(row: Row, scale: Scale) -> dict[str, str] | None:
-    """The speeds of both vehicles: points of two lines, 96 wide and 22 high, and in words.
-
-    None where a vehicle has none.
-    """
-    if not _drawn(row):
-        return None
-    (left_low, left_high), (right_low, right_high) = row["left_range_mps"], row["right_range_mps"]
-    return {
-        "left": _spark_points(row["left_mps"], scale),
-        "right": _spark_points(row["right_mps"], scale),
-        "words": f"speed of the left vehicle {left_low:.1f} to {left_high:.1f} m/s, "
-        f"of the right one {right_low:.1f} to {right_high:.1f} m/s",
-    }
-
-
-def _spark_points(speeds: Sequence[float], scale: Scale) -> str:
-    low, high = scale
-    step, height = 96 / max(len(speeds) - 1, 1), 22 / (high - low)
-    return " ".join(
-        [f"{step * i:.0f},{22 - height * (speed - low):.1f}" for i, speed in enumerate(speeds)]
-    )
-
-
 def condition_text(headway: float, velocity: float) -> str:
-    """A condition in words, of its projected headway in m and its relative velocity in m/s."""
+    """A condition in words, from its projected headway in m and its relative velocity in m/s."""
     if headway == 0:
         ahead = "both would reach the merge point together"
     else:
@@ -122,7 +84,7 @@ def outcome_text(row: Row, scenario: ScenarioConfig) -> str:
 
 
 def collision_text(scenario: ScenarioConfig) -> str:
-    """What the scenario takes for a collision."""
+    """What counts as a collision in the scenario."""
     length = f"{scenario.vehicle_length_m:g} m"
     return {
         "euclid2d": f"their centres came closer than {length}, a vehicle's length",
@@ -275,7 +237,7 @@ def label(row: Row) -> str:
 
 
 def collision_bounds(trial: Trial) -> list[float | None]:
-    """Below which headway the vehicles collide at each sample; None: at none."""
+    """The headway below which the vehicles collide, for each sample; None where they cannot."""
     left, right = trial.states.get("left"), trial.states.get("right")
     if left is None or right is None:
         return []
@@ -311,7 +273,7 @@ def _rounded(values: Sequence[float], digits: int) -> list[float]:
 
 
 def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
-    """A plan as steps over its horizon, beside what the plan before had in mind for that time.
+    """A plan as steps over its horizon, beside what the previous plan intended for that time.
 
     None where there is no plan.
     """
@@ -331,15 +293,6 @@ def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
         "most_mps2": scenario.max_acceleration_mps2,
         "steps": pace.plan_actions,
     }
-
-
-def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
-    """Points of a step line from -1 to 1, ``steps`` across the width."""
-    points = []
-    for i, value in enumerate(values):
-        y = height * (1 - (min(max(value, -1.0), 1.0) + 1) / 2)
-        points += [f"{width * i / steps:.1f},{y:.1f}", f"{width * (i + 1) / steps:.1f},{y:.1f}"]
-    return " ".join(points)
 
 
 def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:

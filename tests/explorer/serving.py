@@ -1,7 +1,10 @@
-"""An explorer in a thread of the tests' own process."""
+"""An explorer in a thread of the tests' own process, and a program that holds its database."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -31,3 +34,21 @@ def served(db: Path, port: int = 0):
     finally:
         server.should_exit = True
         thread.join()
+
+
+@contextmanager
+def held(db: Path):
+    """Another program holds the database, and has changed something."""
+    holding = (
+        "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True);"
+        "sys.stdin.read()"
+    )
+    holder = subprocess.Popen(
+        [sys.executable, "-c", holding, str(db)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert holder.stdout.readline() == b"held\n"
+    os.utime(db)
+    try:
+        yield
+    finally:
+        holder.communicate()

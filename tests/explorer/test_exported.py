@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import re
 import shutil
-import zlib
 from pathlib import Path
 
 import duckdb
@@ -137,25 +134,6 @@ def test_a_page_of_chosen_trials_holds_these_alone(page, study, tmp_path):
     expect(page.locator("h1")).to_have_text("emulator/baseline/N_0_0/rep01")
     page.locator("#chooser").select_option(index=1)
     expect(page.locator("h1")).to_have_text("emulator/baseline/N_0_0/rep02")
-
-
-def test_equal_blocks_of_prompts_are_there_once(study, tmp_path):
-    file = tmp_path / "three.html"
-    list(export_page(study, file, ["emulator/baseline/N_0_0/*"]))
-    text = file.read_text(encoding="utf-8")
-    bundle = json.loads(re.search(r'id="bundle">(.*?)</script>', text)[1])
-
-    def unpacked(packed):
-        return json.loads(zlib.decompress(base64.b64decode(packed)))
-
-    blocks = unpacked(bundle["blocks"])
-    assert len(blocks) == len(set(blocks))
-    assert sum("You drive a car" in block for block in blocks) > 3
-    panels = [
-        p for packed in bundle["trials"].values() for p in unpacked(packed)["panels"].values()
-    ]
-    assert len(panels) > 30
-    assert all("You drive a car" not in panel for panel in panels)
 
 
 @pytest.mark.parametrize(

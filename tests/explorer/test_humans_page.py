@@ -12,7 +12,8 @@ from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
-from analysis.explorer.pages.humans import HUMAN, chart, kinds, marker, marks
+from analysis.explorer.pages.humans import HUMAN, chart, kinds, marks
+from analysis.explorer.pictures import marker
 from analysis.explorer.site import Site
 from analysis.figures.styles import HUMAN_STYLE, MARKERS, driver_style
 from analysis.human.archive import open_files
@@ -49,9 +50,7 @@ def ask(db):
     client = TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
 
     def get(address="/humans"):
-        while 'class="computing"' in (
-            text := client.get(address, headers={"hx-request": "true"}).text
-        ):
+        while 'class="computing"' in (text := client.get(address).text):
             pass
         return unescape(text)
 

@@ -12,8 +12,8 @@ from starlette.testclient import TestClient
 from analysis.explorer.app import explorer
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.export import export_folder
+from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.site import Site
-from analysis.explorer.views import sparkline, speed_scale
 from tests.analysis.studies import Drive, write_study, yielding
 
 HOST = "127.0.0.1:8700"
@@ -89,7 +89,7 @@ def test_a_sparkline_cuts_nothing_and_the_page_says_its_scale(client, db):
             "SELECT min(velocity_mps), max(velocity_mps) FROM states"
         ).fetchall()
     assert slowest == 0
-    low, high = speed_scale(rows)
+    low, high = speed_range(rows)
     assert low <= slowest < fastest <= high
     heights = {
         side: [float(point.partition(",")[2]) for point in line[side].split()]

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import socket
-import subprocess
-import sys
+from contextlib import closing
 
 import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.analysis_process import Child, Computing, Result
+from analysis.explorer.analysis_process import Computing, Result, worker
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
+from tests.explorer.serving import held
 
 HOST = "127.0.0.1:8700"
 TRIAL = "/trials/emulator/baseline/N_0_0/rep01"
@@ -95,25 +94,11 @@ def test_a_trial_that_failed_again_shows_its_new_error(db):
 def test_while_another_program_holds_the_database_the_last_list_is_shown(db):
     site = Site(db)
     assert "holds the database" not in ask(site, "/trials").text
-    holder = subprocess.Popen(
-        [
-            *(sys.executable, "-c"),
-            "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True);"
-            "sys.stdin.read()",
-            str(db),
-        ],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    )
-    assert holder.stdout.readline() == b"held\n"
-    os.utime(db)  # something has changed
-    try:
+    with held(db):
         for address in ("/trials", "/trials?condition=N_0_0", "/sweeps", "/tables"):
             reply = ask(site, address)
             assert reply.status_code == 200
             assert "Another program holds the database" in reply.text
-    finally:
-        holder.communicate()
     assert "holds the database" not in ask(site, "/trials").text
 
 
@@ -129,18 +114,16 @@ async def test_a_port_that_is_taken_is_said_in_a_line(merge_runner, study):
 def test_a_file_of_the_users_own_is_not_taken_for_ours(study, tmp_path, monkeypatch):
     (tmp_path / "analysis.py").write_text("print('MINE')")
     monkeypatch.chdir(tmp_path)
-    child = Child(study)
-    try:
-        assert child.ask(("tables", "attempts"))["counted"] > 0
-    finally:
-        child.close()
+    with closing(worker(study)) as child:
+        said, _ = child.ask(("tables", "attempts"), seconds=60, most_bytes=10**6)
+    assert said["counted"] > 0
 
 
 def test_a_fault_in_a_computation_does_not_stay(study):
-    answers = iter([ValueError("a fault"), {"counted": 1}])
+    answers = iter([ValueError("a fault"), ({"counted": 1}, b"")])
 
     class Faulty:
-        def ask(self, request):
+        def ask(self, request, **limits):
             answer = next(answers)
             if isinstance(answer, Exception):
                 raise answer

@@ -9,15 +9,17 @@ import shutil
 import tempfile
 import threading
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import duckdb
 import pytest
 
+from analysis.explorer import child, query_worker
 from analysis.explorer import query_process as sandbox
-from analysis.explorer import query_worker as child
-from analysis.explorer.query_process import Caps, NoAnswer, Sandbox
-from analysis.explorer.query_worker import Query
+from analysis.explorer.child import Ended, NoAnswer
+from analysis.explorer.query_process import Sandbox
+from analysis.explorer.query_worker import Caps, Query
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
 from merge_runner.results.database import open_database
@@ -57,11 +59,11 @@ def queries(study):
 @pytest.fixture
 def run(study, monkeypatch):
     """Runs a query as its process would, in this one: starting one takes longer than most."""
-    monkeypatch.setattr(child, "_confine", lambda query: None)
+    monkeypatch.setattr(query_worker, "_confine", lambda caps: None)
 
     def answer(sql, *, as_csv=False, rows=1000, size=5_000_000):
-        query = Query(str(study), sql, as_csv, rows, 2000, size, memory_mb=512, seconds=10)
-        said, content = child._run(query)
+        query = Query(str(study), sql, as_csv, Caps(rows=rows, size=size))
+        said, content = query_worker._run(query)
         return content if as_csv and not said else said
 
     return answer
@@ -209,16 +211,17 @@ def test_a_sweep_writes_while_a_query_runs(own, monkeypatch):
     assert queries._current() is not copy
 
 
-def recorded(monkeypatch, name):
+def recorded(monkeypatch, name, *, with_options=False):
     """What is made of a class of the standard library from now on."""
     module, _, kind = name.partition(".")
-    made, original = [], getattr(getattr(sandbox, module), kind)
+    made, original = [], getattr(getattr(child, module), kind)
 
     def make(*arguments, **options):
-        made.append(original(*arguments, **options))
-        return made[-1]
+        thing = original(*arguments, **options)
+        made.append((thing, options) if with_options else thing)
+        return thing
 
-    monkeypatch.setattr(f"analysis.explorer.query_process.{name}", make)
+    monkeypatch.setattr(f"analysis.explorer.child.{name}", make)
     return made
 
 
@@ -245,7 +248,56 @@ def reads(process, copy):
 def test_the_environment_of_a_query_holds_nothing_of_ours(monkeypatch):
     for name in ("ANTHROPIC_API_KEY", "HTTPS_PROXY", "HOME", "PYTHONPATH"):
         monkeypatch.setenv(name, "ours")
-    assert "ours" not in sandbox._environment().values()
+    started = recorded(monkeypatch, "subprocess.Popen", with_options=True)
+    sandbox._worker().close()
+    ((_, options),) = started
+    assert "ours" not in options["env"].values()
+
+
+def test_a_process_that_cannot_be_started_is_said_in_a_line(queries, monkeypatch):
+    queries._current()
+    monkeypatch.setattr("sys.executable", "/nowhere/python")
+    assert refusal(queries, "SELECT 1") == "no process can be started: No such file or directory"
+
+
+def test_a_query_ends_with_the_explorer_even_if_that_is_killed(queries):
+    worker = sandbox._worker(queries._current().fd)
+    query = Query(f"/dev/fd/{queries._current().fd}", ENDLESS, False, Caps())
+    ended = []
+
+    def ask():
+        with pytest.raises(Ended) as exc:
+            worker.ask(asdict(query), seconds=LOADED_S, most_bytes=10**6)
+        ended.append(exc.value)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    until(lambda: reads(worker.process, queries._current()))
+    worker.process.stdin.close()  # as the system does when a process is gone
+    asking.join(LOADED_S)
+    assert [(one.code, one.late) for one in ended] == [(0, False)]
+
+
+def test_an_answer_is_whole_or_refused_and_one_that_is_no_answer_is_an_end(tmp_path, monkeypatch):
+    (tmp_path / "parrot.py").write_text(
+        "import sys\n"
+        "for line in sys.stdin:\n"
+        "    sys.stdout.write(__import__('json').loads(line)); sys.stdout.flush()\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+
+    def said(answer, most_bytes=100):
+        with contextlib.closing(child.Child("parrot")) as parrot:
+            return parrot.ask(answer, seconds=LOADED_S, most_bytes=most_bytes)
+
+    assert said('{"x": 1, "bytes": 3}\nabc') == ({"x": 1}, b"abc")
+    with pytest.raises(NoAnswer, match="no such table"):
+        said('{"error": "no such table", "bytes": 0}\n')
+    for large in ('{"bytes": 3}\nabc', '{"bytes": 0, "x": "a long line"}\n'):
+        with pytest.raises(NoAnswer, match="too large"):
+            said(large, most_bytes=15)
+    with pytest.raises(Ended):
+        said("no JSON\n")
 
 
 def test_what_lies_in_the_log_beside_the_database_is_read(own, tmp_path):

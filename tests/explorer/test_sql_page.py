@@ -14,8 +14,10 @@ import pytest
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
-from analysis.explorer.examples import EXAMPLES
-from analysis.explorer.query_process import Caps, NoAnswer, Result
+from analysis.explorer.child import NoAnswer
+from analysis.explorer.pages.sql import EXAMPLES
+from analysis.explorer.query_process import QueryResult
+from analysis.explorer.query_worker import Caps
 from analysis.explorer.schema import tables
 from analysis.explorer.site import Site
 from merge_runner.results.store import query
@@ -48,7 +50,7 @@ def asked(site, monkeypatch):
 
     def result(sql):
         queries.append(sql)
-        return Result([("x", "INTEGER")], [[("1", 0)]], False, 0.0)
+        return QueryResult([("x", "INTEGER")], [[("1", 0)]], False, 0.0)
 
     monkeypatch.setattr(site.sandbox, "result", result)
     monkeypatch.setattr(site.sandbox, "csv", lambda sql: queries.append(sql) or b"x\n1\n")
@@ -153,7 +155,7 @@ def test_a_result_is_a_table_with_types_and_links_to_trials(client, site, monkey
     name = "o3/baseline/L_0_8/rep01"
     columns = {"trial_id": ("VARCHAR", name), "rep": ("INTEGER", "1")}
     columns |= {"spec_hash": ("VARCHAR", "o3-baseline")} if spec else {"x": ("INTEGER[]", None)}
-    result = Result(
+    result = QueryResult(
         [(name, kind) for name, (kind, _) in columns.items()],
         [[text and (text, 0) for _, text in columns.values()]],
         False,
@@ -170,7 +172,7 @@ def test_a_result_is_a_table_with_types_and_links_to_trials(client, site, monkey
 
 
 def test_a_cut_result_says_so(client, site, monkeypatch):
-    result = Result([("trial_id", "VARCHAR")], [[("x" * 2000, 1234)]] * 2, True, 0.0)
+    result = QueryResult([("trial_id", "VARCHAR")], [[("x" * 2000, 1234)]] * 2, True, 0.0)
     monkeypatch.setattr(site.sandbox, "result", lambda sql: result)
     page = client.get("/sql?q=select").text
     assert "The first <strong>2</strong> rows of more" in page

@@ -25,6 +25,7 @@ from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.progress import Progress
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Said, write_study, yielding
+from tests.explorer.serving import held
 
 URL = "/sweeps/sweep-1"
 CONFIG = {
@@ -122,7 +123,7 @@ def test_every_cell_and_every_cause_leads_to_the_trials_that_it_counts(written):
     for url, count, _ in links:
         asked = {k: v[0] for k, v in parse_qs(urlsplit(html.unescape(url)).query).items()}
         totals = site.catalogue.totals(filter_of(asked)).values()
-        there = sum(part.trials if "cause" in asked else part.ended for part in totals)
+        there = sum(part["trials" if "cause" in asked else "ended"] for part in totals)
         assert there == int(count), url
     causes = {parse_qs(urlsplit(html.unescape(url)).query)["cause"][0]
               for url, _, kind in links if "trial" in kind}  # fmt: skip
@@ -162,7 +163,7 @@ def test_an_alias_is_nothing_that_went_wrong(study):
     for alias in ("o3-alias", "o3"):
         assert site.catalogue.totals(filter_of({"cause": f"model: o3 → {alias}"})) == {}
     another = site.catalogue.totals(filter_of({"cause": "model: o3 → another"}))
-    assert another["drivers"].trials == 1
+    assert another["drivers"]["trials"] == 1
     with duckdb.connect(str(study)) as connection:
         connection.execute("UPDATE calls SET outcome = 'ok'")
         connection.execute("UPDATE decisions SET failure = NULL, valid = true, fallback = false")
@@ -180,7 +181,7 @@ def test_two_other_models_have_a_line_and_a_list_each(study):
         link = html.unescape(re.search(f'id="model-{number}" href="([^"]*)"', shown)[1])
         asked = {k: v[0] for k, v in parse_qs(urlsplit(link).query).items()}
         assert asked["cause"] == f"model: o3 → {name}"
-        assert site.catalogue.totals(filter_of(asked))["drivers"].trials > 0
+        assert site.catalogue.totals(filter_of(asked))["drivers"]["trials"] > 0
 
 
 def page_of(site):
@@ -209,7 +210,6 @@ def test_while_it_runs_the_cells_are_those_of_its_progress_file(study):
     assert "1.50 USD in this run; 2.50 of at most 9.00 USD over all runs" in text
     assert "N_0_0 1 of 3 1 failed" in text
     assert "all 1 of 33 1 failed" in text
-    assert f'sse-connect="{URL}/events"' in client.get(URL).text
 
 
 @pytest.mark.parametrize(
@@ -242,58 +242,37 @@ def test_a_finished_sweep_that_another_model_answered_is_doubtful():
     assert assessment_of(entry, "", 7).kind == "doubtful"
 
 
-async def test_a_stream_tells_what_is_new_and_ends_with_the_sweep(study, monkeypatch):
-    monkeypatch.setattr(page, "LOOK_EVERY_S", 0.02)
+def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(study):
     file = running(study)
-    site = Site(study)
-    events = page.sweep_events(site, "sweep-1")
-    assert "event: sweep" in await anext(events)
-    assert await anext(events) == (
-        "event: state\ndata: <span>Running: 2 of 33 trials ended, about 20 s left.</span>\n\n"
-    )
+    client = browser(study)
+    look = news_of(client.get(URL).text)
+    assert client.get(look).status_code == 204
     running(study, ended={"finished": 3})
-    assert "Running: 3 of 33" in await anext(events)
-    # Who listens finds the same sentence, which is not read out again.
-    assert '<span aria-live="off">Running: 3 of 33' in await anext(events)
+    told = client.get(look).text
+    # Who listens finds the same state, which is not read out again.
+    assert '<span aria-live="off">Running: 3 of 33' in told
     Store(study).end_sweep("sweep-1", END, 130)
     file.remove()
-    rest = [event async for event in events]
-    assert [event.split("\n")[0] for event in rest] == [
-        "event: sweep",
-        "event: state",
-        "event: done",
-    ]
-    assert "it was interrupted" in rest[0]
+    assert "<span>Stopped: it was interrupted" in client.get(news_of(told)).text
 
 
-async def test_a_stream_ends_when_the_server_does(study, monkeypatch):
-    monkeypatch.setattr(page, "LOOK_EVERY_S", 0.02)
-    monkeypatch.setattr(page, "BEAT_EVERY_S", 0.0)
-    running(study)
-    site = Site(study)
-    events = page.sweep_events(site, "sweep-1")
-    heard = [await anext(events) for _ in range(3)]
-    assert heard[-1] == ": still here\n\n"
-    site.closing = True
-    assert [event async for event in events] == []
-
-
-async def test_a_sweep_that_slept_goes_on_in_the_same_stream(study, monkeypatch):
-    monkeypatch.setattr(page, "LOOK_EVERY_S", 0.02)
+def test_a_sweep_that_slept_goes_on_on_the_same_page(study):
     running(study, pid=2**22 + 1)
-    events = page.sweep_events(Site(study), "sweep-1")
-    heard = [await anext(events) for _ in range(2)]
-    assert "event: state\ndata: <span>Stopped without a word" in heard[1]
+    client = browser(study)
+    shown = client.get(URL).text
+    assert "Stopped without a word" in shown
     running(study)
-    assert "Running: 2 of 33" in await anext(events)
+    assert "<span>Running: 2 of 33" in client.get(news_of(shown)).text
 
 
-def test_a_stream_is_never_packed(study):
-    Store(study).end_sweep("sweep-1", END, 0)
-    reply = browser(study).get(f"{URL}/events", headers={"accept-encoding": "gzip"})
-    assert reply.headers["content-type"].startswith("text/event-stream")
-    assert "content-encoding" not in reply.headers
-    assert reply.text.endswith("event: done\ndata: \n\n")
+def test_a_sweep_is_not_said_to_be_lost_while_its_end_cannot_be_read(study):
+    file = running(study)
+    client = browser(study)
+    look = news_of(client.get(URL).text)
+    with held(study):
+        file.remove()
+        assert client.get(look).status_code == 204
+    assert "Stopped without a word" in client.get(look).text
 
 
 def test_the_newest_sweep_is_the_first_page_and_the_first_of_the_list(study):
@@ -344,4 +323,3 @@ def test_a_database_without_sweeps_begins_with_its_trials(tmp_path):
     assert client.get("/", follow_redirects=False).headers["location"] == "/trials"
     assert "holds no sweep" in client.get("/sweeps").text
     assert client.get("/sweeps/none").status_code == 404
-    assert client.get("/sweeps/none/events").status_code == 404

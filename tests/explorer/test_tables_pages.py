@@ -15,22 +15,16 @@ from starlette.testclient import TestClient
 
 from analysis.data.study import Study
 from analysis.explain import explain
-from analysis.explorer.analysis_process import (
-    Child,
-    Computing,
-    Ended,
-    Failed,
-    Failure,
-    Result,
-    Waiting,
-)
+from analysis.explorer.analysis_process import Computing, Result, Waiting, worker
 from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
+from analysis.explorer.child import Ended, NoAnswer
 from analysis.explorer.pages.ablations import ablations
-from analysis.explorer.pages.humans import kinds, scale
+from analysis.explorer.pages.humans import kinds
 from analysis.explorer.pages.tables import ABOUT
+from analysis.explorer.pictures import ends_and_ticks
 from analysis.explorer.site import Site
-from analysis.metrics import shown_in
+from analysis.metrics import METRICS, shown_in
 from analysis.tables import TABLES, make_tables
 from merge_runner.errors import MergeRunnerError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -46,11 +40,11 @@ class InProcess:
     def __init__(self, db):
         self._numbers = Numbers(db)
 
-    def ask(self, request):
+    def ask(self, request, **limits):
         try:
-            return self._numbers.answer(request)
+            return self._numbers.answer(request), b""
         except MergeRunnerError as exc:
-            raise Failure(str(exc)) from exc
+            raise NoAnswer(str(exc)) from exc
 
     def close(self):
         pass
@@ -104,11 +98,11 @@ def ask(site):
     client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
 
     def get(address, code=200):
-        for _ in range(20):
-            reply = client.get(address, headers={"hx-request": "true"})
-            assert reply.status_code == code, reply.text
+        for _ in range(300):
+            reply = client.get(address)
             if 'class="computing"' not in reply.text:
                 break
+        assert reply.status_code == code, reply.text
         return reply.text
 
     return get
@@ -161,7 +155,7 @@ def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at
     asked = []
 
     class Counting(InProcess):
-        def ask(self, request):
+        def ask(self, request, **limits):
             asked.append(request)
             return super().ask(request)
 
@@ -169,7 +163,7 @@ def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at
     site.computing = Computing(db, Counting)
     client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
     address = "/trials?cell=attempts/nobody:n"
-    while (waited := client.get(address, headers={"hx-request": "true"})).status_code == 200:
+    while (waited := client.get(address)).status_code == 200:
         pass
     assert (waited.status_code, waited.headers["hx-refresh"]) == (404, "true")
     assert client.get(address).status_code == 404
@@ -181,8 +175,8 @@ def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_
     found = {(1, 1): {"absent": "no such row"}, (2, 2): {"value": "7"}}
 
     class Once(InProcess):
-        def ask(self, request):
-            return found[computing._state]
+        def ask(self, request, **limits):
+            return found[computing._state], b""
 
     computing = Computing(db, Once)
     cell, table = ("cell", "attempts", "o3/A9", "n"), ("tables", "attempts")
@@ -321,10 +315,10 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
     going, asked = threading.Event(), threading.Event()
 
     class Slow(InProcess):
-        def ask(self, request):
+        def ask(self, request, **limits):
             asked.set()
             going.wait(20)
-            raise Ended("it broke <off>")
+            raise NoAnswer("it broke <off>")
 
     site = Site(db)
     site.computing = Computing(db, Slow)
@@ -334,7 +328,8 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
     assert listed(client.get("/trials").text) == 66
     assert "Computing, about" in client.get("/ablations").text
     going.set()
-    later = client.get("/humans", headers={"hx-request": "true"}).text
+    while "Computing, about" in (later := client.get("/humans").text):
+        pass
     assert "This could not be computed:</strong> it broke &lt;off&gt;" in later
     site.computing.close()
 
@@ -343,9 +338,9 @@ def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
     made = []
 
     class Counting(InProcess):
-        def ask(self, request):
+        def ask(self, request, **limits):
             made.append(request)
-            return {"counted": len(made)}
+            return {"counted": len(made)}, b""
 
     computing = Computing(db, Counting)
     first = computing.ask(("humans",), (1, 1), wait_s=5)
@@ -358,18 +353,21 @@ def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
 
 
 def test_a_process_of_its_own_answers_alike_and_its_end_is_a_failure(db):
-    computing = Computing(db, Child)
+    computing = Computing(db)
     request = ("tables", "attempts")
     while isinstance(found := computing.ask(request, (1, 1), wait_s=30), Waiting):
         pass
     assert found.content == Numbers(db).answer(request)
-    broken = computing.ask(("nothing",), (1, 1), wait_s=30)
-    assert broken == Failed("nothing answers ['nothing']")
+    with pytest.raises(NoAnswer, match=re.escape("nothing answers ['nothing']")):
+        computing.ask(("nothing",), (1, 1), wait_s=30)
+    computing._child.process.kill()
+    with pytest.raises(NoAnswer, match=r"without an answer \(exit code -9\)"):
+        computing.ask(("tables", "fallbacks"), (1, 1), wait_s=30)
     computing.close()
-    child = Child(db)
+    child = worker(db)
     child.close()
     with pytest.raises(Ended):
-        child.ask(request)
+        child.ask(request, seconds=1, most_bytes=1000)
 
 
 @pytest.mark.parametrize(
@@ -383,6 +381,7 @@ def test_a_process_of_its_own_answers_alike_and_its_end_is_a_failure(db):
     ],
 )
 def test_a_scale_holds_all_that_is_shown_and_0(kind, reached, ends):
-    low, high, ticks = scale(next(each for each in kinds() if each.name == kind), *reached)
+    metric = METRICS[kind]
+    low, high, ticks = ends_and_ticks(*reached, metric.lowest, metric.highest)
     assert (low, high) == ends
     assert {low, 0, high} <= {round(tick, 6) for tick in ticks}

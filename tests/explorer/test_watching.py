@@ -101,7 +101,7 @@ def test_escape_leads_back_to_the_list_as_it_was_filtered(page):
     expect(page.locator("a.decision[aria-current]")).to_have_count(1)
     page.keyboard.press("Escape")
     expect(page.locator(".decision-panel")).to_have_count(0)
-    expect(page.locator("#decision")).to_contain_text("What they said last")
+    expect(page.locator("#decision")).to_contain_text("What they last said")
     page.keyboard.press("Escape")
     page.wait_for_url("**/trials?condition=N_0_0&sort=-end")
 

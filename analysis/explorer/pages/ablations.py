@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -11,7 +12,7 @@ from typing import Any
 from analysis.explorer import views
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.computed import computed
-from analysis.explorer.reading import reading
+from analysis.explorer.pictures import Scale
 from analysis.explorer.site import NotThere, Site
 from analysis.metrics import COLLISIONS
 from analysis.metrics import JOINT as JOINT_RATE
@@ -22,21 +23,21 @@ from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
 BASELINE = "baseline"
 # The blocks of each prompt, as its spec names them; a program has none.
 STORED = """
-SELECT variant, any_value(names) FROM trials JOIN (
+SELECT variant, any_value(names) AS names FROM listed JOIN (
     SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
 ) USING (spec_hash) WHERE len(names) > 0 GROUP BY ALL
 """
-# Rates are decided trial by trial, and differ in single trials. Collisions are outcomes.
+# Rates are decided trial by trial, so that single trials differ: by these columns.
 FATES = {COLLISIONS.name: "outcome", JOINT_RATE.name: "joint"}
 JOINT = {True: "joint", False: "not joint"}
-# What the rates count of it.
+# The value of the column that a rate counts.
 COUNTED: dict[str, str | bool] = {"outcome": "collided", "joint": True}
-# A difference is drawn so wide, in units of its picture.
+# The width of the picture of a difference.
 WIDTH = 120.0
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class BaselineDifference:
     """A variant's difference from the baseline: texts, and numbers for its picture."""
 
     value: float
@@ -54,7 +55,7 @@ class Difference:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class Estimate:
     """One measure of a variant: its estimate with interval and n, and its difference."""
 
     measure: str
@@ -62,11 +63,11 @@ class Cell:
     estimate: str
     interval: str
     n: int | None
-    difference: Difference | None
+    difference: BaselineDifference | None
 
 
 @dataclass(frozen=True, slots=True)
-class Driver:
+class DriverVariants:
     """A driver's variants, the baseline first; ``widest`` by measure: the picture's half range.
 
     ``label`` is how the driver is shown.
@@ -74,12 +75,12 @@ class Driver:
 
     name: str
     label: str
-    variants: dict[str, list[Cell]]
+    variants: dict[str, list[Estimate]]
     widest: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class RateTrials:
     """The trials of a variant, those of them that count in the rate, and those in no pair."""
 
     variant: str
@@ -89,9 +90,9 @@ class Side:
     counted_alone: list[dict[str, Any]]
 
 
-def ablations_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
+def ablations_page(site: Site, asked: Mapping[str, str]) -> str:
     """All drivers with their variants."""
-    found = computed(site, ("tables", "ablation-quantitative", "contrasts"), asked, patient=patient)
+    found = computed(site, ("tables", "ablation-quantitative", "contrasts"), asked)
     values: dict[str, Any] = {"drivers": [], "alone": [], "measures": [], "notes": ()}
     if found.result is not None:
         quantitative, contrasts = map(from_text, found.result.content["tables"])
@@ -125,8 +126,7 @@ def left_out(site: Site, variant: str) -> str:
 
 def _as_stored(site: Site, variant: str) -> Variant | None:
     """What a variant that is not registered here changes, by the blocks that its specs name."""
-    with reading(site.db) as connection:
-        stored = dict(connection.execute(STORED).fetchall())
+    stored = {row["variant"]: row["names"] for row in site.catalogue.ask(STORED)}
     if variant not in stored:
         return None
     own, baseline = frozenset(stored[variant]), frozenset(blocks_of(BASELINE))
@@ -139,7 +139,7 @@ def measures(quantitative: Table) -> list[Column]:
     return [column for column in quantitative.columns if f"{column.name}_ci" in names]
 
 
-def ablations(quantitative: Table, contrasts: Table) -> list[Driver]:
+def ablations(quantitative: Table, contrasts: Table) -> list[DriverVariants]:
     """Every driver's variants, from the two tables that say what there is to say of them."""
     compared = {row.id: row for row in contrasts.rows}
     # The baseline's n stands beside every difference from it.
@@ -148,13 +148,13 @@ def ablations(quantitative: Table, contrasts: Table) -> list[Driver]:
         for row in contrasts.rows
         if row.values["reference"] == BASELINE
     }
-    drivers: dict[str, Driver] = {}
+    drivers: dict[str, DriverVariants] = {}
     for row in quantitative.rows:
         setting = str(row.values["setting"])
         name = row.groups[0].removesuffix(f"/{setting}")
         if setting:
             variants = drivers.setdefault(
-                name, Driver(name, str(row.values["driver"]), {})
+                name, DriverVariants(name, str(row.values["driver"]), {})
             ).variants
             variants[setting] = [
                 _cell(quantitative, contrasts, row, column, compared, of_baseline)
@@ -172,14 +172,14 @@ def _cell(
     column: Column,
     compared: Mapping[str, Row],
     of_baseline: Mapping[tuple[str, str], Value],
-) -> Cell:
+) -> Estimate:
     found = compared.get(f"{row.id}/baseline/{column.name}")
     interval = next(c for c in quantitative.columns if c.name == f"{column.name}_ci")
     limits = row.values.get(interval.name)
     n = of_baseline.get((row.id, column.name)) if found is None else found.values["n"]
     # Collisions are counted over all that ended, which is the n of the row.
     n = row.values["n"] if column.name == COLLISIONS.name else n
-    return Cell(
+    return Estimate(
         column.name,
         row.id,
         shown_value(column, row.values.get(column.name)),
@@ -189,7 +189,7 @@ def _cell(
     )
 
 
-def _reach(driver: Driver) -> None:
+def _reach(driver: DriverVariants) -> None:
     """How far the differences of each measure reach, with their intervals."""
     for i, measure in enumerate(cell.measure for cell in next(iter(driver.variants.values()))):
         found = [cells[i].difference for cells in driver.variants.values()]
@@ -200,16 +200,17 @@ def _reach(driver: Driver) -> None:
             for limit in (difference.value, difference.low, difference.high)
             if limit is not None
         ]
+        # Where all differences are 0 any range shows them.
         driver.widest[measure] = max(reach, default=0.0) or 1.0
 
 
-def _difference(contrasts: Table, row: Row) -> Difference:
+def _difference(contrasts: Table, row: Row) -> BaselineDifference:
     columns = {column.name: column for column in contrasts.columns}
     value, limits = row.values["difference"], row.values.get("ci")
     assert isinstance(value, float)
     low, high = limits if isinstance(limits, tuple) else (None, None)
     text = shown_value(columns["difference"], value)
-    return Difference(
+    return BaselineDifference(
         value,
         low,
         high,
@@ -220,15 +221,16 @@ def _difference(contrasts: Table, row: Row) -> Difference:
     )
 
 
-def bar(difference: Difference, widest: float) -> dict[str, float]:
+def bar(difference: BaselineDifference, widest: float) -> dict[str, float]:
     """Where a difference and its ends lie in a picture of ``WIDTH``, 0 in its middle."""
-
-    def x(value: float) -> float:
-        return round(WIDTH / 2 * (1 + 0.94 * value / widest), 1)
-
+    margin = 0.03 * WIDTH
+    x = Scale(-widest, widest, margin, WIDTH - margin)
     low = difference.value if difference.low is None else difference.low
     high = difference.value if difference.high is None else difference.high
-    return {"low": x(low), "at": x(difference.value), "high": x(high)}
+    return {
+        name: round(x(value), 1)
+        for name, value in (("low", low), ("at", difference.value), ("high", high))
+    }
 
 
 def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -239,7 +241,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
         raise NotThere(f"pairs differ by {' or '.join(FATES.values())}")
     if not model or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
-    # A mark tells apart drivers that ran under several settings of the task.
+    # Tables mark the name of a driver that ran under several settings; its trials have no mark.
     name, found = model, site.catalogue.pairs(model, variant, fate)
     if not found:
         name = model.partition(" [")[0]
@@ -248,10 +250,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
     own = {(pair["trial_id"], pair["spec_hash"]) for pair in pairs}
     base = {(pair["base_id"], pair["base_hash"]) for pair in pairs}
     differing = [pair for pair in pairs if pair["fate"] != pair["base_fate"]]
-    kinds: dict[tuple[str, str], int] = {}
-    for pair in differing:
-        kind = (_fate(pair["base_fate"]), _fate(pair["fate"]))
-        kinds[kind] = kinds.get(kind, 0) + 1
+    kinds = Counter((_fate(pair["base_fate"]), _fate(pair["fate"])) for pair in differing)
     return site.render(
         "discordant.html",
         here="ablations",
@@ -272,7 +271,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
 
 def side_of(
     site: Site, model: str, variant: str, fate: str, paired: Collection[tuple[str, str]]
-) -> Side:
+) -> RateTrials:
     """What a rate counts on one side, and what of it is in none of the pairs."""
     trials = [
         row
@@ -283,17 +282,13 @@ def side_of(
     counted, counted_alone = (
         [row for row in rows if row[fate] == COUNTED[fate]] for rows in (trials, alone)
     )
-    return Side(variant, len(trials), len(counted), len(alone), counted_alone)
+    return RateTrials(variant, len(trials), len(counted), len(alone), counted_alone)
 
 
 def of_equal_tasks(site: Site, pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The pairs whose two specs differ in nothing but the prompt."""
-    hashes = list({pair[name] for pair in pairs for name in ("spec_hash", "base_hash")})
-    with reading(site.db) as connection:
-        rows = connection.execute(
-            "SELECT spec_hash, spec FROM specs WHERE list_contains(?, spec_hash)", [hashes]
-        ).fetchall()
-    tasks = {spec_hash: _task(spec) for spec_hash, spec in rows}
+    specs = site.catalogue.ask("SELECT spec_hash, spec FROM specs")
+    tasks = {row["spec_hash"]: _task(row["spec"]) for row in specs}
     return [pair for pair in pairs if tasks.get(pair["spec_hash"]) == tasks.get(pair["base_hash"])]
 
 

@@ -6,16 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
-from analysis.explorer.analysis_process import Request, Result, Waiting, about_s
-from analysis.explorer.query_params import seconds
+from analysis.explorer.analysis_process import LONGEST_S, Request, Result, Waiting, about_s
+from analysis.explorer.child import NoAnswer
 from analysis.explorer.site import NotThere, Site
-from analysis.explorer.urls import query_of
+from analysis.explorer.urls import query_of, seconds
 
-# What is kept in the database comes within the first; the second is for a page that shows a clock.
+# What is kept in the database comes within this time; what takes longer is asked for again.
 AT_ONCE_S = 0.3
-PATIENT_S = 4.0
-# A page that stands alone must hold the result.
-EXPORT_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,23 +44,22 @@ def computed(
     request: Request,
     asked: Mapping[str, str],
     *,
-    patient: bool = False,
     wait_s: float = AT_ONCE_S,
 ) -> Computed:
-    """Ask for something; a ``patient`` page has said already that it takes a while.
-
-    Raises NotThere where the tables do not hold it.
-    """
+    """Ask for something, and wait for it for a moment; raises NotThere where no table holds it."""
     state = site.catalogue.state()
     if site.static:
-        wait_s = EXPORT_S
-    elif patient:
-        wait_s = PATIENT_S
-    found = site.computing.ask(request, state, since=seconds(asked.get("since", "")), wait_s=wait_s)
+        wait_s = LONGEST_S  # a page that stands alone must hold the result
+    since, failure = seconds(asked.get("since", "")), ""
+    found: Result | Waiting | None = None
+    try:
+        found = site.computing.ask(request, state, since=since, wait_s=wait_s)
+    except NoAnswer as exc:
+        failure = str(exc)
     result = found if isinstance(found, Result) else None
     if result is not None and "absent" in result.content:
         raise NotThere(result.content["absent"])
-    failure = "" if isinstance(found, Result | Waiting) else found.text
+    # Later than this one by the smallest step that an address shows.
     later = {"since": f"{result.at + 0.001:.3f}"} if result else {}
     return Computed(
         result=result,

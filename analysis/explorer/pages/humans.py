@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import ceil, floor, log10
-from statistics import quantiles
 from typing import Any
 
 from analysis.explorer import views
 from analysis.explorer.details import scenario_of
 from analysis.explorer.pages.computed import computed
+from analysis.explorer.pictures import Axis, Scale, ends_and_ticks, marker, reach
 from analysis.explorer.site import Site
 from analysis.figures.styles import HUMAN_STYLE, Style, driver_style
 from analysis.metrics import Metric, intervals_of, shown_in
@@ -20,7 +19,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 HUMAN = "human"
 SHAPE_WORDS = {"down": "triangle that points down"}
-# Of a picture, in its units.
+# Sizes in a picture, in its units.
 LEFT, TOP, HEIGHT, FOOT, STEP, LEAST, ARROW = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0, 3.0
 
 
@@ -72,7 +71,6 @@ def kinds() -> list[Kind]:
 class Mark:
     """How a group is drawn."""
 
-    group: str
     style: Style
     label: str
 
@@ -82,11 +80,11 @@ class Mark:
         return SHAPE_WORDS.get(self.style.shape, self.style.shape)
 
 
-def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
+def humans_page(site: Site, asked: Mapping[str, str]) -> str:
     """Small multiples over the conditions, one row a measure, and the differences."""
     # Before and after an import of humans it is another page, and not an older one.
     (humans,) = site.catalogue.ask("SELECT count(*) AS n FROM listed WHERE source = 'human'")
-    found = computed(site, ("humans", str(humans["n"])), asked, patient=patient)
+    found = computed(site, ("humans", str(humans["n"])), asked)
     values: dict[str, Any] = {"own": []}
     if found.result is not None:
         content = found.result.content
@@ -96,6 +94,7 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
             "human": next((group for group in groups if group["id"] == HUMAN), None),
             "measured": content["measured"],
             "outcomes_from": content["outcomes_from"],
+            "published_trials": content["published_trials"],
             "conditions": {
                 name: views.condition_text(*of) for name, of in content["conditions"].items()
             },
@@ -123,6 +122,7 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         here="humans",
         computed=found,
         in_table={metric.name for metric in shown_in("tables")},
+        human_conditions=len(HUMAN_CONDITIONS),
         path=marker,
         value=value_text,
         **values,
@@ -130,7 +130,7 @@ def humans_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
 
 
 def rule_text(group: Mapping[str, Any]) -> str:
-    """What is taken for a collision in the trials of a group, and how often it is looked for."""
+    """What counts as a collision in the trials of a group, and how often it is looked for."""
     source = HUMAN if group["id"] == HUMAN else ""
     scenario = scenario_of(source, group["scenario"])
     return f"{views.collision_text(scenario)}, looked for {1 / scenario.step_s:g} times a second"
@@ -145,14 +145,14 @@ def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
         if group["id"] != HUMAN:
             style = driver_style(models)
             models += 1
-        found[group["id"]] = Mark(group["id"], style, group["driver"])
+        found[group["id"]] = Mark(style, group["driver"])
     return found
 
 
 def collisions(groups: Sequence[Mapping[str, Any]], rule: str) -> list[dict[str, Any]]:
     """Collided, decided and all trials of each group, by condition and together.
 
-    A group that this rule is not known of has no row.
+    A group for which this rule is not known has no row.
     """
     rows = []
     for group in groups:
@@ -206,7 +206,11 @@ def chart(
         for of_condition in group["conditions"].values()
         if (found := of_condition.get(kind.name)) is not None and found["value"] is not None
     ]
-    axis = Axis(*scale(kind, *reach(known, list(printed.values()))))
+    metric = kind.metric
+    low, high, ticks = ends_and_ticks(
+        *reach(known, list(printed.values())), metric.lowest, metric.highest
+    )
+    axis = Axis(Scale(low, high, TOP + HEIGHT, TOP), ticks)
     panel = max(LEAST, STEP * (len(groups) + 1))
     panels: list[dict[str, Any]] = []
     for i, name in enumerate(conditions):
@@ -217,7 +221,7 @@ def chart(
             if found is None or found["value"] is None:
                 continue
             x = round(x0 + panel / 2 + STEP * (j - (len(groups) - 1) / 2), 1)
-            points.append({"group": group["id"], "x": x, "of": found, **axis.placed(found)})
+            points.append({"group": group["id"], "x": x, "of": found, **axis.placed(found, ARROW)})
         line = axis.y(printed[name]) if name in printed else None
         panels.append({"name": name, "x": round(x0, 1), "points": points, "line": line})
     return {
@@ -237,81 +241,6 @@ def chart(
             if point["arrows"]
         ],
     }
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """The values at the bottom and the top of a row of panels, and those of its ticks."""
-
-    low: float
-    high: float
-    ticks: Sequence[float]
-
-    def y(self, value: float) -> float:
-        """Where a value is drawn: at the edge if it lies beyond it."""
-        inside = min(max(value, self.low), self.high)
-        return round(TOP + HEIGHT * (1 - (inside - self.low) / (self.high - self.low)), 1)
-
-    def placed(self, found: Mapping[str, Any]) -> dict[str, Any]:
-        """Where an estimate is drawn, and the ends of its interval with arrows where it goes on."""
-        at, low, high = {"y": self.y(found["value"])}, found["low"], found["high"]
-        if low is None:
-            return {**at, "ends": None, "arrows": []}
-        arrows = [("down", TOP + HEIGHT - ARROW)] if low < self.low else []
-        arrows += [("triangle", TOP + ARROW)] if high > self.high else []
-        return {**at, "ends": (self.y(low), self.y(high)), "arrows": arrows}
-
-
-def reach(estimates: Sequence[Mapping[str, Any]], printed: Sequence[float]) -> tuple[float, float]:
-    """What an axis has to show: every value, and of the intervals what is not far out.
-
-    Far out is, as Tukey draws it, what lies beyond the quartiles of all that could be shown by more
-    than 1.5 times their distance: an interval of two or three trials may be ten times as long.
-    """
-    values = [*printed, *(found["value"] for found in estimates)]
-    ends = [found[end] for found in estimates for end in ("low", "high") if found[end] is not None]
-    if len(values) < 2:
-        return min([*values, *ends], default=0.0), max([*values, *ends], default=1.0)
-    first, _, third = quantiles([*values, *ends], n=4, method="inclusive")
-    beyond = 1.5 * (third - first)
-    low = max(min([*values, *ends]), first - beyond)
-    high = min(max([*values, *ends]), third + beyond)
-    return min([low, *values]), max([high, *values])
-
-
-def scale(kind: Kind, low: float, high: float) -> tuple[float, float, list[float]]:
-    """Both ends of an axis, and its ticks: round steps, with 0 in it."""
-    lowest, highest = kind.metric.lowest, kind.metric.highest
-    low = min(low, 0.0) if lowest is None else lowest
-    high = max(high, 0.0) if highest is None else highest
-    high = high if high > low else low + 1.0
-    rough = (high - low) / 4
-    size = 10.0 ** floor(log10(rough))
-    step = next(size * m for m in (1, 2, 2.5, 5, 10) if size * m >= rough * 0.999)
-    first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
-    last = max(last, first + 1)
-    return first * step, last * step, [round(i * step, 6) for i in range(first, last + 1)]
-
-
-def marker(shape: str, x: float, y: float, r: float = 4.2) -> str:
-    """A shape about a point, as a path."""
-    corners: dict[str, list[tuple[float, float]]] = {
-        "square": [(-1, -1), (1, -1), (1, 1), (-1, 1)],
-        "triangle": [(0, -1.2), (1.15, 0.9), (-1.15, 0.9)],
-        "down": [(0, 1.2), (1.15, -0.9), (-1.15, -0.9)],
-        "diamond": [(0, -1.35), (1.35, 0), (0, 1.35), (-1.35, 0)],
-    }
-    if shape in corners:
-        points = [f"{x + r * 0.9 * dx:.1f} {y + r * 0.9 * dy:.1f}" for dx, dy in corners[shape]]
-        return f"M{' L'.join(points)}Z"
-    if shape == "cross":
-        return (
-            f"M{x - r:.1f} {y - r:.1f} L{x + r:.1f} {y + r:.1f} "
-            f"M{x - r:.1f} {y + r:.1f} L{x + r:.1f} {y - r:.1f}"
-        )
-    if shape == "plus":
-        return f"M{x - r:.1f} {y:.1f} H{x + r:.1f} M{x:.1f} {y - r:.1f} V{y + r:.1f}"
-    return f"M{x - r:.1f} {y:.1f} a{r} {r} 0 1 0 {2 * r:.1f} 0 a{r} {r} 0 1 0 {-2 * r:.1f} 0Z"
 
 
 def value_text(found: Mapping[str, Any] | None, digits: int) -> str:

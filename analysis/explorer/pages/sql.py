@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from analysis.explorer.child import NoAnswer
 from analysis.explorer.display_text import visible
-from analysis.explorer.examples import EXAMPLES
-from analysis.explorer.query_process import DOWNLOADED_ROWS, LONGEST, NoAnswer, Result
+from analysis.explorer.query_process import DOWNLOADED_ROWS, LONGEST, QueryResult
 from analysis.explorer.schema import tables, units
 from analysis.explorer.site import Site
 from merge_runner.errors import MergeRunnerError
@@ -16,9 +16,31 @@ UNANSWERED = (NoAnswer, MergeRunnerError)
 NUMBERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
            "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE", "DECIMAL", "BIGNUM")  # fmt: skip
 
+# Queries to begin with: those of the README.
+EXAMPLES = {
+    "Who merged first, and how often did they collide?": """\
+select model_left, variant, condition, count(*) as trials,
+    count_if(merged_first = 'left') as left_first,
+    count_if(merged_first = 'right') as right_first,
+    count_if(status = 'collided') as collided
+from trials
+group by all order by all""",
+    "Gap at the merge point, speed deviation, and joint contribution per variant": """\
+select variant, count(gap_m) as n, round(avg(gap_m), 2) as gap_m,
+    round(avg(rmse_mps), 2) as rmse_mps, round(100 * avg(joint::int), 1) as joint_percent
+from trials join trial_metrics using (trial_id, spec_hash)
+group by all order by all""",
+    "What did the drivers say in the trials that ended in a collision?": """\
+select trial_id, side, time_s, tactical, rationale
+from decisions join trials using (trial_id, spec_hash)
+where status = 'collided'
+order by trial_id, decision, side
+limit 20""",
+}
+
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class ShownValue:
     """A value as it is shown; no text: NULL. ``left_out`` counts characters."""
 
     text: str | None
@@ -72,20 +94,20 @@ def is_number(kind: str) -> bool:
     return kind.partition("(")[0] in NUMBERS and not kind.endswith("]")
 
 
-def _cells(site: Site, result: Result) -> list[list[Cell]]:
+def _cells(site: Site, result: QueryResult) -> list[list[ShownValue]]:
     """The rows of a result; a column ``trial_id`` leads to the trials, with the spec beside it."""
     names = [name for name, _ in result.columns]
     spec = names.index("spec_hash") if "spec_hash" in names else None
 
-    def shown(row: list[tuple[str, int] | None], place: int) -> Cell:
+    def shown(row: list[tuple[str, int] | None], place: int) -> ShownValue:
         value = row[place]
         if value is None:
-            return Cell(None)
+            return ShownValue(None)
         text, left_out = value
         link = ""
         if names[place] == "trial_id" and text and not left_out:
             of_spec = None if spec is None else row[spec]
             link = site.at.trial({"trial_id": text, "spec_hash": of_spec and of_spec[0]})
-        return Cell(visible(text), left_out, link)
+        return ShownValue(visible(text), left_out, link)
 
     return [[shown(row, place) for place in range(len(names))] for row in result.rows]

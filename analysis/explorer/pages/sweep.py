@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
-import time
-from collections.abc import AsyncIterator, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from datetime import UTC, datetime
 
-from markupsafe import escape
-
-from analysis.explorer.display_text import visible
 from analysis.explorer.site import NothingNew, NotThere, Site
 from analysis.explorer.sweeps import Sweep, VariantCondition, duration, find_sweep, list_sweeps
 from analysis.explorer.views import condition_text, prompt_text
-from merge_runner.errors import MergeRunnerError
 from merge_runner.prompts.blocks import VARIANTS
-from merge_runner.results.progress_file import read_standing
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
-LOOK_EVERY_S = 1.0
-READ_EVERY_S = 3.0
-BEAT_EVERY_S = 15.0
-# Between two looks it is seen so often whether the server ends.
-LOOKS = 10
 KINDS = {
     "trial": "Trials that failed",
     "plan": "Replies without a valid plan",
@@ -48,100 +35,32 @@ def sweeps_page(site: Site, seen: str = "") -> str:
 
 def sweep_page(site: Site, sweep_id: str, seen: str = "") -> str:
     """One sweep, and a newer one if there is; raises NotThere, and NothingNew as ``seen``."""
-    sweep = _find(site, sweep_id)
-    newest = list_sweeps(site.catalogue)[0]
-    newer = newest if newest.sweep_id != sweep_id else None
-    state = (sweep, newer and (newer.sweep_id, newer.state))
-    return site.render(
-        "sweep.html", here="sweeps", newer=newer, seen=_news(state, seen), **_values(site, sweep)
-    )
-
-
-def _news(state: object, seen: str) -> str:
-    """What is shown, as a short text that differs where it does; raises NothingNew."""
-    now = hashlib.sha256(repr(state).encode()).hexdigest()[:16]
-    if now == seen:
-        raise NothingNew
-    return now
-
-
-def require_sweep(site: Site, sweep_id: str) -> None:
-    """Raise NotThere where there is no such sweep."""
-    _find(site, sweep_id)
-
-
-async def sweep_events(site: Site, sweep_id: str) -> AsyncIterator[str]:
-    """What changes on a sweep's page, as server-sent events, until the sweep ends.
-
-    ``sweep`` is the part of the page that is replaced, ``state`` its sentence for who listens, and
-    ``done`` the last one.
-    """
-    watched = _Watched(site, sweep_id)
-    spoke = time.monotonic()
-    while not site.closing:
-        for name, text in await asyncio.to_thread(watched.news):
-            yield _event(name, text)
-            spoke = time.monotonic()
-            if name == "done":
-                return
-        if time.monotonic() - spoke >= BEAT_EVERY_S:
-            spoke = time.monotonic()
-            yield ": still here\n\n"
-        for _ in range(LOOKS):
-            if not site.closing:
-                await asyncio.sleep(LOOK_EVERY_S / LOOKS)
-
-
-@dataclass(slots=True)
-class _Watched:
-    """What one browser has been told of a sweep."""
-
-    site: Site
-    sweep_id: str
-    updated_at: datetime | None = None
-    read_at: float = 0.0
-    state: str = ""
-    said: str = ""
-    shown: str = ""
-
-    def news(self) -> list[tuple[str, str]]:
-        """The events since the last look."""
-        catalogue = self.site.catalogue
-        standing = read_standing(self.site.db, self.sweep_id)
-        alive = standing if standing and standing.alive else None
-        if alive and alive.updated_at == self.updated_at:
-            return []
-        due = time.monotonic() - self.read_at >= READ_EVERY_S
-        if self.state == "lost" and not alive and not due:
-            return []
-        try:
-            sweep = find_sweep(catalogue, self.sweep_id, refresh=due or not alive)
-        except MergeRunnerError:
-            return []  # the database is not there now: there is a next time
-        if due or not alive:
-            self.read_at = time.monotonic()
-        if sweep is None:
-            return [("done", "")]
-        if catalogue.held and not alive:
-            return []  # how it ended cannot be read yet
-        self.updated_at = alive.updated_at if alive else None
-        shown = self.site.render("_sweep.html", seen="", **_values(self.site, sweep))
-        events = [("sweep", shown)] if shown != self.shown else []
-        self.shown = shown
-        if sweep.assessment.text != self.said:
-            # Read out once per state, and not once a second.
-            quiet = ' aria-live="off"' if sweep.entry.state == self.state else ""
-            text = escape(visible(sweep.assessment.text))
-            events.append(("state", f"<span{quiet}>{text}</span>"))
-            self.said, self.state = sweep.assessment.text, sweep.entry.state
-        return events if sweep.entry.followed else [*events, ("done", "")]
-
-
-def _find(site: Site, sweep_id: str) -> Sweep:
     sweep = find_sweep(site.catalogue, sweep_id)
     if sweep is None:
         raise NotThere(f"the database holds no sweep {sweep_id}")
-    return sweep
+    state = sweep.entry.state
+    if seen and state == "lost" and site.catalogue.held:
+        raise NothingNew  # how it ended cannot be read yet
+    newer = sweep.newest if sweep.newest.sweep_id != sweep_id else None
+    shown = (sweep, newer and (newer.sweep_id, newer.state))
+    return site.render(
+        "sweep.html",
+        here="sweeps",
+        newer=newer,
+        seen=_news(shown, seen, state),
+        # A screen reader says the sentence once a state, and not every time that a number changes.
+        quiet=seen.startswith(f"{state}-"),
+        heard=bool(seen),
+        **_values(site, sweep),
+    )
+
+
+def _news(shown: object, seen: str, state: str = "all") -> str:
+    """What is shown, as a short text that differs where it does; raises NothingNew."""
+    now = f"{state}-{hashlib.sha256(repr(shown).encode()).hexdigest()[:16]}"
+    if now == seen:
+        raise NothingNew
+    return now
 
 
 def _values(site: Site, sweep: Sweep) -> dict[str, object]:
@@ -173,7 +92,7 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
 
 
 def _condition_texts(site: Site, names: list[str]) -> dict[str, str]:
-    """Conditions in words; nothing is said of one that no human drove and no trial tells yet."""
+    """Conditions in words; empty for one that no human drove and that has no trial yet."""
     known = {
         name: (one.projected_headway_m, one.relative_velocity_mps)
         for name, one in HUMAN_CONDITIONS.items()
@@ -232,8 +151,3 @@ def _lasted(began: datetime, until: datetime | None) -> str:
     if until.tzinfo is None:
         until = until.replace(tzinfo=UTC)
     return duration((until - began.replace(tzinfo=UTC)).total_seconds())
-
-
-def _event(name: str, text: str) -> str:
-    lines = "".join(f"data: {line}\n" for line in text.splitlines() or [""])
-    return f"event: {name}\n{lines}\n"

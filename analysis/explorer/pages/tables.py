@@ -10,7 +10,7 @@ from analysis.tables import TABLES
 from analysis.tables.formats import table_view
 from analysis.tables.model import from_text
 
-# What stands in each, for the list of them: their titles are known once they are made.
+# What each shows, for the list: their own titles are known only when they are made.
 ABOUT = {
     "who-first": "Table III: who merges first, by headway and relative velocity",
     "gap": "Table IV: the gap, by headway and relative velocity",
@@ -37,11 +37,11 @@ def tables_page(site: Site) -> str:
     return site.render("tables.html", here="tables", about=ABOUT)
 
 
-def table_page(site: Site, name: str, asked: Mapping[str, str], *, patient: bool = False) -> str:
+def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """One table; raises NotThere."""
     if name not in TABLES:
         raise NotThere(f"there is no table {name}; there are {', '.join(TABLES)}")
-    found = computed(site, ("tables", name), asked, patient=patient)
+    found = computed(site, ("tables", name), asked)
     shown = None
     if found.result is not None:
         shown = table_view(

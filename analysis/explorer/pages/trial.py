@@ -10,12 +10,12 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from analysis.explorer import views
-from analysis.explorer.catalogue import Filter
 from analysis.explorer.details import Decision, Trial, read_decisions, read_trial
 from analysis.explorer.display_text import shortened
-from analysis.explorer.query_params import whole
+from analysis.explorer.pictures import step_points
 from analysis.explorer.reading import Row
 from analysis.explorer.site import NotThere, Site
+from analysis.explorer.urls import whole
 from merge_runner.records import SIDES
 
 # So many trials of a kind are offered to compare with.
@@ -94,7 +94,7 @@ def rendered(site: Site, row: Row, trial: Trial, found: Decision) -> str:
         reply=None if body is None else {"text": text, "more": more},
         raw=site.at.raw(row, found.row["side"], found.row["decision"]),
         chart=views.plan_chart(found, trial),
-        points=views.step_points,
+        points=step_points,
         aftermath=views.aftermath(trial, found),
     )
 
@@ -130,8 +130,7 @@ def alternatives(site: Site, row: Row) -> dict[str, list[Row]]:
 
     ``key`` names one in an address: by its name, and its spec where that name has several.
     """
-    same = Filter(condition=row["condition"])
-    found = site.catalogue.near(same, row, OFFERED)
+    found = site.catalogue.near(row, OFFERED)
     times = Counter(other["trial_id"] for other in found)
     kinds: dict[str, list[Row]] = {}
     for other in found:

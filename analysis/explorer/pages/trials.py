@@ -8,29 +8,29 @@ from typing import Any
 
 from analysis.explorer.catalogue import FACETS, PAGE, SORTS, Filter
 from analysis.explorer.pages.computed import computed
-from analysis.explorer.query_params import whole
+from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.site import NothingNew, NotThere, Site
-from analysis.explorer.views import sparkline, speed_scale
+from analysis.explorer.urls import whole
 from analysis.tables import TABLES
 from merge_runner.errors import StoreError
 
 EXPORT_WAIT_S = 300.0
 
 
-def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) -> str:
-    """One page of the trials that an address asks for; ``patient``: an answer may take a while."""
+def trials_page(site: Site, asked: Mapping[str, str]) -> str:
+    """One page of the trials that an address asks for."""
     state = "-".join(map(str, site.catalogue.state()))
     if "seen" in asked:
         return _news(site, asked, state)
     wanted, sort = filter_of(asked), sort_of(asked)
     cell, named = asked.get("cell", ""), None
     if cell:
-        named = computed(site, cell_request(cell), asked, patient=patient)
+        named = computed(site, cell_request(cell), asked)
         if named.result is None:
             return site.render("behind.html", here="trials", cell=cell, computed=named)
         wanted = replace(wanted, trials=behind(named.result.content))
     totals = site.catalogue.totals(wanted)
-    trials = sum(part.trials for part in totals.values())
+    trials = sum(part["trials"] for part in totals.values())
     last = max(1, -(-trials // PAGE))
     number = min(page_of(asked), last)
     rows = site.catalogue.page(wanted, sort, number)
@@ -47,7 +47,7 @@ def trials_page(site: Site, asked: Mapping[str, str], *, patient: bool = False) 
         totals=totals,
         trials=trials,
         rows=rows,
-        scale=speed_scale(rows),
+        scale=speed_range(rows),
         news=at_of(site, asked, seen=state),
         page=number,
         last_page=last,
@@ -61,7 +61,7 @@ def at_of(site: Site, asked: Mapping[str, str], **state: str) -> str:
 
 
 def _news(site: Site, asked: Mapping[str, str], state: str) -> str:
-    """That other trials are there than were seen; raises NothingNew."""
+    """A note that the trials are no longer those that were seen; raises NothingNew."""
     if asked["seen"] == state:
         raise NothingNew
     (every,) = site.catalogue.ask("SELECT count(*) AS n FROM listed")

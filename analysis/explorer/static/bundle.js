@@ -1,9 +1,7 @@
 "use strict";
 // An exported page holds many trials, each compressed by itself; the address names the one shown.
 (async () => {
-  const bundle = JSON.parse(document.getElementById("bundle").textContent);
-  const blocks = await unpacked(bundle.blocks);
-  const whole = (html) => html.replace(/\u0001(\d+);/g, (_, number) => blocks[number]);
+  const trials = JSON.parse(document.getElementById("bundle").textContent);
   const chooser = document.getElementById("chooser");
   const asked = new URL(location.href).searchParams;
   const options = [...chooser.options];
@@ -14,10 +12,10 @@
     const [trial, spec] = chooser.value.split("|");
     location.search = new URLSearchParams({ trial, spec });
   });
-  const trial = await unpacked(bundle.trials[chosen.value]);
+  const trial = await unpacked(trials[chosen.value]);
   window.explorer = {
-    panel: async (link) => whole(trial.panels[`${link.dataset.side}/${link.dataset.n}`]),
-    data: async (option) => (await unpacked(bundle.trials[option.dataset.url])).data,
+    panel: async (link) => trial.panels[`${link.dataset.side}/${link.dataset.n}`],
+    data: async (option) => (await unpacked(trials[option.dataset.url])).data,
   };
   document.getElementById("shown").innerHTML = trial.html;
   document.title = `${chosen.text.replace(/: [^:]*$/, "")} · merge-runner`;

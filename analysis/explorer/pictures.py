@@ -1,0 +1,158 @@
+"""Still pictures: where their lines and marks lie, in the units of the SVG that a template writes.
+
+Only the replay draws in the browser, since it moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil, floor, log10
+from statistics import quantiles
+from typing import Any
+
+from analysis.explorer.reading import Row
+from merge_runner.records import SIDES
+
+SPARK_WIDTH, SPARK_HEIGHT = 96.0, 22.0
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Where values lie in a picture: ``low`` at ``from_``, ``high`` at ``to``, others between.
+
+    What lies beyond is drawn at the edge.
+    """
+
+    low: float
+    high: float
+    from_: float
+    to: float
+
+    def __call__(self, value: float) -> float:
+        """The place of a value."""
+        inside = min(max(value, self.low), self.high)
+        return self.from_ + (self.to - self.from_) * (inside - self.low) / (self.high - self.low)
+
+
+def speed_range(rows: Sequence[Row]) -> tuple[int, int]:
+    """The whole m/s at the bottom and the top of all sparklines of these trials."""
+    ranges = [row[f"{side}_range_mps"] for row in rows if _drawn(row) for side in SIDES]
+    low = floor(min((low for low, _ in ranges), default=0.0))
+    return low, max(ceil(max((high for _, high in ranges), default=0.0)), low + 1)
+
+
+def _drawn(row: Row) -> bool:
+    return bool(row["left_mps"] and row["right_mps"])
+
+
+def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
+    """The speeds of both vehicles: points of two lines, and in words.
+
+    None where a vehicle has none.
+    """
+    if not _drawn(row):
+        return None
+    (left_low, left_high), (right_low, right_high) = row["left_range_mps"], row["right_range_mps"]
+    return {
+        "left": _spark_points(row["left_mps"], speeds),
+        "right": _spark_points(row["right_mps"], speeds),
+        "words": f"speed of the left vehicle {left_low:.1f} to {left_high:.1f} m/s, "
+        f"of the right one {right_low:.1f} to {right_high:.1f} m/s",
+    }
+
+
+def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
+    x = Scale(0, max(len(values) - 1, 1), 0.0, SPARK_WIDTH)
+    y = Scale(*speeds, SPARK_HEIGHT, 0.0)
+    return " ".join([f"{x(i):.0f},{y(speed):.1f}" for i, speed in enumerate(values)])
+
+
+def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
+    """Points of a step line from -1 to 1, ``steps`` across the width."""
+    x, y = Scale(0, steps, 0.0, width), Scale(-1.0, 1.0, height, 0.0)
+    return " ".join(
+        f"{x(i):.1f},{y(value):.1f} {x(i + 1):.1f},{y(value):.1f}" for i, value in enumerate(values)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """An axis of a panel, and the values of its ticks."""
+
+    scale: Scale
+    ticks: Sequence[float]
+
+    def y(self, value: float) -> float:
+        """Where a value is drawn."""
+        return round(self.scale(value), 1)
+
+    def placed(self, found: Mapping[str, Any], arrow: float) -> dict[str, Any]:
+        """Where an estimate is drawn, and the ends of its interval.
+
+        Where that goes on beyond the axis there are arrows, so far from the edge.
+        """
+        at, low, high = {"y": self.y(found["value"])}, found["low"], found["high"]
+        if low is None:
+            return {**at, "ends": None, "arrows": []}
+        arrows = [("down", self.scale.from_ - arrow)] if low < self.scale.low else []
+        arrows += [("triangle", self.scale.to + arrow)] if high > self.scale.high else []
+        return {**at, "ends": (self.y(low), self.y(high)), "arrows": arrows}
+
+
+def reach(estimates: Sequence[Mapping[str, Any]], printed: Sequence[float]) -> tuple[float, float]:
+    """What an axis has to show: every value, and of the intervals what is not far out.
+
+    Far out is what lies further than 1.5 times the distance of the quartiles beyond them (Tukey's
+    fences, Exploratory Data Analysis, 1977): an interval of two or three trials may be ten times as
+    long as the others.
+    """
+    values = [*printed, *(found["value"] for found in estimates)]
+    ends = [found[end] for found in estimates for end in ("low", "high") if found[end] is not None]
+    if len(values) < 2:
+        return min([*values, *ends], default=0.0), max([*values, *ends], default=1.0)
+    first, _, third = quantiles([*values, *ends], n=4, method="inclusive")
+    beyond = 1.5 * (third - first)
+    low = max(min([*values, *ends]), first - beyond)
+    high = min(max([*values, *ends]), third + beyond)
+    return min([low, *values]), max([high, *values])
+
+
+def ends_and_ticks(
+    low: float, high: float, lowest: float | None, highest: float | None
+) -> tuple[float, float, list[float]]:
+    """Both ends of an axis, and its ticks: round steps, with 0 in it.
+
+    ``lowest`` and ``highest`` are the ends where the values have such.
+    """
+    low = min(low, 0.0) if lowest is None else lowest
+    high = max(high, 0.0) if highest is None else highest
+    high = high if high > low else low + 1.0
+    rough = (high - low) / 4
+    size = 10.0 ** floor(log10(rough))
+    step = next(size * m for m in (1, 2, 2.5, 5, 10) if size * m >= rough * 0.999)
+    # Against rounding: 0.3 / 0.1 is a little less than 3, and would make one step more.
+    first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
+    last = max(last, first + 1)
+    return first * step, last * step, [round(i * step, 6) for i in range(first, last + 1)]
+
+
+def marker(shape: str, x: float, y: float, r: float = 4.2) -> str:
+    """A shape about a point, as a path."""
+    corners: dict[str, list[tuple[float, float]]] = {
+        "square": [(-1, -1), (1, -1), (1, 1), (-1, 1)],
+        "triangle": [(0, -1.2), (1.15, 0.9), (-1.15, 0.9)],
+        "down": [(0, 1.2), (1.15, -0.9), (-1.15, -0.9)],
+        "diamond": [(0, -1.35), (1.35, 0), (0, 1.35), (-1.35, 0)],
+    }
+    if shape in corners:
+        points = [f"{x + r * 0.9 * dx:.1f} {y + r * 0.9 * dy:.1f}" for dx, dy in corners[shape]]
+        return f"M{' L'.join(points)}Z"
+    if shape == "cross":
+        return (
+            f"M{x - r:.1f} {y - r:.1f} L{x + r:.1f} {y + r:.1f} "
+            f"M{x - r:.1f} {y + r:.1f} L{x + r:.1f} {y - r:.1f}"
+        )
+    if shape == "plus":
+        return f"M{x - r:.1f} {y:.1f} H{x + r:.1f} M{x:.1f} {y - r:.1f} V{y + r:.1f}"
+    return f"M{x - r:.1f} {y:.1f} a{r} {r} 0 1 0 {2 * r:.1f} 0 a{r} {r} 0 1 0 {-2 * r:.1f} 0Z"
