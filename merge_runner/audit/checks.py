@@ -1,24 +1,19 @@
 """What must hold of every trial, as queries for what does not: trial_id, side, decision, text.
 
-They read the tables of a database and the temporary ones that sweeps.py makes: ``audited`` (the
-trials), ``rules`` (numbers of a spec's scenario and track), ``paces`` (when the driver of a spec's
-side decides), ``drivers`` (per spec and side the endpoint and the body of an empty request, NULL
-for a program), ``entries`` (the models of the sweep) and ``other_models`` (who answered in place
-of whom).
+They read the tables of a database, or of calls alone those that recordings.py makes, and the
+temporary ones that sweeps.py makes: ``audited`` (the trials), ``rules`` (numbers of a spec's
+scenario and track), ``paces`` (when the driver of a spec's side decides), ``drivers`` (per spec and
+side the endpoint and the body of an empty request, NULL for a program), ``entries`` (the models of
+the sweep) and ``other_models`` (who answered in place of whom).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 
+import duckdb
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """A query whose rows are findings of a kind."""
-
-    kind: str
-    sql: str
-
+from merge_runner.audit.findings import Finding
 
 # The numbers that a trial's rows repeat are those of its states.
 OUTCOMES = """
@@ -219,13 +214,24 @@ FROM asked JOIN drivers USING (spec_hash, side)
 WHERE replace(request, prompt, '""') IS DISTINCT FROM body
 """
 
-CHECKS = (
-    Check("outcome", OUTCOMES),
-    Check("numbering", NUMBERS),
-    Check("plan", PLANS),
-    Check("call", CALLS),
-    Check("attempt", ATTEMPTS),
-    Check("model", MODELS),
-    Check("served", SERVED),
-    Check("request", REQUESTS),
-)
+# Kind of finding to the query for it.
+CHECKS = {
+    "outcome": OUTCOMES,
+    "numbering": NUMBERS,
+    "plan": PLANS,
+    "call": CALLS,
+    "attempt": ATTEMPTS,
+    "model": MODELS,
+    "served": SERVED,
+    "request": REQUESTS,
+}
+
+
+def run_checks(
+    connection: duckdb.DuckDBPyConnection, kinds: Iterable[str] = tuple(CHECKS)
+) -> Iterator[Finding]:
+    """What these checks find."""
+    for kind in kinds:
+        rows = connection.execute(f"{CHECKS[kind]} ORDER BY ALL").fetchall()
+        for trial_id, side, decision, text in rows:
+            yield Finding(kind, text, trial=trial_id, side=side, decision=decision)

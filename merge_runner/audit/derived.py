@@ -19,7 +19,7 @@ import duckdb
 
 from merge_runner.audit.answers import COLUMNS, Answer, answers_another, read_answer
 from merge_runner.audit.expected import Spec, SweepConfig
-from merge_runner.audit.findings import Finding
+from merge_runner.audit.findings import Audit, Finding
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver, MakeDriver, Seat, take_seat
 from merge_runner.drivers.language_model import LanguageModel
@@ -79,20 +79,6 @@ OTHER_RULES = "anything, since another version of the program made them by other
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
 NOT_INSTALLED = "anything, since their condition or their scenario is not installed"
 OTHER_PROGRAM = "the decisions of a program that is not as it was"
-
-
-@dataclass(slots=True)
-class Derived:
-    """What was found, in how many trials, and what of how many could not be derived."""
-
-    findings: list[Finding] = field(default_factory=list)
-    trials: int = 0
-    left_out: Counter[str] = field(default_factory=Counter)
-
-    @property
-    def notes(self) -> list[str]:
-        """What could not be derived, for a reader."""
-        return [f"not derived anew in {n} trials: {w}" for w, n in self.left_out.items() if n]
 
 
 class _NotStored(Exception):  # what happened, and no error of the program
@@ -186,11 +172,15 @@ class _AsStored:
 
 
 def check_derived(
-    connection: duckdb.DuckDBPyConnection, specs: Mapping[str, Spec], config: SweepConfig
-) -> Derived:
+    connection: duckdb.DuckDBPyConnection,
+    specs: Mapping[str, Spec],
+    config: SweepConfig,
+    audit: Audit,
+) -> None:
     """Derive the audited trials anew, and compare every column that replies and specs tell."""
-    found = Derived()
-    found.findings += [
+    left_out: Counter[str] = Counter()
+    played = 0
+    audit.findings += [
         Finding("config", f"its model {name} has the format {model.format!r}, which there is not")
         for name, model in config.models.items()
         if model.format and model.format not in FORMATS
@@ -199,13 +189,14 @@ def check_derived(
     batches = in_batches(connection, audited, PLACES, partial(_tables, connection))
     with ThreadPoolExecutor(max_workers=1) as thread:  # a loop of its own: one may run here
         for tables in batches:
-            trials = list(_trials(tables, specs, config, found))
+            trials = list(_trials(tables, specs, config, left_out))
             records = thread.submit(asyncio.run, _all_played(trials)).result()
             for trial, record in zip(trials, records, strict=True):
-                found.findings += _findings(trial, record, tables)
+                audit.findings += _findings(trial, record, tables)
                 trial.drivers.clear()  # which know it: else its replies stay until a collection
-            found.trials += len(trials)
-    return found
+            played += len(trials)
+    audit.counts["derived anew"] = played
+    audit.notes += [f"not derived anew in {n} trials: {what}" for what, n in left_out.items()]
 
 
 async def _all_played(trials: list[_Trial]) -> list[TrialRecord | _NotStored]:
@@ -229,7 +220,10 @@ def _tables(
 
 
 def _trials(
-    tables: Mapping[str, Stored], specs: Mapping[str, Spec], config: SweepConfig, found: Derived
+    tables: Mapping[str, Stored],
+    specs: Mapping[str, Spec],
+    config: SweepConfig,
+    left_out: Counter[str],
 ) -> Iterator[_Trial]:
     """The trials that can be derived; what is left out is counted, or told by other checks."""
     wires = _wires(config)
@@ -240,7 +234,7 @@ def _trials(
             continue
         scenario = SCENARIOS.get(spec.scenario.name)
         if scenario is None or row["condition"] not in CONDITIONS:
-            found.left_out[NOT_INSTALLED] += 1
+            left_out[NOT_INSTALLED] += 1
             continue
         paces = {side: pace for side in SIDES if (pace := spec.pace(side)) is not None}
         if len(paces) < len(SIDES):
@@ -248,7 +242,7 @@ def _trials(
         known = all(side in wires for side in SIDES if spec.asks(side))
         same_rules = spec.content.get("spec_version") == SPEC_VERSION
         if not (same_rules and known and spec.track == scenario.track):
-            found.left_out[OTHER_RULES] += 1
+            left_out[OTHER_RULES] += 1
             continue
         calls, decisions = tables["calls"].named(key), tables["decisions"].named(key)
         trial = _Trial(
@@ -259,7 +253,7 @@ def _trials(
             {(d["side"], d["decision"]): _decided(d) for d in decisions},
             scripted=any(model.provider == "emulator" for model in config.models.values()),
         )
-        found.left_out.update(_seat(trial, spec, paces))
+        left_out.update(_seat(trial, spec, paces))
         yield trial
 
 

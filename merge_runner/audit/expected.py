@@ -35,15 +35,6 @@ class ModelFacts(_Facts):
     path: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """Where in a sweep a trial stands."""
-
-    variant: str
-    condition: str
-    repetition: int
-
-
 class SweepConfig(_Facts):
     """The configuration of a sweep as its row holds it."""
 
@@ -63,16 +54,25 @@ class SweepConfig(_Facts):
         return {"left": left, "right": right or left}
 
     @cached_property
-    def trials(self) -> dict[str, Cell]:
-        """Trial id to its cell, spelled as the plan spells them."""
+    def trials(self) -> dict[str, dict[str, Any]]:
+        """Trial id, spelled as the plan spells it, to what the trial's row should say."""
         suffix = f"/set{self.sample_set}" if self.sample_set else ""
+        of_all = {
+            "sample_set": self.sample_set,
+            "model_left": self.sides["left"],
+            "model_right": self.sides["right"],
+            "source": "llm" if self.models else "driver",
+        }
         return {
-            f"{self.model}/{variant}/{condition}/rep{repetition:02d}{suffix}": Cell(
-                variant, condition, repetition
-            )
+            f"{self.model}/{variant}/{condition}/rep{rep:02d}{suffix}": {
+                "variant": variant,
+                "condition": condition,
+                "rep": rep,
+                **of_all,
+            }
             for variant, repetitions in self.repetitions.items()
             for condition in self.conditions
-            for repetition in range(1, repetitions + 1)
+            for rep in range(1, repetitions + 1)
         }
 
 

@@ -28,10 +28,12 @@ WHERE body IS NOT NULL
 """
 
 # Two slots of one spec with one call, and two calls of any spec with one reply: a proxy that
-# caches answers a repetition, or a fresh set of samples, with an old reply.
+# caches answers a repetition, or a fresh set of samples, with an old reply. ``done`` holds the
+# trials of which it was told before.
 _SHARED = """
 WITH suspects AS ({suspects})
-SELECT list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places
+SELECT list(DISTINCT (trial_id, side, decision, spec_hash)
+    ORDER BY (trial_id, side, decision, spec_hash)) AS places
 FROM {slots} SEMI JOIN suspects USING ({what})
 GROUP BY {what}
 HAVING len(places) > 1
@@ -119,20 +121,25 @@ def _hashed_otherwise(
     )
 
 
-def check_sharing(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
-    """Find the slots that are no samples of their own; ``done`` holds what was told before."""
-    for sql, text in (
-        (SHARED_CALLS, "its call is also that of"),
-        (SHARED_REPLIES, "its answer, with the provider's id of it, is also that of"),
-    ):
-        for (slots,) in connection.execute(sql).fetchall():
-            first, *others = slots
-            told = "; ".join(_place(slot) for slot in others[:SHOWN])
-            more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
-            trial_id, side, decision = first
-            yield Finding(
-                "shared", f"{text} {told}{more}", trial=trial_id, side=side, decision=decision
-            )
+def shared_calls(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
+    """Find the slots of a spec that are no samples of their own, since they share a call."""
+    return _shared(connection, SHARED_CALLS, "its call is also that of")
+
+
+def shared_replies(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
+    """Find the calls that are no samples of their own, since they share a reply."""
+    told = "its answer, with the provider's id of it, is also that of"
+    return _shared(connection, SHARED_REPLIES, told)
+
+
+def _shared(connection: duckdb.DuckDBPyConnection, sql: str, text: str) -> Iterator[Finding]:
+    for (slots,) in connection.execute(sql).fetchall():
+        (trial_id, side, decision, _), *others = slots
+        told = "; ".join("{}, {}, decision {}".format(*slot) for slot in others[:SHOWN])
+        more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
+        yield Finding(
+            "shared", f"{text} {told}{more}", trial=trial_id, side=side, decision=decision
+        )
 
 
 def calls_in_common(connection: duckdb.DuckDBPyConnection) -> Iterator[Sharing]:
@@ -156,7 +163,3 @@ def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:
     assert row is not None
     repeated, alike = row
     return alike if alike == repeated >= MANY_REPEATED else 0
-
-
-def _place(slot: tuple[str, str, int]) -> str:
-    return "{}, {}, decision {}".format(*slot)

@@ -10,7 +10,7 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -237,6 +237,21 @@ def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
     """The rows of a result, a few at a time."""
     while batch := result.fetchmany(ROWS_AT_ONCE):
         yield from batch
+
+
+def by_name(result: duckdb.DuckDBPyConnection) -> Iterator[dict[str, Any]]:
+    """The rows of a result, each by the names of its columns."""
+    names = [column[0] for column in result.description or ()]
+    return (dict(zip(names, row, strict=True)) for row in result.fetchall())
+
+
+def append(
+    connection: duckdb.DuckDBPyConnection, table: str, rows: Iterable[tuple[Any, ...]]
+) -> None:
+    """Add rows to a table."""
+    appender = connection.appender(table)  # an INSERT would be a statement for each row
+    appender.append_rows(list(rows))
+    appender.flush()
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
 from merge_runner.llm.verify import DAMAGED, check_attempts, check_body
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
-from merge_runner.results.database import Settings, in_memory
+from merge_runner.results.database import Settings, append, in_memory
 from merge_runner.text_safety import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 2"
@@ -137,7 +137,7 @@ def _write_parts(
                 content.update(_fingerprint(row[0], row[-1]))
                 size += _size(row)
             calls += len(some)
-            _append(connection, some)
+            append(connection, "calls", some)
             connection.execute(
                 f"COPY calls TO {quoted(f'{folder}/{part:06}.parquet')} (COMPRESSION snappy)"
             )
@@ -202,12 +202,6 @@ def _of_bounded_size(rows: Iterable[tuple[Any, ...]]) -> Iterator[list[tuple[Any
 
 def _size(row: tuple[Any, ...]) -> int:
     return len(row[-2]) + len(row[-1])
-
-
-def _append(connection: duckdb.DuckDBPyConnection, rows: list[tuple[Any, ...]]) -> None:
-    appender = connection.appender("calls")
-    appender.append_rows(rows)
-    appender.flush()
 
 
 def read_recording(file: Path) -> Iterator[Entry]:

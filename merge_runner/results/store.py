@@ -24,6 +24,8 @@ from merge_runner.results.database import (
     SCHEMA_VERSION,
     TEXTS,
     Instance,
+    append,
+    by_name,
     fetched,
     merge_small_groups,
     migrate,
@@ -101,7 +103,7 @@ class Store:
                 ],
             )
             _add_specs(connection, specs)
-            _append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
+            append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
 
     def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
         """Note when and how a sweep ended."""
@@ -150,9 +152,9 @@ class Store:
                 if stored.get(key, "failed") != "failed" and record.status != "failed"
             }
             differing = _differing(connection, again)
-            _append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
+            append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
             for table in ("trials", "states", "decisions", "calls"):
-                _append(connection, table, chain.from_iterable(made[table] for made in new))
+                append(connection, table, chain.from_iterable(made[table] for made in new))
             return differing
 
     def add_recorded(
@@ -174,8 +176,8 @@ class Store:
                 if known.setdefault(key, rows) != rows:
                     differing.append(record.spec.trial_id)
             new = list(known.values())[stored:]
-            _append(connection, "trials", (trial for trial, _ in new))
-            _append(connection, "states", chain.from_iterable(states for _, states in new))
+            append(connection, "trials", (trial for trial, _ in new))
+            append(connection, "states", chain.from_iterable(states for _, states in new))
             return len(new), len(records) - len(new) - len(differing), differing
 
     @contextmanager
@@ -332,10 +334,8 @@ def used_call_keys(path: Path, sweep_id: str | None) -> tuple[str, list[str]]:
 def sweep_row(path: Path, sweep_id: str) -> dict[str, Any]:
     """One row of the sweeps table, column to value."""
     with read_database(path) as connection:
-        result = connection.execute("SELECT * FROM sweeps WHERE sweep_id = ?", [sweep_id])
-        names = [column[0] for column in result.description or ()]
-        row = result.fetchone()
-    return dict(zip(names, row or (), strict=True))
+        found = connection.execute("SELECT * FROM sweeps WHERE sweep_id = ?", [sweep_id])
+        return next(by_name(found))
 
 
 @dataclass(frozen=True, slots=True)
@@ -475,11 +475,3 @@ def _delete(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None
             f"DELETE FROM {table} WHERE trial_id = ? AND spec_hash = ?",  # noqa: S608 # constants
             keys,
         )
-
-
-def _append(
-    connection: duckdb.DuckDBPyConnection, table: str, rows: Iterable[tuple[Any, ...]]
-) -> None:
-    appender = connection.appender(table)
-    appender.append_rows(list(rows))
-    appender.flush()

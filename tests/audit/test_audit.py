@@ -791,7 +791,7 @@ RECORDINGS = {
         "served", "scripted-driver -> gpt-0: another model answered than was asked for (1 ans",
     ),
     "an attempt is gone": (
-        lambda e: [answered(e[0], number=2), *e[1:]], "attempt", "its attempts are out of order",
+        lambda e: [answered(e[0], number=2), *e[1:]], "attempt", "its attempts are numbered [2]",
     ),
     "a trial is gone": (lambda _: [], "missing", "nothing is recorded"),
 }  # fmt: skip
