@@ -49,7 +49,6 @@ from merge_runner.results.comparison import (
     Stored,
     TrialKey,
     in_batches,
-    rows_of_trials,
     stored_rows,
 )
 from merge_runner.results.rows import decision_rows, state_rows, trial_row
@@ -73,7 +72,7 @@ NOT_DERIVED = (
     "sweeps.git_dirty",
     "sweeps.versions",
 )
-ASKED = "sha256(request::VARCHAR) AS asked"
+CALLS = f"trial_id, spec_hash, {', '.join(COLUMNS)}, sha256(request::VARCHAR) AS asked"
 # What a reader is told could not be derived.
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
@@ -207,16 +206,12 @@ def _tables(
     connection: duckdb.DuckDBPyConnection, keys: list[TrialKey], spans: Spans
 ) -> dict[str, Stored]:
     """What is stored of these trials; of ``calls`` what replies tell, and the replies."""
-    tables = {
-        table: stored_rows(connection, table, keys, spans[table])
-        for table in ("trials", "states", "decisions")
+    return {
+        table: stored_rows(
+            connection, table, keys, spans[table], CALLS if table == "calls" else None
+        )
+        for table in PLACES
     }
-    calls = Stored("calls", (*COLUMNS, "asked"))
-    columns = f"trial_id, spec_hash, {', '.join(COLUMNS)}, {ASKED}"
-    rows = rows_of_trials(connection, columns, "calls", keys, spans["calls"])
-    for trial_id, spec_hash, *values in rows.fetchall():
-        calls.rows.setdefault((trial_id, spec_hash), []).append(tuple(values))
-    return {**tables, "calls": calls}
 
 
 def _trials(

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import duckdb
 
-from merge_runner.results.database import append, streamed
+from merge_runner.results.database import append, fetched
 
 # Earlier emulators gave every reply the same id: those of a stand-in tell nothing. The present
 # ones give each reply its own, and are audited like any provider.
@@ -66,7 +66,7 @@ def find_ids(connection: duckdb.DuckDBPyConnection) -> None:
     )
     found = [
         (place, *told)
-        for place, reply, provider in streamed(connection, REPLIES)
+        for place, reply, provider in fetched(connection.execute(REPLIES))
         if (told := identified(reply or "", provider))
     ]
     append(connection, "identified", found)

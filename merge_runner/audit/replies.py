@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import duckdb
 
 from merge_runner.audit.findings import Finding, Sharing
-from merge_runner.results.database import streamed
+from merge_runner.results.database import fetched
 
 SHOWN = 3
 
@@ -116,7 +116,7 @@ def _hashed_otherwise(
     """
     return sorted(
         (trial_id, side, decision, None not in parts)
-        for trial_id, side, decision, told, *parts in streamed(connection, sql)
+        for trial_id, side, decision, told, *parts in fetched(connection.execute(sql))
         if None in parts or hashlib.sha256("".join(parts).encode()).hexdigest() != told
     )
 

@@ -119,14 +119,19 @@ def stored_rows(
     table: str,
     keys: Sequence[TrialKey],
     span: Span | None = None,
+    columns: str | None = None,
 ) -> Stored:
-    """The rows of these trials, with hashes in place of long texts."""
-    hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in LONG.get(table, ()))
-    columns = f"* REPLACE ({hashes})" if hashes else "*"
+    """The rows of these trials: these columns, or all of them with hashes in place of long texts.
+
+    The columns must have those that identify a row.
+    """
+    hashed = LONG.get(table, ()) if columns is None else ()
+    hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in hashed)
+    columns = columns or (f"* REPLACE ({hashes})" if hashes else "*")
     result = rows_of_trials(connection, columns, table, keys, span)
     names = tuple(column[0] for column in result.description or ())
     trial_id, spec_hash = names.index("trial_id"), names.index("spec_hash")
-    stored = Stored(table, names, LONG.get(table, ()))
+    stored = Stored(table, names, hashed)
     for row in result.fetchall():
         stored.rows.setdefault((row[trial_id], row[spec_hash]), []).append(row)
     return stored

@@ -228,13 +228,8 @@ def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
     return Path(row[0]).stat().st_size - row[1] * BYTES_OF_A_CALL if row else 0
 
 
-def streamed(connection: duckdb.DuckDBPyConnection, sql: str) -> Iterator[tuple[Any, ...]]:
-    """The rows of a query on long texts; no other query may run until it has ended."""
-    return fetched(connection.execute(sql))
-
-
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
-    """The rows of a result, a few at a time."""
+    """The rows of a result, a few at a time; its connection runs no other query until the end."""
     while batch := result.fetchmany(ROWS_AT_ONCE):
         yield from batch
 
