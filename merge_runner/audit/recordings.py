@@ -6,8 +6,9 @@ import hashlib
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import ValidationError
 
@@ -22,7 +23,13 @@ from merge_runner.llm.cache import Entry
 from merge_runner.llm.keys import canonical_json, without_prompt
 from merge_runner.records import SIDES, Side, Slot
 from merge_runner.results.database import SETTINGS, append, in_memory
-from merge_runner.results.recording import read_recording, summarise
+from merge_runner.results.recording import (
+    BATCH,
+    UNCOVERED,
+    is_covered,
+    read_provenance,
+    read_recording,
+)
 from merge_runner.results.rows import Row
 from merge_runner.served_model import other_models
 
@@ -37,67 +44,72 @@ CREATE TABLE reply_ids (trial_id VARCHAR, spec_hash VARCHAR, side VARCHAR, decis
     call_key VARCHAR, model_requested VARCHAR, endpoint VARCHAR, reply_id VARCHAR,
     content VARCHAR);
 CREATE TABLE sweeps (config JSON);
+CREATE TABLE audited (trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE done (trial_id VARCHAR, spec_hash VARCHAR);
+CREATE TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 """
-AUDITED = "CREATE TABLE audited AS SELECT DISTINCT trial_id, spec_hash FROM calls"
-OTHER_MODELS = "CREATE TABLE other_models (model_requested VARCHAR, model_served VARCHAR)"
+AUDITED = "INSERT INTO audited SELECT DISTINCT trial_id, spec_hash FROM calls"
+COUNTS = """
+SELECT 'calls', count(DISTINCT call_key) FROM calls
+UNION ALL SELECT 'attempts', count(*) FROM calls
+UNION ALL SELECT 'reply ids', count(DISTINCT (endpoint, model_requested, reply_id)) FROM reply_ids
+"""
+OUTCOMES = """
+SELECT 'answers ' || outcome AS name, count(*)
+FROM (SELECT max_by(outcome, attempt) AS outcome FROM calls GROUP BY call_key)
+GROUP BY ALL ORDER BY name
+"""
 
 
-@dataclass(frozen=True, slots=True)
-class Drive:
+class Drive(NamedTuple):
     """One driver in the trials of one repetition: those of several variants together.
 
     ``template`` is the request without its prompt, with the model and the endpoint.
     """
 
     template: str
-    condition: str
+    trial: str
     repetition: int
-    sample_set: int
     side: Side
+
+
+# How often each decision of each driver was asked for.
+Drives = defaultdict[Drive, Counter[int]]
 
 
 def audit_recording(file: Path) -> Audit:
     """Audit a recording; one that is damaged is a finding. Raises UsageError without a file."""
     audit = Audit(str(file))
-    drives: defaultdict[Drive, Counter[int]] = defaultdict(Counter)
-    calls: list[Row] = []
-    reply_ids: list[Row] = []
-    try:
-        summary = summarise(file)
-        for entry in read_recording(file):
-            drives[_drive(entry)][entry.request.slot.decision] += 1
-            calls += _calls(entry)
-            reply_ids += _reply_ids(entry)
-            audit.findings += _exchanged(entry)
-    except RecordingError as exc:
-        return Audit(str(file), findings=[Finding("recording", str(exc))])
-    audit.counts = {
-        "calls": summary.calls,
-        "attempts": summary.attempts,
-        "drives": len(drives),
-        "reply ids": len({(endpoint, model, told) for *_, model, endpoint, told, _ in reply_ids}),
-        **{f"answers {name}": count for name, count in sorted(summary.outcomes.items())},
-    }
-    audit.notes += summary.notes
-    config = _config(summary.provenance)
+    drives: Drives = defaultdict(Counter)
     with in_memory(SETTINGS) as connection:
         connection.execute(TABLES)
-        for table, rows in (("calls", calls), ("reply_ids", reply_ids)):
-            append(connection, table, rows)
-        if config is None:
-            audit.notes.append(NO_CONFIG)
-        else:
-            append(connection, "sweeps", [(summary.provenance["config"],)])
+        try:
+            provenance = read_provenance(file)
+            entries = read_recording(file)
+            while some := list(islice(entries, BATCH)):
+                append(connection, "calls", chain.from_iterable(map(_calls, some)))
+                append(connection, "reply_ids", chain.from_iterable(map(_reply_ids, some)))
+                audit.findings += chain.from_iterable(map(_exchanged, some))
+                for entry in some:
+                    drives[_drive(entry)][entry.request.slot.decision] += 1
+        except RecordingError as exc:
+            return Audit(str(file), findings=[Finding("recording", str(exc))])
+        config = _config(provenance)
+        if config is not None:
+            append(connection, "sweeps", [(provenance["config"],)])
         connection.execute(AUDITED)
         connection.execute(REPEATED_IDS)
-        connection.execute(OTHER_MODELS)
         append(connection, "other_models", other_models(connection))
+        audit.counts = dict(connection.execute(COUNTS).fetchall())
+        audit.counts["drives"] = len(drives)
+        audit.counts |= dict(connection.execute(OUTCOMES).fetchall())
         audit.findings += _numbering(drives, config)
         audit.findings += shared_replies(connection)
         audit.findings += run_checks(connection, ("served", "attempt"))
+        audit.findings += _missing(drives, config, ended=_ended(provenance))
+        audit.notes += [] if is_covered(provenance) else [UNCOVERED]
         audit.notes += meaningless_ids(connection)
-    audit.findings += _missing(drives, config, ended=_ended(summary.provenance))
+        audit.notes += [] if config else [NO_CONFIG]
     return audit
 
 
@@ -105,13 +117,16 @@ def _drive(entry: Entry) -> Drive:
     request, slot = entry.request, entry.request.slot
     asked = (request.endpoint, request.model, request.path, request.headers)
     template = canonical_json([*asked, without_prompt(request.body)])
-    return Drive(template, slot.condition, slot.repetition, slot.sample_set, slot.side)
+    return Drive(template, _place(slot)[0], slot.repetition, slot.side)
 
 
 def _place(slot: Slot) -> tuple[str, Side, int]:
     """The trials, in a reader's words, the side and the decision."""
-    suffix = f"/set{slot.sample_set}" if slot.sample_set else ""
-    return f"{slot.condition}/rep{slot.repetition:02d}{suffix}", slot.side, slot.decision
+    return _trial(slot.condition, slot.repetition, slot.sample_set), slot.side, slot.decision
+
+
+def _trial(condition: str, repetition: int, sample_set: int) -> str:
+    return f"{condition}/rep{repetition:02d}" + (f"/set{sample_set}" if sample_set else "")
 
 
 def _calls(entry: Entry) -> Iterator[Row]:
@@ -158,7 +173,7 @@ def _config(provenance: dict[str, str]) -> SweepConfig | None:
         return None
 
 
-def _numbering(drives: dict[Drive, Counter[int]], config: SweepConfig | None) -> Iterator[Finding]:
+def _numbering(drives: Drives, config: SweepConfig | None) -> Iterator[Finding]:
     """Every driver is asked from its first decision to its last, once per variant.
 
     Where a driver takes control at its own tunnel's exit, the later one begins later.
@@ -174,10 +189,10 @@ def _numbering(drives: dict[Drive, Counter[int]], config: SweepConfig | None) ->
         first = min(numbers) if late else 0
         for number in range(first, max(numbers) + 1):
             if numbers[number] == 0:
-                yield _in(drive, number, "numbering", "nothing is recorded, though of later ones")
+                yield _misnumbered(drive, number, "nothing is recorded, though of later ones")
             elif numbers[number] > variants:
                 text = f"{numbers[number]} requests are recorded, for {variants} prompt variants"
-                yield _in(drive, number, "numbering", text)
+                yield _misnumbered(drive, number, text)
 
 
 def _ended(provenance: dict[str, str]) -> bool:
@@ -185,22 +200,19 @@ def _ended(provenance: dict[str, str]) -> bool:
     return "ended_at" in provenance and provenance.get("exit_code", "0") == "0"
 
 
-def _missing(
-    drives: dict[Drive, Counter[int]], config: SweepConfig | None, *, ended: bool
-) -> Iterator[Finding]:
+def _missing(drives: Drives, config: SweepConfig | None, *, ended: bool) -> Iterator[Finding]:
     """Of a sweep that has ended, every trial asks each of its models for a first decision."""
     if config is None or not ended:
         return
     asked = [side for side in SIDES if config.sides[side] in config.models]
-    recorded = {(drive.condition, drive.repetition, drive.side) for drive in drives}
+    recorded = {(drive.trial, drive.side) for drive in drives}
     cells = {(trial["condition"], trial["rep"]) for trial in config.trials.values()}
     for condition, repetition in sorted(cells):
+        trial = _trial(condition, repetition, config.sample_set)
         for side in asked:
-            if (condition, repetition, side) not in recorded:
-                drive = Drive("", condition, repetition, config.sample_set, side)
-                yield _in(drive, None, "missing", "nothing is recorded")
+            if (trial, side) not in recorded:
+                yield Finding("missing", "nothing is recorded", trial=trial, side=side)
 
 
-def _in(drive: Drive, decision: int | None, kind: str, text: str) -> Finding:
-    slot = Slot(drive.condition, drive.repetition, drive.side, decision or 0, drive.sample_set)
-    return Finding(kind, text, None, *_place(slot)[:2], decision)
+def _misnumbered(drive: Drive, decision: int, text: str) -> Finding:
+    return Finding("numbering", text, trial=drive.trial, side=drive.side, decision=decision)

@@ -93,7 +93,7 @@ class Stored:
         for index, name in enumerate(self.names):
             if name in ignored:
                 continue
-            places = [p for p in common if not _same(old[p][index], new[p][index], tolerance)]
+            places = [p for p in common if not same_value(old[p][index], new[p][index], tolerance)]
             if places:
                 first = places[0]
                 yield Difference(
@@ -206,11 +206,12 @@ def _spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, 
     return {(trial_id, spec_hash): (first, last) for trial_id, spec_hash, first, last in rows}
 
 
-def _same(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table
+def same_value(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table
+    """Whether two values of a table are equal, numbers within the tolerance, also in lists."""
     if one == other:
         return True
     if isinstance(one, list) and isinstance(other, list):
         return len(one) == len(other) and all(
-            _same(a, b, tolerance) for a, b in zip(one, other, strict=True)
+            same_value(a, b, tolerance) for a, b in zip(one, other, strict=True)
         )
     return isinstance(one, float) and isinstance(other, float) and abs(one - other) <= tolerance

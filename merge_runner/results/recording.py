@@ -227,7 +227,7 @@ def read_recording(file: Path) -> Iterator[Entry]:
             f"{file} is not as it was exported: it holds {number} calls of {told.get('calls')}, "
             "and its content has another hash"
         )
-    if told.get("format") != FIRST_FORMAT and told.get(PROVENANCE_HASH) != _provenance_hash(told):
+    if is_covered(told) and told.get(PROVENANCE_HASH) != _provenance_hash(told):
         raise RecordingError(
             f"{file} is not as it was exported: what it says of where it comes from has another "
             "hash"
@@ -297,7 +297,7 @@ def summarise(file: Path) -> Summary:
         served[entry.attempts[-1].model_served or "unknown"] += 1
         endpoints[entry.request.endpoint] += 1
         outcomes[entry.attempts[-1].outcome] += 1
-    provenance = _provenance(file)
+    provenance = read_provenance(file)
     return Summary(
         calls=calls,
         scripted=scripted,
@@ -308,7 +308,7 @@ def summarise(file: Path) -> Summary:
         endpoints=dict(endpoints),
         outcomes=dict(outcomes),
         provenance=provenance,
-        covered=provenance.get("format") != FIRST_FORMAT,
+        covered=is_covered(provenance),
     )
 
 
@@ -324,6 +324,11 @@ def _written(file: Path) -> Iterator[None]:
 def _fingerprint(key: str, attempts: str) -> bytes:
     """The part of a row that the hash of a recording covers directly: its key covers the rest."""
     return f"{key} {attempts}\n".encode()
+
+
+def is_covered(provenance: dict[str, str]) -> bool:
+    """Whether the hash of the file covers the provenance, too."""
+    return provenance.get("format") != FIRST_FORMAT
 
 
 def _provenance_hash(metadata: dict[str, str]) -> str:
@@ -456,7 +461,8 @@ def _number(connection: duckdb.DuckDBPyConnection, sql: str) -> int:
     return int(row[0] or 0) if row else 0
 
 
-def _provenance(file: Path) -> dict[str, str]:
+def read_provenance(file: Path) -> dict[str, str]:
+    """What a recording says of where it comes from, not verified; raises RecordingError."""
     with _opened(file) as connection:
         return _metadata(file, connection)
 
