@@ -15,7 +15,7 @@ import duckdb
 
 from merge_runner.audit.findings import Finding
 
-# The numbers that a trial's rows repeat are those of its states.
+# What a trial's row repeats of its states agrees with them.
 OUTCOMES = """
 WITH driven AS (
     SELECT trial_id, spec_hash, max(step) AS last_step, count(*) AS samples,
@@ -43,7 +43,7 @@ WITH driven AS (
         WHEN left_step IS NULL AND right_step IS NULL THEN
             if(merged_first IS NULL, NULL, 'nobody merged, and it has a first merger')
         WHEN merged_first IS NULL THEN 'a vehicle merged, and it has no first merger'
-        -- Within one step the exact instants decide, which are not compared here.
+        -- Who was first within one step depends on exact instants, which are not derived here.
         WHEN left_step = right_step THEN NULL
         WHEN merged_first <> if(right_step IS NULL OR left_step < right_step, 'left', 'right')
             THEN format('{} merged first by its row, and not by its states', merged_first)
@@ -198,7 +198,7 @@ FROM (
 GROUP BY model_requested, model_served
 """
 
-# The spec holds the body of a request with an empty prompt.
+# The spec holds the body of a request with an empty prompt: with the prompt cut out they are equal.
 REQUESTS = """
 WITH asked AS (
     SELECT trial_id, spec_hash, side, decision, request::VARCHAR AS request,

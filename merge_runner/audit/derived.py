@@ -1,8 +1,8 @@
-"""What is stored, derived anew: each reply is read, and each trial driven by it, once more.
+"""Everything stored, derived anew: each reply is read again, and each trial is driven by it again.
 
-This tells what was changed after it was stored. It takes the program's own drivers, formats and
-world for it. Whether these are right is asked by the other checks, which share little with them:
-how a reply is read, a driver's pace, the track and what a collision is.
+This shows what was changed after it was stored. It uses the program's own drivers, formats and
+world; whether these are right is left to the other checks, which share little with them: how a
+reply is read, a driver's pace, the track and what a collision is.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from merge_runner.results.comparison import (
     in_batches,
     stored_rows,
 )
-from merge_runner.results.rows import decision_rows, state_rows, trial_row
+from merge_runner.results.rows import rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.registry import SCENARIOS
 from merge_runner.trial import play_trial
@@ -59,8 +59,8 @@ from merge_runner.trial import play_trial
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
 SHOWN = 60
-# The columns that neither a reply nor a spec tells: docs/reference/audit.md says why. A cache tells
-# those of ``calls`` but ``cached``.
+# The columns that follow from neither a reply nor a spec; docs/reference/audit.md says why. A
+# cache has those of ``calls``, except ``cached``.
 NOT_DERIVED = (
     "calls.cached",
     "calls.started_at",
@@ -73,14 +73,14 @@ NOT_DERIVED = (
     "sweeps.versions",
 )
 CALLS = f"trial_id, spec_hash, {', '.join(COLUMNS)}, sha256(request::VARCHAR) AS asked"
-# What a reader is told could not be derived.
+# What could not be derived, in a reader's words.
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
 NOT_INSTALLED = "anything, since their condition or their scenario is not installed"
 OTHER_PROGRAM = "the decisions of a program that is not as it was"
 
 
-class _NotStored(Exception):  # what happened, and no error of the program
+class _NotStored(Exception):  # the name says what was found: it is no error of the program
     """What a decision would be derived from is not stored."""
 
 
@@ -88,8 +88,7 @@ class _NotStored(Exception):  # what happened, and no error of the program
 class _Trial:
     """A trial as it is stored.
 
-    ``scripted`` says that the sweep asks the emulator. Its prompts are not derived unless
-    ``prompts``.
+    ``scripted`` says that the sweep asks the emulator, ``prompts`` that its prompts are derived.
     """
 
     key: TrialKey
@@ -154,7 +153,7 @@ class _Trial:
 
 @dataclass(frozen=True, slots=True)
 class _AsStored:
-    """Drives the stored plans of a side."""
+    """A driver that repeats the stored decisions of a side."""
 
     plans: Mapping[tuple[str, int], Decision]
     seat: Seat
@@ -186,13 +185,14 @@ def check_derived(
     ]
     audited = connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall()
     batches = in_batches(connection, audited, PLACES, partial(_tables, connection))
-    with ThreadPoolExecutor(max_workers=1) as thread:  # a loop of its own: one may run here
+    # An event loop may run in the caller's thread, where no other one can.
+    with ThreadPoolExecutor(max_workers=1) as thread:
         for tables in batches:
             trials = list(_trials(tables, specs, config, left_out))
             records = thread.submit(asyncio.run, _all_played(trials)).result()
             for trial, record in zip(trials, records, strict=True):
                 audit.findings += _findings(trial, record, tables)
-                trial.drivers.clear()  # which know it: else its replies stay until a collection
+                trial.drivers.clear()  # they refer to it, so that its replies would stay in memory
             played += len(trials)
     audit.counts["derived anew"] = played
     audit.notes += [f"not derived anew in {n} trials: {what}" for what, n in left_out.items()]
@@ -220,7 +220,7 @@ def _trials(
     config: SweepConfig,
     left_out: Counter[str],
 ) -> Iterator[_Trial]:
-    """The trials that can be derived; what is left out is counted, or told by other checks."""
+    """The trials that can be derived; the others are counted, or reported by other checks."""
     wires = _wires(config)
     for key in tables["trials"].rows:
         spec = specs.get(key[1])
@@ -263,7 +263,7 @@ def _wires(config: SweepConfig) -> dict[str, WireFormat]:
 
 
 def _decided(row: Mapping[str, Any]) -> Decision:
-    """What a program is stored to have decided."""
+    """The stored decision of a program."""
     return Decision(
         row["plan"], tuple(row["applied"]), failure=row["failure"], fallback=row["fallback"]
     )
@@ -272,7 +272,7 @@ def _decided(row: Mapping[str, Any]) -> Decision:
 def _seat(trial: _Trial, spec: Spec, paces: Mapping[Side, Pace]) -> set[str]:
     """Give the trial its drivers; returns what of it cannot be derived.
 
-    A program that is not registered here, or another one by now, drives as it is stored.
+    A program that is not registered here, or has changed since, repeats its stored decisions.
     """
     variant, blocks = trial.row["variant"], spec.content.get("prompt_blocks")
     trial.prompts = not blocks or (variant in VARIANTS and block_digests(variant) == blocks)
@@ -314,14 +314,10 @@ def _findings(
     ignored = set() if trial.prompts else {"prompt", "prompt_hash"}
     if record.status == "failed":
         ignored.add("error")  # the reason, in words
-    for table, rows in (
-        ("trials", [trial_row(record)]),
-        ("states", state_rows(record)),
-        ("decisions", decision_rows(record)),
-        ("calls", [attempt.derived for attempt in trial.attempts]),
-    ):
-        for difference in tables[table].differences(
-            trial.key, rows, ignored=ignored, tolerance=TOLERANCE
+    wanted = {**rows_of(record), "calls": [attempt.derived for attempt in trial.attempts]}
+    for table, stored in tables.items():
+        for difference in stored.differences(
+            trial.key, wanted[table], ignored=ignored, tolerance=TOLERANCE
         ):
             yield _finding(trial.key[0], difference)
 

@@ -19,7 +19,7 @@ from merge_runner.scenarios.merge.geometry import Track, track_of
 
 
 class _Facts(BaseModel):
-    """Read leniently: an older or newer program may have written more."""
+    """Read leniently: another version of the program may have written more members."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -49,7 +49,7 @@ class SweepConfig(_Facts):
 
     @property
     def sides(self) -> dict[str, str]:
-        """Side to the name of its driver; read here on its own, so that the plan is audited too."""
+        """Side to the name of its driver; without the plan's code, so that this is audited too."""
         left, _, right = self.model.partition("+")
         return {"left": left, "right": right or left}
 
@@ -132,7 +132,7 @@ class Spec:
         return "endpoint" in self.driver(side)
 
     def between_body_and_slot(self, side: str) -> str | None:
-        """That part of the text of its keys; None where it is not known."""
+        """That part of the text of which a call's key is the hash; None where it is not known."""
         driver = self.driver(side)
         endpoint, path, headers = (driver.get(name) for name in ("endpoint", "path", "headers"))
         if not isinstance(headers, dict):
@@ -142,7 +142,7 @@ class Spec:
         return between_body_and_slot(endpoint, path, tuple(headers.items()))
 
     def disagreements(self, config: SweepConfig, variant: str) -> Iterator[str]:
-        """In what the spec of a variant is another than the sweep's configuration says."""
+        """In what the spec of a variant disagrees with the sweep's configuration."""
         if self.content.get("scenario") != config.scenario:
             yield "scenario"
         if self.content.get("sample_set") != config.sample_set:

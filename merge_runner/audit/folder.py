@@ -49,7 +49,7 @@ def _attempts(
 
 
 def _problem(cache: ResponseCache, row: dict[str, Any]) -> str | None:
-    """In what the cache has an attempt otherwise."""
+    """In what the cache disagrees with a row; None if in nothing."""
     key, number, cached = row["call_key"], row["attempt"], row["cached"]
     place = (row["trial_id"], row["spec_hash"], row["side"], row["decision"])
     try:
@@ -73,7 +73,7 @@ def _problem(cache: ResponseCache, row: dict[str, Any]) -> str | None:
 
 
 def _asked(row: dict[str, Any]) -> ChatRequest:
-    """The request of a row, of whose call the cache holds attempts alone."""
+    """The request of a row whose call has attempts in the cache, but no answer."""
     return ChatRequest(
         key=row["call_key"],
         provider=row["provider"],

@@ -1,4 +1,4 @@
-"""What the ids that providers give their replies say of whether an answer was given twice."""
+"""Whether an answer was given twice, by the ids that providers give their replies."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import duckdb
 
 from merge_runner.results.database import append, fetched
 
-# Earlier emulators gave every reply the same id: those of a stand-in tell nothing. The present
-# ones give each reply its own, and are audited like any provider.
+# Earlier emulators gave every reply one of these ids, which therefore tell nothing. The present one
+# gives each reply its own, and is audited like any provider.
 CONSTANT_IDS = ("chatcmpl-emulated", "resp_emulated", "msg_emulated", "emulated")
-# Where our own formats have the answer; what stands beside it, as a time, may change in a copy.
+# Where our own formats have the answer; what is beside it, such as a time, may differ in a copy.
 ANSWERS = ("choices", "output", "candidates", "content")
 REPLIES = "SELECT rowid, reply::VARCHAR, provider FROM calls WHERE http_status = 200"
-# An id is one within the endpoint that gave it: two emulators answer the same question with the
-# same.
+# Ids are compared within an endpoint: two emulators give equal questions equal ids.
 REPLY_IDS = """
 CREATE OR REPLACE TEMP TABLE reply_ids AS
 SELECT trial_id, spec_hash, side, decision, call_key, model_requested,
@@ -53,7 +52,7 @@ def identified(reply: str, provider: str | None) -> tuple[str, str] | None:
     found = body.get("id") or body.get("responseId")
     if not isinstance(found, str) or (provider == "emulator" and found in CONSTANT_IDS):
         return None
-    # Of another format all counts, or any two of its answers would be alike.
+    # In an unknown format everything counts: else any two of its answers would be equal.
     known = any(name in body for name in ANSWERS)
     answer = json.dumps([body.get(name) for name in ANSWERS] if known else body)
     return found, hashlib.blake2b(answer.encode(), digest_size=16).hexdigest()
@@ -75,7 +74,7 @@ def find_ids(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def meaningless_ids(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
-    """Notes of the servers whose ids are no proof."""
+    """Notes on the servers whose ids prove nothing."""
     for model, endpoint, count in connection.execute(MEANINGLESS).fetchall():
         yield (
             f"{count} replies of {model} at {endpoint or 'its endpoint'} have an id that the "

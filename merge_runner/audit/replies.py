@@ -12,7 +12,7 @@ from merge_runner.results.database import fetched
 
 SHOWN = 3
 
-# A place, a hash, and the parts of the text that has it; that of a key is in llm/keys.py.
+# A place, a hash, and the parts of the text that should have it; see llm/keys.py for that of a key.
 KEYS = """
 SELECT trial_id, side, decision, call_key, '{"body":', request::VARCHAR,
     ',' || between_body_and_slot || '{"condition":' || to_json(condition)::VARCHAR
@@ -110,7 +110,7 @@ def check_hashes(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
 def _hashed_otherwise(
     connection: duckdb.DuckDBPyConnection, sql: str
 ) -> list[tuple[str, str, int, bool]]:
-    """The places where a text has not its hash, and whether all of the text is there.
+    """The places where a text does not have its hash, and whether none of its parts is missing.
 
     Python hashes several times as fast as the database.
     """
@@ -143,7 +143,7 @@ def _shared(connection: duckdb.DuckDBPyConnection, sql: str, text: str) -> Itera
 
 
 def calls_in_common(connection: duckdb.DuckDBPyConnection) -> Iterator[Sharing]:
-    """The calls that are those of several specs, since the requests were identical."""
+    """The calls that several specs share, since their requests were identical."""
     for first, first_spec, second, second_spec, count in connection.execute(IN_COMMON).fetchall():
         if first == second:
             first, second = f"{first} ({first_spec})", f"{second} ({second_spec})"  # noqa: PLW2901 # one name for two specs

@@ -118,7 +118,7 @@ def _missing(
     seen: Mapping[str, str],
     audit: Audit,
 ) -> list[str]:
-    """The trials that no sweep has played: what stops is gone on with by another one."""
+    """The trials that no sweep has played: another one may have gone on where this one stopped."""
     missing = [name for name in config.trials if name not in seen]
     if not missing:
         return missing

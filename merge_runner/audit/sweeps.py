@@ -61,7 +61,7 @@ SELECT * FROM
     (SELECT count(DISTINCT reply_id) AS "reply ids"
     FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash))
 """
-# What a sweep did not play, since earlier ones had.
+# The trials that a sweep did not play, since earlier ones had.
 TAKEN_OVER = """
 SELECT b.sweep_id, count(*)
 FROM (SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?)
@@ -70,7 +70,7 @@ JOIN sweeps ON sweeps.sweep_id = b.sweep_id
     AND started_at < (SELECT started_at FROM sweeps WHERE sweep_id = ?)
 GROUP BY ALL ORDER BY ALL
 """
-# What belongs to nothing: a table's name, the trial, and how many rows.
+# Rows that belong to nothing: the table, the trial, and how many they are.
 LOOSE = """
 SELECT 'trials', trial_id, count(*) FROM trials
 ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human' GROUP BY ALL
@@ -280,7 +280,7 @@ def _taken_over(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> Iterabl
 
 
 def _checked_elsewhere(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> Iterable[str]:
-    """That later sweeps have its trials too, under which they are counted and checked."""
+    """A note that later sweeps have its trials too, with which they are counted and checked."""
     (count,) = connection.execute(
         "SELECT count(*) FROM sweep_trials SEMI JOIN done USING (trial_id, spec_hash) "
         "WHERE sweep_id = ?",
@@ -291,7 +291,7 @@ def _checked_elsewhere(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> 
 
 
 def _alike_notes(connection: duckdb.DuckDBPyConnection) -> Iterable[str]:
-    """What is no sample; the emulator has a few phrases."""
+    """A note on answers that may be no samples; the emulator's are not: it has a few phrases."""
     scripted = _counts(connection, "SELECT count(*) AS trials FROM audited WHERE scripted")
     if (repeated := answers_alike(connection)) and not scripted["trials"]:
         yield (

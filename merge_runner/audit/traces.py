@@ -43,7 +43,7 @@ ORDER BY ALL
 
 
 def reach_m(scenario: ScenarioConfig) -> float:
-    """A distance of the centres from which on no rule sees a collision, with room for rounding."""
+    """The distance of the centres beyond which no rule sees a collision, with room for rounding."""
     return hypot(scenario.vehicle_length_m, scenario.vehicle_width_m) + TOLERANCE_M
 
 

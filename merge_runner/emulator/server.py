@@ -108,7 +108,7 @@ class Emulator:
         return web.Response(body=sent, content_type="application/json")
 
     def _attempt(self, request: web.Request, where: str) -> int:
-        """The attempt's number: the client's own count, else how often this was asked."""
+        """The attempt's number: the client's own count, or else how often this was asked."""
         told = request.headers.get(ATTEMPT_HEADER, "")
         self._asked[where] += 1
         return int(told) if re.fullmatch("[0-9]{1,6}", told) else self._asked[where]
@@ -132,9 +132,9 @@ class Emulator:
 
 
 async def _say_scripted(request: web.Request, response: web.StreamResponse) -> None:
-    """Every response says that a stand-in made it, even one that refuses or is not JSON.
+    """Every response says that a stand-in made it, even an error or one that is not JSON.
 
-    And which request it answers, as many gateways do.
+    It repeats the id of its request, as many gateways do.
     """
     response.headers[SCRIPTED_HEADER] = "true"
     if ID_HEADER in request.headers:

@@ -171,10 +171,11 @@ def in_batches(
 ) -> Iterator[Read]:
     """What ``read`` makes of some trials at a time, given where the rows of each table lie.
 
-    Few enough at a time to fit into the database's memory.
+    Where they do not fit into the database's memory, fewer are read at a time.
     """
     where = {table: _spans(connection, table) for table in tables}
     nowhere = (0, -1)
+    # In the order in which they are stored, so that a batch is one stretch of each table.
     ordered = sorted(keys, key=lambda key: [spans.get(key, nowhere) for spans in where.values()])
     first, size = 0, BATCH
     while batch := ordered[first : first + size]:

@@ -31,8 +31,9 @@ PATIENCE_S = 60.0
 LOGS = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
 """How the names of a database's own files go on."""
 ROWS_AT_ONCE, COPIED_AT_ONCE = 100, 2_048
-# What a file takes for each call where replies are short, compressed and with its share of states;
-# and how much more than that is little enough to be merged, and to be read as if they were short.
+# The size of a file for each of its calls where replies are short, compressed and with its share of
+# the states; and up to how much more its row groups are merged, and its texts are read without more
+# memory.
 BYTES_OF_A_CALL, MERGED_BYTES, SHORT_BYTES = 3_000, 2**26, 2**23
 LOG = logging.getLogger(__name__)
 Settings = dict[str, str | bool | int | float | list[str]]
@@ -85,8 +86,8 @@ class Instance:
     Making one takes longer than most of what is done with it, so there is one for everything.
     After an error it may be unusable, and a new one is made.
 
-    Where it does not ``confine`` those who read, they do so themselves; else they reach the file
-    that they read, and those in the folder ``also``.
+    A connection for reading reaches the file that it reads and those in the folder ``also``, and
+    nothing else; where the instance does not ``confine`` it, whoever opens it must.
     """
 
     def __init__(
@@ -160,7 +161,7 @@ def _detach(connection: duckdb.DuckDBPyConnection, name: str, instance: Instance
     try:
         connection.execute(f"USE memory; DETACH {name}")
     except duckdb.Error as exc:
-        # What was committed lies in the log beside the file; there is no room to move it over.
+        # As on a full disk: what was committed stays in the log beside the file, and is not lost.
         LOG.warning("the database was not closed in order: %s", first_line(exc))
         instance.drop()
 
@@ -220,7 +221,7 @@ def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
 
 
 def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
-    """By how much the open file is larger than it would be with short replies."""
+    """How much larger the open file is than it would be with short replies."""
     row = connection.execute(
         "SELECT path, estimated_size FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
@@ -380,7 +381,7 @@ def migrate(path: Path) -> None:
     as ``NAME.v1.duckdb``. Raises UsageError where that is not possible.
     """
     path = path.resolve()
-    copy = path.with_name(f"{path.name}.migrating")
+    copy = path.with_name(f"{path.name}.migrating")  # on the same disk, so that it can be renamed
     try:
         # Opened for writing, so that nobody else writes while it is copied.
         with open_database(path, read_only=False, patience_s=PATIENCE_S) as connection:

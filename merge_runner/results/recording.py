@@ -35,7 +35,7 @@ from merge_runner.results.database import Settings, append, in_memory
 from merge_runner.text_safety import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 2"
-# Its hash does not cover where the recording comes from.
+# The hash of such a file does not cover what it says of its origin.
 FIRST_FORMAT = "merge-runner recording 1"
 UNCOVERED = (
     "it was exported by an earlier version: its hash does not cover what it says of where it comes "
@@ -126,7 +126,7 @@ def _write_parts(
     folder: Path, file: Path, entries: Iterable[Entry | None], provenance: dict[str, str]
 ) -> None:
     """Write the entries part by part into the folder, and all of them as the file."""
-    partial = file.with_name(file.name + ".partial")
+    partial = file.with_name(file.name + ".partial")  # no reader sees half a file
     content, calls, size = hashlib.sha256(), 0, 0
     with in_memory(READING) as connection:
         columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
@@ -265,7 +265,10 @@ class Spilled(Mapping[str, Entry]):
 
 
 def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
-    """Verify the whole file, then add what the cache lacks; returns (added, already there)."""
+    """Verify the whole file, then add what the cache lacks; returns (added, already there).
+
+    Reading it twice keeps nothing of a file that proves damaged at its end.
+    """
     for _ in read_recording(file):
         pass
     added = there = 0
