@@ -38,17 +38,14 @@ NO_CONFIG = "it does not say of what sweep it is: trials are not compared"
 # the place of a spec's hash: a recording does not say which prompt variant it was made for.
 TABLES = """
 CREATE TABLE calls (trial_id VARCHAR, spec_hash VARCHAR, side VARCHAR, decision BIGINT,
-    call_key VARCHAR, request VARCHAR, model_requested VARCHAR, attempt BIGINT, http_status INTEGER,
-    model_served VARCHAR, outcome VARCHAR);
-CREATE TABLE reply_ids (trial_id VARCHAR, spec_hash VARCHAR, side VARCHAR, decision BIGINT,
-    call_key VARCHAR, model_requested VARCHAR, endpoint VARCHAR, reply_id VARCHAR,
-    content VARCHAR);
+    call_key VARCHAR, request VARCHAR, endpoint VARCHAR, model_requested VARCHAR, attempt BIGINT,
+    http_status INTEGER, model_served VARCHAR, outcome VARCHAR, reply_id VARCHAR, content VARCHAR);
+CREATE VIEW reply_ids AS FROM calls WHERE reply_id IS NOT NULL;
+CREATE VIEW audited AS SELECT DISTINCT trial_id, spec_hash FROM calls;
 CREATE TABLE sweeps (config JSON);
-CREATE TABLE audited (trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE done (trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 """
-AUDITED = "INSERT INTO audited SELECT DISTINCT trial_id, spec_hash FROM calls"
 COUNTS = """
 SELECT 'calls', count(DISTINCT call_key) FROM calls
 UNION ALL SELECT 'attempts', count(*) FROM calls
@@ -88,7 +85,6 @@ def audit_recording(file: Path) -> Audit:
             entries = read_recording(file)
             while some := list(islice(entries, BATCH)):
                 append(connection, "calls", chain.from_iterable(map(_calls, some)))
-                append(connection, "reply_ids", chain.from_iterable(map(_reply_ids, some)))
                 audit.findings += chain.from_iterable(map(_exchanged, some))
                 for entry in some:
                     drives[_drive(entry)][entry.request.slot.decision] += 1
@@ -97,7 +93,6 @@ def audit_recording(file: Path) -> Audit:
         config = _config(provenance)
         if config is not None:
             append(connection, "sweeps", [(provenance["config"],)])
-        connection.execute(AUDITED)
         connection.execute(REPEATED_IDS)
         append(connection, "other_models", other_models(connection))
         audit.counts = dict(connection.execute(COUNTS).fetchall())
@@ -133,21 +128,12 @@ def _calls(entry: Entry) -> Iterator[Row]:
     """Rows of ``calls``, without the texts: all attempts at a call have its one request."""
     request = entry.request
     trial, side, decision = _place(request.slot)
-    call = (trial, request.key, side, decision, request.key, "", request.model)
+    call = (trial, request.key, side, decision, request.key, "", request.endpoint, request.model)
     for attempt in entry.attempts:
         told = (attempt.number, attempt.http_status, attempt.model_served, attempt.outcome)
-        yield (*call, *told)
-
-
-def _reply_ids(entry: Entry) -> Iterator[Row]:
-    """Rows of ``reply_ids``."""
-    request = entry.request
-    trial, side, decision = _place(request.slot)
-    call = (trial, request.key, side, decision, request.key, request.model, request.endpoint)
-    for attempt in entry.attempts:
-        if attempt.http_status == 200:
-            told = identified(attempt.reply or "", request.provider)
-            yield from [(*call, *told)] if told else []
+        answered = attempt.http_status == 200
+        found = identified(attempt.reply or "", request.provider) if answered else None
+        yield (*call, *told, *(found or (None, None)))
 
 
 def _exchanged(entry: Entry) -> Iterator[Finding]:
@@ -186,13 +172,16 @@ def _numbering(drives: Drives, config: SweepConfig | None) -> Iterator[Finding]:
             if config
             else numbers[min(numbers)]
         )
-        first = min(numbers) if late else 0
-        for number in range(first, max(numbers) + 1):
-            if numbers[number] == 0:
-                yield _misnumbered(drive, number, "nothing is recorded, though of later ones")
-            elif numbers[number] > variants:
+        before = min(numbers) - 1 if late else -1
+        for number in sorted(numbers):
+            if number > before + 1:
+                # One finding for each hole: the numbers of a foreign file may be of any size.
+                text = f"nothing is recorded, though of later ones: the next is {number}"
+                yield Finding("numbering", text, None, drive.trial, drive.side, before + 1)
+            if numbers[number] > variants:
                 text = f"{numbers[number]} requests are recorded, for {variants} prompt variants"
-                yield _misnumbered(drive, number, text)
+                yield Finding("numbering", text, None, drive.trial, drive.side, number)
+            before = number
 
 
 def _ended(provenance: dict[str, str]) -> bool:
@@ -212,7 +201,3 @@ def _missing(drives: Drives, config: SweepConfig | None, *, ended: bool) -> Iter
         for side in asked:
             if (trial, side) not in recorded:
                 yield Finding("missing", "nothing is recorded", trial=trial, side=side)
-
-
-def _misnumbered(drive: Drive, decision: int, text: str) -> Finding:
-    return Finding("numbering", text, trial=drive.trial, side=drive.side, decision=decision)

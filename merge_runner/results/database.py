@@ -422,13 +422,9 @@ def _discard(copy: Path) -> None:
 
 def _free_name(path: Path, version: int) -> Path:
     """A free name for the old file, so that it never replaces another one."""
-    names = (f"{path.stem}.v{version}{number}{path.suffix}" for number in _numbers())
+    numbers = itertools.chain([""], (f"-{number}" for number in itertools.count(2)))
+    names = (f"{path.stem}.v{version}{number}{path.suffix}" for number in numbers)
     return next(kept for kept in map(path.with_name, names) if not kept.exists())
-
-
-def _numbers() -> Iterator[str]:
-    yield ""
-    yield from (f"-{number}" for number in itertools.count(2))
 
 
 def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
