@@ -3,8 +3,8 @@
 They read the tables of a database, or of calls alone those that recordings.py makes, and the
 temporary ones that sweeps.py makes: ``audited`` (the trials), ``rules`` (numbers of a spec's
 scenario and track), ``paces`` (when the driver of a spec's side decides), ``drivers`` (per spec and
-side the endpoint and the body of an empty request, NULL for a program), ``entries`` (the models of
-the sweep) and ``other_models`` (who answered in place of whom).
+side the endpoint and the body of an empty request, NULL for a program), ``sweep_models`` (what a
+sweep calls its models) and ``other_models`` (who answered in place of whom).
 """
 
 from __future__ import annotations
@@ -122,6 +122,7 @@ WITH numbered AS (
 SELECT trial_id, side, decision, text FROM judged WHERE text IS NOT NULL
 """
 
+# A trial that failed ended in the middle of a decision, which may have attempts and no row.
 CALLS = """
 WITH called AS (
     SELECT trial_id, spec_hash, side, decision, call_key, max_by(outcome, attempt) AS outcome
@@ -178,11 +179,11 @@ SELECT trial_id, side, decision, text FROM judged WHERE text IS NOT NULL
 MODELS = """
 SELECT trial_id, side, min(decision), format(
     '{} attempts asked for {} of {}, the sweep names {} of {}',
-    count(*), model_requested, calls.provider, id, entries.provider)
+    count(*), model_requested, calls.provider, id, sweep_models.provider)
 FROM calls JOIN audited USING (trial_id, spec_hash)
-JOIN entries ON name = if(side = 'left', model_left, model_right)
-WHERE model_requested IS DISTINCT FROM id OR calls.provider IS DISTINCT FROM entries.provider
-GROUP BY trial_id, side, model_requested, calls.provider, id, entries.provider
+JOIN sweep_models ON name = if(side = 'left', model_left, model_right)
+WHERE model_requested IS DISTINCT FROM id OR calls.provider IS DISTINCT FROM sweep_models.provider
+GROUP BY trial_id, side, model_requested, calls.provider, id, sweep_models.provider
 """
 
 # One finding for each pair of models, at its first answer.

@@ -135,6 +135,7 @@ class _Trial:
         """A language model that gives the stored replies."""
         ordered = sorted(self.attempts, key=lambda attempt: attempt.row["attempt"])
         last = {(a.row["side"], a.row["decision"]): a for a in ordered}
+        failed = self.row["status"] == "failed"  # a driver that knew the trial would keep it alive
 
         async def ask(_: str, slot: Slot, __: TrialSpec) -> ChatReply:
             answer = last.get((slot.side, slot.decision))
@@ -142,7 +143,7 @@ class _Trial:
             request = ChatRequest(key, "", "", "", "", {}, "", slot)
             if answer is not None and answer.text is not None:
                 return ChatReply(answer.text, answer.wanted["outcome"], request, (), 0)
-            if self.row["status"] == "failed":
+            if failed:
                 raise CallFailed("no answer", request)
             raise _NotStored(
                 f"the reply to decision {slot.decision} on the {slot.side} is not stored"
@@ -192,7 +193,6 @@ def check_derived(
             records = thread.submit(asyncio.run, _all_played(trials)).result()
             for trial, record in zip(trials, records, strict=True):
                 audit.findings += _findings(trial, record, tables)
-                trial.drivers.clear()  # they refer to it, so that its replies would stay in memory
             played += len(trials)
     audit.counts["derived anew"] = played
     audit.notes += [f"not derived anew in {n} trials: {what}" for what, n in left_out.items()]

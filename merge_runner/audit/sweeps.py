@@ -41,7 +41,7 @@ CREATE OR REPLACE TEMP TABLE paces (spec_hash VARCHAR, side VARCHAR, interval_st
 CREATE OR REPLACE TEMP TABLE drivers (spec_hash VARCHAR, side VARCHAR, endpoint VARCHAR,
     body VARCHAR, between_body_and_slot VARCHAR);
 CREATE OR REPLACE TEMP TABLE done AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
-CREATE OR REPLACE TEMP TABLE entries (name VARCHAR, id VARCHAR, provider VARCHAR);
+CREATE OR REPLACE TEMP TABLE sweep_models (name VARCHAR, id VARCHAR, provider VARCHAR);
 CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 """
 AUDITED = """
@@ -152,8 +152,8 @@ def _audit(
     if config is not None:
         check_slots(connection, config, specs, audit, finished=finished)
     models = config.models if config else {}
-    connection.execute("DELETE FROM entries")
-    append(connection, "entries", [(name, m.id, m.provider) for name, m in models.items()])
+    connection.execute("DELETE FROM sweep_models")
+    append(connection, "sweep_models", [(name, m.id, m.provider) for name, m in models.items()])
     audit.counts |= _counts(connection, COUNTS)
     audit.findings += run_checks(connection)
     audit.findings += check_traces(connection, specs)

@@ -85,7 +85,10 @@ def _collision(
 def _gap_m(
     before_m: Sequence[float], after_m: Sequence[float], scenario: ScenarioConfig, track: Track
 ) -> float:
-    """The net gap at the first arrival at the merge point, linear within the step."""
+    """The net gap at the first arrival at the merge point (arXiv 2604.09609, Table IV).
+
+    Positions are linear within the step.
+    """
     steps = list(zip(before_m, after_m, strict=True))
     shares = ((track.merge_point_m - a) / (b - a) for a, b in steps if b >= track.merge_point_m)
     share = min(shares, default=nan)  # DuckDB takes what is no number for the largest

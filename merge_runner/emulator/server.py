@@ -117,18 +117,19 @@ class Emulator:
         """Say nothing for long, or cut the connection before or within the reply."""
         if fault == "hang":
             await asyncio.sleep(self._faults.hang_s)
-        elif fault == "reset" and request.transport is not None:
-            connection = request.transport.get_extra_info("socket")
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_AT_CLOSE)
-        elif fault == "truncated_body" and request.transport is not None:
-            request.transport.write(
+        transport = request.transport  # None once the client has gone
+        if transport is not None and fault == "truncated_body":
+            transport.write(
                 b"HTTP/1.1 200 OK\r\ncontent-type: application/json\r\n"
                 b'%s: true\r\ncontent-length: 5000\r\n\r\n{"id": "cut' % SCRIPTED_HEADER.encode()
             )
-            request.transport.close()
-        if request.transport is not None and fault != "truncated_body":
-            request.transport.abort()
-        return web.Response(status=500)
+            transport.close()
+        elif transport is not None:
+            if fault == "reset":
+                connection = transport.get_extra_info("socket")
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_AT_CLOSE)
+            transport.abort()
+        return web.Response(status=500)  # which nobody gets: the connection has ended
 
 
 async def _say_scripted(request: web.Request, response: web.StreamResponse) -> None:

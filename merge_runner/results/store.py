@@ -264,7 +264,10 @@ def results_digest(path: Path) -> tuple[str, int]:
 def _by_trial(
     connection: duckdb.DuckDBPyConnection, columns: str, table: str
 ) -> Iterator[tuple[TrialKey, list[list[Any]]]]:
-    """The rows of each trial once it is complete: they lie together, and are too many to sort."""
+    """The rows of each trial as soon as all of them are read.
+
+    They lie together in the table, which is too large to be sorted.
+    """
     counts = {
         (trial_id, spec_hash): count
         for trial_id, spec_hash, count in connection.execute(
