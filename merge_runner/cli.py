@@ -428,14 +428,14 @@ def recording_export(
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.results import signing
     from merge_runner.results.recording import export_recording
-    from merge_runner.results.store import sweep_row, used_call_keys
+    from merge_runner.results.store import recorded_sweep
 
     if sign is not None:
         signing.tool_for(sign)
-    found, keys = used_call_keys(db, sweep_id)
+    row, keys = recorded_sweep(db, sweep_id)
+    found = row["sweep_id"]
     if not keys:
         raise UsageError(f"the sweep {found} made no call: there is nothing to record")
-    row = sweep_row(db, found)
     provenance = {name: str(value) for name, value in row.items() if value is not None}
     calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance)
     say(f"{calls} calls of {found} are in {file}")

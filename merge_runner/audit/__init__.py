@@ -1,4 +1,4 @@
-"""Whether what is stored is what was asked, answered and driven, each sample once."""
+"""Checks that what is stored is what was asked, answered and driven, and each sample only once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a stored attempt says, read anew from its reply."""
+"""What a stored attempt says, read again from its reply."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from merge_runner.llm.http_outcome import RawReply, judge
 from merge_runner.records import ANSWERED_FIELD, ANSWERS, says_scripted
 from merge_runner.results.rows import Row
 
-# A row of ``calls`` as it is read here; ``READ`` of it is what its reply tells.
+# The columns of ``calls`` that are read here: where an attempt stands, and what its reply says.
 PLACE = ("decision", "side", "attempt")
 READ = (
     "outcome",
@@ -30,7 +30,7 @@ COLUMNS = (*PLACE, *READ, "call_key", "provider", "http_status", "reply")
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """An attempt: what its row should hold, and the text that was answered, None without one."""
+    """An attempt: its row, what that should hold, and the text of its answer, None without one."""
 
     row: dict[str, Any]
     wanted: dict[str, Any]
@@ -46,8 +46,8 @@ class Answer:
 def read_answer(row: dict[str, Any], wire: WireFormat) -> Answer:
     """Read the reply of a row.
 
-    An attempt that failed stays as it is, since its name rests on headers that are not stored;
-    also of an answer the header alone may have said that a stand-in made it.
+    A failed attempt is taken as it is stored: its outcome depends on headers, which are not. The
+    mark of a stand-in may have been a header too, so that a stored ``scripted`` is believed.
     """
     raw = RawReply(row["http_status"] or 0, {}, _body(row["reply"]))
     told = {"scripted": row["scripted"] or row["provider"] == "emulator" or says_scripted(raw.body)}
@@ -64,9 +64,9 @@ def read_answer(row: dict[str, Any], wire: WireFormat) -> Answer:
 
 
 def answers_another(payload: object, body_sha256: str, slot: Mapping[str, Any]) -> bool:
-    """Whether a reply says that it is the answer to another request, as the emulator's tell.
+    """Whether a reply says that it answers another request, as only the emulator's can.
 
-    A slot stands there only if the server was told one.
+    It names a slot only if the client sent one.
     """
     told = payload.get(ANSWERED_FIELD) if isinstance(payload, dict) else None
     if not isinstance(told, dict):
@@ -86,7 +86,7 @@ def _told(reading: Reading) -> dict[str, Any]:
 
 
 def _body(reply: str | None) -> str:
-    """The body as it came: what the table would not take as JSON lies there as a JSON string."""
+    """The body as it came; what the table could not take as JSON is stored as a JSON string."""
     if reply is None or not reply.startswith('"'):
         return reply or ""
     try:

@@ -1,26 +1,21 @@
 """What must hold of every trial, as queries for what does not: trial_id, side, decision, text.
 
-They read the tables of a database and the temporary ones that sweeps.py makes: ``audited`` (the
-trials), ``rules`` (numbers of a spec's scenario and track), ``paces`` (when the driver of a spec's
-side decides), ``drivers`` (per spec and side the endpoint and the body of an empty request, NULL
-for a program), ``entries`` (the models of the sweep) and ``other_models`` (who answered in place
-of whom).
+They read the tables of a database, or of calls alone those that recordings.py makes, and the
+temporary ones that sweeps.py makes: ``audited`` (the trials), ``rules`` (numbers of a spec's
+scenario and track), ``paces`` (when the driver of a spec's side decides), ``drivers`` (per spec and
+side the endpoint and the body of an empty request, NULL for a program), ``sweep_models`` (what a
+sweep calls its models) and ``other_models`` (who answered in place of whom).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 
+import duckdb
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """A query whose rows are findings of a kind."""
+from merge_runner.audit.findings import Finding
 
-    kind: str
-    sql: str
-
-
-# The numbers that a trial's rows repeat are those of its states.
+# What a trial's row repeats of its states agrees with them.
 OUTCOMES = """
 WITH driven AS (
     SELECT trial_id, spec_hash, max(step) AS last_step, count(*) AS samples,
@@ -48,7 +43,7 @@ WITH driven AS (
         WHEN left_step IS NULL AND right_step IS NULL THEN
             if(merged_first IS NULL, NULL, 'nobody merged, and it has a first merger')
         WHEN merged_first IS NULL THEN 'a vehicle merged, and it has no first merger'
-        -- Within one step the exact instants decide, which are not compared here.
+        -- Who was first within one step depends on exact instants, which are not derived here.
         WHEN left_step = right_step THEN NULL
         WHEN merged_first <> if(right_step IS NULL OR left_step < right_step, 'left', 'right')
             THEN format('{} merged first by its row, and not by its states', merged_first)
@@ -127,6 +122,7 @@ WITH numbered AS (
 SELECT trial_id, side, decision, text FROM judged WHERE text IS NOT NULL
 """
 
+# A trial that failed ended in the middle of a decision, which may have attempts and no row.
 CALLS = """
 WITH called AS (
     SELECT trial_id, spec_hash, side, decision, call_key, max_by(outcome, attempt) AS outcome
@@ -183,11 +179,11 @@ SELECT trial_id, side, decision, text FROM judged WHERE text IS NOT NULL
 MODELS = """
 SELECT trial_id, side, min(decision), format(
     '{} attempts asked for {} of {}, the sweep names {} of {}',
-    count(*), model_requested, calls.provider, id, entries.provider)
+    count(*), model_requested, calls.provider, id, sweep_models.provider)
 FROM calls JOIN audited USING (trial_id, spec_hash)
-JOIN entries ON name = if(side = 'left', model_left, model_right)
-WHERE model_requested IS DISTINCT FROM id OR calls.provider IS DISTINCT FROM entries.provider
-GROUP BY trial_id, side, model_requested, calls.provider, id, entries.provider
+JOIN sweep_models ON name = if(side = 'left', model_left, model_right)
+WHERE model_requested IS DISTINCT FROM id OR calls.provider IS DISTINCT FROM sweep_models.provider
+GROUP BY trial_id, side, model_requested, calls.provider, id, sweep_models.provider
 """
 
 # One finding for each pair of models, at its first answer.
@@ -203,7 +199,7 @@ FROM (
 GROUP BY model_requested, model_served
 """
 
-# The spec holds the body of a request with an empty prompt.
+# The spec holds the body of a request with an empty prompt: with the prompt cut out they are equal.
 REQUESTS = """
 WITH asked AS (
     SELECT trial_id, spec_hash, side, decision, request::VARCHAR AS request,
@@ -219,13 +215,24 @@ FROM asked JOIN drivers USING (spec_hash, side)
 WHERE replace(request, prompt, '""') IS DISTINCT FROM body
 """
 
-CHECKS = (
-    Check("outcome", OUTCOMES),
-    Check("numbering", NUMBERS),
-    Check("plan", PLANS),
-    Check("call", CALLS),
-    Check("attempt", ATTEMPTS),
-    Check("model", MODELS),
-    Check("served", SERVED),
-    Check("request", REQUESTS),
-)
+# Kind of finding to the query for it.
+CHECKS = {
+    "outcome": OUTCOMES,
+    "numbering": NUMBERS,
+    "plan": PLANS,
+    "call": CALLS,
+    "attempt": ATTEMPTS,
+    "model": MODELS,
+    "served": SERVED,
+    "request": REQUESTS,
+}
+
+
+def run_checks(
+    connection: duckdb.DuckDBPyConnection, kinds: Iterable[str] = tuple(CHECKS)
+) -> Iterator[Finding]:
+    """What these checks find."""
+    for kind in kinds:
+        rows = connection.execute(f"{CHECKS[kind]} ORDER BY ALL").fetchall()
+        for trial_id, side, decision, text in rows:
+            yield Finding(kind, text, trial=trial_id, side=side, decision=decision)

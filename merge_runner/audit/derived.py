@@ -1,8 +1,8 @@
-"""What is stored, derived anew: each reply is read, and each trial driven by it, once more.
+"""Everything stored, derived anew: each reply is read again, and each trial is driven by it again.
 
-This tells what was changed after it was stored. It takes the program's own drivers, formats and
-world for it. Whether these are right is asked by the other checks, which share little with them:
-how a reply is read, a driver's pace, the track and what a collision is.
+This shows what was changed after it was stored. It uses the program's own drivers, formats and
+world; whether these are right is left to the other checks, which share little with them: how a
+reply is read, a driver's pace, the track and what a collision is.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import duckdb
 
 from merge_runner.audit.answers import COLUMNS, Answer, answers_another, read_answer
 from merge_runner.audit.expected import Spec, SweepConfig
-from merge_runner.audit.findings import Finding
+from merge_runner.audit.findings import Audit, Finding
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver, MakeDriver, Seat, take_seat
 from merge_runner.drivers.language_model import LanguageModel
@@ -49,10 +49,9 @@ from merge_runner.results.comparison import (
     Stored,
     TrialKey,
     in_batches,
-    rows_of_trials,
     stored_rows,
 )
-from merge_runner.results.rows import decision_rows, state_rows, trial_row
+from merge_runner.results.rows import rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.registry import SCENARIOS
 from merge_runner.trial import play_trial
@@ -60,8 +59,8 @@ from merge_runner.trial import play_trial
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
 SHOWN = 60
-# The columns that neither a reply nor a spec tells: docs/reference/audit.md says why. A cache tells
-# those of ``calls`` but ``cached``.
+# The columns that follow from neither a reply nor a spec; docs/reference/audit.md says why. A
+# cache has those of ``calls``, except ``cached``.
 NOT_DERIVED = (
     "calls.cached",
     "calls.started_at",
@@ -73,29 +72,15 @@ NOT_DERIVED = (
     "sweeps.git_dirty",
     "sweeps.versions",
 )
-ASKED = "sha256(request::VARCHAR) AS asked"
-# What a reader is told could not be derived.
+CALLS = f"trial_id, spec_hash, {', '.join(COLUMNS)}, sha256(request::VARCHAR) AS asked"
+# What could not be derived, in a reader's words.
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
 NOT_INSTALLED = "anything, since their condition or their scenario is not installed"
 OTHER_PROGRAM = "the decisions of a program that is not as it was"
 
 
-@dataclass(slots=True)
-class Derived:
-    """What was found, in how many trials, and what of how many could not be derived."""
-
-    findings: list[Finding] = field(default_factory=list)
-    trials: int = 0
-    left_out: Counter[str] = field(default_factory=Counter)
-
-    @property
-    def notes(self) -> list[str]:
-        """What could not be derived, for a reader."""
-        return [f"not derived anew in {n} trials: {w}" for w, n in self.left_out.items() if n]
-
-
-class _NotStored(Exception):  # what happened, and no error of the program
+class _NotStored(Exception):  # the name says what was found: it is no error of the program
     """What a decision would be derived from is not stored."""
 
 
@@ -103,8 +88,7 @@ class _NotStored(Exception):  # what happened, and no error of the program
 class _Trial:
     """A trial as it is stored.
 
-    ``scripted`` says that the sweep asks the emulator. Its prompts are not derived unless
-    ``prompts``.
+    ``scripted`` says that the sweep asks the emulator, ``prompts`` that its prompts are derived.
     """
 
     key: TrialKey
@@ -151,6 +135,7 @@ class _Trial:
         """A language model that gives the stored replies."""
         ordered = sorted(self.attempts, key=lambda attempt: attempt.row["attempt"])
         last = {(a.row["side"], a.row["decision"]): a for a in ordered}
+        failed = self.row["status"] == "failed"  # a driver that knew the trial would keep it alive
 
         async def ask(_: str, slot: Slot, __: TrialSpec) -> ChatReply:
             answer = last.get((slot.side, slot.decision))
@@ -158,7 +143,7 @@ class _Trial:
             request = ChatRequest(key, "", "", "", "", {}, "", slot)
             if answer is not None and answer.text is not None:
                 return ChatReply(answer.text, answer.wanted["outcome"], request, (), 0)
-            if self.row["status"] == "failed":
+            if failed:
                 raise CallFailed("no answer", request)
             raise _NotStored(
                 f"the reply to decision {slot.decision} on the {slot.side} is not stored"
@@ -169,7 +154,7 @@ class _Trial:
 
 @dataclass(frozen=True, slots=True)
 class _AsStored:
-    """Drives the stored plans of a side."""
+    """A driver that repeats the stored decisions of a side."""
 
     plans: Mapping[tuple[str, int], Decision]
     seat: Seat
@@ -186,26 +171,31 @@ class _AsStored:
 
 
 def check_derived(
-    connection: duckdb.DuckDBPyConnection, specs: Mapping[str, Spec], config: SweepConfig
-) -> Derived:
+    connection: duckdb.DuckDBPyConnection,
+    specs: Mapping[str, Spec],
+    config: SweepConfig,
+    audit: Audit,
+) -> None:
     """Derive the audited trials anew, and compare every column that replies and specs tell."""
-    found = Derived()
-    found.findings += [
+    left_out: Counter[str] = Counter()
+    played = 0
+    audit.findings += [
         Finding("config", f"its model {name} has the format {model.format!r}, which there is not")
         for name, model in config.models.items()
         if model.format and model.format not in FORMATS
     ]
     audited = connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall()
     batches = in_batches(connection, audited, PLACES, partial(_tables, connection))
-    with ThreadPoolExecutor(max_workers=1) as thread:  # a loop of its own: one may run here
+    # An event loop may run in the caller's thread, where no other one can.
+    with ThreadPoolExecutor(max_workers=1) as thread:
         for tables in batches:
-            trials = list(_trials(tables, specs, config, found))
+            trials = list(_trials(tables, specs, config, left_out))
             records = thread.submit(asyncio.run, _all_played(trials)).result()
             for trial, record in zip(trials, records, strict=True):
-                found.findings += _findings(trial, record, tables)
-                trial.drivers.clear()  # which know it: else its replies stay until a collection
-            found.trials += len(trials)
-    return found
+                audit.findings += _findings(trial, record, tables)
+            played += len(trials)
+    audit.counts["derived anew"] = played
+    audit.notes += [f"not derived anew in {n} trials: {what}" for what, n in left_out.items()]
 
 
 async def _all_played(trials: list[_Trial]) -> list[TrialRecord | _NotStored]:
@@ -216,22 +206,21 @@ def _tables(
     connection: duckdb.DuckDBPyConnection, keys: list[TrialKey], spans: Spans
 ) -> dict[str, Stored]:
     """What is stored of these trials; of ``calls`` what replies tell, and the replies."""
-    tables = {
-        table: stored_rows(connection, table, keys, spans[table])
-        for table in ("trials", "states", "decisions")
+    return {
+        table: stored_rows(
+            connection, table, keys, spans[table], CALLS if table == "calls" else None
+        )
+        for table in PLACES
     }
-    calls = Stored("calls", (*COLUMNS, "asked"))
-    columns = f"trial_id, spec_hash, {', '.join(COLUMNS)}, {ASKED}"
-    rows = rows_of_trials(connection, columns, "calls", keys, spans["calls"])
-    for trial_id, spec_hash, *values in rows.fetchall():
-        calls.rows.setdefault((trial_id, spec_hash), []).append(tuple(values))
-    return {**tables, "calls": calls}
 
 
 def _trials(
-    tables: Mapping[str, Stored], specs: Mapping[str, Spec], config: SweepConfig, found: Derived
+    tables: Mapping[str, Stored],
+    specs: Mapping[str, Spec],
+    config: SweepConfig,
+    left_out: Counter[str],
 ) -> Iterator[_Trial]:
-    """The trials that can be derived; what is left out is counted, or told by other checks."""
+    """The trials that can be derived; the others are counted, or reported by other checks."""
     wires = _wires(config)
     for key in tables["trials"].rows:
         spec = specs.get(key[1])
@@ -240,7 +229,7 @@ def _trials(
             continue
         scenario = SCENARIOS.get(spec.scenario.name)
         if scenario is None or row["condition"] not in CONDITIONS:
-            found.left_out[NOT_INSTALLED] += 1
+            left_out[NOT_INSTALLED] += 1
             continue
         paces = {side: pace for side in SIDES if (pace := spec.pace(side)) is not None}
         if len(paces) < len(SIDES):
@@ -252,7 +241,7 @@ def _trials(
             scenario.source,
         )
         if not (same_rules and known and same_world):
-            found.left_out[OTHER_RULES] += 1
+            left_out[OTHER_RULES] += 1
             continue
         calls, decisions = tables["calls"].named(key), tables["decisions"].named(key)
         trial = _Trial(
@@ -263,7 +252,7 @@ def _trials(
             {(d["side"], d["decision"]): _decided(d) for d in decisions},
             scripted=any(model.provider == "emulator" for model in config.models.values()),
         )
-        found.left_out.update(_seat(trial, spec, paces))
+        left_out.update(_seat(trial, spec, paces))
         yield trial
 
 
@@ -278,7 +267,7 @@ def _wires(config: SweepConfig) -> dict[str, WireFormat]:
 
 
 def _decided(row: Mapping[str, Any]) -> Decision:
-    """What a program is stored to have decided."""
+    """The stored decision of a program."""
     return Decision(
         row["plan"], tuple(row["applied"]), failure=row["failure"], fallback=row["fallback"]
     )
@@ -287,7 +276,7 @@ def _decided(row: Mapping[str, Any]) -> Decision:
 def _seat(trial: _Trial, spec: Spec, paces: Mapping[Side, Pace]) -> set[str]:
     """Give the trial its drivers; returns what of it cannot be derived.
 
-    A program that is not registered here, or another one by now, drives as it is stored.
+    A program that is not registered here, or has changed since, repeats its stored decisions.
     """
     variant, blocks = trial.row["variant"], spec.content.get("prompt_blocks")
     trial.prompts = not blocks or (variant in VARIANTS and block_digests(variant) == blocks)
@@ -329,14 +318,10 @@ def _findings(
     ignored = set() if trial.prompts else {"prompt", "prompt_hash"}
     if record.status == "failed":
         ignored.add("error")  # the reason, in words
-    for table, rows in (
-        ("trials", [trial_row(record)]),
-        ("states", state_rows(record)),
-        ("decisions", decision_rows(record)),
-        ("calls", [attempt.derived for attempt in trial.attempts]),
-    ):
-        for difference in tables[table].differences(
-            trial.key, rows, ignored=ignored, tolerance=TOLERANCE
+    wanted = {**rows_of(record), "calls": [attempt.derived for attempt in trial.attempts]}
+    for table, stored in tables.items():
+        for difference in stored.differences(
+            trial.key, wanted[table], ignored=ignored, tolerance=TOLERANCE
         ):
             yield _finding(trial.key[0], difference)
 

@@ -19,7 +19,7 @@ from merge_runner.scenarios.merge.geometry import Track, track_of
 
 
 class _Facts(BaseModel):
-    """Read leniently: an older or newer program may have written more."""
+    """Read leniently: another version of the program may have written more members."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -33,15 +33,6 @@ class ModelFacts(_Facts):
     aliases: tuple[str, ...] = ()
     parameters: dict[str, JsonValue] = {}
     path: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """Where in a sweep a trial stands."""
-
-    variant: str
-    condition: str
-    repetition: int
 
 
 class SweepConfig(_Facts):
@@ -58,21 +49,30 @@ class SweepConfig(_Facts):
 
     @property
     def sides(self) -> dict[str, str]:
-        """Side to the name of its driver; read here on its own, so that the plan is audited too."""
+        """Side to the name of its driver; without the plan's code, so that this is audited too."""
         left, _, right = self.model.partition("+")
         return {"left": left, "right": right or left}
 
     @cached_property
-    def trials(self) -> dict[str, Cell]:
-        """Trial id to its cell, spelled as the plan spells them."""
+    def trials(self) -> dict[str, dict[str, Any]]:
+        """Trial id, spelled as the plan spells it, to what the trial's row should say."""
         suffix = f"/set{self.sample_set}" if self.sample_set else ""
+        of_all = {
+            "sample_set": self.sample_set,
+            "model_left": self.sides["left"],
+            "model_right": self.sides["right"],
+            "source": "llm" if self.models else "driver",
+        }
         return {
-            f"{self.model}/{variant}/{condition}/rep{repetition:02d}{suffix}": Cell(
-                variant, condition, repetition
-            )
+            f"{self.model}/{variant}/{condition}/rep{rep:02d}{suffix}": {
+                "variant": variant,
+                "condition": condition,
+                "rep": rep,
+                **of_all,
+            }
             for variant, repetitions in self.repetitions.items()
             for condition in self.conditions
-            for repetition in range(1, repetitions + 1)
+            for rep in range(1, repetitions + 1)
         }
 
 
@@ -132,7 +132,7 @@ class Spec:
         return "endpoint" in self.driver(side)
 
     def between_body_and_slot(self, side: str) -> str | None:
-        """That part of the text of its keys; None where it is not known."""
+        """That part of the text of which a call's key is the hash; None where it is not known."""
         driver = self.driver(side)
         endpoint, path, headers = (driver.get(name) for name in ("endpoint", "path", "headers"))
         if not isinstance(headers, dict):
@@ -142,7 +142,7 @@ class Spec:
         return between_body_and_slot(endpoint, path, tuple(headers.items()))
 
     def disagreements(self, config: SweepConfig, variant: str) -> Iterator[str]:
-        """In what the spec of a variant is another than the sweep's configuration says."""
+        """In what the spec of a variant disagrees with the sweep's configuration."""
         if self.content.get("scenario") != config.scenario:
             yield "scenario"
         if self.content.get("sample_set") != config.sample_set:

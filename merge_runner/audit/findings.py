@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 SHOWN = 10
@@ -43,19 +43,19 @@ class Sharing:
         return f"{self.first} and {self.second} share {self.count} {self.what}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Audit:
     """What was checked of ``subject``: a sweep, a database, a recording or a cache.
 
-    ``counts`` say how much was checked, in the order of checking; of a sweep among them
-    ``missing`` and ``failed`` trials. All holds where there is no finding.
+    The checks add to it. ``counts`` say how much was checked, in the order of checking; of a sweep
+    among them ``missing`` and ``failed`` trials. All holds where there is no finding.
     """
 
     subject: str
-    counts: dict[str, int]
-    findings: tuple[Finding, ...] = ()
-    sharings: tuple[Sharing, ...] = ()
-    notes: tuple[str, ...] = ()
+    counts: dict[str, int] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+    sharings: list[Sharing] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     @property
     def ok(self) -> bool:

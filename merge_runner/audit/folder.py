@@ -13,7 +13,7 @@ from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import ChatRequest, Slot
 from merge_runner.results.comparison import Spans, TrialKey, in_batches, rows_of_trials
-from merge_runner.results.database import read_database, room_for_texts
+from merge_runner.results.database import by_name, read_database, room_for_texts
 from merge_runner.results.rows import call_row
 
 TRIALS = """
@@ -38,19 +38,18 @@ def audit_cache(path: Path, folder: Path, sweep_id: str | None = None) -> Audit:
                         findings.append(Finding("cache", problem, sweep_id, *place))
     finally:
         cache.close()
-    return Audit(str(folder), {"calls": len(keys)}, tuple(findings))
+    return Audit(str(folder), {"calls": len(keys)}, findings)
 
 
 def _attempts(
     connection: duckdb.DuckDBPyConnection, keys: list[TrialKey], spans: Spans
 ) -> list[dict[str, Any]]:
     rows = rows_of_trials(connection, "*", "calls", keys, spans["calls"])
-    names = [column[0] for column in rows.description or ()]
-    return [dict(zip(names, row, strict=True)) for row in rows.fetchall()]
+    return list(by_name(rows))
 
 
 def _problem(cache: ResponseCache, row: dict[str, Any]) -> str | None:
-    """In what the cache has an attempt otherwise."""
+    """In what the cache disagrees with a row; None if in nothing."""
     key, number, cached = row["call_key"], row["attempt"], row["cached"]
     place = (row["trial_id"], row["spec_hash"], row["side"], row["decision"])
     try:
@@ -74,7 +73,7 @@ def _problem(cache: ResponseCache, row: dict[str, Any]) -> str | None:
 
 
 def _asked(row: dict[str, Any]) -> ChatRequest:
-    """The request of a row, of whose call the cache holds attempts alone."""
+    """The request of a row whose call has attempts in the cache, but no answer."""
     return ChatRequest(
         key=row["call_key"],
         provider=row["provider"],

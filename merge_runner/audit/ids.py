@@ -1,4 +1,4 @@
-"""What the ids that providers give their replies say of whether an answer was given twice."""
+"""Whether an answer was given twice, by the ids that providers give their replies."""
 
 from __future__ import annotations
 
@@ -8,23 +8,21 @@ from collections.abc import Iterator
 
 import duckdb
 
-from merge_runner.results.database import streamed
+from merge_runner.results.database import append, fetched
 
-# Earlier emulators gave every reply the same id: those of a stand-in tell nothing. The present
-# ones give each reply its own, and are audited like any provider.
+# Earlier emulators gave every reply one of these ids, which therefore tell nothing. The present one
+# gives each reply its own, and is audited like any provider.
 CONSTANT_IDS = ("chatcmpl-emulated", "resp_emulated", "msg_emulated", "emulated")
-# Where our own formats have the answer; what stands beside it, as a time, may change in a copy.
+# Where our own formats have the answer; what is beside it, such as a time, may differ in a copy.
 ANSWERS = ("choices", "output", "candidates", "content")
-REPLIES = "SELECT rowid, reply::VARCHAR FROM calls WHERE http_status = 200"
-# An id is one within the endpoint that gave it: two emulators answer the same question with the
-# same.
-REPLY_IDS = f"""
+REPLIES = "SELECT rowid, reply::VARCHAR, provider FROM calls WHERE http_status = 200"
+# Ids are compared within an endpoint: two emulators give equal questions equal ids.
+REPLY_IDS = """
 CREATE OR REPLACE TEMP TABLE reply_ids AS
 SELECT trial_id, spec_hash, side, decision, call_key, model_requested,
     coalesce(endpoint, '') AS endpoint, reply_id, content
 FROM identified JOIN calls ON calls.rowid = place LEFT JOIN drivers USING (spec_hash, side)
-WHERE NOT (provider = 'emulator' AND reply_id IN {CONSTANT_IDS})
-"""  # noqa: S608 # constants
+"""
 # Some servers draw ids out of a thousand, or have but one. An id that came with different answers
 # proves nothing; neither does any other one of a server most of whose repeated ids are such.
 REPEATED_IDS = """
@@ -43,8 +41,8 @@ WHERE NOT (same AND telling) GROUP BY ALL ORDER BY ALL
 """
 
 
-def identified(reply: str) -> tuple[str, str] | None:
-    """A reply's id and a hash of its answer; None for one without an id, or that is no object."""
+def identified(reply: str, provider: str | None) -> tuple[str, str] | None:
+    """A reply's id and a hash of its answer; None for one without an id that tells anything."""
     try:
         body = json.loads(reply)
     except (ValueError, RecursionError):
@@ -52,9 +50,9 @@ def identified(reply: str) -> tuple[str, str] | None:
     if not isinstance(body, dict):
         return None
     found = body.get("id") or body.get("responseId")
-    if not isinstance(found, str):
+    if not isinstance(found, str) or (provider == "emulator" and found in CONSTANT_IDS):
         return None
-    # Of another format all counts, or any two of its answers would be alike.
+    # In an unknown format everything counts: else any two of its answers would be equal.
     known = any(name in body for name in ANSWERS)
     answer = json.dumps([body.get(name) for name in ANSWERS] if known else body)
     return found, hashlib.blake2b(answer.encode(), digest_size=16).hexdigest()
@@ -67,25 +65,19 @@ def find_ids(connection: duckdb.DuckDBPyConnection) -> None:
     )
     found = [
         (place, *told)
-        for place, reply in streamed(connection, REPLIES)
-        if (told := identified(reply or ""))
+        for place, reply, provider in fetched(connection.execute(REPLIES))
+        if (told := identified(reply or "", provider))
     ]
-    appender = connection.appender("identified")
-    appender.append_rows(found)
-    appender.flush()
+    append(connection, "identified", found)
     connection.execute(REPLY_IDS)
     connection.execute(REPEATED_IDS)
 
 
 def meaningless_ids(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
-    """Notes of the servers whose ids are no proof."""
+    """Notes on the servers whose ids prove nothing."""
     for model, endpoint, count in connection.execute(MEANINGLESS).fetchall():
-        yield repetition_note(model, endpoint, count)
-
-
-def repetition_note(model: str, endpoint: str, count: int) -> str:
-    """That so many replies of a server have ids that prove nothing."""
-    return (
-        f"{count} replies of {model} at {endpoint or 'its endpoint'} have an id that the server "
-        "gave to different answers: its ids do not tell whether an answer was given twice"
-    )
+        yield (
+            f"{count} replies of {model} at {endpoint or 'its endpoint'} have an id that the "
+            "server gave to different answers: its ids do not tell whether an answer was given "
+            "twice"
+        )

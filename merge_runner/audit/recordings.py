@@ -6,130 +6,143 @@ import hashlib
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from itertools import chain, islice
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import ValidationError
 
 from merge_runner.audit.answers import answers_another
+from merge_runner.audit.checks import run_checks
 from merge_runner.audit.expected import SweepConfig
 from merge_runner.audit.findings import Audit, Finding
-from merge_runner.audit.ids import CONSTANT_IDS, identified, repetition_note
+from merge_runner.audit.ids import REPEATED_IDS, identified, meaningless_ids
+from merge_runner.audit.replies import shared_replies
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import Entry
 from merge_runner.llm.keys import canonical_json, without_prompt
 from merge_runner.records import SIDES, Side, Slot
-from merge_runner.results.recording import read_recording, summarise
-from merge_runner.served_model import others_among
+from merge_runner.results.database import SETTINGS, append, in_memory
+from merge_runner.results.recording import (
+    BATCH,
+    UNCOVERED,
+    is_covered,
+    read_provenance,
+    read_recording,
+)
+from merge_runner.results.rows import Row
+from merge_runner.served_model import other_models
 
 NO_CONFIG = "it does not say of what sweep it is: trials are not compared"
-# An endpoint, a model, and an id that it gave a reply.
-ReplyId = tuple[str, str, str]
-Answer = tuple[Slot, str]
+# The tables that the checks of calls read. Each call has a trial of its own there, with its key in
+# the place of a spec's hash: a recording does not say which prompt variant it was made for.
+TABLES = """
+CREATE TABLE calls (trial_id VARCHAR, spec_hash VARCHAR, side VARCHAR, decision BIGINT,
+    call_key VARCHAR, request VARCHAR, endpoint VARCHAR, model_requested VARCHAR, attempt BIGINT,
+    http_status INTEGER, model_served VARCHAR, outcome VARCHAR, reply_id VARCHAR, content VARCHAR);
+CREATE VIEW reply_ids AS FROM calls WHERE reply_id IS NOT NULL;
+CREATE VIEW audited AS SELECT DISTINCT trial_id, spec_hash FROM calls;
+CREATE TABLE sweeps (config JSON);
+CREATE TABLE done (trial_id VARCHAR, spec_hash VARCHAR);
+CREATE TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
+"""
+COUNTS = """
+SELECT 'calls', count(DISTINCT call_key) FROM calls
+UNION ALL SELECT 'attempts', count(*) FROM calls
+UNION ALL SELECT 'reply ids', count(DISTINCT (endpoint, model_requested, reply_id)) FROM reply_ids
+"""
+OUTCOMES = """
+SELECT 'answers ' || outcome AS name, count(*)
+FROM (SELECT max_by(outcome, attempt) AS outcome FROM calls GROUP BY call_key)
+GROUP BY ALL ORDER BY name
+"""
 
 
-@dataclass(frozen=True, slots=True)
-class Track:
+class Drive(NamedTuple):
     """One driver in the trials of one repetition: those of several variants together.
 
     ``template`` is the request without its prompt, with the model and the endpoint.
     """
 
     template: str
-    condition: str
+    trial: str
     repetition: int
-    sample_set: int
     side: Side
 
-    @property
-    def trial(self) -> str:
-        """The trials in a reader's words."""
-        suffix = f"/set{self.sample_set}" if self.sample_set else ""
-        return f"{self.condition}/rep{self.repetition:02d}{suffix}"
 
-
-@dataclass(slots=True)
-class Contents:
-    """What is gathered of a recording while it is read, without its texts.
-
-    ``reply_ids`` has the calls of each endpoint, model and id of a reply: by their key, the slot
-    and a hash of the answer.
-    """
-
-    decisions: defaultdict[Track, Counter[int]] = field(
-        default_factory=lambda: defaultdict(Counter)
-    )
-    reply_ids: defaultdict[ReplyId, dict[str, Answer]] = field(
-        default_factory=lambda: defaultdict(dict)
-    )
-    served: Counter[tuple[str, str]] = field(default_factory=Counter)
-    misnumbered: list[Slot] = field(default_factory=list)
-    exchanged: list[Slot] = field(default_factory=list)
+# How often each decision of each driver was asked for.
+Drives = defaultdict[Drive, Counter[int]]
 
 
 def audit_recording(file: Path) -> Audit:
     """Audit a recording; one that is damaged is a finding. Raises UsageError without a file."""
-    try:
-        summary = summarise(file)
-        contents = Contents()
-        for entry in read_recording(file):
-            _gather(entry, contents)
-    except RecordingError as exc:
-        return Audit(str(file), {}, (Finding("recording", str(exc)),))
-    config = _config(summary.provenance)
-    tracks = contents.decisions
-    telling, notes = _repeated(contents)
-    findings = [
-        *_numbering(tracks, config),
-        *_shared(telling),
-        *_served(contents, config),
-        *(_at(slot, "attempt", "its attempts are out of order, or one follows an answer")
-          for slot in contents.misnumbered),
-        *(_at(slot, "derived", "its reply is, as the server says in it, another's answer")
-          for slot in contents.exchanged),
-        *_missing(tracks, config, ended=_ended(summary.provenance)),
-    ]  # fmt: skip
-    return Audit(
-        subject=str(file),
-        counts={
-            "calls": summary.calls,
-            "attempts": summary.attempts,
-            "drives": len(tracks),
-            "reply ids": len(contents.reply_ids),
-            **{f"answers {name}": count for name, count in sorted(summary.outcomes.items())},
-        },
-        findings=tuple(findings),
-        notes=(*summary.notes, *notes, *(() if config else (NO_CONFIG,))),
-    )
+    audit = Audit(str(file))
+    drives: Drives = defaultdict(Counter)
+    with in_memory(SETTINGS) as connection:
+        connection.execute(TABLES)
+        try:
+            provenance = read_provenance(file)
+            entries = read_recording(file)
+            while some := list(islice(entries, BATCH)):
+                append(connection, "calls", chain.from_iterable(map(_calls, some)))
+                audit.findings += chain.from_iterable(map(_exchanged, some))
+                for entry in some:
+                    drives[_drive(entry)][entry.request.slot.decision] += 1
+        except RecordingError as exc:
+            return Audit(str(file), findings=[Finding("recording", str(exc))])
+        config = _config(provenance)
+        if config is not None:
+            append(connection, "sweeps", [(provenance["config"],)])
+        connection.execute(REPEATED_IDS)
+        append(connection, "other_models", other_models(connection))
+        audit.counts = dict(connection.execute(COUNTS).fetchall())
+        audit.counts["drives"] = len(drives)
+        audit.counts |= dict(connection.execute(OUTCOMES).fetchall())
+        audit.findings += _numbering(drives, config)
+        audit.findings += shared_replies(connection)
+        audit.findings += run_checks(connection, ("served", "attempt"))
+        audit.findings += _missing(drives, config, ended=_ended(provenance))
+        audit.notes += [] if is_covered(provenance) else [UNCOVERED]
+        audit.notes += meaningless_ids(connection)
+        audit.notes += [] if config else [NO_CONFIG]
+    return audit
 
 
-def _gather(entry: Entry, contents: Contents) -> None:
+def _drive(entry: Entry) -> Drive:
     request, slot = entry.request, entry.request.slot
-    template = canonical_json(
-        [
-            request.endpoint,
-            request.model,
-            request.path,
-            request.headers,
-            without_prompt(request.body),
-        ]
-    )
-    track = Track(template, slot.condition, slot.repetition, slot.sample_set, slot.side)
-    contents.decisions[track][slot.decision] += 1
+    asked = (request.endpoint, request.model, request.path, request.headers)
+    template = canonical_json([*asked, without_prompt(request.body)])
+    return Drive(template, _place(slot)[0], slot.repetition, slot.side)
+
+
+def _place(slot: Slot) -> tuple[str, Side, int]:
+    """The trials, in a reader's words, the side and the decision."""
+    return _trial(slot.condition, slot.repetition, slot.sample_set), slot.side, slot.decision
+
+
+def _trial(condition: str, repetition: int, sample_set: int) -> str:
+    return f"{condition}/rep{repetition:02d}" + (f"/set{sample_set}" if sample_set else "")
+
+
+def _calls(entry: Entry) -> Iterator[Row]:
+    """Rows of ``calls``, without the texts: all attempts at a call have its one request."""
+    request = entry.request
+    trial, side, decision = _place(request.slot)
+    call = (trial, request.key, side, decision, request.key, "", request.endpoint, request.model)
     for attempt in entry.attempts:
-        told = identified(attempt.reply or "") if attempt.http_status == 200 else None
-        if told and not (request.provider == "emulator" and told[0] in CONSTANT_IDS):
-            replies = contents.reply_ids[request.endpoint, request.model, told[0]]
-            replies[request.key] = (slot, told[1])
-        if attempt.http_status == 200 and attempt.model_served is not None:
-            contents.served[request.model, attempt.model_served] += 1
+        told = (attempt.number, attempt.http_status, attempt.model_served, attempt.outcome)
+        answered = attempt.http_status == 200
+        found = identified(attempt.reply or "", request.provider) if answered else None
+        yield (*call, *told, *(found or (None, None)))
+
+
+def _exchanged(entry: Entry) -> Iterator[Finding]:
+    request = entry.request
     asked = hashlib.sha256(request.body.encode()).hexdigest()
-    if any(answers_another(_json(a.reply), asked, slot.as_dict()) for a in entry.attempts):
-        contents.exchanged.append(slot)
-    numbers = [attempt.number for attempt in entry.attempts]
-    early = any(a.outcome in ("ok", "refusal", "truncated") for a in entry.attempts[:-1])
-    if early or numbers != list(range(1, len(numbers) + 1)):
-        contents.misnumbered.append(slot)
+    slot = request.slot.as_dict()
+    if any(answers_another(_json(attempt.reply), asked, slot) for attempt in entry.attempts):
+        text = "its reply is, as the server says in it, another's answer"
+        yield Finding("derived", text, None, *_place(request.slot))
 
 
 def _json(text: str | None) -> object:
@@ -146,67 +159,29 @@ def _config(provenance: dict[str, str]) -> SweepConfig | None:
         return None
 
 
-def _numbering(tracks: dict[Track, Counter[int]], config: SweepConfig | None) -> Iterator[Finding]:
+def _numbering(drives: Drives, config: SweepConfig | None) -> Iterator[Finding]:
     """Every driver is asked from its first decision to its last, once per variant.
 
     Where a driver takes control at its own tunnel's exit, the later one begins later.
     """
     late = config is not None and config.scenario.get("control_start") == "own_exit"
-    for track, numbers in tracks.items():
+    for drive, numbers in drives.items():
         # Without a word on variants: as many as there are first requests.
         variants = (
-            sum(track.repetition <= wanted for wanted in config.repetitions.values())
+            sum(drive.repetition <= wanted for wanted in config.repetitions.values())
             if config
             else numbers[min(numbers)]
         )
-        first = min(numbers) if late else 0
-        for number in range(first, max(numbers) + 1):
-            if numbers[number] == 0:
-                yield _in(track, number, "numbering", "nothing is recorded, though of later ones")
-            elif numbers[number] > variants:
+        before = min(numbers) - 1 if late else -1
+        for number in sorted(numbers):
+            if number > before + 1:
+                # One finding for each hole: the numbers of a foreign file may be of any size.
+                text = f"nothing is recorded, though of later ones: the next is {number}"
+                yield Finding("numbering", text, None, drive.trial, drive.side, before + 1)
+            if numbers[number] > variants:
                 text = f"{numbers[number]} requests are recorded, for {variants} prompt variants"
-                yield _in(track, number, "numbering", text)
-
-
-def _repeated(contents: Contents) -> tuple[list[list[Slot]], list[str]]:
-    """The calls with one answer under one id, and notes of servers whose ids prove nothing.
-
-    The rule is that of a database (see ids.py).
-    """
-    servers: defaultdict[tuple[str, str], list[list[Answer]]] = defaultdict(list)
-    for (endpoint, model, _), answers in contents.reply_ids.items():
-        if len(answers) > 1:
-            servers[endpoint, model].append(list(answers.values()))
-    telling, notes = [], []
-    for (endpoint, model), repeated in servers.items():
-        same = [answers for answers in repeated if len({content for _, content in answers}) == 1]
-        found = same if 2 * len(same) >= len(repeated) else []
-        telling += [[slot for slot, _ in answers] for answers in found]
-        if others := sum(map(len, repeated)) - sum(map(len, found)):
-            notes.append(repetition_note(model, endpoint, others))
-    return telling, notes
-
-
-def _shared(telling: list[list[Slot]]) -> Iterator[Finding]:
-    for slots in telling:
-        first, second, *rest = sorted(slots, key=lambda slot: tuple(slot.as_dict().items()))
-        more = f" and {len(rest)} more" if rest else ""
-        yield _at(
-            first,
-            "shared",
-            f"its answer, with the provider's id of it, is also that of {_told(second)}{more}",
-        )
-
-
-def _served(contents: Contents, config: SweepConfig | None) -> Iterator[Finding]:
-    models = config.models.values() if config else ()
-    aliases = [(model.id, alias) for model in models for alias in model.aliases]
-    for requested, served in others_among(sorted(contents.served), aliases):
-        yield Finding(
-            "served",
-            f"{requested} -> {served}: another model answered than was asked for "
-            f"({contents.served[requested, served]} answers)",
-        )
+                yield Finding("numbering", text, None, drive.trial, drive.side, number)
+            before = number
 
 
 def _ended(provenance: dict[str, str]) -> bool:
@@ -214,31 +189,15 @@ def _ended(provenance: dict[str, str]) -> bool:
     return "ended_at" in provenance and provenance.get("exit_code", "0") == "0"
 
 
-def _missing(
-    tracks: dict[Track, Counter[int]], config: SweepConfig | None, *, ended: bool
-) -> Iterator[Finding]:
+def _missing(drives: Drives, config: SweepConfig | None, *, ended: bool) -> Iterator[Finding]:
     """Of a sweep that has ended, every trial asks each of its models for a first decision."""
     if config is None or not ended:
         return
     asked = [side for side in SIDES if config.sides[side] in config.models]
-    recorded = {(track.condition, track.repetition, track.side) for track in tracks}
-    cells = {(cell.condition, cell.repetition) for cell in config.trials.values()}
+    recorded = {(drive.trial, drive.side) for drive in drives}
+    cells = {(trial["condition"], trial["rep"]) for trial in config.trials.values()}
     for condition, repetition in sorted(cells):
+        trial = _trial(condition, repetition, config.sample_set)
         for side in asked:
-            if (condition, repetition, side) not in recorded:
-                track = Track("", condition, repetition, config.sample_set, side)
-                yield _in(track, None, "missing", "nothing is recorded")
-
-
-def _in(track: Track, decision: int | None, kind: str, text: str) -> Finding:
-    return Finding(kind, text, trial=track.trial, side=track.side, decision=decision)
-
-
-def _at(slot: Slot, kind: str, text: str) -> Finding:
-    track = Track("", slot.condition, slot.repetition, slot.sample_set, slot.side)
-    return _in(track, slot.decision, kind, text)
-
-
-def _told(slot: Slot) -> str:
-    found = _at(slot, "", "")
-    return f"{found.trial}, {found.side}, decision {found.decision}"
+            if (trial, side) not in recorded:
+                yield Finding("missing", "nothing is recorded", trial=trial, side=side)

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 import duckdb
 
 from merge_runner.audit.findings import Finding, Sharing
-from merge_runner.results.database import streamed
+from merge_runner.results.database import fetched
 
 SHOWN = 3
 
-# A place, a hash, and the parts of the text that has it; that of a key is in llm/keys.py.
+# A place, a hash, and the parts of the text that should have it; see llm/keys.py for that of a key.
 KEYS = """
 SELECT trial_id, side, decision, call_key, '{"body":', request::VARCHAR,
     ',' || between_body_and_slot || '{"condition":' || to_json(condition)::VARCHAR
@@ -28,10 +28,12 @@ WHERE body IS NOT NULL
 """
 
 # Two slots of one spec with one call, and two calls of any spec with one reply: a proxy that
-# caches answers a repetition, or a fresh set of samples, with an old reply.
+# caches answers a repetition, or a fresh set of samples, with an old reply. ``done`` holds the
+# trials of which it was told before.
 _SHARED = """
 WITH suspects AS ({suspects})
-SELECT list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places
+SELECT list(DISTINCT (trial_id, side, decision, spec_hash)
+    ORDER BY (trial_id, side, decision, spec_hash)) AS places
 FROM {slots} SEMI JOIN suspects USING ({what})
 GROUP BY {what}
 HAVING len(places) > 1
@@ -108,35 +110,40 @@ def check_hashes(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
 def _hashed_otherwise(
     connection: duckdb.DuckDBPyConnection, sql: str
 ) -> list[tuple[str, str, int, bool]]:
-    """The places where a text has not its hash, and whether all of the text is there.
+    """The places where a text does not have its hash, and whether none of its parts is missing.
 
     Python hashes several times as fast as the database.
     """
     return sorted(
         (trial_id, side, decision, None not in parts)
-        for trial_id, side, decision, told, *parts in streamed(connection, sql)
+        for trial_id, side, decision, told, *parts in fetched(connection.execute(sql))
         if None in parts or hashlib.sha256("".join(parts).encode()).hexdigest() != told
     )
 
 
-def check_sharing(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
-    """Find the slots that are no samples of their own; ``done`` holds what was told before."""
-    for sql, text in (
-        (SHARED_CALLS, "its call is also that of"),
-        (SHARED_REPLIES, "its answer, with the provider's id of it, is also that of"),
-    ):
-        for (slots,) in connection.execute(sql).fetchall():
-            first, *others = slots
-            told = "; ".join(_place(slot) for slot in others[:SHOWN])
-            more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
-            trial_id, side, decision = first
-            yield Finding(
-                "shared", f"{text} {told}{more}", trial=trial_id, side=side, decision=decision
-            )
+def shared_calls(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
+    """Find the slots of a spec that are no samples of their own, since they share a call."""
+    return _shared(connection, SHARED_CALLS, "its call is also that of")
+
+
+def shared_replies(connection: duckdb.DuckDBPyConnection) -> Iterator[Finding]:
+    """Find the calls that are no samples of their own, since they share a reply."""
+    told = "its answer, with the provider's id of it, is also that of"
+    return _shared(connection, SHARED_REPLIES, told)
+
+
+def _shared(connection: duckdb.DuckDBPyConnection, sql: str, text: str) -> Iterator[Finding]:
+    for (slots,) in connection.execute(sql).fetchall():
+        (trial_id, side, decision, _), *others = slots
+        told = "; ".join("{}, {}, decision {}".format(*slot) for slot in others[:SHOWN])
+        more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
+        yield Finding(
+            "shared", f"{text} {told}{more}", trial=trial_id, side=side, decision=decision
+        )
 
 
 def calls_in_common(connection: duckdb.DuckDBPyConnection) -> Iterator[Sharing]:
-    """The calls that are those of several specs, since the requests were identical."""
+    """The calls that several specs share, since their requests were identical."""
     for first, first_spec, second, second_spec, count in connection.execute(IN_COMMON).fetchall():
         if first == second:
             first, second = f"{first} ({first_spec})", f"{second} ({second_spec})"  # noqa: PLW2901 # one name for two specs
@@ -156,7 +163,3 @@ def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:
     assert row is not None
     repeated, alike = row
     return alike if alike == repeated >= MANY_REPEATED else 0
-
-
-def _place(slot: tuple[str, str, int]) -> str:
-    return "{}, {}, decision {}".format(*slot)

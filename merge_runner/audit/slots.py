@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import partial
+from typing import Any
 
 import duckdb
 
-from merge_runner.audit.expected import Cell, Spec, SweepConfig
-from merge_runner.audit.findings import Finding
+from merge_runner.audit.expected import Spec, SweepConfig
+from merge_runner.audit.findings import Audit, Finding
 from merge_runner.llm.keys import spec_hash
 from merge_runner.records import SIDES
+from merge_runner.results.database import by_name
 
 TRIALS = """
 SELECT trial_id, spec_hash, links, status, error, variant, condition, rep, sample_set, model_left,
@@ -30,129 +30,85 @@ WHERE status <> 'failed'
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A trial of a sweep as it is stored; ``status`` and what follows is None without a row."""
-
-    trial_id: str
-    spec_hash: str
-    links: int
-    status: str | None
-    error: str | None
-    variant: str | None
-    condition: str | None
-    repetition: int | None
-    sample_set: int | None
-    model_left: str | None
-    model_right: str | None
-    source: str | None
-
-
-@dataclass(slots=True)
-class Slots:
-    """What was found of a sweep's trials."""
-
-    findings: list[Finding] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-
 def check_slots(
     connection: duckdb.DuckDBPyConnection,
-    sweep_id: str,
     config: SweepConfig,
     specs: Mapping[str, Spec],
+    audit: Audit,
     *,
     finished: bool,
-) -> Slots:
-    """Compare the trials of a sweep with its configuration.
+) -> None:
+    """Compare the trials of a sweep, the audit's subject, with its configuration.
 
     Of a sweep that does not claim to be ``finished`` what is missing or failed is a note.
     """
-    found = Slots()
+    found, sweep_id = audit.findings, audit.subject
     for name, started_at in connection.execute(NAMED, [sweep_id]).fetchall():
         if sweep_id != f"{name}-{config.model}-{started_at:%Y%m%dT%H%M%S%f}":
             text = "its id is not made of its name, its drivers and when it started"
-            found.findings.append(Finding("config", text, sweep=sweep_id))
-    rows = [Row(*values) for values in connection.execute(TRIALS, [sweep_id]).fetchall()]
-    finding = partial(Finding, sweep=sweep_id)
+            found.append(Finding("config", text))
+    rows = list(by_name(connection.execute(TRIALS, [sweep_id])))
     seen: dict[str, str] = {}
     for row in rows:
-        here = partial(finding, trial=row.trial_id)
-        first = seen.setdefault(row.trial_id, row.spec_hash)
-        problems = _problems(row, config, None if first == row.spec_hash else first)
-        found.findings += [here("slot", text) for text in problems]
-    found.findings += [
-        finding(kind="spec", text=text, trial=row.trial_id)
-        for row in {row.spec_hash: row for row in reversed(rows)}.values()
-        for text in _spec_problems(row, config, specs)
-    ]
-    missing = _missing(connection, config, specs, seen, found)
-    failed = [row for row in rows if row.status == "failed"]
-    found.counts = {
+        first = seen.setdefault(row["trial_id"], row["spec_hash"])
+        for text in _problems(row, config, first):
+            found.append(Finding("slot", text, trial=row["trial_id"]))
+    # A spec that many trials share is told once, at the first of them.
+    for row in {row["spec_hash"]: row for row in reversed(rows)}.values():
+        for text in _spec_problems(row, config, specs):
+            found.append(Finding("spec", text, trial=row["trial_id"]))
+    missing = _missing(connection, config, specs, seen, audit)
+    failed = [row for row in rows if row["status"] == "failed"]
+    audit.counts |= {
         "trials": len(config.trials),
-        "stored": sum(row.status is not None for row in rows),
+        "stored": sum(row["status"] is not None for row in rows),
         "missing": len(missing),
         "failed": len(failed),
     }
-    if not finished and (missing or failed):
-        found.notes.append(
+    if finished:
+        found += [Finding("missing", "it was not played", trial=name) for name in missing]
+        found += [
+            Finding("failed", row["error"] or "it failed", trial=row["trial_id"]) for row in failed
+        ]
+    elif missing or failed:
+        audit.notes.append(
             f"unfinished: {len(missing)} of {len(config.trials)} trials are missing, "
             f"{len(failed)} failed; the same command again plays them"
         )
-        return found
-    found.findings += [finding("missing", "it was not played", trial=name) for name in missing]
-    found.findings += [
-        finding("failed", row.error or "it failed", trial=row.trial_id) for row in failed
-    ]
-    return found
 
 
-def _problems(row: Row, config: SweepConfig, other_spec: str | None) -> Iterator[str]:
-    if row.links > 1:
-        yield f"it is {row.links} times in the sweep"
-    if other_spec is not None:
-        yield f"it is in the sweep with the specs {other_spec} and {row.spec_hash}"
-    cell = config.trials.get(row.trial_id)
-    if cell is None:
+def _problems(row: dict[str, Any], config: SweepConfig, first_spec: str) -> Iterator[str]:
+    if row["links"] > 1:
+        yield f"it is {row['links']} times in the sweep"
+    if row["spec_hash"] != first_spec:
+        yield f"it is in the sweep with the specs {first_spec} and {row['spec_hash']}"
+    wanted = config.trials.get(row["trial_id"])
+    if wanted is None:
         yield "the sweep's configuration has no such trial"
-    elif row.status is None:
+    elif row["status"] is None:
         yield "it is in the sweep and not among the trials"
-    else:
-        wanted = _told(config, cell)
-        differing = [name for name, value in wanted.items() if getattr(row, name) != value]
-        if differing:
-            yield "its row is another in " + ", ".join(differing)
+    elif differing := [name for name, value in wanted.items() if row[name] != value]:
+        yield "its row is another in " + ", ".join(differing)
 
 
-def _told(config: SweepConfig, cell: Cell) -> dict[str, object]:
-    """What the row of a cell's trial says."""
-    return {
-        "variant": cell.variant,
-        "condition": cell.condition,
-        "repetition": cell.repetition,
-        "sample_set": config.sample_set,
-        "model_left": config.sides["left"],
-        "model_right": config.sides["right"],
-        "source": "llm" if config.models else "driver",
-    }
-
-
-def _spec_problems(row: Row, config: SweepConfig, specs: Mapping[str, Spec]) -> Iterator[str]:
-    spec = specs.get(row.spec_hash)
+def _spec_problems(
+    row: dict[str, Any], config: SweepConfig, specs: Mapping[str, Spec]
+) -> Iterator[str]:
+    name = row["spec_hash"]
+    spec = specs.get(name)
     if spec is None:
-        yield f"the spec {row.spec_hash} is not stored"
+        yield f"the spec {name} is not stored"
         return
-    if spec_hash(spec.text) != row.spec_hash:
-        yield f"the spec stored as {row.spec_hash} has the hash {spec_hash(spec.text)}"
+    if spec_hash(spec.text) != name:
+        yield f"the spec stored as {name} has the hash {spec_hash(spec.text)}"
     if spec.scenario is None or spec.track is None:
-        yield f"the scenario of the spec {row.spec_hash} cannot be read: its trials are not checked"
+        yield f"the scenario of the spec {name} cannot be read: its trials are not checked"
     elif None in map(spec.pace, SIDES):
-        yield f"the rates of the spec {row.spec_hash} cannot be read: its decisions are not checked"
-    cell = config.trials.get(row.trial_id)
-    differing = list(spec.disagreements(config, cell.variant)) if cell else []
+        yield f"the rates of the spec {name} cannot be read: its decisions are not checked"
+    wanted = config.trials.get(row["trial_id"])
+    differing = list(spec.disagreements(config, wanted["variant"])) if wanted else []
     if differing:
-        yield f"the spec {row.spec_hash} is not what the sweep says in {', '.join(differing)}"
+        yield f"the spec {name} is not what the sweep says in {', '.join(differing)}"
 
 
 def _missing(
@@ -160,9 +116,9 @@ def _missing(
     config: SweepConfig,
     specs: Mapping[str, Spec],
     seen: Mapping[str, str],
-    found: Slots,
+    audit: Audit,
 ) -> list[str]:
-    """The trials that no sweep has played: what stops is gone on with by another one."""
+    """The trials that no sweep has played: another one may have gone on where this one stopped."""
     missing = [name for name in config.trials if name not in seen]
     if not missing:
         return missing
@@ -175,5 +131,5 @@ def _missing(
     hashes = sorted(set().union(*same.values()))
     ended = {name for (name,) in connection.execute(ENDED, [missing, hashes]).fetchall()}
     if ended:
-        found.notes.append(f"{len(ended)} of its trials were played by another sweep")
+        audit.notes.append(f"{len(ended)} of its trials were played by another sweep")
     return [name for name in missing if name not in ended]

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import duckdb
 from pydantic import ValidationError
 
-from merge_runner.audit.checks import CHECKS
-from merge_runner.audit.derived import Derived, check_derived
+from merge_runner.audit.checks import run_checks
+from merge_runner.audit.derived import check_derived
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Audit, Finding, Sharing
 from merge_runner.audit.ids import find_ids, meaningless_ids
@@ -21,14 +20,15 @@ from merge_runner.audit.replies import (
     answers_alike,
     calls_in_common,
     check_hashes,
-    check_sharing,
+    shared_calls,
+    shared_replies,
 )
-from merge_runner.audit.slots import Slots, check_slots
+from merge_runner.audit.slots import check_slots
 from merge_runner.audit.traces import GAPS, check_traces, reach_m
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.llm.keys import canonical_json
 from merge_runner.records import SIDES
-from merge_runner.results.database import read_database, room_for_texts
+from merge_runner.results.database import append, by_name, read_database, room_for_texts
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
 
@@ -41,7 +41,7 @@ CREATE OR REPLACE TEMP TABLE paces (spec_hash VARCHAR, side VARCHAR, interval_st
 CREATE OR REPLACE TEMP TABLE drivers (spec_hash VARCHAR, side VARCHAR, endpoint VARCHAR,
     body VARCHAR, between_body_and_slot VARCHAR);
 CREATE OR REPLACE TEMP TABLE done AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
-CREATE OR REPLACE TEMP TABLE entries (name VARCHAR, id VARCHAR, provider VARCHAR);
+CREATE OR REPLACE TEMP TABLE sweep_models (name VARCHAR, id VARCHAR, provider VARCHAR);
 CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 """
 AUDITED = """
@@ -61,7 +61,7 @@ SELECT * FROM
     (SELECT count(DISTINCT reply_id) AS "reply ids"
     FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash))
 """
-# What a sweep did not play, since earlier ones had.
+# The trials that a sweep did not play, since earlier ones had.
 TAKEN_OVER = """
 SELECT b.sweep_id, count(*)
 FROM (SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?)
@@ -70,7 +70,7 @@ JOIN sweeps ON sweeps.sweep_id = b.sweep_id
     AND started_at < (SELECT started_at FROM sweeps WHERE sweep_id = ?)
 GROUP BY ALL ORDER BY ALL
 """
-# What belongs to nothing: a table's name, the trial, and how many rows.
+# Rows that belong to nothing: the table, the trial, and how many they are.
 LOOSE = """
 SELECT 'trials', trial_id, count(*) FROM trials
 ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human' GROUP BY ALL
@@ -90,15 +90,6 @@ LOOSE_TEXTS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class _Sweep:
-    """A row of ``sweeps``, as far as it is audited."""
-
-    sweep_id: str
-    config: str
-    ended: bool
-
-
 def audit_sweep(
     path: Path, sweep_id: str, *, finished: bool | None = None, derive: bool = True
 ) -> Audit:
@@ -110,13 +101,16 @@ def audit_sweep(
     """
     with _reading(path) as connection:
         known = _sweeps(connection)
-        sweep = next((sweep for sweep in known if sweep.sweep_id == sweep_id), None)
-        if sweep is None:
-            names = ", ".join(sweep.sweep_id for sweep in known) or "none"
-            raise UsageError(f"{path} holds no sweep {sweep_id}; valid: {names}")
+        if sweep_id not in known:
+            raise UsageError(
+                f"{path} holds no sweep {sweep_id}; valid: {', '.join(known) or 'none'}"
+            )
         specs = _prepare(connection)
-        audit = _audit(connection, sweep, specs, finished=finished, derive=derive)
-        return replace(audit, sharings=(*audit.sharings, *calls_in_common(connection)))
+        config, ended = known[sweep_id]
+        claims = ended if finished is None else finished
+        audit = _audit(connection, sweep_id, config, specs, finished=claims, derive=derive)
+        audit.sharings += calls_in_common(connection)
+        return audit
 
 
 def audit_database(path: Path) -> list[Audit]:
@@ -127,8 +121,8 @@ def audit_database(path: Path) -> list[Audit]:
     with _reading(path) as connection:
         specs = _prepare(connection)
         audits = []
-        for sweep in reversed(_sweeps(connection)):
-            audits.append(_audit(connection, sweep, specs))
+        for sweep_id, (config, ended) in reversed(_sweeps(connection).items()):
+            audits.append(_audit(connection, sweep_id, config, specs, finished=ended))
             connection.execute("INSERT INTO done SELECT trial_id, spec_hash FROM audited")
         connection.execute("CREATE OR REPLACE TEMP TABLE audited AS FROM trials")
         return [*reversed(audits), _whole(connection, path, bool(audits))]
@@ -145,51 +139,47 @@ def _reading(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
 
 def _audit(
     connection: duckdb.DuckDBPyConnection,
-    sweep: _Sweep,
+    sweep_id: str,
+    config_text: str,
     specs: Mapping[str, Spec],
     *,
-    finished: bool | None = None,
+    finished: bool,
     derive: bool = True,
 ) -> Audit:
-    connection.execute(AUDITED, [sweep.sweep_id])
-    slots = Slots()
-    derived = Derived()
-    models: list[tuple[Any, ...]] = []
+    connection.execute(AUDITED, [sweep_id])
+    audit = Audit(sweep_id)
+    config = _config(config_text, audit)
+    if config is not None:
+        check_slots(connection, config, specs, audit, finished=finished)
+    models = config.models if config else {}
+    connection.execute("DELETE FROM sweep_models")
+    append(connection, "sweep_models", [(name, m.id, m.provider) for name, m in models.items()])
+    audit.counts |= _counts(connection, COUNTS)
+    audit.findings += run_checks(connection)
+    audit.findings += check_traces(connection, specs)
+    audit.findings += check_hashes(connection)
+    audit.findings += shared_calls(connection)
+    audit.findings += shared_replies(connection)
+    audit.sharings += _taken_over(connection, sweep_id)
+    audit.notes += _checked_elsewhere(connection, sweep_id)
+    audit.notes += meaningless_ids(connection)
+    audit.notes += _alike_notes(connection)
+    if derive and config is not None:
+        check_derived(connection, specs, config, audit)
+    audit.findings = [replace(finding, sweep=sweep_id) for finding in audit.findings]
+    return audit
+
+
+def _config(text: str, audit: Audit) -> SweepConfig | None:
+    """The configuration of a sweep; one that cannot be read is a finding."""
     try:
-        config = SweepConfig.model_validate_json(sweep.config)
+        return SweepConfig.model_validate_json(text)
     except ValidationError as exc:
-        text = f"its configuration cannot be read, so that its trials are not known: {_first(exc)}"
-        slots.findings.append(Finding("config", text))
-    else:
-        claims = sweep.ended if finished is None else finished
-        slots = check_slots(connection, sweep.sweep_id, config, specs, finished=claims)
-        models = [(name, m.id, m.provider) for name, m in config.models.items()]
-        derived = check_derived(connection, specs, config) if derive else derived
-    connection.execute("DELETE FROM entries")
-    _fill(connection, "entries", models)
-    findings = [
-        *slots.findings,
-        *_rule_findings(connection),
-        *check_traces(connection, specs),
-        *check_hashes(connection),
-        *check_sharing(connection),
-        *derived.findings,
-    ]
-    return Audit(
-        subject=sweep.sweep_id,
-        counts=slots.counts
-        | _counts(connection, COUNTS)
-        | ({"derived anew": derived.trials} if derive else {}),
-        findings=tuple(replace(finding, sweep=sweep.sweep_id) for finding in findings),
-        sharings=tuple(_taken_over(connection, sweep.sweep_id)),
-        notes=(
-            *slots.notes,
-            *_checked_elsewhere(connection, sweep.sweep_id),
-            *meaningless_ids(connection),
-            *_alike_notes(connection),
-            *derived.notes,
-        ),
-    )
+        error = exc.errors()[0]
+        first = f"{'.'.join(map(str, error['loc']))}: {error['msg']}"
+        told = f"its configuration cannot be read, so that its trials are not known: {first}"
+        audit.findings.append(Finding("config", told))
+        return None
 
 
 def _whole(connection: duckdb.DuckDBPyConnection, path: Path, sweeps: bool) -> Audit:
@@ -203,26 +193,27 @@ def _whole(connection: duckdb.DuckDBPyConnection, path: Path, sweeps: bool) -> A
     return Audit(
         subject=str(path),
         counts=_counts(connection, counts),
-        findings=tuple(
+        findings=[
             Finding(
                 "loose",
                 LOOSE_TEXTS.get(table, f"{rows} rows of {table} belong to no trial"),
                 trial=trial_id,
             )
             for table, trial_id, rows in loose
-        ),
-        sharings=tuple(calls_in_common(connection)),
-        notes=() if sweeps else ("there is no sweep in this database",),
+        ],
+        sharings=list(calls_in_common(connection)),
+        notes=[] if sweeps else ["there is no sweep in this database"],
     )
 
 
-def _sweeps(connection: duckdb.DuckDBPyConnection) -> list[_Sweep]:
+def _sweeps(connection: duckdb.DuckDBPyConnection) -> dict[str, tuple[str, bool]]:
+    """The sweeps, oldest first: the configuration of each, and whether it ended."""
     rows = connection.execute(
         # Of sweeps of earlier versions only whether they ended is known, not how.
         "SELECT sweep_id, config, coalesce(exit_code = 0, ended_at IS NOT NULL) FROM sweeps "
         "ORDER BY started_at, sweep_id"
     ).fetchall()
-    return [_Sweep(*row) for row in rows]
+    return {sweep_id: (config, ended) for sweep_id, config, ended in rows}
 
 
 def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
@@ -232,7 +223,7 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
         for name, text in connection.execute("SELECT spec_hash, spec FROM specs").fetchall()
     }
     connection.execute(TABLES)
-    _fill(
+    append(
         connection,
         "rules",
         (
@@ -251,7 +242,7 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
             if (scenario := spec.scenario) is not None and (track := spec.track) is not None
         ),
     )
-    _fill(
+    append(
         connection,
         "paces",
         (
@@ -261,7 +252,7 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
             if (pace := spec.pace(side)) is not None
         ),
     )
-    _fill(
+    append(
         connection,
         "drivers",
         (
@@ -276,18 +267,11 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
             for side in SIDES
         ),
     )
-    _fill(connection, "other_models", other_models(connection))
+    append(connection, "other_models", other_models(connection))
     find_ids(connection)
     connection.execute(USED)
     connection.execute(GAPS)
     return specs
-
-
-def _rule_findings(connection: duckdb.DuckDBPyConnection) -> Iterable[Finding]:
-    for check in CHECKS:
-        rows = connection.execute(f"{check.sql} ORDER BY ALL").fetchall()
-        for trial_id, side, decision, text in rows:
-            yield Finding(check.kind, text, trial=trial_id, side=side, decision=decision)
 
 
 def _taken_over(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> Iterable[Sharing]:
@@ -296,7 +280,7 @@ def _taken_over(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> Iterabl
 
 
 def _checked_elsewhere(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> Iterable[str]:
-    """That later sweeps have its trials too, under which they are counted and checked."""
+    """A note that later sweeps have its trials too, with which they are counted and checked."""
     (count,) = connection.execute(
         "SELECT count(*) FROM sweep_trials SEMI JOIN done USING (trial_id, spec_hash) "
         "WHERE sweep_id = ?",
@@ -307,7 +291,7 @@ def _checked_elsewhere(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> 
 
 
 def _alike_notes(connection: duckdb.DuckDBPyConnection) -> Iterable[str]:
-    """What is no sample; the emulator has a few phrases."""
+    """A note on answers that may be no samples; the emulator's are not: it has a few phrases."""
     scripted = _counts(connection, "SELECT count(*) AS trials FROM audited WHERE scripted")
     if (repeated := answers_alike(connection)) and not scripted["trials"]:
         yield (
@@ -316,21 +300,6 @@ def _alike_notes(connection: duckdb.DuckDBPyConnection) -> Iterable[str]:
         )
 
 
-def _fill(
-    connection: duckdb.DuckDBPyConnection, table: str, rows: Iterable[tuple[Any, ...]]
-) -> None:
-    appender = connection.appender(table)
-    appender.append_rows(list(rows))
-    appender.flush()
-
-
 def _counts(connection: duckdb.DuckDBPyConnection, sql: str) -> dict[str, int]:
     """A query's only row, numbers by name."""
-    result = connection.execute(sql)
-    names = [column[0] for column in result.description or ()]
-    return dict(zip(names, result.fetchall()[0], strict=True))
-
-
-def _first(exc: ValidationError) -> str:
-    error = exc.errors()[0]
-    return f"{'.'.join(map(str, error['loc']))}: {error['msg']}"
+    return next(by_name(connection.execute(sql)))

@@ -10,6 +10,7 @@ import duckdb
 from merge_runner.audit.expected import Spec
 from merge_runner.audit.findings import Finding
 from merge_runner.config import ScenarioConfig
+from merge_runner.results.comparison import same_value
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import Track
 
@@ -42,7 +43,7 @@ ORDER BY ALL
 
 
 def reach_m(scenario: ScenarioConfig) -> float:
-    """A distance of the centres from which on no rule sees a collision, with room for rounding."""
+    """The distance of the centres beyond which no rule sees a collision, with room for rounding."""
     return hypot(scenario.vehicle_length_m, scenario.vehicle_width_m) + TOLERANCE_M
 
 
@@ -60,7 +61,7 @@ def check_traces(
             yield Finding("outcome", text, trial=trial_id)
         finished = status == "finished" and before_m is not None and after_m is not None
         found_m = _gap_m(before_m, after_m, scenario, track) if finished else None
-        if not _same(gap_m, found_m):
+        if not same_value(gap_m, found_m, TOLERANCE_M):
             text = f"it is {_metres(gap_m)} in trial_metrics, and by its states {_metres(found_m)}"
             yield Finding("gap", text, trial=trial_id)
 
@@ -84,18 +85,15 @@ def _collision(
 def _gap_m(
     before_m: Sequence[float], after_m: Sequence[float], scenario: ScenarioConfig, track: Track
 ) -> float:
-    """The net gap at the first arrival at the merge point, linear within the step."""
+    """The net gap at the first arrival at the merge point (arXiv 2604.09609, Table IV).
+
+    Positions are linear within the step.
+    """
     steps = list(zip(before_m, after_m, strict=True))
     shares = ((track.merge_point_m - a) / (b - a) for a, b in steps if b >= track.merge_point_m)
     share = min(shares, default=nan)  # DuckDB takes what is no number for the largest
     left_m, right_m = (a + share * (b - a) for a, b in steps)
     return abs(left_m - right_m) - scenario.vehicle_length_m
-
-
-def _same(one_m: float | None, other_m: float | None) -> bool:
-    if one_m is None or other_m is None:
-        return one_m is other_m
-    return abs(one_m - other_m) <= TOLERANCE_M
 
 
 def _metres(value: float | None) -> str:

@@ -115,6 +115,7 @@ def temper_for(seen: Seen, slot: Slot | None, prompt: str) -> Temper:
 
 def _chance_left_first(condition: str) -> float:
     kinematics = CONDITIONS[condition]
+    # arXiv 2604.09609, Table III.
     odds = -0.30 + 1.11 * kinematics.projected_headway_m - 3.30 * kinematics.relative_velocity_mps
     return 1 / (1 + math.exp(-odds))
 
@@ -171,6 +172,7 @@ def _on_straight(seen: Seen) -> tuple[float, str]:
     if seen.relative_distance <= 0:
         return 0.0, "The other car is behind me. I keep my speed and leave the merge area."
     if closing > 0.1 and gap < 4 + 2 * closing:
+        # From v^2 = 2 a s, with 1 m to spare and a little more.
         needed = -(closing**2) / (2 * max(gap - 1.0, 0.5)) - 0.2
         return max(HARDEST_BRAKING_MPS2, needed), (
             f"The other car is {gap:.1f} m ahead and slower. I brake until I match its speed."
@@ -201,7 +203,8 @@ def _projected_lead_m(seen: Seen) -> float:
 
 
 def _even_acceleration(metres: float, distance: float | None, speed: float) -> float:
-    """The constant acceleration that gains a distance before the leader reaches the merge."""
+    """The constant acceleration that gains a distance before the leader reaches the merge point."""
+    # From s = a t^2 / 2; near the merge point t is bounded, for a to stay within reason.
     seconds = max(SHORTEST_S, (distance or TRACK.merge_point_m) / max(speed, 0.1))
     return 2 * metres / seconds**2
 

@@ -33,7 +33,8 @@ Fault = Literal[
     "malformed",
 ]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
-# These are outcomes; all others are transient, so a sweep with them ends like one without.
+# These change what a trial records. All others are transient: a sweep with them, which asks again,
+# ends like one without.
 OUTCOMES: frozenset[Fault] = frozenset({"empty", "refused", "malformed"})
 TRANSIENT: tuple[Fault, ...] = tuple(fault for fault in FAULTS if fault not in OUTCOMES)
 

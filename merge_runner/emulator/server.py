@@ -11,16 +11,19 @@ import struct
 import sys
 from collections import Counter
 from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
 
 from aiohttp import web
 
 from merge_runner.emulator.driver import answer
 from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.wire import Answer, Ending, answer_in, dumps, error_in, prompt_of
+from merge_runner.emulator.formats import SERVED, Said, ServedFormat
 from merge_runner.errors import UsageError
 from merge_runner.records import (
     ANSWERED_FIELD,
     ATTEMPT_HEADER,
+    SCRIPTED_FIELD,
     SCRIPTED_HEADER,
     SIDES,
     SLOT_HEADER,
@@ -40,8 +43,11 @@ STATUS_FAULTS = {
 }
 # What anything but a chat request can raise: refused with 400.
 UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
-ENDINGS: dict[str, Ending] = {"refused": "refused", "empty": "empty"}
-MALFORMED = "M\n\nI would rather describe my plan in words than write a list of numbers."
+# What the model says in place of the driver's answer.
+TEXTS = {
+    "malformed": "M\n\nI would rather describe my plan in words than write a list of numbers.",
+    "empty": "",
+}
 ID_HEADER = "x-request-id"
 # A linger time of zero sends a reset instead of an orderly close.
 RESET_AT_CLOSE = struct.pack("ii", 1, 0)
@@ -49,7 +55,7 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class Emulator:
-    """Answers chat requests of all four formats; ``faults`` decides what goes wrong."""
+    """Answers chat requests of every format in SERVED; ``faults`` decides what goes wrong."""
 
     def __init__(self, faults: FaultPlan | None = None) -> None:
         self._faults = faults or FaultPlan()
@@ -58,40 +64,25 @@ class Emulator:
         self.app.on_response_prepare.append(_say_scripted)
         self.app.add_routes(
             [
-                web.post("/v1/chat/completions", self._chat),
-                web.post("/v1/responses", self._responses),
-                web.post("/v1/messages", self._anthropic),
-                web.post(r"/{version:v1\w*}/models/{model}:generateContent", self._gemini),
+                *(web.post(each.path, partial(self._serve, each)) for each in SERVED),
                 web.get("/v1/models", self._models),
             ]
         )
-
-    async def _chat(self, request: web.Request) -> web.StreamResponse:
-        return await self._serve(request, "openai-chat")
-
-    async def _responses(self, request: web.Request) -> web.StreamResponse:
-        return await self._serve(request, "openai-responses")
-
-    async def _anthropic(self, request: web.Request) -> web.StreamResponse:
-        return await self._serve(request, "anthropic")
-
-    async def _gemini(self, request: web.Request) -> web.StreamResponse:
-        return await self._serve(request, "gemini")
 
     async def _models(self, request: web.Request) -> web.StreamResponse:
         listed = [{"id": model, "object": "model", "owned_by": "emulator"} for model in MODELS]
         return web.json_response({"object": "list", "data": listed})
 
-    async def _serve(self, request: web.Request, wire: str) -> web.StreamResponse:
+    async def _serve(self, wire: ServedFormat, request: web.Request) -> web.StreamResponse:
         raw = await request.read()
         try:
             body = json.loads(raw)
             slot = _slot(request.headers.get(SLOT_HEADER))
-            prompt = prompt_of(wire, body)
+            prompt = wire.prompt(body)
             model = request.match_info.get("model") or str(body.get("model", MODELS[0]))
             (prompt + model).encode()
         except UNREADABLE:
-            return _send(error_in(wire, 400, "The body is not valid."))
+            return _error(wire, 400, "The body is not valid.")
         where = request.headers.get(SLOT_HEADER) or hashlib.sha256(raw).hexdigest()
         attempt = self._attempt(request, where)
         fault = self._faults.fault(where, attempt)
@@ -101,24 +92,23 @@ class Emulator:
         if fault == "bad_gateway":
             return web.Response(status=502, text="<html>502 Bad Gateway</html>")
         if fault == "rate_limit":
-            wait = self._faults.wait_s(where, attempt)
-            return _send(error_in(wire, 429, "Rate limit reached.", wait))
-        if fault is not None and fault in STATUS_FAULTS:
-            return _send(error_in(wire, STATUS_FAULTS[fault], "An emulated fault."))
+            return _error(wire, 429, "Rate limit reached.", self._faults.wait_s(where, attempt))
+        if fault in STATUS_FAULTS:
+            return _error(wire, STATUS_FAULTS[fault], "An emulated fault.")
+        text = TEXTS[fault] if fault in TEXTS else answer(prompt, slot)
+        # Only the same attempt at the same request gets the same id: the audit takes one that
+        # comes back for an answer that was given twice.
         reply_id = hashlib.sha256(raw + f"{request.path} {where} {attempt}".encode()).hexdigest()
-        text = MALFORMED if fault == "malformed" else answer(prompt, slot)
-        ending = ENDINGS.get(fault, "stop") if fault else "stop"
-        reply = answer_in(wire, reply_id[:24], model, prompt, text, ending)
-        reply.body[ANSWERED_FIELD] = {
+        reply = wire.answer(Said(reply_id[:24], model, prompt, text, fault == "refused"))
+        reply[ANSWERED_FIELD] = {
             "body_sha256": hashlib.sha256(raw).hexdigest(),
             "slot": slot and slot.as_dict(),
         }
-        if fault == "truncated_json":
-            return web.Response(body=dumps(reply.body)[:-20], content_type="application/json")
-        return _send(reply)
+        sent = _dumps(reply)[: -20 if fault == "truncated_json" else None]
+        return web.Response(body=sent, content_type="application/json")
 
     def _attempt(self, request: web.Request, where: str) -> int:
-        """The attempt's number: the client's own count, else how often this was asked."""
+        """The attempt's number: the client's own count, or else how often this was asked."""
         told = request.headers.get(ATTEMPT_HEADER, "")
         self._asked[where] += 1
         return int(told) if re.fullmatch("[0-9]{1,6}", told) else self._asked[where]
@@ -127,24 +117,25 @@ class Emulator:
         """Say nothing for long, or cut the connection before or within the reply."""
         if fault == "hang":
             await asyncio.sleep(self._faults.hang_s)
-        elif fault == "reset" and request.transport is not None:
-            connection = request.transport.get_extra_info("socket")
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_AT_CLOSE)
-        elif fault == "truncated_body" and request.transport is not None:
-            request.transport.write(
+        transport = request.transport  # None once the client has gone
+        if transport is not None and fault == "truncated_body":
+            transport.write(
                 b"HTTP/1.1 200 OK\r\ncontent-type: application/json\r\n"
                 b'%s: true\r\ncontent-length: 5000\r\n\r\n{"id": "cut' % SCRIPTED_HEADER.encode()
             )
-            request.transport.close()
-        if request.transport is not None and fault != "truncated_body":
-            request.transport.abort()
-        return web.Response(status=500)
+            transport.close()
+        elif transport is not None:
+            if fault == "reset":
+                connection = transport.get_extra_info("socket")
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_AT_CLOSE)
+            transport.abort()
+        return web.Response(status=500)  # which nobody gets: the connection has ended
 
 
 async def _say_scripted(request: web.Request, response: web.StreamResponse) -> None:
-    """Every response says that a stand-in made it, even one that refuses or is not JSON.
+    """Every response says that a stand-in made it, even an error or one that is not JSON.
 
-    And which request it answers, as many gateways do.
+    It repeats the id of its request, as many gateways do.
     """
     response.headers[SCRIPTED_HEADER] = "true"
     if ID_HEADER in request.headers:
@@ -176,13 +167,16 @@ def _slot(header: str | None) -> Slot | None:
     return slot
 
 
-def _send(reply: Answer) -> web.Response:
+def _error(wire: ServedFormat, status: int, message: str, delay_s: float = 0.0) -> web.Response:
+    body, headers = wire.error(status, message, delay_s)
     return web.Response(
-        body=dumps(reply.body),
-        status=reply.status,
-        headers=reply.headers,
-        content_type="application/json",
+        body=_dumps(body), status=status, headers=headers, content_type="application/json"
     )
+
+
+def _dumps(body: dict[str, Any]) -> bytes:
+    """A body as it is sent, with the field that says that no model made it."""
+    return json.dumps({**body, SCRIPTED_FIELD: True}, ensure_ascii=False).encode()
 
 
 async def serve(port: int, faults: FaultPlan | None = None) -> tuple[web.AppRunner, str]:

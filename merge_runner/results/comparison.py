@@ -93,7 +93,7 @@ class Stored:
         for index, name in enumerate(self.names):
             if name in ignored:
                 continue
-            places = [p for p in common if not _same(old[p][index], new[p][index], tolerance)]
+            places = [p for p in common if not same_value(old[p][index], new[p][index], tolerance)]
             if places:
                 first = places[0]
                 yield Difference(
@@ -119,14 +119,19 @@ def stored_rows(
     table: str,
     keys: Sequence[TrialKey],
     span: Span | None = None,
+    columns: str | None = None,
 ) -> Stored:
-    """The rows of these trials, with hashes in place of long texts."""
-    hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in LONG.get(table, ()))
-    columns = f"* REPLACE ({hashes})" if hashes else "*"
+    """The rows of these trials: these columns, or all of them with hashes in place of long texts.
+
+    The columns must have those that identify a row.
+    """
+    hashed = LONG.get(table, ()) if columns is None else ()
+    hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in hashed)
+    columns = columns or (f"* REPLACE ({hashes})" if hashes else "*")
     result = rows_of_trials(connection, columns, table, keys, span)
     names = tuple(column[0] for column in result.description or ())
     trial_id, spec_hash = names.index("trial_id"), names.index("spec_hash")
-    stored = Stored(table, names, LONG.get(table, ()))
+    stored = Stored(table, names, hashed)
     for row in result.fetchall():
         stored.rows.setdefault((row[trial_id], row[spec_hash]), []).append(row)
     return stored
@@ -166,10 +171,11 @@ def in_batches(
 ) -> Iterator[Read]:
     """What ``read`` makes of some trials at a time, given where the rows of each table lie.
 
-    Few enough at a time to fit into the database's memory.
+    Where they do not fit into the database's memory, fewer are read at a time.
     """
     where = {table: _spans(connection, table) for table in tables}
     nowhere = (0, -1)
+    # In the order in which they are stored, so that a batch is one stretch of each table.
     ordered = sorted(keys, key=lambda key: [spans.get(key, nowhere) for spans in where.values()])
     first, size = 0, BATCH
     while batch := ordered[first : first + size]:
@@ -201,11 +207,12 @@ def _spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, 
     return {(trial_id, spec_hash): (first, last) for trial_id, spec_hash, first, last in rows}
 
 
-def _same(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table
+def same_value(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table
+    """Whether two values of a table are equal, numbers within the tolerance, also in lists."""
     if one == other:
         return True
     if isinstance(one, list) and isinstance(other, list):
         return len(one) == len(other) and all(
-            _same(a, b, tolerance) for a, b in zip(one, other, strict=True)
+            same_value(a, b, tolerance) for a, b in zip(one, other, strict=True)
         )
     return isinstance(one, float) and isinstance(other, float) and abs(one - other) <= tolerance

@@ -10,7 +10,7 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -31,8 +31,9 @@ PATIENCE_S = 60.0
 LOGS = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
 """How the names of a database's own files go on."""
 ROWS_AT_ONCE, COPIED_AT_ONCE = 100, 2_048
-# What a file takes for each call where replies are short, compressed and with its share of states;
-# and how much more than that is little enough to be merged, and to be read as if they were short.
+# The size of a file for each of its calls where replies are short, compressed and with its share of
+# the states; and up to how much more its row groups are merged, and its texts are read without more
+# memory.
 BYTES_OF_A_CALL, MERGED_BYTES, SHORT_BYTES = 3_000, 2**26, 2**23
 LOG = logging.getLogger(__name__)
 Settings = dict[str, str | bool | int | float | list[str]]
@@ -98,8 +99,8 @@ class Instance:
     Making one takes longer than most of what is done with it, so there is one for everything.
     After an error it may be unusable, and a new one is made.
 
-    Where it does not ``confine`` those who read, they do so themselves; else they reach the file
-    that they read, and those in the folder ``also``.
+    A connection for reading reaches the file that it reads and those in the folder ``also``, and
+    nothing else; where the instance does not ``confine`` it, whoever opens it must.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ def _detach(connection: duckdb.DuckDBPyConnection, name: str, instance: Instance
     try:
         connection.execute(f"USE memory; DETACH {name}")
     except duckdb.Error as exc:
-        # What was committed lies in the log beside the file; there is no room to move it over.
+        # As on a full disk: what was committed stays in the log beside the file, and is not lost.
         LOG.warning("the database was not closed in order: %s", first_line(exc))
         instance.drop()
 
@@ -233,7 +234,7 @@ def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
 
 
 def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
-    """By how much the open file is larger than it would be with short replies."""
+    """How much larger the open file is than it would be with short replies."""
     row = connection.execute(
         "SELECT path, estimated_size FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
@@ -241,15 +242,25 @@ def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
     return Path(row[0]).stat().st_size - row[1] * BYTES_OF_A_CALL if row else 0
 
 
-def streamed(connection: duckdb.DuckDBPyConnection, sql: str) -> Iterator[tuple[Any, ...]]:
-    """The rows of a query on long texts; no other query may run until it has ended."""
-    return fetched(connection.execute(sql))
-
-
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
-    """The rows of a result, a few at a time."""
+    """The rows of a result, a few at a time; its connection runs no other query until the end."""
     while batch := result.fetchmany(ROWS_AT_ONCE):
         yield from batch
+
+
+def by_name(result: duckdb.DuckDBPyConnection) -> Iterator[dict[str, Any]]:
+    """The rows of a result, each by the names of its columns."""
+    names = [column[0] for column in result.description or ()]
+    return (dict(zip(names, row, strict=True)) for row in result.fetchall())
+
+
+def append(
+    connection: duckdb.DuckDBPyConnection, table: str, rows: Iterable[tuple[Any, ...]]
+) -> None:
+    """Add rows to a table."""
+    appender = connection.appender(table)  # an INSERT would be a statement for each row
+    appender.append_rows(list(rows))
+    appender.flush()
 
 
 @contextmanager
@@ -385,7 +396,7 @@ def migrate(path: Path) -> None:
     as ``NAME.v1.duckdb``. Raises UsageError where that is not possible.
     """
     path = path.resolve()
-    copy = path.with_name(f"{path.name}.migrating")
+    copy = path.with_name(f"{path.name}.migrating")  # on the same disk, so that it can be renamed
     try:
         # Opened for writing, so that nobody else writes while it is copied.
         with open_database(path, read_only=False, patience_s=PATIENCE_S) as connection:
@@ -426,13 +437,9 @@ def _discard(copy: Path) -> None:
 
 def _free_name(path: Path, version: int) -> Path:
     """A free name for the old file, so that it never replaces another one."""
-    names = (f"{path.stem}.v{version}{number}{path.suffix}" for number in _numbers())
+    numbers = itertools.chain([""], (f"-{number}" for number in itertools.count(2)))
+    names = (f"{path.stem}.v{version}{number}{path.suffix}" for number in numbers)
     return next(kept for kept in map(path.with_name, names) if not kept.exists())
-
-
-def _numbers() -> Iterator[str]:
-    yield ""
-    yield from (f"-{number}" for number in itertools.count(2))
 
 
 def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:

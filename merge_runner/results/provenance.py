@@ -37,7 +37,7 @@ def program() -> str:
 
 
 def _commit() -> str | None:
-    """The commit of a repository at the folder that holds the package, which has it as its own."""
+    """The commit of the repository in the project's folder, if it tracks the package."""
     package = _git("ls-files", "--error-unmatch", "merge_runner/__init__.py")
     return _git("rev-parse", "HEAD") if package else None
 

@@ -31,11 +31,11 @@ from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
 from merge_runner.llm.verify import DAMAGED, check_attempts, check_body
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
-from merge_runner.results.database import Settings, in_memory
+from merge_runner.results.database import Settings, append, in_memory
 from merge_runner.text_safety import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 2"
-# Its hash does not cover where the recording comes from.
+# The hash of such a file does not cover what it says of its origin.
 FIRST_FORMAT = "merge-runner recording 1"
 UNCOVERED = (
     "it was exported by an earlier version: its hash does not cover what it says of where it comes "
@@ -126,7 +126,7 @@ def _write_parts(
     folder: Path, file: Path, entries: Iterable[Entry | None], provenance: dict[str, str]
 ) -> None:
     """Write the entries part by part into the folder, and all of them as the file."""
-    partial = file.with_name(file.name + ".partial")
+    partial = file.with_name(file.name + ".partial")  # no reader sees half a file
     content, calls, size = hashlib.sha256(), 0, 0
     with in_memory(READING) as connection:
         columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
@@ -137,7 +137,7 @@ def _write_parts(
                 content.update(_fingerprint(row[0], row[-1]))
                 size += _size(row)
             calls += len(some)
-            _append(connection, some)
+            append(connection, "calls", some)
             connection.execute(
                 f"COPY calls TO {quoted(f'{folder}/{part:06}.parquet')} (COMPRESSION snappy)"
             )
@@ -204,12 +204,6 @@ def _size(row: tuple[Any, ...]) -> int:
     return len(row[-2]) + len(row[-1])
 
 
-def _append(connection: duckdb.DuckDBPyConnection, rows: list[tuple[Any, ...]]) -> None:
-    appender = connection.appender("calls")
-    appender.append_rows(rows)
-    appender.flush()
-
-
 def read_recording(file: Path) -> Iterator[Entry]:
     """All entries of a recording, each verified against its key; raises RecordingError."""
     with _opened(file) as connection:
@@ -233,7 +227,7 @@ def read_recording(file: Path) -> Iterator[Entry]:
             f"{file} is not as it was exported: it holds {number} calls of {told.get('calls')}, "
             "and its content has another hash"
         )
-    if told.get("format") != FIRST_FORMAT and told.get(PROVENANCE_HASH) != _provenance_hash(told):
+    if is_covered(told) and told.get(PROVENANCE_HASH) != _provenance_hash(told):
         raise RecordingError(
             f"{file} is not as it was exported: what it says of where it comes from has another "
             "hash"
@@ -271,7 +265,10 @@ class Spilled(Mapping[str, Entry]):
 
 
 def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
-    """Verify the whole file, then add what the cache lacks; returns (added, already there)."""
+    """Verify the whole file, then add what the cache lacks; returns (added, already there).
+
+    Reading it twice keeps nothing of a file that proves damaged at its end.
+    """
     for _ in read_recording(file):
         pass
     added = there = 0
@@ -303,7 +300,7 @@ def summarise(file: Path) -> Summary:
         served[entry.attempts[-1].model_served or "unknown"] += 1
         endpoints[entry.request.endpoint] += 1
         outcomes[entry.attempts[-1].outcome] += 1
-    provenance = _provenance(file)
+    provenance = read_provenance(file)
     return Summary(
         calls=calls,
         scripted=scripted,
@@ -314,7 +311,7 @@ def summarise(file: Path) -> Summary:
         endpoints=dict(endpoints),
         outcomes=dict(outcomes),
         provenance=provenance,
-        covered=provenance.get("format") != FIRST_FORMAT,
+        covered=is_covered(provenance),
     )
 
 
@@ -330,6 +327,11 @@ def _written(file: Path) -> Iterator[None]:
 def _fingerprint(key: str, attempts: str) -> bytes:
     """The part of a row that the hash of a recording covers directly: its key covers the rest."""
     return f"{key} {attempts}\n".encode()
+
+
+def is_covered(provenance: dict[str, str]) -> bool:
+    """Whether the hash of the file covers the provenance, too."""
+    return provenance.get("format") != FIRST_FORMAT
 
 
 def _provenance_hash(metadata: dict[str, str]) -> str:
@@ -462,7 +464,8 @@ def _number(connection: duckdb.DuckDBPyConnection, sql: str) -> int:
     return int(row[0] or 0) if row else 0
 
 
-def _provenance(file: Path) -> dict[str, str]:
+def read_provenance(file: Path) -> dict[str, str]:
+    """What a recording says of where it comes from, not verified; raises RecordingError."""
     with _opened(file) as connection:
         return _metadata(file, connection)
 

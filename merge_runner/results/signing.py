@@ -66,7 +66,10 @@ def _signature(file: Path, tool: str) -> Path:
 def _run(
     tool: str, options: Sequence[object], file: Path | None = None, *, asks: bool = False
 ) -> bytes:
-    """Run a tool on a file; if it ``asks``, at the terminal. Raises RecordingError."""
+    """Run a tool on a file; one that ``asks`` for a passphrase does so at the terminal.
+
+    Raises RecordingError.
+    """
     try:
         with file.open("rb") if file else nullcontext() as content:
             done = subprocess.run(  # noqa: S603 # the user's own tool

@@ -18,12 +18,14 @@ import duckdb
 
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.records import TrialRecord
-from merge_runner.results.comparison import PLACES, TrialKey, stored_rows
+from merge_runner.results.comparison import PLACES, TrialKey, rows_of_trials, stored_rows
 from merge_runner.results.database import (
     PATIENCE_S,
     SCHEMA_VERSION,
     TEXTS,
     Instance,
+    append,
+    by_name,
     fetched,
     merge_small_groups,
     migrate,
@@ -32,11 +34,10 @@ from merge_runner.results.database import (
     room_for_texts,
     schema_sql,
     schema_version,
-    streamed,
     unreadable_is_usage,
     update_measures,
 )
-from merge_runner.results.rows import Row, rows_of, state_rows, trial_row
+from merge_runner.results.rows import Row, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.served_model import other_models, sql_of
 from merge_runner.signals import at_signals
@@ -101,7 +102,7 @@ class Store:
                 ],
             )
             _add_specs(connection, specs)
-            _append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
+            append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
 
     def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
         """Note when and how a sweep ended."""
@@ -119,11 +120,7 @@ class Store:
         """
         with self._writing() as connection:
             _refuse_other_conditions(connection, list(keys))
-            return {
-                key
-                for key, status in _statuses(connection, list(keys)).items()
-                if status != "failed"
-            }
+            return {key for key, ended in _ended(connection, list(keys)).items() if ended}
 
     def write(
         self, sweep_id: str, records: Sequence[TrialRecord], *, patience_s: float
@@ -133,50 +130,28 @@ class Store:
         Returns the ids of those that are stored with other values, and in which columns.
         """
         # Made before the lock is taken, though a trial that is stored already needs none.
-        rows = [rows_of(record) for record in records]
+        played = [(record, rows_of(record)) for record in records]
         with self._writing(patience_s) as connection:
             merge_small_groups(connection)
-            keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
-            stored = _statuses(connection, keys)
-            _delete(connection, [key for key, status in stored.items() if status == "failed"])
-            new = [
-                made
-                for made, key in zip(rows, keys, strict=True)
-                if stored.get(key, "failed") == "failed"
-            ]
-            again = {
-                key: made
-                for record, made, key in zip(records, rows, keys, strict=True)
-                if stored.get(key, "failed") != "failed" and record.status != "failed"
-            }
-            differing = _differing(connection, again)
-            _append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
-            for table in ("trials", "states", "decisions", "calls"):
-                _append(connection, table, chain.from_iterable(made[table] for made in new))
-            return differing
+            _, differing = _add_trials(connection, played)
+            keys = (_key(record) for record in records)
+            append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
+            return dict(differing)
 
     def add_recorded(
         self, records: Sequence[TrialRecord], specs: dict[str, str]
     ) -> tuple[int, int, list[str]]:
-        """Store recorded trials without decisions; one that is stored already stays as it is.
+        """Store recorded trials, of no sweep; one that is stored already stays as it is.
 
         Returns how many were added, how many were stored already, and the ids of those that are
         stored with other values.
         """
+        played = [(record, rows_of(record)) for record in records]
         with self._writing() as connection:
             _add_specs(connection, specs)
-            keys = [(record.spec.trial_id, record.spec.spec_hash) for record in records]
-            known = _stored(connection, keys)
-            stored = len(known)
-            differing = []
-            for key, record in zip(keys, records, strict=True):
-                rows = (trial_row(record), list(state_rows(record)))
-                if known.setdefault(key, rows) != rows:
-                    differing.append(record.spec.trial_id)
-            new = list(known.values())[stored:]
-            _append(connection, "trials", (trial for trial, _ in new))
-            _append(connection, "states", chain.from_iterable(states for _, states in new))
-            return len(new), len(records) - len(new) - len(differing), differing
+            added, differing = _add_trials(connection, played)
+            there = len(records) - added - len(differing)
+            return added, there, [trial_id for trial_id, _ in differing]
 
     @contextmanager
     def _writing(self, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
@@ -289,7 +264,10 @@ def results_digest(path: Path) -> tuple[str, int]:
 def _by_trial(
     connection: duckdb.DuckDBPyConnection, columns: str, table: str
 ) -> Iterator[tuple[TrialKey, list[list[Any]]]]:
-    """The rows of each trial once it is complete: they lie together, and are too many to sort."""
+    """The rows of each trial as soon as all of them are read.
+
+    They lie together in the table, which is too large to be sorted.
+    """
     counts = {
         (trial_id, spec_hash): count
         for trial_id, spec_hash, count in connection.execute(
@@ -297,9 +275,8 @@ def _by_trial(
         ).fetchall()
     }
     begun: dict[TrialKey, list[list[Any]]] = {}
-    for trial_id, spec_hash, *values in streamed(
-        connection,
-        f"SELECT trial_id, spec_hash, {columns} FROM {table}",  # noqa: S608 # constants
+    for trial_id, spec_hash, *values in fetched(
+        connection.execute(f"SELECT trial_id, spec_hash, {columns} FROM {table}")  # noqa: S608 # constants
     ):
         rows = begun.setdefault((trial_id, spec_hash), [])
         rows.append(values)
@@ -307,35 +284,24 @@ def _by_trial(
             yield (trial_id, spec_hash), begun.pop((trial_id, spec_hash))
 
 
-def used_call_keys(path: Path, sweep_id: str | None) -> tuple[str, list[str]]:
-    """The sweep (the newest if None is named) and the keys of the calls that it used."""
+def recorded_sweep(path: Path, sweep_id: str | None) -> tuple[dict[str, Any], list[str]]:
+    """The row of a sweep (the newest if None is named) and the keys of the calls that it used.
+
+    Raises UsageError.
+    """
     with read_database(path) as connection:
-        found = connection.execute(
-            "SELECT sweep_id FROM sweeps WHERE sweep_id = coalesce(?, sweep_id) "
-            "ORDER BY started_at DESC LIMIT 1",
-            [sweep_id],
-        ).fetchone()
-        if found is None:
-            known = connection.execute("SELECT sweep_id FROM sweeps ORDER BY ALL").fetchall()
-            names = ", ".join(name for (name,) in known) or "none"
+        sweeps = list(by_name(connection.execute("FROM sweeps ORDER BY started_at")))
+        sweep = next((s for s in reversed(sweeps) if sweep_id in (None, s["sweep_id"])), None)
+        if sweep is None:
+            names = ", ".join(sorted(sweep["sweep_id"] for sweep in sweeps)) or "none"
             raise UsageError(f"{path} holds no sweep {sweep_id or ''}; valid: {names}")
         keys = connection.execute(
-            "SELECT DISTINCT call_key FROM decisions SEMI JOIN sweep_trials "
-            "ON decisions.trial_id = sweep_trials.trial_id "
-            "AND decisions.spec_hash = sweep_trials.spec_hash AND sweep_id = ? "
-            "WHERE call_key IS NOT NULL ORDER BY call_key",
-            [found[0]],
+            "SELECT DISTINCT call_key FROM decisions SEMI JOIN "
+            "(SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?) "
+            "USING (trial_id, spec_hash) WHERE call_key IS NOT NULL ORDER BY call_key",
+            [sweep["sweep_id"]],
         ).fetchall()
-    return found[0], [key for (key,) in keys]
-
-
-def sweep_row(path: Path, sweep_id: str) -> dict[str, Any]:
-    """One row of the sweeps table, column to value."""
-    with read_database(path) as connection:
-        result = connection.execute("SELECT * FROM sweeps WHERE sweep_id = ?", [sweep_id])
-        names = [column[0] for column in result.description or ()]
-        row = result.fetchone()
-    return dict(zip(names, row or (), strict=True))
+    return sweep, [key for (key,) in keys]
 
 
 @dataclass(frozen=True, slots=True)
@@ -419,19 +385,9 @@ def _add_specs(connection: duckdb.DuckDBPyConnection, specs: dict[str, str]) -> 
         connection.execute("INSERT OR IGNORE INTO specs VALUES (?, ?)", list(item))
 
 
-def _rows_of(
-    connection: duckdb.DuckDBPyConnection, keys: list[TrialKey], select: str, order: str = "ALL"
-) -> list[Row]:
-    return connection.execute(
-        f"{select} SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) "
-        f"USING (trial_id, spec_hash) ORDER BY {order}",
-        [[key[0] for key in keys], [key[1] for key in keys]],
-    ).fetchall()
-
-
 def _refuse_other_conditions(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:
-    stored = "SELECT condition, projected_headway_m, relative_velocity_mps FROM trials"
-    for name, *numbers in set(_rows_of(connection, keys, stored)):
+    columns = "DISTINCT condition, projected_headway_m, relative_velocity_mps"
+    for name, *numbers in rows_of_trials(connection, columns, "trials", keys).fetchall():
         condition = CONDITIONS[name]
         if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
             raise UsageError(
@@ -440,46 +396,59 @@ def _refuse_other_conditions(connection: duckdb.DuckDBPyConnection, keys: list[T
             )
 
 
-def _statuses(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> dict[TrialKey, str]:
-    rows = _rows_of(connection, keys, "SELECT trial_id, spec_hash, status FROM trials")
-    return {(trial_id, spec_hash): status for trial_id, spec_hash, status in rows}
+def _key(record: TrialRecord) -> TrialKey:
+    return record.spec.trial_id, record.spec.spec_hash
 
 
-def _stored(
-    connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]
-) -> dict[TrialKey, tuple[Row, list[Row]]]:
-    """The rows of those of these trials that are stored: the trial's, and its states in order."""
-    trials = _rows_of(connection, keys, "FROM trials")
-    found: dict[TrialKey, tuple[Row, list[Row]]] = {(row[0], row[1]): (row, []) for row in trials}
-    for row in _rows_of(connection, keys, "FROM states", "trial_id, spec_hash, step, side"):
-        found[row[0], row[1]][1].append(row)
-    return found
+def _ended(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> dict[TrialKey, bool]:
+    """Which of these trials are stored, and whether each ended: a failed one is played again."""
+    columns = "trial_id, spec_hash, status <> 'failed'"
+    rows = rows_of_trials(connection, columns, "trials", keys).fetchall()
+    return {(trial_id, spec_hash): ended for trial_id, spec_hash, ended in rows}
+
+
+def _add_trials(
+    connection: duckdb.DuckDBPyConnection, played: list[tuple[TrialRecord, dict[str, list[Row]]]]
+) -> tuple[int, list[tuple[str, list[str]]]]:
+    """Store whole trials, in the place of failed ones; compare those that ended before.
+
+    Returns how many were stored, and the id of each that is stored with other values, with the
+    columns.
+    """
+    stored = _ended(connection, [_key(record) for record, _ in played])
+    _delete(connection, [key for key, ended in stored.items() if not ended])
+    new: dict[TrialKey, dict[str, list[Row]]] = {}
+    again: list[tuple[TrialKey, dict[str, list[Row]]]] = []
+    for record, rows in played:
+        key = _key(record)
+        if not stored.get(key) and key not in new:
+            new[key] = rows
+        elif record.status != "failed":
+            again.append((key, rows))
+    for table in PLACES:
+        append(connection, table, chain.from_iterable(rows[table] for rows in new.values()))
+    return len(new), list(_differing(connection, again))
 
 
 def _differing(
-    connection: duckdb.DuckDBPyConnection, played: dict[TrialKey, dict[str, list[Row]]]
-) -> dict[str, list[str]]:
-    """Which trials are stored with other values than were played, and in which columns."""
-    found: dict[str, list[str]] = {}
-    for table in PLACES if played else ():
-        stored = stored_rows(connection, table, list(played))
-        for key, made in played.items():
-            for difference in stored.differences(key, made[table], ignored=OF_A_RUN):
-                found.setdefault(key[0], []).append(difference.name)
-    return found
+    connection: duckdb.DuckDBPyConnection, played: list[tuple[TrialKey, dict[str, list[Row]]]]
+) -> Iterator[tuple[str, list[str]]]:
+    """The ids of trials that are stored with other values than were played, and the columns."""
+    keys = [key for key, _ in played]
+    tables = [stored_rows(connection, table, keys) for table in PLACES] if played else []
+    for key, rows in played:
+        columns = [
+            difference.name
+            for stored in tables
+            for difference in stored.differences(key, rows[stored.table], ignored=OF_A_RUN)
+        ]
+        if columns:
+            yield key[0], columns
 
 
 def _delete(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:
-    for table in ("calls", "decisions", "states", "trials") if keys else ():
+    for table in PLACES if keys else ():
         connection.executemany(
             f"DELETE FROM {table} WHERE trial_id = ? AND spec_hash = ?",  # noqa: S608 # constants
             keys,
         )
-
-
-def _append(
-    connection: duckdb.DuckDBPyConnection, table: str, rows: Iterable[tuple[Any, ...]]
-) -> None:
-    appender = connection.appender(table)
-    appender.append_rows(list(rows))
-    appender.flush()

@@ -764,14 +764,14 @@ def answered(entry: Entry, **changes: object) -> Entry:
     return replace(entry, attempts=(*entry.attempts[:-1], replace(entry.attempts[-1], **changes)))
 
 
-def asked_anew(entry: Entry) -> Entry:
-    """Another request in the same slot."""
+def asked_anew(entry: Entry, **changes: object) -> Entry:
+    """Another request in the same slot, or in a changed one."""
     old = entry.request
     body = json.loads(old.body)
     body["messages"][0]["content"] += "?"
     request = make_request(
         provider=old.provider, endpoint=old.endpoint, model=old.model, path=old.path,
-        headers=old.headers, body=body, slot=old.slot,
+        headers=old.headers, body=body, slot=replace(old.slot, **changes),
     )  # fmt: skip
     return answered(replace(entry, request=request), reply="{}")
 
@@ -779,6 +779,9 @@ def asked_anew(entry: Entry) -> Entry:
 RECORDINGS = {
     "nothing": (lambda e: e, None, ""),
     "a decision is gone": (lambda e: e[:2] + e[3:], "numbering", "nothing is recorded, though"),
+    "decisions are gone up to one of any number": (
+        lambda e: [*e, asked_anew(e[0], decision=10**15)], "numbering", "though of later ones",
+    ),
     "a slot was asked twice": (
         lambda e: [*e, asked_anew(e[2])], "numbering", "2 requests are recorded, for 1 prompt",
     ),
@@ -791,35 +794,42 @@ RECORDINGS = {
         "served", "scripted-driver -> gpt-0: another model answered than was asked for (1 ans",
     ),
     "an attempt is gone": (
-        lambda e: [answered(e[0], number=2), *e[1:]], "attempt", "its attempts are out of order",
+        lambda e: [answered(e[0], number=2), *e[1:]], "attempt", "its attempts are numbered [2]",
     ),
     "a trial is gone": (lambda _: [], "missing", "nothing is recorded"),
 }  # fmt: skip
+
+
+def recorded(folder: Path, entries: list[Entry], provenance: dict[str, str]) -> Path:
+    """A recording of these entries."""
+    cache, file = ResponseCache(folder / "cache"), folder / "changed.parquet"
+    cache.put_now(entries)
+    export_recording(file, cache, [e.request.key for e in entries], provenance)
+    return file
 
 
 @pytest.mark.parametrize("what", RECORDINGS)
 def test_each_damage_of_a_recording_is_found_and_nothing_else(exported, tmp_path, what):
     entries, provenance = exported
     change, kind, text = RECORDINGS[what]
-    changed = change(entries)
-    cache = ResponseCache(tmp_path / "cache")
-    cache.put_now(changed)
-    export_recording(
-        tmp_path / "changed.parquet", cache, [e.request.key for e in changed], provenance
-    )
-    found = audit("--recording", tmp_path / "changed.parquet")
+    found = audit("--recording", recorded(tmp_path, change(entries), provenance))
     assert [finding["kind"] for finding in found.findings] == ([kind] if kind else [])
     assert all(text in finding["text"] for finding in found.findings)
 
 
 def test_a_recording_without_its_origin_is_audited_as_far_as_it_goes(exported, tmp_path):
     entries, _ = exported
-    cache = ResponseCache(tmp_path / "cache")
-    cache.put_now(entries)
-    export_recording(tmp_path / "bare.parquet", cache, [e.request.key for e in entries], {})
-    found = audit("--recording", tmp_path / "bare.parquet")
+    found = audit("--recording", recorded(tmp_path, entries, {}))
     assert found.code == 0
     assert "it does not say of what sweep it is" in found.notes
+
+
+def test_a_reply_that_two_prompts_of_one_slot_share_is_found(exported, tmp_path):
+    entries, _ = exported
+    again = answered(asked_anew(entries[0]), reply=entries[0].attempts[-1].reply)
+    (finding,) = audit("--recording", recorded(tmp_path, [*entries, again], {})).findings
+    assert finding["kind"] == "shared"
+    assert "is also that of N_0_0/rep01, left, decision 0" in finding["text"]
 
 
 def test_a_damaged_recording_is_a_finding(tmp_path):

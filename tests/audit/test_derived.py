@@ -92,7 +92,7 @@ def test_what_is_changed_is_bad_and_good_answers_a_retry_and_a_program(made):
         assert ask("SELECT count(*) FROM calls WHERE outcome = 'rate_limited'") > 0
         assert ask(f"SELECT valid FROM decisions WHERE {ROWS['decisions']}")
     (audit, _) = audit_database(db)
-    assert (audit.counts["derived anew"], audit.notes) == (1, ())
+    assert (audit.counts["derived anew"], audit.notes) == (1, [])
 
 
 @pytest.mark.parametrize(("table", "column", "kind"), COLUMNS)
@@ -170,10 +170,10 @@ def test_an_answer_that_is_said_to_have_come_with_an_error_is_found(db):
 def test_a_program_that_is_another_one_by_now_is_said_and_only_driven(db, monkeypatch):
     monkeypatch.setattr("merge_runner.drivers.registry.source_digest", lambda *_, **__: "edited")
     (audit, _) = audit_database(db)
-    assert audit.findings == ()
-    assert audit.notes == (
-        "not derived anew in 1 trials: the decisions of a program that is not as it was",
-    )
+    assert audit.findings == []
+    assert audit.notes == [
+        "not derived anew in 1 trials: the decisions of a program that is not as it was"
+    ]
     change(db, "UPDATE states SET position_m = position_m + 1e-6 WHERE step = 3 AND side = 'right'")
     assert findings(db)
 
@@ -181,7 +181,7 @@ def test_a_program_that_is_another_one_by_now_is_said_and_only_driven(db, monkey
 def test_prompts_of_other_texts_are_said_and_the_rest_is_derived(db, monkeypatch):
     monkeypatch.setattr("merge_runner.audit.derived.block_digests", lambda _: {"C0": "older"})
     (audit, _) = audit_database(db)
-    assert audit.findings == ()
+    assert audit.findings == []
     assert "the prompts, made of other texts than this version has" in audit.notes[0]
     change(db, f"UPDATE decisions SET rationale = 'x' WHERE {ROWS['decisions']}")
     assert findings(db)

@@ -86,7 +86,7 @@ async def test_a_pipe_is_no_database(merge_runner, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     run = await merge_runner("replay", "baseline", "--db", "pipe")
     assert run.code == 2
-    assert "pipe is no file" in run.err
+    assert "pipe is not a file" in run.err
 
 
 def test_a_position_that_is_no_number_is_a_finding(db):

@@ -13,7 +13,6 @@ from aiohttp import web
 from merge_runner.emulator.chance import draw
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.emulator.server import HOST, Emulator
-from merge_runner.emulator.wire import dumps
 from merge_runner.records import SCRIPTED_FIELD
 from tests.emulator.scenarios import SCENARIOS
 from tests.emulator.scenarios.base import Scene
@@ -65,8 +64,16 @@ async def play(request, handler):
     if isinstance(body, str):
         return web.Response(status=scene.status, headers=headers, text=body)
     return web.Response(
-        body=dumps(body), status=scene.status, headers=headers, content_type="application/json"
+        body=_marked(body), status=scene.status, headers=headers, content_type="application/json"
     )
+
+
+def _marked(body):
+    """JSON, which may be a list of objects, with the field that says that no model made it."""
+    marked = [
+        {**part, SCRIPTED_FIELD: True} for part in (body if isinstance(body, list) else [body])
+    ]
+    return json.dumps(marked if isinstance(body, list) else marked[0], ensure_ascii=False).encode()
 
 
 def _told_now(scene):
