@@ -118,7 +118,7 @@ class Fits:
         at = self.terms.index(criterion.term)
         # An error is 0 where no residual is left: what is divided by it is judged right as well.
         with np.errstate(divide="ignore", invalid="ignore"):
-            _, holds = criterion.judge(self.b[:, at], self.se[:, at], self.p[:, at], self.freedom)
+            holds = criterion.holds(self.b[:, at], self.se[:, at], self.p[:, at], self.freedom)
         return self.sound & holds
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from analysis.data.study import Group, Study, of_group
 from analysis.metrics import GAP, LEFT_FIRST, RULES_NOTE, Metric, intervals_of, shown_in
 from analysis.stats.group_scores import Fits, fits
-from analysis.stats.indicators import INDICATORS, TESTED, Verdict, paper_verdicts, robust_verdicts
+from analysis.stats.indicators import INDICATORS, PAPER, ROBUST, TESTED, Verdict, verdicts
 from analysis.stats.intervals import Estimate
 from analysis.stats.measures import estimate, undecided, values
 from analysis.tables.attempts import FALLBACK
@@ -169,8 +169,8 @@ def _verdict_row(group: Group, kept: Group, name: str, why: str) -> Row:
 def _judged(found: Fits, name: str) -> tuple[Verdict, Verdict]:
     """An indicator by the paper's rule and by the robust one."""
     return (
-        paper_verdicts(found.logit, found.ols)[name],
-        robust_verdicts(found.firth, found.hc3)[name],
+        verdicts(PAPER, found.logit, found.ols)[name],
+        verdicts(ROBUST, found.firth, found.hc3)[name],
     )
 
 

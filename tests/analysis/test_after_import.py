@@ -145,7 +145,7 @@ def test_a_driver_is_compared_with_the_humans_by_i5(imported):
     (group,) = imported.models
     found = score(imported, group)
     assert found.robust["I5"] == Verdict(False)
-    assert found.paper["I5"] == Verdict(None, None, "the paper judged by eye")
+    assert found.paper["I5"] == Verdict(None, "the paper judged by eye")
     (table,) = make_tables(imported, ["velocity-profiles"])
     human, driver = (row.values for row in table.rows)
     assert human["gain"] < 0 < driver["gain"]
@@ -173,7 +173,7 @@ def test_figures_say_that_who_was_first_is_published_while_some_humans_are_missi
 def test_humans_are_not_compared_with_themselves(imported):
     found = score(imported, imported.human)
     for verdicts in (found.paper, found.robust):
-        assert verdicts["I5"] == Verdict(None, None, "the humans are the reference")
+        assert verdicts["I5"] == Verdict(None, "the humans are the reference")
     (table,) = make_tables(imported, ["velocity-profiles"])
     assert table.rows[0].values.get("difference_sd") is None
 
