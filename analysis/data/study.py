@@ -194,6 +194,11 @@ class Study:
         """The humans and every driver with the baseline prompt."""
         return [group for group in self.groups if group.setting in {"", BASELINE}]
 
+    @property
+    def measured(self) -> list[Group]:
+        """The groups whose speeds are known: all, but for humans before an import."""
+        return [group for group in self.groups if group.measured]
+
     @cached_property
     def profiles(self) -> pd.DataFrame:
         """One row a vehicle: whether it acted, and how far its acceleration is held."""

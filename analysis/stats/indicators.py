@@ -102,6 +102,11 @@ class Verdict:
     why: str = ""
 
 
+def disagree(one: Verdict, other: Verdict) -> bool:
+    """Whether one says that an indicator holds and the other that it does not."""
+    return None not in {one.passed, other.passed} and one.passed != other.passed
+
+
 def verdicts(
     criteria: Mapping[str, Criterion], who_first: Regression, gap: Regression
 ) -> dict[str, Verdict]:
