@@ -45,7 +45,7 @@ from analysis.figures.styles import (
     turned,
 )
 from analysis.stats.intervals import Estimate
-from analysis.tables.formats import VARIANTS
+from merge_runner.prompts.blocks import title_of
 
 # Laid out by hand: many rows of equal panels need no solver. In inches.
 LABEL_IN, ROW_IN = 1.15, 0.62
@@ -125,7 +125,7 @@ def _name(group: Group) -> str:
     driver = wrapped(group.label, LABEL_IN)
     if not group.setting:
         return driver
-    return f"{driver}\n{wrapped(VARIANTS.get(group.setting, group.setting), LABEL_IN)}"
+    return f"{driver}\n{wrapped(title_of(group.setting), LABEL_IN)}"
 
 
 def _traces(axis: Axes, study: Study, group: Group, first: str, styles: Styles) -> None:

@@ -8,12 +8,12 @@ from dataclasses import replace
 from analysis.data.study import Group, Study
 from analysis.stats.group_scores import Fits, fits
 from analysis.stats.intervals import POWER
+from analysis.stats.penalised import firth_intervals
 from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
 from analysis.stats.variants import (
     Corrected,
     Differences,
     corrected_differences,
-    firth_intervals,
     gap_differences,
     variants,
     who_first_differences,
