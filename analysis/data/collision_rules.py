@@ -136,6 +136,7 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     columns += ["projected_headway_m", "relative_velocity_mps"]
     for trial in ended[columns].itertuples(index=False):
         key = (trial.trial_id, trial.spec_hash)
+        # A trial that ended before both drivers had decided holds nothing to judge by.
         known = trial.source == "human" or key in decided
         for reading in readings:
             task = tasks[trial.spec_hash, reading]
@@ -147,8 +148,9 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
             elif seen(task, near.get(key, ()), between=reading == BOXES):
                 outcome = "collided", None
             elif trial.status != "collided":
+                # No other end than a collision depends on the rule.
                 outcome = trial.status, trial.merged_first
-            elif key not in speeds:
+            elif key not in speeds:  # humans have no plans that could be driven further
                 outcome = UNDECIDED, None
             else:
                 sides = [plans[key][side] for side in SIDES]

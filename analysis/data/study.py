@@ -176,7 +176,7 @@ class Study:
     def conditions(self) -> dict[str, tuple[float, float]]:
         """Name to projected headway in m and relative velocity in m/s: the humans', then others.
 
-        The others are told by the stored trials, since whoever registered them may not be here.
+        The others are read from the stored trials: what registered them may not be installed here.
         """
         played = {
             row.condition: (row.projected_headway_m, row.relative_velocity_mps)

@@ -114,5 +114,5 @@ def score(study: Study, group: Group) -> Score:
 
 @cache
 def population(study: Study) -> Population:
-    """The humans from whom the ceilings are drawn."""
+    """The human trials that the ceilings are drawn from."""
     return imported_humans(study.human.ended) if study.complete else published_humans()
