@@ -174,11 +174,11 @@ def _serve(db: Path, port: int, bind: str) -> None:
             f"the explorer needs {exc.name}: pip install 'merge-runner[view]'"
         ) from exc
 
-    def told(address: str) -> None:
+    def announce(address: str) -> None:
         print_out(address)
         say("open this address in a browser; Ctrl-C ends the explorer")
 
-    serve(db, port, bind, told)
+    serve(db, port, bind, announce)
 
 
 def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[str]) -> None:

@@ -115,8 +115,9 @@ def query_of(group: Group, predicate: str) -> str:
     """The query that lists the trials of a group which a value rests on, with their measures."""
     for metric in METRICS.values():
         judged = metric.value in JUDGED
-        told = _decided(group, metric.column) if judged else metric.counts_in_database
-        predicate = re.sub(rf"\b{metric.counts}", told.replace("\\", r"\\"), predicate)
+        stored = _decided(group, metric.column) if judged else metric.counts_in_database
+        # A predicate may name the column of a metric, which no table of the database has.
+        predicate = re.sub(rf"\b{metric.counts}", stored.replace("\\", r"\\"), predicate)
     variant = f" AND variant = '{group.setting}'" if group.setting else ""
     narrowed = f" AND {group.narrowed}" if group.narrowed else ""
     return (

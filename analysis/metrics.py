@@ -9,12 +9,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from analysis.bounded import Bounded
 from merge_runner.errors import UsageError
 from merge_runner.registry import Registry
 
 Estimator = Literal["proportion", "mean", "median"]
-# tables: Tables V and VII, the contrasts, and what is said and shown of these; fallbacks,
+# tables: Tables V and VII, the contrasts, and the sentences and pages made of these; fallbacks,
 # criticality: the tables of these names; distributions: the figure; humans: the page of the
 # explorer; conclusions: a sentence on each driver.
 Place = Literal["tables", "fallbacks", "criticality", "distributions", "humans", "conclusions"]
@@ -32,6 +31,21 @@ INTERVALS: dict[Estimator, str] = {
 JUDGED = ("collided", "collided_boxes")
 # The fields of a sentence on a driver.
 TOLD = ("value", "subject", "estimator", "trials")
+
+
+@dataclass(frozen=True, slots=True)
+class Bounded:
+    """A value with its 95 % interval; None where there is none."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+    def bounds(self, factor: float = 1.0) -> tuple[float, float] | None:
+        """Both ends of the interval, in units of 1 / ``factor``."""
+        if self.low is None or self.high is None:
+            return None
+        return factor * self.low, factor * self.high
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,7 +295,7 @@ JOINT = register(
 
 
 def _criticality(name: str, label: str, unit: str, meaning: str) -> Metric:
-    """A surrogate measure of safety, a column of ``trial_metrics``, of which medians are told."""
+    """A surrogate measure of safety, a column of ``trial_metrics``, summed up by its median."""
     shown = frozenset[Place]({"criticality"})
     return register(
         Metric(

@@ -13,3 +13,8 @@ class TableFormat(StrEnum):
     JSON = "json"
     MD = "md"
     LATEX = "latex"
+
+    @property
+    def suffix(self) -> str:
+        """That of its files."""
+        return {"text": "txt", "latex": "tex"}.get(self, self.value)

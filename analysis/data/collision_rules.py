@@ -7,7 +7,6 @@ driven again, and the last ones go on as far as they reach; what is open then st
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, pairwise
 from math import ceil, hypot, isclose
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple, get_args
 
 import pandas as pd
 
-from analysis.data.load import SPECS, load_each
+from analysis.data.load import load_each, load_specs
 from merge_runner.config import CollisionRule, ScenarioConfig
 from merge_runner.drivers.pace import pace_of
 from merge_runner.records import SIDES
@@ -117,10 +116,9 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     ``status`` is finished, collided, timeout or undecided.
     """
     ended = trials[trials["status"] != "failed"]
-    specs = load_each({"specs": SPECS}, db)["specs"]
-    texts = dict(zip(specs["spec_hash"], specs["spec"], strict=True))
-    told = {name: json.loads(texts.get(name, "{}")) for name in ended["spec_hash"].unique()}
-    tasks = _tasks(told)
+    stored = load_specs(db)
+    specs = {name: stored.get(name, {}) for name in ended["spec_hash"].unique()}
+    tasks = _tasks(specs)
     found = load_each(
         {"plans": PLANS, "near": _near(tasks), "decided": DECIDED, "speeds": MEAN_SPEEDS}, db
     )
@@ -138,6 +136,7 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     columns += ["projected_headway_m", "relative_velocity_mps"]
     for trial in ended[columns].itertuples(index=False):
         key = (trial.trial_id, trial.spec_hash)
+        # A trial that ended before both drivers had decided holds nothing to judge by.
         known = trial.source == "human" or key in decided
         for reading in readings:
             task = tasks[trial.spec_hash, reading]
@@ -149,13 +148,14 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
             elif seen(task, near.get(key, ()), between=reading == BOXES):
                 outcome = "collided", None
             elif trial.status != "collided":
+                # No other end than a collision depends on the rule.
                 outcome = trial.status, trial.merged_first
-            elif key not in speeds:
+            elif key not in speeds:  # humans have no plans that could be driven further
                 outcome = UNDECIDED, None
             else:
                 sides = [plans[key][side] for side in SIDES]
                 lasting = [
-                    pace_of(task.config, told[trial.spec_hash].get(side, {})).action_steps
+                    pace_of(task.config, specs[trial.spec_hash].get(side, {})).action_steps
                     for side in SIDES
                 ]
                 outcome = redrive(
@@ -236,7 +236,7 @@ def _is_multiple(time_s: float, step_s: float) -> bool:
     return isclose(time_s / step_s, round(time_s / step_s), abs_tol=1e-6)
 
 
-def _tasks(told: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], Task]:
+def _tasks(specs: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], Task]:
     """The task of each spec under each reading; that of humans is the default one."""
     return {
         (spec_hash, reading): Task(
@@ -246,7 +246,7 @@ def _tasks(told: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], Task]
             ),
             track_of(spec),
         )
-        for spec_hash, spec in told.items()
+        for spec_hash, spec in specs.items()
         for reading in READINGS
     }
 

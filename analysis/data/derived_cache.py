@@ -1,7 +1,7 @@
-"""What is computed from the results and kept beside them in the database, until they change.
+"""Tables and figures that the database keeps beside the results, until these change.
 
-Kept are whole tables and figures. Where the file cannot be written, as on a read-only disk or while
-another program holds it, nothing is kept, and the next run computes anew.
+Where the file cannot be written, as on a read-only disk or while another program holds it, nothing
+is kept, and the next run computes them again.
 """
 
 from __future__ import annotations
@@ -81,6 +81,7 @@ def program() -> str:
 
 def state(connection: duckdb.DuckDBPyConnection) -> str:
     """A hash of all that the tables of the open database depend on: its rows and the program."""
+    # A sum of hashes does not depend on the order of rows, which DuckDB does not promise.
     sums = connection.execute(
         " UNION ALL ".join(
             f"SELECT '{name}', count(*), sum(hash(hash(one))::HUGEINT) FROM {rows} AS one"  # noqa: S608 # constants
@@ -118,7 +119,7 @@ def keep_finished(db: Path, made_of: str, options: str, contents: dict[str, str]
     try:
         with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
             if schema_version(connection, db) < SCHEMA_VERSION:
-                return  # a copy of it was read
+                return  # what was read is a copy in the newer schema: the file itself is older
             connection.begin()
             connection.execute(KEPT)
             if state(connection) == made_of:

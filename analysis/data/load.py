@@ -5,16 +5,21 @@ A query that a single table, page or statistic needs stands beside it.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from pydantic import BaseModel, JsonValue, ValidationError
 
+from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.results.database import read_database
 from merge_runner.results.store import query
+from merge_runner.scenarios.merge.geometry import TRACK, Track
 from merge_runner.served_model import ALIASES, PAIRS, Pair, others_among
 
 TRIALS = (
@@ -95,8 +100,26 @@ DECISIONS = """
 SELECT trial_id, spec_hash, fallback, count(*) AS decisions
 FROM decisions GROUP BY ALL ORDER BY ALL
 """
-
 SPECS = "SELECT spec_hash, spec FROM specs"
+SPECS_WITH_A_TRIAL = """
+SELECT spec_hash, spec, min(trial_id) AS trial_id
+FROM specs LEFT JOIN trials USING (spec_hash) GROUP BY ALL ORDER BY ALL
+"""
+
+
+class _Driver(BaseModel):
+    """What a spec says of a driver: a model has the body of its requests, a program has none."""
+
+    body: dict[str, JsonValue] = {}
+
+
+class _Spec(BaseModel):
+    """What is read of a spec; that of humans says none of this."""
+
+    scenario: ScenarioConfig = ScenarioConfig()
+    track: Track = TRACK
+    left: _Driver = _Driver()
+    right: _Driver = _Driver()
 
 
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
@@ -119,6 +142,23 @@ def load_each(queries: Mapping[str, str], db: Path | str = DEFAULT_DB) -> dict[s
             columns = [column[0] for column in result.description or ()]
             found[name] = pd.DataFrame(result.fetchall(), columns=columns)
         return found
+
+
+def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:
+    """Every stored spec by its hash; raises UsageError for one that cannot be read."""
+    found = {}
+    for row in load_each({"specs": SPECS_WITH_A_TRIAL}, db)["specs"].itertuples():
+        found[row.spec_hash] = json.loads(row.spec)
+        try:
+            _Spec.model_validate(found[row.spec_hash])
+        except ValidationError as exc:
+            first = exc.errors()[0]
+            place = ".".join(map(str, first["loc"])) or "all of it"
+            raise UsageError(
+                f"the spec {row.spec_hash}, of {row.trial_id}, cannot be read: {place}: "
+                f"{first['msg']}; `merge-runner audit` names what else is wrong"
+            ) from exc
+    return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ def trials_with_metrics(db: Path) -> pd.DataFrame:
 
 
 def outcomes_with_metrics() -> pd.DataFrame:
-    """The published human outcomes with a column for each metric that they tell.
+    """The published human outcomes with a column for each metric that they determine.
 
     Raises UsageError where the SQL of a metric fails there.
     """
@@ -45,8 +45,8 @@ def outcomes_with_metrics() -> pd.DataFrame:
             sql = f"SELECT {_columns(metrics)} FROM trials ORDER BY number"  # noqa: S608 # ours
             return connection.sql(sql).df()
 
-    told = (one for one in METRICS.values() if one.humans_from == "outcomes")
-    return outcomes.join(_loaded(load, told, "fails on the published human outcomes"))
+    known = (one for one in METRICS.values() if one.humans_from == "outcomes")
+    return outcomes.join(_loaded(load, known, "fails on the published human outcomes"))
 
 
 def _loaded(load: Load, metrics: Iterable[Metric], fails: str) -> pd.DataFrame:

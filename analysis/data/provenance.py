@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.data.load import ANSWERED, load_each, rows
+from analysis.data.load import ANSWERED, load_each, load_specs, rows
 from analysis.data.study import Group, Study, of_group
 from merge_runner.audit.replies import answers_alike
 from merge_runner.config import ScenarioConfig
@@ -50,7 +50,7 @@ FROM (
 GROUP BY provider, model_requested, model_served ORDER BY ALL
 """
 SPECS = """
-SELECT DISTINCT driver, variant, spec_hash, spec
+SELECT DISTINCT driver, variant, spec_hash
 FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE source <> 'human' ORDER BY ALL
 """
@@ -174,19 +174,21 @@ def provenance(db: Path) -> Provenance:
         },
         db,
     )
+    stored = load_specs(db)
+    specs = {row: stored[row.spec_hash] for row in found["specs"].itertuples(index=False)}
     return Provenance(
         sweeps=found["sweeps"],
         calls=found["calls"],
         sweep_costs=found["sweep_costs"],
         model_costs=found["model_costs"],
         switches={
-            f"{row.driver}/{row.variant} ({row.spec_hash})": _switched(row.spec) or "defaults"
-            for row in found["specs"].itertuples()
+            f"{row.driver}/{row.variant} ({row.spec_hash})": _switched(spec) or "defaults"
+            for row, spec in specs.items()
         },
-        tasks={row.spec_hash: _switched(row.spec) for row in found["specs"].itertuples()},
+        tasks={row.spec_hash: _switched(spec) for row, spec in specs.items()},
         mismatches=_mismatches(found["served"], found["aliases"]),
         alike=_alike(db),
-        sent={row.spec_hash: _sent(json.loads(row.spec)) for row in found["specs"].itertuples()},
+        sent={row.spec_hash: _sent(spec) for row, spec in specs.items()},
     )
 
 
@@ -217,9 +219,9 @@ def _other_model(study: Study, answered: pd.DataFrame) -> list[bool]:
     return [pair in study.calls.others for pair in pairs]
 
 
-def _switched(spec: str) -> str:
+def _switched(spec: Mapping[str, Any]) -> str:
     """The settings of a spec's driving task that differ from the defaults."""
-    defaults, scenario = ScenarioConfig().model_dump(), json.loads(spec).get("scenario", {})
+    defaults, scenario = ScenarioConfig().model_dump(), spec.get("scenario", {})
     return ", ".join(f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v)
 
 

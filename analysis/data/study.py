@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -19,12 +20,12 @@ from analysis.data.load import (
     LEFT_SPEEDS,
     PLANS,
     SHARED,
-    SPECS,
     SPEEDS,
     TRACES,
     Calls,
     load_calls,
     load_each,
+    load_specs,
 )
 from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
 from merge_runner.drivers.registry import stand_in
@@ -140,15 +141,15 @@ class Study:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
         self.db = Path(db)
         self.chosen = models
-        found = load_each({"specs": SPECS, "traces": TRACES}, self.db)
+        specs = load_specs(self.db)
         trials = trials_with_metrics(self.db).merge(
-            found["traces"], on=["trial_id", "spec_hash"], how="left"
+            self._read(TRACES), on=["trial_id", "spec_hash"], how="left"
         )
         trials = judged(self.db, trials)
         recorded = trials["source"] == HUMAN
         self.imported = imported(trials[recorded]) if recorded.any() else None
         self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
-        every = _model_groups(trials[~recorded], _tasks(found["specs"]))
+        every = _model_groups(trials[~recorded], _tasks(specs))
         valid = [HUMAN, *dict.fromkeys(group.driver for group in every)]
         wanted = valid if models is None else list(models)
         unknown = [name for name in wanted if name not in valid]
@@ -175,7 +176,7 @@ class Study:
     def conditions(self) -> dict[str, tuple[float, float]]:
         """Name to projected headway in m and relative velocity in m/s: the humans', then others.
 
-        The others are told by the stored trials, since whoever registered them may not be here.
+        The others are read from the stored trials: what registered them may not be installed here.
         """
         played = {
             row.condition: (row.projected_headway_m, row.relative_velocity_mps)
@@ -193,6 +194,11 @@ class Study:
     def baselines(self) -> list[Group]:
         """The humans and every driver with the baseline prompt."""
         return [group for group in self.groups if group.setting in {"", BASELINE}]
+
+    @property
+    def measured(self) -> list[Group]:
+        """The groups whose speeds are known: all, but for humans before an import."""
+        return [group for group in self.groups if group.measured]
 
     @cached_property
     def profiles(self) -> pd.DataFrame:
@@ -262,14 +268,13 @@ def _published_group() -> Group:
     )  # fmt: skip
 
 
-def _tasks(specs: pd.DataFrame) -> dict[str, str]:
+def _tasks(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """Spec hash to a hash of what it covers beside the prompt: equal for variants of one study."""
     tasks = {}
-    for row in specs.itertuples():
-        spec = json.loads(row.spec)
-        spec.pop("prompt_blocks", None)
-        text = json.dumps(spec, sort_keys=True)
-        tasks[row.spec_hash] = hashlib.sha256(text.encode()).hexdigest()[:8]
+    for spec_hash, spec in specs.items():
+        beside = {name: value for name, value in spec.items() if name != "prompt_blocks"}
+        text = json.dumps(beside, sort_keys=True)
+        tasks[spec_hash] = hashlib.sha256(text.encode()).hexdigest()[:8]
     return tasks
 
 

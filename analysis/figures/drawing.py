@@ -7,11 +7,12 @@ import textwrap
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
 from analysis.data.reference_data import HUMAN_TRIALS
 from analysis.data.study import Group, Study
-from analysis.figures.panels import Point
+from analysis.figures.panels import Array, Point
 from analysis.figures.styles import Style
 
 # IEEE transactions: one column and the whole page, in inches.
@@ -74,6 +75,20 @@ def key(style: Style, label: str) -> Line2D:
     return Line2D(
         [], [], color=style.colour, marker=style.marker, ms=3, lw=0.8, mfc="white", label=label
     )
+
+
+def draw_traces(axis: Axes, found: list[Array], colour: str, count: int) -> None:
+    """Traces of (time, value), one of ``count`` in the panel: many must not be one blot."""
+    alpha = min(0.4, max(0.06, 25 / max(count, 1)))
+    lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
+    lines.set(capstyle="projecting", joinstyle="round")
+    axis.add_collection(lines)
+    axis.autoscale_view()
+
+
+def letter(axis: Axes, name: str, height: float) -> None:
+    """The letter of a panel, at its upper left corner."""
+    axis.text(-0.02, height, name, transform=axis.transAxes, fontweight="bold", ha="right")
 
 
 def draw_points(axis: Axes, found: list[Point], shift_m: float, style: Style) -> None:

@@ -12,7 +12,6 @@ from typing import Any, Literal
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
@@ -23,7 +22,9 @@ from analysis.figures.drawing import (
     MISSING,
     PAGE_IN,
     draw_points,
+    draw_traces,
     key,
+    letter,
     line_count,
     named,
     remarks,
@@ -248,11 +249,7 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
             axis: Axes = axes[row, column]
             found = left_traces(study, group, first)
             colour = _style(study.baselines, group).colour
-            alpha = min(0.4, max(0.06, 25 / max(len(found), 1)))  # many lines must not be one blot
-            lines = LineCollection(found, color=colour, lw=0.4, alpha=alpha, rasterized=True)
-            lines.set(capstyle="projecting", joinstyle="round")
-            axis.add_collection(lines)
-            axis.autoscale_view()
+            draw_traces(axis, found, colour, len(found))
             if not group.measured:
                 say(axis, MISSING)
             elif not found:
@@ -264,7 +261,7 @@ def _traces(axes: NDArray[np.object_], study: Study) -> None:
             if column == 0:
                 place = "first" if first == "left" else "second"
                 axis.set_ylabel(f"left merges {place}\nv left (m/s)")
-                _panel(axis, panel)
+                letter(axis, panel, 1.06)
             if row == 1:
                 axis.set_xlabel("time (s)")
 
@@ -278,7 +275,7 @@ def _curves(
     label: str,
 ) -> None:
     axes[0].set_ylabel(label)
-    _panel(axes[0], panel)
+    letter(axes[0], panel, 1.06)
     for axis, velocity in zip(axes, velocities, strict=True):
         for index, group in enumerate(groups):
             found = points(group, velocity)
@@ -307,7 +304,3 @@ def _style(groups: list[Group], group: Group) -> Style:
 
 def _mark(passed: bool | None) -> str:
     return "–" if passed is None else "✓" if passed else "✗"
-
-
-def _panel(axis: Axes, letter: str) -> None:
-    axis.text(-0.02, 1.06, letter, transform=axis.transAxes, fontweight="bold", ha="right")

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -16,7 +15,9 @@ from analysis.figures.drawing import (
     MISSING,
     PAGE_IN,
     draw_points,
+    draw_traces,
     key,
+    letter,
     line_count,
     remarks,
     say,
@@ -45,7 +46,7 @@ from analysis.figures.styles import (
     turned,
 )
 from analysis.stats.intervals import Estimate
-from analysis.tables.formats import VARIANTS
+from merge_runner.prompts.blocks import title_of
 
 # Laid out by hand: many rows of equal panels need no solver. In inches.
 LABEL_IN, ROW_IN = 1.15, 0.62
@@ -125,19 +126,15 @@ def _name(group: Group) -> str:
     driver = wrapped(group.label, LABEL_IN)
     if not group.setting:
         return driver
-    return f"{driver}\n{wrapped(VARIANTS.get(group.setting, group.setting), LABEL_IN)}"
+    return f"{driver}\n{wrapped(title_of(group.setting), LABEL_IN)}"
 
 
 def _traces(axis: Axes, study: Study, group: Group, first: str, styles: Styles) -> None:
     """The left speeds of those trials in which this side merged first."""
     parts = [left_traces(study, _part(group, velocity), first) for velocity in styles]
     count = sum(map(len, parts))
-    alpha = min(0.4, max(0.06, 25 / max(count, 1)))  # many lines must not be one blot
     for found, style in zip(parts, styles.values(), strict=True):
-        lines = LineCollection(found, color=style.colour, lw=0.4, alpha=alpha, rasterized=True)
-        lines.set(capstyle="projecting", joinstyle="round")
-        axis.add_collection(lines)
-    axis.autoscale_view()
+        draw_traces(axis, found, style.colour, count)
     if count:
         # Who goes first drives faster: below there is room, and above for who goes second.
         y, va = (0.04, "bottom") if first == "left" else (0.96, "top")
@@ -200,9 +197,9 @@ def _limits(found: list[Estimate], lines: list[float]) -> tuple[float, float]:
 
 
 def _headings(axes: NDArray[np.object_]) -> None:
-    for axis, heading, letter in zip(axes[0], HEADINGS, "ABCDE", strict=True):
+    for axis, heading, panel in zip(axes[0], HEADINGS, "ABCDE", strict=True):
         axis.set_title(heading)
-        axis.text(-0.02, 1.1, letter, transform=axis.transAxes, fontweight="bold", ha="right")
+        letter(axis, panel, 1.1)
     for axis, label in zip(axes[-1], XLABELS, strict=True):
         axis.set_xlabel(label)
 

@@ -103,7 +103,7 @@ def human_status(db: DbOption = DEFAULT_DB) -> None:
 def _nothing_in(path: Path, files: list[File]) -> str:
     inner = [file.name for file in files if file.name.lower().endswith(".zip")]
     hint = f"; unpack it, and import {', '.join(inner)} of it" if inner else ""
-    return f"no trial is in {path}: trials are experiment_N_iter_M.csv or .mat{hint}"
+    return f"no trial is in {path}: trials are experiment_N_iter_M.csv{hint}"
 
 
 def _messages(download: Download, report: Report) -> Iterator[str]:

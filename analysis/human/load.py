@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import PurePath
 
 from analysis.human.archive import File, Unreadable, refuse_bombs
 from analysis.human.record import SPEC, SPEC_HASH, trial_record
-from analysis.human.trace import Trace, parse_csv, parse_mat
+from analysis.human.trace import parse_csv
 from merge_runner.records import TrialRecord
 from merge_runner.results.store import Store
 
@@ -20,20 +20,18 @@ NAME = re.compile(
     r"_(?P<phase>iter|training)_(?P<number>[0-9]{1,6})\.(?P<suffix>csv|mat|pkl)",
     re.IGNORECASE,
 )
-PARSERS: dict[str, Callable[[bytes], Trace]] = {"csv": parse_csv, "mat": parse_mat}
-ONLY_PICKLED = (
-    "it exists only as PKL, which runs code when it is read and needs the experiment's own "
-    "program: export it there as CSV"
-)
+# The recorder wrote a CSV, a MAT and a PKL of each trial; unpickling one would run what is in it.
+NOT_READ = "the CSV that the experiment's program writes beside it is what can be imported"
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedTrial:
-    """One trial of a download; ``files`` holds its files by suffix: csv, mat, pkl."""
+    """One trial of a download: its CSV files, copies too, and the names of its other files."""
 
     experiment: int
     iteration: int
-    files: dict[str, list[File]]
+    files: list[File] = field(default_factory=list)
+    others: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +61,7 @@ class Report:
 
 def sort_files(files: Iterable[File]) -> Download:
     """Tell trials, training and simulated runs by their names; raises UsageError for a bomb."""
-    trials: dict[tuple[int, int], dict[str, list[File]]] = {}
+    trials: dict[tuple[int, int], RecordedTrial] = {}
     training: set[tuple[int, int]] = set()
     simulated: set[tuple[int, int]] = set()
     for file in files:
@@ -77,12 +75,14 @@ def sort_files(files: Iterable[File]) -> Download:
         elif phase == "training":
             training.add(run)
         else:
-            trials.setdefault(run, {}).setdefault(suffix, []).append(file)
-    refuse_bombs(
-        file for forms in trials.values() for suffix in PARSERS for file in forms.get(suffix, ())
-    )
+            trial = trials.setdefault(run, RecordedTrial(*run))
+            if suffix == "csv":
+                trial.files.append(file)
+            else:
+                trial.others.append(file.name)
+    refuse_bombs(file for trial in trials.values() for file in trial.files)
     return Download(
-        trials=[RecordedTrial(*run, forms) for run, forms in sorted(trials.items())],
+        trials=[trial for _, trial in sorted(trials.items())],
         training=len(training),
         simulated=len(simulated),
     )
@@ -102,18 +102,21 @@ def import_trials(trials: Iterable[RecordedTrial], store: Store) -> Report:
 
 
 def _read(trial: RecordedTrial, report: Report) -> list[TrialRecord]:
-    """The trial from its CSV, copies too, or else from its MAT; what cannot be read is reported."""
+    """The trial from each of its CSV files; what cannot be read is reported."""
     records: list[TrialRecord] = []
     failed: list[tuple[str, str]] = []
-    for suffix, parse in PARSERS.items():
-        for file in trial.files.get(suffix, ()) if not records else ():
-            try:
-                trace = parse(file.read())
-                records.append(trial_record(trace, trial.experiment, trial.iteration))
-            except Unreadable as exc:
-                failed.append((file.name, str(exc)))
+    for file in trial.files:
+        try:
+            trace = parse_csv(file.read())
+            records.append(trial_record(trace, trial.experiment, trial.iteration))
+        except Unreadable as exc:
+            failed.append((file.name, str(exc)))
     if records:
         report.replaced += failed
+    elif failed:
+        report.unreadable += failed
     else:
-        report.unreadable += failed or [(trial.files["pkl"][0].name, ONLY_PICKLED)]
+        name = trial.others[0]
+        form = PurePath(name).suffix[1:].upper()
+        report.unreadable.append((name, f"it exists only as {form}: {NOT_READ}"))
     return records

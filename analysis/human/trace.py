@@ -1,19 +1,18 @@
-"""One recorded trial as it stands in its file, CSV or MAT.
+"""One recorded trial as it stands in its CSV file.
 
-The experiment's recorder wrote series under dotted names, and scalars into the first row alone;
-MAT has the same names with underscores. Rows count from 0.
+The experiment's recorder wrote series under dotted names, and scalars into the first row alone.
+Rows count from 0.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
 from analysis.human.archive import Unreadable
-from analysis.human.mat import read_mat
 from merge_runner.records import SIDES, Side
 
 POSITIONS: dict[Side, str] = {side: f"travelled_distance.{side}" for side in SIDES}
@@ -43,7 +42,8 @@ def parse_csv(content: bytes) -> Trace:
         # Checked row by row: a small download can unpack to many rows of nothing.
         reader = filter(None, csv.reader(lines, strict=True))
         header = next(reader, [])
-        _require(NEEDED, header)
+        if missing := sorted(set(NEEDED) - set(header)):
+            raise Unreadable(f"it lacks {', '.join(missing)}")
         rows = [_whole(row, header, number) for number, row in enumerate(reader)]
     except (UnicodeDecodeError, csv.Error) as exc:
         raise Unreadable(f"it is not a CSV table: {exc}") from exc
@@ -57,38 +57,22 @@ def _whole(row: list[str], header: list[str], number: int) -> list[str]:
     return row
 
 
-def parse_mat(content: bytes) -> Trace:
-    """Read a trial's MAT file of version 5; raises Unreadable."""
-    variables = read_mat(content)
-    names = {name: name.replace(".", "_") for name in NEEDED}
-    _require(names.values(), variables)
-    return _trace({name: variables[names[name]] for name in NEEDED})
-
-
-def _require(names: Iterable[str], found: Iterable[str]) -> None:
-    if missing := sorted(set(names) - set(found)):
-        raise Unreadable(f"it lacks {', '.join(missing)}")
-
-
-def _trace(columns: Mapping[str, Sequence[float | str]]) -> Trace:
+def _trace(columns: Mapping[str, Sequence[str]]) -> Trace:
     """Check the columns; of ``dt`` (ms) and ``end_state`` only the first value counts."""
-    lengths = {len(columns[name]) for name in SERIES}
-    if len(lengths) > 1:
-        raise Unreadable(f"its series differ in length: {sorted(lengths)} samples")
-    if max(lengths) < 2:
+    if len(columns["dt"]) < 2:
         raise Unreadable("it has fewer than 2 rows")
-    steps_ms = _numbers("dt", columns["dt"][:1])
-    if not steps_ms or steps_ms[0] <= 0:
-        raise Unreadable(f"dt is {steps_ms}, not a time in ms")
+    (step_ms,) = _numbers("dt", columns["dt"][:1])
+    if step_ms <= 0:
+        raise Unreadable(f"dt is {step_ms:g}, not a time in ms")
     return Trace(
-        step_s=steps_ms[0] / 1000,
-        end_state=str(next(iter(columns["end_state"]), "")),
+        step_s=step_ms / 1000,
+        end_state=columns["end_state"][0],
         positions_m={side: _numbers(name, columns[name]) for side, name in POSITIONS.items()},
         velocities_mps={side: _numbers(name, columns[name]) for side, name in VELOCITIES.items()},
     )
 
 
-def _numbers(name: str, values: Sequence[float | str]) -> list[float]:
+def _numbers(name: str, values: Sequence[str]) -> list[float]:
     try:
         numbers = list(map(float, values))
     except ValueError:
@@ -99,7 +83,7 @@ def _numbers(name: str, values: Sequence[float | str]) -> list[float]:
     return numbers
 
 
-def _is_number(value: float | str) -> bool:
+def _is_number(value: str) -> bool:
     try:
         return isfinite(float(value))
     except ValueError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from analysis.data.provenance import Mismatch, Provenance, tally
@@ -21,25 +22,79 @@ class Alarm:
 
 def alarms(study: Study, origin: Provenance) -> list[Alarm]:
     """What puts the results of a study in doubt, the worst first."""
+    # Title, what was found, and what a reader should know of it.
     found = (
-        ("A scripted stand-in answered", _posing(study)),
-        ("Repetitions are the same trial", _repeated(study)),
-        ("Some trials are equal", _equal(study)),
-        ("The human trials are another data set", _other_humans(study)),
-        ("Answers are word for word as before", _alike(origin)),
-        ("Trials failed", _failed(study)),
-        ("Many fallbacks", _fallbacks(study)),
-        ("Attempts of unknown fate", _unknown(study)),
-        ("Several settings under one name", _mixed(study)),
+        (
+            "A scripted stand-in answered",
+            [f"{group.id}: {group.posing}" for group in posing(study)],
+            "These rows stand last, are in no conclusion, and never beside the paper's row of that "
+            "model.",
+        ),
+        (
+            "Repetitions are the same trial",
+            [
+                f"{group.repeated} of {len(group.trials) + group.repeated} trials of {group.id} "
+                "repeat an earlier one to the last state"
+                for group in study.models
+                if group.repeated
+            ],
+            "A driver without chance goes the same way each time: equal trials count once, in "
+            "every n, interval and test.",
+        ),
+        (
+            "Some trials are equal",
+            [
+                f"{group.equal} of {len(group.trials)} trials of {group.id} are as an earlier one "
+                "to the last state"
+                for group in study.models
+                if group.equal
+            ],
+            "Others of their repetitions differ, so that each counts; where they came from a cache "
+            "on the way, they are no samples.",
+        ),
+        (
+            "The human trials are another data set",
+            study.imported.contradicting if study.imported else (),
+            "They are no part of the published trials, and their rows say so.",
+        ),
+        (
+            "Answers are word for word as before",
+            [
+                f"all {repeated} answers of {driver} to prompts that it was asked before"
+                for driver, repeated in origin.alike.items()
+            ],
+            "A cache on the way or a temperature of 0 does this: the repetitions are no samples.",
+        ),
+        (
+            "Trials failed",
+            [_failures(group) for group in study.models if len(group.trials) > len(group.ended)],
+            "They are in no measure; the same sweep again plays them anew.",
+        ),
+        (
+            "Many fallbacks",
+            list(_fallbacks(study)),
+            "There the older plan was driven, or none: the table fallbacks shows whether that "
+            "changes the results.",
+        ),
+        (
+            "Attempts of unknown fate",
+            list(_unknown(study)),
+            "A run was killed before their reply was seen: they may have been paid for.",
+        ),
+        (
+            "Several settings under one name",
+            list(_mixed(study)),
+            "They are never pooled: all but the most frequent carry a mark.",
+        ),
     )
     return [
         *(Alarm("Another model answered", mismatch(one)) for one in origin.mismatches),
-        *(Alarm(title, text) for title, text in found if text),
+        *(Alarm(title, f"{'; '.join(parts)}. {rest}") for title, parts, rest in found if parts),
     ]
 
 
 def mismatch(one: Mismatch) -> str:
-    """Who answered in the place of whom, how often, and in which sweeps."""
+    """Which model answered in the place of which, how often, and in which sweeps."""
     answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
     sweeps = f"sweep{'s' * (len(one.sweeps) != 1)} {', '.join(one.sweeps) or 'unknown'}"
     return (
@@ -53,69 +108,6 @@ def posing(study: Study) -> list[Group]:
     return [group for group in study.models if group.scripted and EMULATOR not in group.models]
 
 
-def _said(parts: list[str], rest: str) -> str:
-    """What was found, and what to know of it; empty where nothing was."""
-    return f"{'; '.join(parts)}. {rest}" if parts else ""
-
-
-def _posing(study: Study) -> str:
-    return _said(
-        [f"{group.id}: {group.posing}" for group in posing(study)],
-        "These rows stand last, are in no conclusion, and never beside the paper's row of that "
-        "model.",
-    )
-
-
-def _repeated(study: Study) -> str:
-    return _said(
-        [
-            f"{group.repeated} of {len(group.trials) + group.repeated} trials of {group.id} repeat "
-            "an earlier one to the last state"
-            for group in study.models
-            if group.repeated
-        ],
-        "A driver without chance goes the same way each time: equal trials count once, in every n, "
-        "interval and test.",
-    )
-
-
-def _equal(study: Study) -> str:
-    return _said(
-        [
-            f"{group.equal} of {len(group.trials)} trials of {group.id} are as an earlier one to "
-            "the last state"
-            for group in study.models
-            if group.equal
-        ],
-        "Others of their repetitions differ, so that each counts; where they came from a cache on "
-        "the way, they are no samples.",
-    )
-
-
-def _other_humans(study: Study) -> str:
-    return _said(
-        list(study.imported.contradicting) if study.imported else [],
-        "They are no part of the published trials, and their rows say so.",
-    )
-
-
-def _alike(origin: Provenance) -> str:
-    return _said(
-        [
-            f"all {repeated} answers of {driver} to prompts that it was asked before"
-            for driver, repeated in origin.alike.items()
-        ],
-        "A cache on the way or a temperature of 0 does this: the repetitions are no samples.",
-    )
-
-
-def _failed(study: Study) -> str:
-    return _said(
-        [_failures(group) for group in study.models if len(group.trials) > len(group.ended)],
-        "They are in no measure; the same sweep again plays them anew.",
-    )
-
-
 def _failures(group: Group) -> str:
     failed = group.trials[group.trials["status"] == "failed"]
     reasons = failed["error"].fillna("no reason is stored").value_counts()
@@ -123,37 +115,25 @@ def _failures(group: Group) -> str:
     return f"{len(failed)} of {len(group.trials)} of {group.id} ({reasons.index[0]}{more})"
 
 
-def _fallbacks(study: Study) -> str:
-    return _said(
-        [
-            f"{found.fallbacks} of {found.decisions} decisions of {group.id} "
-            f"({100 * found.fallbacks / found.decisions:.1f} %)"
-            for group in study.models
-            for found in [tally(study, group)]
-            if found.fallbacks > MANY_FALLBACKS * found.decisions
-        ],
-        "There the older plan was driven, or none: the table fallbacks shows whether that changes "
-        "the results.",
-    )
-
-
-def _unknown(study: Study) -> str:
-    return _said(
-        [
-            f"{found.unknown} of {found.attempts} of {group.id}"
-            for group in study.models
-            for found in [tally(study, group)]
-            if found.unknown
-        ],
-        "A run was killed before their reply was seen: they may have been paid for.",
-    )
-
-
-def _mixed(study: Study) -> str:
-    settings: dict[str, dict[str, None]] = {}
+def _fallbacks(study: Study) -> Iterator[str]:
     for group in study.models:
-        settings.setdefault(group.name, {})[group.name + group.mark] = None
-    return _said(
-        [", ".join(marked) for marked in settings.values() if len(marked) > 1],
-        "They are never pooled: all but the most frequent carry a mark.",
-    )
+        found = tally(study, group)
+        if found.fallbacks > MANY_FALLBACKS * found.decisions:
+            share = 100 * found.fallbacks / found.decisions
+            yield (
+                f"{found.fallbacks} of {found.decisions} decisions of {group.id} ({share:.1f} %)"
+            )
+
+
+def _unknown(study: Study) -> Iterator[str]:
+    for group in study.models:
+        if unknown := tally(study, group).unknown:
+            yield f"{unknown} of {tally(study, group).attempts} of {group.id}"
+
+
+def _mixed(study: Study) -> Iterator[str]:
+    """The names under which several settings were played, each with its marks."""
+    marked: dict[str, dict[str, None]] = {}
+    for group in study.models:
+        marked.setdefault(group.name, {})[group.name + group.mark] = None
+    yield from (", ".join(names) for names in marked.values() if len(names) > 1)

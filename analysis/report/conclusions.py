@@ -128,7 +128,7 @@ def _marks(study: Study, group: Group) -> list[str]:
 def _weight(group: Group, found: Score, name: str) -> str:
     """What the lack of a mark says, from how often humans have it in studies of this size.
 
-    Who has it by neither rule lacks also the one that humans pass more often.
+    A driver that has it by neither rule also lacks the one that humans pass more often.
     """
     robust, paper = found.ceiling.robust.get(name), found.ceiling.paper.get(name)
     if robust is None or paper is None:
@@ -186,7 +186,7 @@ def _told(study: Study, group: Group, metric: Metric) -> str:
     found, subject = estimate(group, metric), metric.in_sentences
     if found.value is None:
         return f"{group.driver}: no trial has {subject}."
-    told = metric.told.format(
+    sentence = metric.told.format(
         value=_number(metric, found.value),
         subject=subject,
         estimator=metric.estimator,
@@ -194,7 +194,7 @@ def _told(study: Study, group: Group, metric: Metric) -> str:
     )
     low_high = found.bounds()
     interval = f" (95 % CI {' to '.join(_digits(metric, x) for x in low_high)})" if low_high else ""
-    return f"{group.driver} {told}{interval}; {_of_humans(study, group, metric)}."
+    return f"{group.driver} {sentence}{interval}; {_of_humans(study, group, metric)}."
 
 
 def _of_humans(study: Study, group: Group, metric: Metric) -> str:
@@ -285,7 +285,7 @@ def _human_limits(study: Study) -> list[str]:
 
 
 def _asked(group: Group, origin: Provenance) -> list[str]:
-    """What the results of a baseline are bound to: the wording, and what was sent with it."""
+    """What the results of a baseline depend on: its task, its wording, what was sent with it."""
     if not group.setting or group.scripted:
         return []
     changed = origin.tasks.get(group.spec_hash or "")
@@ -294,7 +294,7 @@ def _asked(group: Group, origin: Provenance) -> list[str]:
         return [*task, f"{group.driver} is a program: it reads no prompt, and samples nothing."]
     sent = origin.sent.get(group.spec_hash or "") or {"": {}}
     alike = len({str(parameters) for parameters in sent.values()}) == 1
-    told = [
+    listed = [
         _parameters(parameters) if alike else f"{side}: {_parameters(parameters)}"
         for side, parameters in sent.items()
     ]
@@ -302,7 +302,7 @@ def _asked(group: Group, origin: Provenance) -> list[str]:
         *task,
         f"{group.driver}: results hold for the wording of the prompt, which is a reconstruction "
         f"(the original is not public), and for what was sent with it: "
-        f"{'; '.join(dict.fromkeys(told))}.",
+        f"{'; '.join(dict.fromkeys(listed))}.",
     ]
 
 

@@ -9,7 +9,7 @@ from analysis.report.ablated import SLOPES
 from analysis.stats.contrasts import corrected
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import POWER, Difference
-from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, differences
+from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions
 from analysis.tables.notes import listed
 
 LEVELS = {
@@ -20,7 +20,7 @@ LEVELS = {
 
 def unlike(study: Study, group: Group) -> Iterator[str]:
     """What one model of a driver and the humans shows of their difference."""
-    found = differences(study.human, group)
+    found = interactions(study.human, group)
     tested = [(one, one.found) for one in found if one.found is not None]
     for problem in dict.fromkeys(one.problem for one in found if one.problem):
         yield f"{group.driver}: a difference from the humans cannot be tested: {problem}."

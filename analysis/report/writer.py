@@ -16,14 +16,6 @@ from analysis.tables.formats import render
 from analysis.tables.model import Table, options_text
 from merge_runner.errors import UsageError
 
-SUFFIXES = {
-    TableFormat.TEXT: "txt",
-    TableFormat.CSV: "csv",
-    TableFormat.JSON: "json",
-    TableFormat.MD: "md",
-    TableFormat.LATEX: "tex",
-}
-
 
 def write_report(
     db: Path, models: Sequence[str] | None, out: Path, files: Path | None
@@ -50,8 +42,8 @@ def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
     """Write each table in every form; yields the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     for table in tables:
-        for form, suffix in SUFFIXES.items():
-            path = folder / f"{table.name}.{suffix}"
+        for form in TableFormat:
+            path = folder / f"{table.name}.{form.suffix}"
             path.write_text(render([table], form) + "\n", encoding="utf-8")
             yield path
 

@@ -118,7 +118,7 @@ class Fits:
         at = self.terms.index(criterion.term)
         # An error is 0 where no residual is left: what is divided by it is judged right as well.
         with np.errstate(divide="ignore", invalid="ignore"):
-            _, holds = criterion.judge(self.b[:, at], self.se[:, at], self.p[:, at], self.freedom)
+            holds = criterion.holds(self.b[:, at], self.se[:, at], self.p[:, at], self.freedom)
         return self.sound & holds
 
 
@@ -257,6 +257,7 @@ def _firth_step(n: Array, left: Array, b: Array, free: tuple[int, ...]) -> Array
     step[:, free] = np.einsum(
         "bjk,bk->bj", _inverse(design[:, free], weights, alive)[0], score[:, free]
     )
+    # Near separation a Newton step can leave the region where the information is regular.
     return np.clip(step, -5, 5)
 
 
@@ -297,6 +298,7 @@ def _inverse(
 
 
 def _rank(design: Array, n: Array) -> NDArray[np.bool_]:
+    """In which data sets the conditions with trials tell all terms apart."""
     information = _information(design, (n > 0).astype(float))
     return np.asarray(np.linalg.matrix_rank(information) == design.shape[1])
 

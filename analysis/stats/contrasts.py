@@ -79,7 +79,7 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> D
     # Of what is left of both within conditions, the slope is that of the whole model (Frisch and
     # Waugh 1933; Lovell 1963).
     weight = float((group**2).sum())
-    if weight < 1e-12:
+    if weight < 1e-12:  # no condition has trials of both groups
         return None
     difference = float((group * value).sum()) / weight
     freedom = len(both) - by_condition.ngroups - 1
@@ -112,6 +112,7 @@ def _permutation_p(
         shuffled_sums(rng, value[start:end], int(chosen[start:end].sum()))
         for start, end in zip(ends - sizes, ends, strict=True)
     ]
+    # As large but for rounding is as large.
     extreme = int((np.abs(np.sum(parts, axis=0) / weight) >= abs(observed) - 1e-12).sum())
     # The trials as they are count as a shuffle, so that p is never 0 (Phipson and Smyth 2010).
     return (extreme + 1) / (PERMUTATIONS + 1)

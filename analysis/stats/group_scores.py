@@ -11,7 +11,7 @@ from functools import cache
 from analysis.data.reference_data import published
 from analysis.data.study import Group, Study
 from analysis.stats.ceiling import Ceiling, Population, ceiling, imported_humans, published_humans
-from analysis.stats.indicators import Verdict, paper_verdicts, robust_verdicts
+from analysis.stats.indicators import PAPER, ROBUST, Verdict, verdicts
 from analysis.stats.likeness import likeness
 from analysis.stats.regressions import Regression, gap_ols, who_first_firth, who_first_logit
 
@@ -55,6 +55,11 @@ class Score:
     sizes: tuple[int, ...]
 
     @property
+    def rules(self) -> dict[str, dict[str, Verdict]]:
+        """The verdicts by the name of their rule, as it stands in a sentence."""
+        return {PAPER_RULE: self.paper, ROBUST_RULE: self.robust}
+
+    @property
     def ceiling(self) -> Ceiling:
         """The human ceiling for the group's size."""
         return ceiling(self.humans, self.sizes)
@@ -72,18 +77,18 @@ class Total:
         return f"{self.passed} of {self.judged}"
 
 
-def total(verdicts: dict[str, Verdict]) -> Total:
+def total(judged: dict[str, Verdict]) -> Total:
     """The score of a group by one rule."""
-    known = {name: v.passed for name, v in verdicts.items() if v.passed is not None}
-    return Total(sum(known.values()), len(known), tuple(n for n in verdicts if n not in known))
+    known = {name: v.passed for name, v in judged.items() if v.passed is not None}
+    return Total(sum(known.values()), len(known), tuple(n for n in judged if n not in known))
 
 
 def unjudged(found: Score, *names: str) -> dict[str, tuple[list[str], list[str]]]:
     """Why some of these indicators have no verdict: which, and by which rules."""
     reasons: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
     for name in names:
-        for rule, verdicts in ((PAPER_RULE, found.paper), (ROBUST_RULE, found.robust)):
-            if verdicts[name].passed is None and (why := verdicts[name].why):
+        for rule, judged in found.rules.items():
+            if judged[name].passed is None and (why := judged[name].why):
                 indicators, rules = reasons.setdefault(why, ({}, {}))
                 indicators[name] = rules[rule] = None
     return {why: (list(which), list(rules)) for why, (which, rules) in reasons.items()}
@@ -93,21 +98,21 @@ def unjudged(found: Score, *names: str) -> dict[str, tuple[list[str], list[str]]
 def score(study: Study, group: Group) -> Score:
     """Judge a group's indicators."""
     fit = fits(group)
-    paper, robust = paper_verdicts(fit.logit, fit.ols), robust_verdicts(fit.firth, fit.hc3)
+    paper, robust = verdicts(PAPER, fit.logit, fit.ols), verdicts(ROBUST, fit.firth, fit.hc3)
     if not group.measured:
         row = published("paper_ablation_qualitative").query("driver == 'human'").iloc[0]
         for name in ("I3", "I4"):
-            paper[name] = Verdict(bool(row[name.lower()]), None, PUBLISHED)
-        paper["I5"] = Verdict(bool(row["i5"]), None, BY_EYE)
-        robust["I5"] = Verdict(None, None, BY_EYE)
+            paper[name] = Verdict(bool(row[name.lower()]), PUBLISHED)
+        paper["I5"] = Verdict(bool(row["i5"]), BY_EYE)
+        robust["I5"] = Verdict(None, BY_EYE)
     elif group is study.human:
-        paper["I5"] = robust["I5"] = Verdict(None, None, REFERENCE)
+        paper["I5"] = robust["I5"] = Verdict(None, REFERENCE)
     else:
-        paper["I5"], robust["I5"] = Verdict(None, None, NO_RULE), likeness(study, group)
+        paper["I5"], robust["I5"] = Verdict(None, NO_RULE), likeness(study, group)
     return Score(paper, robust, population(study), group.sizes)
 
 
 @cache
 def population(study: Study) -> Population:
-    """The humans from whom the ceilings are drawn."""
+    """The human trials that the ceilings are drawn from."""
     return imported_humans(study.human.ended) if study.complete else published_humans()

@@ -37,20 +37,20 @@ INDICATORS = {
 
 # One number, or an array of one for each of many fits.
 Numbers = float | NDArray[np.float64]
-Judged = tuple[NDArray[np.float64], NDArray[np.bool_]]
+Holds = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class Criterion:
     """Which term decides an indicator, and how.
 
-    ``judge`` takes the term's b, standard error, p and degrees of freedom, and returns the p that
-    counts and whether the indicator holds. It judges one fit like many: a verdict and the human
-    ceiling are decided by the same lines.
+    ``holds`` takes the term's b, standard error, p and degrees of freedom, and returns whether the
+    indicator holds. It judges one fit like many: the same lines decide a verdict and the human
+    ceiling.
     """
 
     term: str
-    judge: Callable[[Numbers, Numbers, Numbers, Numbers], Judged]
+    holds: Callable[[Numbers, Numbers, Numbers, Numbers], Holds]
 
     @property
     def of_who_first(self) -> bool:
@@ -58,21 +58,20 @@ class Criterion:
         return self.term in WHO_FIRST_TERMS
 
 
-def _increases(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Judged:
-    return np.asarray(p), (np.asarray(b) > 0) & (np.asarray(p) < ALPHA)
+def _increases(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Holds:
+    return (np.asarray(b) > 0) & (np.asarray(p) < ALPHA)
 
 
-def _decreases(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Judged:
+def _decreases(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Holds:
     return _increases(-b, se, p, freedom)
 
 
-def _not_significant(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Judged:
-    return np.asarray(p), np.asarray(p) >= ALPHA
+def _not_significant(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Holds:
+    return np.asarray(p) >= ALPHA
 
 
-def _equivalent(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Judged:
-    of_equivalence = equivalence_p(b, se, freedom)
-    return of_equivalence, of_equivalence < ALPHA
+def _equivalent(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Holds:
+    return equivalence_p(b, se, freedom) < ALPHA
 
 
 def equivalence_p(b: Numbers, se: Numbers, freedom: Numbers) -> NDArray[np.float64]:
@@ -89,7 +88,8 @@ PAPER = {
     "I3": Criterion("abs_projected_headway", _increases),
     "I4": Criterion("abs_relative_velocity", _not_significant),
 }
-# The same of better tests; but a large p shows nothing, so that I4 has to be shown.
+# The same rules for better tests; only I4 differs: a large p shows nothing, so that the absence
+# of an effect has to be shown.
 ROBUST = PAPER | {"I4": Criterion("abs_relative_velocity", _equivalent)}
 TESTED = tuple(PAPER)
 
@@ -99,23 +99,18 @@ class Verdict:
     """Whether an indicator holds; None where the data cannot tell, for the reason ``why``."""
 
     passed: bool | None
-    p: float | None = None
     why: str = ""
 
 
-def paper_verdicts(logit: Regression, ols: Regression) -> dict[str, Verdict]:
-    """I1 to I4 by the signs and Wald tests of the paper."""
-    return _verdicts(PAPER, logit, ols)
+def disagree(one: Verdict, other: Verdict) -> bool:
+    """Whether one says that an indicator holds and the other that it does not."""
+    return None not in {one.passed, other.passed} and one.passed != other.passed
 
 
-def robust_verdicts(firth: Regression, hc3: Regression) -> dict[str, Verdict]:
-    """I1 to I4 by Firth's likelihood-ratio tests, HC3 and equivalence."""
-    return _verdicts(ROBUST, firth, hc3)
-
-
-def _verdicts(
+def verdicts(
     criteria: Mapping[str, Criterion], who_first: Regression, gap: Regression
 ) -> dict[str, Verdict]:
+    """I1 to I4 by these criteria; ROBUST ones need Firth's fit and HC3 errors."""
     return {
         name: judged(criterion, who_first if criterion.of_who_first else gap)
         for name, criterion in criteria.items()
@@ -125,7 +120,6 @@ def _verdicts(
 def judged(criterion: Criterion, fit: Regression) -> Verdict:
     """The verdict on one fit."""
     if fit.problem:
-        return Verdict(None, None, fit.problem)
+        return Verdict(None, fit.problem)
     term = fit.terms[criterion.term]
-    p, holds = criterion.judge(term.b, term.se, term.p, fit.freedom)
-    return Verdict(bool(holds), float(p))
+    return Verdict(bool(criterion.holds(term.b, term.se, term.p, fit.freedom)))

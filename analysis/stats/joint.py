@@ -3,7 +3,7 @@
 Who merged first is left ~ (h + dv) x source (logit), the gap is ~ (|h| + |dv| + h*dv) x source
 (least squares); source is 1 for the driver and 0 for the humans. Since it stands in every term, the
 likelihood, and Firth's penalty, fall apart into one factor of the humans and one of the driver: an
-interaction is the driver's coefficient minus the humans' (see ``regressions.difference``).
+interaction is the driver's coefficient minus the humans' (see ``regressions.differences``).
 
 The driver's trials are independent: Fisher's information in the logit, HC3 errors for the gap. The
 humans' come from pairs who differ: a jackknife over the pairs (CV3 of MacKinnon, Nielsen and Webb
@@ -12,30 +12,26 @@ humans' come from pairs who differ: a jackknife over the pairs (CV3 of MacKinnon
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from math import sqrt
 
-import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from analysis.data.reference_data import citation, published
 from analysis.data.study import Group
 from analysis.stats.group_scores import fits
-from analysis.stats.intervals import LEVEL, Difference
+from analysis.stats.intervals import Difference
 from analysis.stats.mixed import MIN_PAIRS
+from analysis.stats.penalised import FIRTH, firth_differences
 from analysis.stats.regressions import (
     GAP_TERMS,
-    MAX_ITERATIONS,
     WHO_FIRST_TERMS,
     Regression,
-    difference,
+    differences,
     gap_ols,
     wald_term,
-    who_first_data,
     who_first_logit,
 )
 
@@ -66,9 +62,14 @@ class Interaction:
 
 
 @cache
-def differences(human: Group, group: Group) -> tuple[Interaction, ...]:
+def interactions(human: Group, group: Group) -> tuple[Interaction, ...]:
     """How a driver differs from the humans: in who merged first, then in the gap, by term."""
-    return (*_of_who_first(human, group), *_of_gap(human, group))
+    mine, theirs = fits(group).hc3, _human_gap(human)
+    found = differences(mine, theirs, "least squares")
+    return (
+        *_of_who_first(human, group),
+        *_by_term(GAP, mine, theirs, found, theirs.remark),
+    )
 
 
 def pairs_known(human: Group, outcome: str) -> int:
@@ -98,18 +99,44 @@ def by_pairs(
 
 
 def _of_who_first(human: Group, group: Group) -> list[Interaction]:
-    mine, theirs = fits(group), _human_who_first(human)
-    if mine.logit.terms and theirs.terms:
-        return [_interaction(WHO_FIRST, term, mine.logit, theirs, "ML") for term in WHO_FIRST_TERMS]
-    return _by_firth(human, group, theirs)
-
-
-def _of_gap(human: Group, group: Group) -> list[Interaction]:
-    mine, theirs = fits(group).hc3, _human_gap(human)
+    """By maximum likelihood, or by Firth's where one of the two has no finite estimate."""
+    mine, theirs = fits(group).logit, _human_who_first(human)
     if mine.terms and theirs.terms:
-        return [_interaction(GAP, term, mine, theirs, "least squares") for term in GAP_TERMS]
-    problem = mine.problem or f"humans: {theirs.problem}"
-    return [Interaction(GAP, term, mine.n, theirs.n, problem=problem) for term in GAP_TERMS]
+        found = differences(mine, theirs, "ML")
+        return _by_term(WHO_FIRST, mine, theirs, found, theirs.remark)
+    remark = theirs.remark if theirs.terms and NARROW in theirs.remark else f"Firth's fit: {NARROW}"
+    mine, theirs = fits(group).firth, fits(human).firth
+    found = firth_differences(group, human)
+    if any(one.by != FIRTH for one in found.values()):
+        mine = replace(mine, problem="Firth's penalised joint fit does not converge")
+    return _by_term(WHO_FIRST, mine, theirs, found, remark)
+
+
+def _by_term(
+    outcome: str,
+    driver: Regression,
+    human: Regression,
+    found: Mapping[str, Difference],
+    remark: str,
+) -> list[Interaction]:
+    """An interaction with the source for each term, or why there is none."""
+    problem = driver.problem or (f"humans: {human.problem}" if human.problem else "")
+    steady = "neither the driver nor the humans vary: there is nothing to test"
+    return [
+        Interaction(outcome, term, driver.n, human.n, problem=problem or steady)
+        if problem or term not in found
+        else Interaction(
+            outcome,
+            term,
+            driver.n,
+            human.n,
+            driver.terms[term].b,
+            human.terms[term].b,
+            found[term],
+            remark=remark,
+        )
+        for term in (WHO_FIRST_TERMS if outcome == WHO_FIRST else GAP_TERMS)
+    ]
 
 
 @cache
@@ -137,78 +164,3 @@ def _human_gap(human: Group) -> Regression:
     }
     remark = f"humans as published ({citation('paper_gap')}); {NO_PAIRS}"
     return Regression(n, terms, freedom=freedom, remark=remark)
-
-
-def _interaction(
-    outcome: str, term: str, driver: Regression, human: Regression, method: str
-) -> Interaction:
-    """The interaction of a term with the source."""
-    found = difference(driver, human, term, method)
-    if found is None:
-        problem = "neither the driver nor the humans vary: there is nothing to test"
-        return Interaction(outcome, term, driver.n, human.n, problem=problem)
-    return Interaction(
-        outcome,
-        term,
-        driver.n,
-        human.n,
-        driver.terms[term].b,
-        human.terms[term].b,
-        found,
-        remark=human.remark,
-    )
-
-
-def _by_firth(human: Group, group: Group, theirs: Regression) -> list[Interaction]:
-    """The joint logit by Firth's penalised likelihood, where maximum likelihood has no estimate.
-
-    Tests and intervals are those of the penalised likelihood (Heinze and Schemper 2002), which
-    takes all trials as independent.
-    """
-    mine, humans = fits(group).firth, fits(human).firth
-    problem = mine.problem or (f"humans: {humans.problem}" if humans.problem else "")
-    if not problem:
-        found = _penalised(human, group)
-        problem = "" if found is not None else "Firth's penalised joint fit does not converge"
-    if problem or found is None:
-        return [
-            Interaction(WHO_FIRST, term, mine.n, humans.n, problem=problem)
-            for term in WHO_FIRST_TERMS
-        ]
-    remark = theirs.remark if theirs.terms and NARROW in theirs.remark else f"Firth's fit: {NARROW}"
-    return [
-        _by_likelihood(_interaction(WHO_FIRST, term, mine, humans, "Firth"), p, bounds, remark)
-        for term, p, bounds in zip(WHO_FIRST_TERMS, *found, strict=True)
-    ]
-
-
-def _by_likelihood(
-    one: Interaction, p: float, bounds: NDArray[np.float64], remark: str
-) -> Interaction:
-    """The same interaction by another test and interval; what is detectable stays Wald's."""
-    assert one.found is not None, "Firth's estimates always have errors"
-    low, high = map(float, bounds)
-    return replace(one, found=replace(one.found, low=low, high=high, p=float(p)), remark=remark)
-
-
-def _penalised(
-    human: Group, group: Group
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Penalised likelihood-ratio p (3,) and profile bounds (3, 2) of source and interactions."""
-    from firthmodels import FirthLogisticRegression
-
-    (x, left), (own, own_left) = who_first_data(human.outcomes), who_first_data(group.outcomes)
-    joint = np.vstack([np.hstack([x, 0 * x]), np.hstack([own, own])])
-    rows = np.column_stack([joint[:, 1:], np.concatenate([left, own_left])])
-    # The trials of a condition that went alike as one row with a weight: that is as good, and fast.
-    cells, weights = np.unique(rows, axis=0, return_counts=True)
-    model = FirthLogisticRegression(max_iter=MAX_ITERATIONS)
-    features = [2, 3, 4]  # after h and dv, the intercept being the model's own
-    with warnings.catch_warnings():
-        # It warns where it does not converge, which is checked below.
-        warnings.simplefilter("ignore", UserWarning)
-        fit = model.fit(cells[:, :-1], cells[:, -1], sample_weight=weights)
-        p = fit.lrt(features).lrt_pvalues_[features]
-        bounds = fit.conf_int(1 - LEVEL, "pl", features, max_iter=MAX_ITERATIONS)[features]
-    sound = fit.converged_ and np.isfinite(p).all() and np.isfinite(bounds).all()
-    return (p, bounds) if sound else None

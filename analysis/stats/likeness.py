@@ -83,12 +83,11 @@ def _independent(trials: pd.DataFrame, column: str) -> Array:
 def likeness(study: Study, group: Group) -> Verdict:
     """I5 of a driver: whether its accelerations are held as humans hold theirs."""
     if gains(study, group)["gain"].isna().all():
-        return Verdict(None, None, NO_ACTION)
+        return Verdict(None, NO_ACTION)
     if not study.human.measured:
-        return Verdict(None, None, "no human traces to compare with: the number alone")
+        return Verdict(None, "no human traces to compare with: the number alone")
     if not study.calibrated:
         return Verdict(
-            None,
             None,
             f"fewer than {ENOUGH_PER_CONDITION} human traces in a condition: the number alone",
         )
@@ -98,12 +97,12 @@ def likeness(study: Study, group: Group) -> Verdict:
 def judged(found: Estimate) -> Verdict:
     """Whether a difference in human standard deviations lies within the margin."""
     if found.value is None and found.n:
-        return Verdict(None, None, "human trials of a condition are alike: no spread to compare by")
+        return Verdict(None, "human trials of a condition are alike: no spread to compare by")
     if found.low is None or found.high is None:
-        return Verdict(None, None, "too few trials or human pairs to compare")
+        return Verdict(None, "too few trials or human pairs to compare")
     if found.low > -MARGIN_SD and found.high < MARGIN_SD:
         return Verdict(True)
     if found.low > MARGIN_SD or found.high < -MARGIN_SD:
         return Verdict(False)
     interval = f"{found.low:.2f} to {found.high:.2f} SD"
-    return Verdict(None, None, f"{interval} from the humans, which settles nothing")
+    return Verdict(None, f"{interval} from the humans, which settles nothing")

@@ -24,7 +24,7 @@ from analysis.stats.regressions import (
 
 Array = NDArray[np.float64]
 NODES = 25
-MIN_PAIRS = 3
+MIN_PAIRS = 3  # fewer say nothing of how pairs vary
 # Where the variance between pairs is this small beside that within, they do not differ.
 ALIKE = 1e-6
 
@@ -40,6 +40,7 @@ def gap_mixed(trials: pd.DataFrame, measure: str = "gap_m") -> Regression:
     if problem:
         return Regression(len(gap), {}, problem)
     model = MixedLM(gap, design, groups=chosen["pair"].to_numpy())
+    # Powell's method needs no gradient, and ends where the others run into the edge of 0 variance.
     for method in (["bfgs", "lbfgs", "cg"], ["powell"]):
         with warnings.catch_warnings():
             # What they warn of is checked below.
@@ -77,6 +78,7 @@ def who_first_mixed(trials: pd.DataFrame) -> Regression:
     def loss(parameters: Array) -> float:
         return -sum(_marginal(parameters, *part) for part in parts)
 
+    # The signs that I1 and I2 expect, and about the published SD between pairs.
     start = np.array([0.0, 0.5, -0.5, np.log(0.5)])
     found = optimize.minimize(loss, start, method="BFGS", options={"gtol": 1e-5})
     # Where pairs do not differ the likelihood is flat in their variance, and the Hessian singular.

@@ -73,18 +73,24 @@ def wald_term(b: float, se: float, freedom: float = inf) -> Term:
     return Term(b, se, statistic, intervals.two_sided_p(statistic, freedom))
 
 
-def difference(
-    first: Regression, second: Regression, term: str, by: str
-) -> intervals.Difference | None:
-    """The difference of a coefficient between fits to two groups that are independent.
+def differences(first: Regression, second: Regression, by: str) -> dict[str, intervals.Difference]:
+    """By term: how the coefficients of fits to two independent groups differ.
 
     A model of both in which every term may differ between them falls apart into a fit of each: the
-    interaction is the difference of the coefficients, and its variance the sum of theirs. None
-    where neither fit leaves an error.
+    interaction is the difference of the coefficients, and its variance the sum of theirs. A term
+    that neither fit leaves an error of is not there.
     """
-    one, other = first.terms[term], second.terms[term]
-    errors = (one.se, first.freedom), (other.se, second.freedom)
-    return intervals.difference(one.b - other.b, *errors, by=by)
+    found = {
+        name: intervals.difference(
+            term.b - second.terms[name].b,
+            (term.se, first.freedom),
+            (second.terms[name].se, second.freedom),
+            by=by,
+        )
+        for name, term in first.terms.items()
+        if name in second.terms
+    }
+    return {name: one for name, one in found.items() if one is not None}
 
 
 def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:

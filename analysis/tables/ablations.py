@@ -14,13 +14,13 @@ from analysis.stats.measures import (
 )
 from analysis.tables.indicators import (
     RULES,
-    percent,
+    ceiling_values,
     score_note,
     score_text,
     verdict_note,
     verdict_values,
 )
-from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import (
     ceiling_notes,
     intermittency_notes,
@@ -29,6 +29,10 @@ from analysis.tables.notes import (
     sample_notes,
 )
 
+KEYS = (
+    *GROUP_COLUMNS,
+    Column("n", "n", "count", 0, "trials that ended", "status <> 'failed'"),
+)
 # Columns that rest on who merged first.
 OF_OUTCOMES = tuple(
     f"{name}_{rule}" for name in ("i1", "i2") for rule in ("paper", "robust", "differ")
@@ -37,7 +41,7 @@ OF_OUTCOMES = tuple(
 
 def ablation_qualitative(study: Study) -> Table:
     """Table VI: I1 to I5 of every driver and prompt variant."""
-    columns = [*_key_columns()]
+    columns = [*KEYS]
     for name in INDICATORS:
         prefix = f"{name.lower()}_"
         columns += [
@@ -95,7 +99,7 @@ def ablation_quantitative(study: Study) -> Table:
     return Table(
         "ablation-quantitative",
         "Quantitative measures across prompt ablations",
-        [*_key_columns(), *(column for metric in metrics for column in _metric_columns(metric))],
+        [*KEYS, *(column for metric in metrics for column in _metric_columns(metric))],
         [_quantitative_row(group) for group in study.groups],
         (
             f"{_denominators(metrics)}; intervals: {intervals_of(metrics)}",
@@ -123,45 +127,28 @@ def _denominators(metrics: list[Metric]) -> str:
     return f"{ended} over all ended trials; {finished} over finished ones"
 
 
-def _key_columns() -> tuple[Column, ...]:
-    return (
-        Column("driver", "driver"),
-        Column("setting", "setting"),
-        Column("n", "n", "count", 0, "trials that ended", "status <> 'failed'"),
-    )
-
-
-def _keys(group: Group) -> dict[str, Value]:
-    return {
-        "driver": group.label,
-        "setting": group.setting,
-        "n": len(group.ended_outcomes),
-    }
-
-
 def _qualitative_row(study: Study, group: Group) -> Row:
     found = score(study, group)
-    values = _keys(group)
+    values: dict[str, Value] = {"n": len(group.ended_outcomes)}
     for name in INDICATORS:
         values |= verdict_values(found, name, f"{name.lower()}_")
     values |= {
         "score_paper": score_text(found.paper),
         "score_robust": score_text(found.robust),
-        "ceiling_paper": percent(found.ceiling.paper.get("I1-I4")),
-        "ceiling_robust": percent(found.ceiling.robust.get("I1-I4")),
     }
-    of_both = outcomes_note(group)
-    if of_both:
-        values |= {"ceiling_paper": None, "ceiling_robust": None}
-        of_both += "; no ceiling: the indicators rest on different trials"
-    remarks = (verdict_note(found, *INDICATORS), score_note(found), of_both, no_ceiling(group))
-    note = "; ".join(filter(None, remarks))
-    return Row(group.id, (group.id,), values, note, published=("n", *OF_OUTCOMES))
+    remarks = [verdict_note(found, *INDICATORS), score_note(found)]
+    if of_both := outcomes_note(group):
+        remarks += [of_both, "no ceiling: the indicators rest on different trials"]
+    else:
+        values |= ceiling_values(found, "I1-I4")
+    remarks.append(no_ceiling(group))
+    return row_of(group, values, *remarks, published=("n", *OF_OUTCOMES))
 
 
 def _quantitative_row(group: Group) -> Row:
     metrics = shown_in("tables")
-    values, missing, absent = _keys(group), [], []
+    values: dict[str, Value] = {"n": len(group.ended_outcomes)}
+    missing, absent = [], []
     shipped: dict[str, list[Metric]] = {}
     for metric in metrics:
         found = estimate_or_reference(group, metric)
@@ -179,11 +166,10 @@ def _quantitative_row(group: Group) -> Row:
     if missing:
         remarks.append(f"no trial with {', '.join(missing)}")
     remarks += [_shipped_note(found, source) for source, found in shipped.items()]
-    return Row(
-        group.id,
-        (group.id,),
+    return row_of(
+        group,
         values,
-        "; ".join(filter(None, remarks)),
+        *remarks,
         printed=tuple(metric.name for found in shipped.values() for metric in found),
         published=(
             "n",

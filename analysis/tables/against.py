@@ -17,7 +17,7 @@ from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import UsageError
 
 PAPER = "paper"
-# Whom the paper has rows of, and what may follow the name of a driver that is one of them.
+# The drivers that the paper has rows of.
 DRIVERS = ("human", "o3", "gemini-2.5-pro")
 METRICS_FILE = "paper_ablation_quantitative"
 INDICATORS_FILE = "paper_ablation_qualitative"
@@ -44,15 +44,15 @@ INDICATOR_ROWS = {**{f"I{i}": f"i{i}" for i in range(1, 6)}, "score": "score"}
 def placed(table: Table, groups: Iterable[Group]) -> Table:
     """The table with rows that say which driver of the paper they stand beside.
 
-    That is a driver of the very name whom its provider answered, and no stand-in.
+    A driver stands beside that of its very name, if its provider answered and no stand-in did.
     """
     if not in_paper(table):
         return table
     known = {group.id: group for group in groups}
-    return replace(table, rows=[_placed(table, row, known[row.groups[0]]) for row in table.rows])
+    return replace(table, rows=[_placed(row, known[row.groups[0]]) for row in table.rows])
 
 
-def _placed(table: Table, row: Row, group: Group) -> Row:
+def _placed(row: Row, group: Group) -> Row:
     (asked, *others) = group.models
     sample_set = "" if group.name == asked else f"/set{group.trials['sample_set'].iloc[0]}"
     own = not others and group.name == asked + sample_set and not group.scripted
@@ -61,24 +61,14 @@ def _placed(table: Table, row: Row, group: Group) -> Row:
         row,
         beside=asked if own and asked in DRIVERS else "",
         stand_in_for=group.models if posing else (),
-        printed=_printed(table, row, group),
+        printed=_printed(row, group),
     )
 
 
-def _printed(table: Table, row: Row, group: Group) -> tuple[str, ...]:
+def _printed(row: Row, group: Group) -> tuple[str, ...]:
     """The columns that rest on published values: to compare them with these says nothing."""
-    every = tuple(column.name for column in table.columns)
-    if not group.measured:
-        return every
-    if group.published_outcomes is None:
-        return row.printed
-    item = row.id.rpartition("/")[2]
-    metrics = {metric.name: metric.humans_from for metric in shown_in("tables")}
-    # Collisions by the drivers' rule are unknown until all is imported, as are the outcomes.
-    of_outcomes = item in {"I1", "I2"} or metrics.get(item, "recordings") != "recordings"
-    if table.name == "who-first" or of_outcomes:
-        return every
-    return tuple(name for name, source in metrics.items() if source == "outcomes")
+    of_outcomes = not group.measured or group.published_outcomes is not None
+    return (*row.printed, *row.published) if of_outcomes else row.printed
 
 
 def against(table: Table, reference: str, driver: str | None = None) -> Table:

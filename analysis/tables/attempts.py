@@ -5,7 +5,7 @@ from __future__ import annotations
 from analysis.data.load import ANSWERED
 from analysis.data.provenance import ANSWERS, Tally, tally
 from analysis.data.study import Group, Study
-from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import sample_notes
 from merge_runner.served_model import sql_of
 from merge_runner.text_safety import quoted
@@ -58,8 +58,7 @@ def _columns(study: Study, reasons: tuple[str, ...]) -> list[Column]:
         for reason in reasons
     ]
     return [
-        Column("driver", "driver"),
-        Column("setting", "setting"),
+        *GROUP_COLUMNS,
         *parts,
         *_rated(
             "invalid",
@@ -102,8 +101,6 @@ def _other_model(study: Study) -> str:
 
 def _row(group: Group, found: Tally, reasons: tuple[str, ...]) -> Row:
     values: dict[str, Value] = {
-        "driver": group.label,
-        "setting": group.setting,
         "trials": found.trials,
         "failed": found.failed,
         "calls": found.calls,
@@ -119,7 +116,7 @@ def _row(group: Group, found: Tally, reasons: tuple[str, ...]) -> Row:
         "unknown": found.unknown,
         "other_model": found.others,
     }
-    return Row(group.id, (group.id,), values, _note(found))
+    return row_of(group, values, _note(found))
 
 
 def _share(name: str, count: int, of: int) -> dict[str, Value]:

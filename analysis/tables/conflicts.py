@@ -6,8 +6,8 @@ from analysis.data.reference_data import citation, published
 from analysis.data.study import Group, Study
 from analysis.metrics import shown_in
 from analysis.stats.measures import values
-from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import sample_notes
+from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from analysis.tables.notes import measured_notes, sample_notes
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.text_safety import quoted
 
@@ -48,8 +48,7 @@ def conflict_resolution(study: Study) -> Table:
 
 def criticality(study: Study) -> Table:
     """One row a group: medians and quartiles of surrogate safety measures of finished trials."""
-    measured = [group for group in study.groups if group.measured]
-    columns = [Column("driver", "driver"), Column("setting", "setting")]
+    columns = [*GROUP_COLUMNS]
     for metric in shown_in("criticality"):
         name, digits, counts = metric.name, metric.decimals, metric.counts
         columns += [
@@ -61,38 +60,32 @@ def criticality(study: Study) -> Table:
         "criticality",
         "Time to merge, post-encroachment time, time to collision and hardest acceleration",
         columns,
-        [_criticality(group) for group in measured],
+        [_criticality(group) for group in study.measured],
         (
             "medians and quartiles of the finished trials that have the measure: one that never "
             "closes in after the merge has no time to collision",
-            *([] if measured else ["there is no measured trial to show"]),
-            *sample_notes(study, measured),
+            *measured_notes(study),
         ),
     )
 
 
 def _resolution(group: Group, condition: str) -> Row:
-    key: dict[str, Value] = {"condition": condition, "driver": group.label}
-    row = f"{group.id}/{condition}"
+    key: dict[str, Value] = {"condition": condition}
     where = f"condition = {quoted(condition)} AND conflict_resolution_s IS NOT NULL"
     if not group.measured:
         printed = published("human_outcomes").set_index("condition").loc[condition]
         cells = {name: float(printed[name]) for name in QUARTILES}
         n = int(printed["left_first"] + printed["right_first"])
-        return Row(
-            row,
-            (group.id,),
-            {**key, "n": n, **cells},
-            f"published, not from traces ({citation('human_outcomes')})",
-        )
+        note = f"published, not from traces ({citation('human_outcomes')})"
+        return row_of(group, {**key, "n": n, **cells}, note, item=condition)
     known = group.ended.loc[group.ended["condition"] == condition, "conflict_resolution_s"].dropna()
     note = "" if len(known) else f"{condition}: no trial that resolved the conflict"
     cells = {name: float(known.quantile(q)) for name, q in QUARTILES.items() if len(known)}
-    return Row(row, (group.id,), {**key, "n": len(known), **cells}, note, where)
+    return row_of(group, {**key, "n": len(known), **cells}, note, item=condition, counts=where)
 
 
 def _criticality(group: Group) -> Row:
-    cells: dict[str, Value] = {"driver": group.label, "setting": group.setting}
+    cells: dict[str, Value] = {}
     missing = []
     for metric in shown_in("criticality"):
         found = values(group, metric)
@@ -103,4 +96,4 @@ def _criticality(group: Group) -> Row:
         low, middle, high = (float(found.quantile(q)) for q in QUARTILES.values())
         cells |= {metric.name: middle, f"{metric.name}_quartiles": (low, high)}
     note = f"no finished trial with {', '.join(missing)}" if missing else ""
-    return Row(group.id, (group.id,), cells, note)
+    return row_of(group, cells, note)

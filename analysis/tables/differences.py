@@ -6,8 +6,7 @@ from math import isinf
 
 from analysis.data.study import Group, Study
 from analysis.stats.intervals import Difference
-from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, pairs_known
-from analysis.stats.joint import differences as tested
+from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions, pairs_known
 from analysis.stats.mixed import MIN_PAIRS
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import sample_notes
@@ -25,7 +24,7 @@ def differences(study: Study) -> Table:
     drivers = [group for group in study.baselines if group is not study.human]
     compared = drivers if study.human in study.groups else []
     human = study.human
-    rows = [_row(human, group, one) for group in compared for one in tested(human, group)]
+    rows = [_row(human, group, one) for group in compared for one in interactions(human, group)]
     return Table(
         "differences",
         "Differences of the baseline from humans, tested in one model of both",

@@ -5,19 +5,19 @@ from __future__ import annotations
 from analysis.data.study import Group, Study, of_group
 from analysis.metrics import GAP, LEFT_FIRST, RULES_NOTE, Metric, intervals_of, shown_in
 from analysis.stats.group_scores import Fits, fits
-from analysis.stats.indicators import INDICATORS, TESTED, Verdict, paper_verdicts, robust_verdicts
+from analysis.stats.indicators import INDICATORS, PAPER, ROBUST, TESTED, Verdict, disagree, verdicts
 from analysis.stats.intervals import Estimate
 from analysis.stats.measures import estimate, undecided, values
 from analysis.tables.attempts import FALLBACK
 from analysis.tables.indicators import RULES
-from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import sample_notes
 
 # What an indicator's regression is fitted to.
 FITTED = {"I1": LEFT_FIRST, "I2": LEFT_FIRST, "I3": GAP, "I4": GAP}
 # The two sides: name, suffix of the columns, predicate of the trials.
 ALL = ("all", "", "")
-KEPT = ("without", "_without", f"NOT {FALLBACK}")
+WITHOUT = ("without", "_without", f"NOT {FALLBACK}")
 
 
 def fallbacks(study: Study) -> Table:
@@ -27,16 +27,15 @@ def fallbacks(study: Study) -> Table:
         "fallbacks",
         "Outcomes with and without the trials that had a fallback",
         (
-            Column("driver", "driver"),
-            Column("setting", "setting"),
+            *GROUP_COLUMNS,
             Column("measure", "measure"),
             *_numbers(*ALL),
-            *_numbers(*KEPT),
+            *_numbers(*WITHOUT),
             Column("difference", "difference", "number", 2, "without minus all", optional=True),
             _verdict("paper", "paper's rule", *ALL),
-            _verdict("paper", "paper's rule", *KEPT),
+            _verdict("paper", "paper's rule", *WITHOUT),
             _verdict("robust", "robust", *ALL),
-            _verdict("robust", "robust", *KEPT),
+            _verdict("robust", "robust", *WITHOUT),
             Column("differ", "", meaning="where a verdict changes", optional=True),
         ),
         rows,
@@ -81,11 +80,11 @@ def _verdict(rule: str, heading: str, name: str, suffix: str, within: str) -> Co
 
 
 def _rows(study: Study, group: Group) -> list[Row]:
-    kept = without_fallbacks(study, group)
-    why = _why(group, kept)
+    clean = without_fallbacks(study, group)
+    why = _why(group, clean)
     return [
-        *(_metric_row(group, kept, metric, why) for metric in shown_in("fallbacks")),
-        *(_verdict_row(group, kept, name, why) for name in TESTED),
+        *(_metric_row(group, clean, metric, why) for metric in shown_in("fallbacks")),
+        *(_verdict_row(group, clean, name, why) for name in TESTED),
     ]
 
 
@@ -98,22 +97,22 @@ def without_fallbacks(study: Study, group: Group) -> Group:
     return group.part(lambda trials: ~trials["trial_id"].isin(had))
 
 
-def _why(group: Group, kept: Group) -> str:
+def _why(group: Group, clean: Group) -> str:
     """What a reader should know of the comparison, where it is none."""
     if group.ended.empty:
         return "no trial ended"
-    if len(kept.ended) == len(group.ended):
-        whose = "no trial had" if kept is group else "no trial that ended had"
+    if len(clean.ended) == len(group.ended):
+        whose = "no trial had" if clean is group else "no trial that ended had"
         return f"{whose} a fallback: nothing differs"
-    if kept.ended.empty:
+    if clean.ended.empty:
         return "every trial had a fallback: nothing is left without"
     return ""
 
 
-def _metric_row(group: Group, kept: Group, metric: Metric, why: str) -> Row:
-    found, without = estimate(group, metric), estimate(kept, metric)
+def _metric_row(group: Group, clean: Group, metric: Metric, why: str) -> Row:
+    found, without = estimate(group, metric), estimate(clean, metric)
     cells: dict[str, Value] = {
-        **_keys(group, metric.heading),
+        "measure": metric.heading,
         **_estimated(found, "all", ""),
         **_estimated(without, "without", "_without"),
     }
@@ -121,58 +120,37 @@ def _metric_row(group: Group, kept: Group, metric: Metric, why: str) -> Row:
         cells["difference"] = without.value - found.value
     missing = found.value is None or (without.value is None and not why)
     nothing = f"{metric.heading}: no trial with this measure" if missing else ""
-    return Row(
-        f"{group.id}/{metric.name}",
-        (group.id,),
-        cells,
-        "; ".join(filter(None, (why, nothing, undecided(group, metric)))),
-        metric.counts,
-    )
+    remarks = (why, nothing, undecided(group, metric))
+    return row_of(group, cells, *remarks, item=metric.name, counts=metric.counts)
 
 
 def _estimated(found: Estimate, name: str, suffix: str) -> dict[str, Value]:
-    interval = found.bounds()
-    return {f"n{suffix}": found.n, name: found.value, f"ci{suffix}": interval}
+    return {f"n{suffix}": found.n, name: found.value, f"ci{suffix}": found.bounds()}
 
 
-def _verdict_row(group: Group, kept: Group, name: str, why: str) -> Row:
-    found, without = _judged(fits(group), name), _judged(fits(kept), name)
-    changed = any(
-        None not in {one.passed, other.passed} and one.passed != other.passed
-        for one, other in zip(found, without, strict=True)
-    )
+def _verdict_row(group: Group, clean: Group, name: str, why: str) -> Row:
+    found, without = _judged(fits(group), name), _judged(fits(clean), name)
+    changed = any(disagree(*pair) for pair in zip(found, without, strict=True))
     sides = (("", found), *(() if why else ((" without", without),)))
     reasons = dict.fromkeys(
-        f"{name}{side}: {verdict.why}"
-        for side, verdicts in sides
-        for verdict in verdicts
-        if verdict.why
+        f"{name}{side}: {verdict.why}" for side, both in sides for verdict in both if verdict.why
     )
-    return Row(
-        f"{group.id}/{name}",
-        (group.id,),
-        {
-            **_keys(group, name),
-            "n": len(values(group, FITTED[name])),
-            "paper": found[0].passed,
-            "robust": found[1].passed,
-            "n_without": len(values(kept, FITTED[name])),
-            "paper_without": without[0].passed,
-            "robust_without": without[1].passed,
-            "differ": "≠" if changed else None,
-        },
-        "; ".join(filter(None, (why, *reasons))),
-        FITTED[name].counts,
-    )
+    cells: dict[str, Value] = {
+        "measure": name,
+        "n": len(values(group, FITTED[name])),
+        "paper": found[0].passed,
+        "robust": found[1].passed,
+        "n_without": len(values(clean, FITTED[name])),
+        "paper_without": without[0].passed,
+        "robust_without": without[1].passed,
+        "differ": "≠" if changed else None,
+    }
+    return row_of(group, cells, why, *reasons, item=name, counts=FITTED[name].counts)
 
 
 def _judged(found: Fits, name: str) -> tuple[Verdict, Verdict]:
     """An indicator by the paper's rule and by the robust one."""
     return (
-        paper_verdicts(found.logit, found.ols)[name],
-        robust_verdicts(found.firth, found.hc3)[name],
+        verdicts(PAPER, found.logit, found.ols)[name],
+        verdicts(ROBUST, found.firth, found.hc3)[name],
     )
-
-
-def _keys(group: Group, measure: str) -> dict[str, Value]:
-    return {"driver": group.label, "setting": group.setting, "measure": measure}

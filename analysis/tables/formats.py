@@ -14,19 +14,10 @@ from collections.abc import Callable, Sequence
 
 from analysis.table_format import TableFormat
 from analysis.tables.model import Column, Row, Table, Value
+from merge_runner.prompts.blocks import title_of
 from merge_runner.text_safety import csv_writer, in_spreadsheet
 
 MISSING = "–"
-VARIANTS = {
-    "baseline": "Baseline",
-    "A1": "A1 (-History)",
-    "A2": "A2 (-Prev. acc. plan)",
-    "A3": "A3 (-Safety)",
-    "A4": "A4 (-Human)",
-    "A5": "A5 (-Distance)",
-    "A6": "A6 (-Reassess)",
-    "A7": "A7 (-Tactical plan)",
-}
 
 
 def render(tables: Sequence[Table], form: TableFormat) -> str:
@@ -185,7 +176,7 @@ def _text(column: Column, value: Value) -> str:
     if isinstance(value, bool):
         return "✓" if value else "✗"
     if column.name == "setting" and isinstance(value, str):
-        return VARIANTS.get(value, value)
+        return title_of(value)
     if column.kind == "p" and isinstance(value, float):
         return "<0.001" if value < 0.001 else f"{value:.3f}"
     if isinstance(value, float):

@@ -6,8 +6,8 @@ from analysis.data.study import Group, Study
 from analysis.metrics import GAP
 from analysis.stats.intervals import mean
 from analysis.stats.regressions import Regression, gap_ols
-from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import sample_notes
+from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from analysis.tables.notes import measured_notes
 
 # Column of the trials to what is measured.
 DEFINITIONS = {
@@ -20,14 +20,11 @@ TERMS = {"headway": "abs_projected_headway", "velocity": "abs_relative_velocity"
 
 def gap_definitions(study: Study) -> Table:
     """One row a group and definition: the mean gap, and what I3 and I4 rest on."""
-    measured = [group for group in study.groups if group.measured]
-    rows = [_row(group, column) for group in measured for column in DEFINITIONS]
     return Table(
         "gap-definitions",
         "The gap and its dependence on headway and velocity, by the definition of the gap",
         (
-            Column("driver", "driver"),
-            Column("setting", "setting"),
+            *GROUP_COLUMNS,
             Column("definition", "definition"),
             Column("n", "n", "count", 0, "finished trials with this gap"),
             Column(GAP.name, GAP.heading, GAP.kind, 2, "mean, net of the vehicle length"),
@@ -37,12 +34,11 @@ def gap_definitions(study: Study) -> Table:
             Column("velocity_b", "b of |Δv|", "number", 2, "coefficient of |Δv| in s (I4)"),
             Column("velocity_p", "p", "p", 3, "its t test"),
         ),
-        rows,
+        [_row(group, column) for group in study.measured for column in DEFINITIONS],
         (
             "coefficients: least squares of the gap on |h|, |Δv| and h·Δv, as in the table gap; "
             "the mean position is that of Siebinga et al.",
-            *([] if rows else ["there is no measured trial to show"]),
-            *sample_notes(study, measured),
+            *measured_notes(study),
         ),
     )
 
@@ -51,15 +47,13 @@ def _row(group: Group, column: str) -> Row:
     found = mean(group.finished[column].to_numpy(float))
     fit = gap_ols(group.trials, column)
     values: dict[str, Value] = {
-        "driver": group.label,
-        "setting": group.setting,
         "definition": DEFINITIONS[column],
         "n": found.n,
         GAP.name: found.value,
         "gap_m_ci": found.bounds(),
         **_coefficients(fit),
     }
-    return Row(f"{group.id}/{column}", (group.id,), values, fit.problem, f"{column} IS NOT NULL")
+    return row_of(group, values, fit.problem, item=column, counts=f"{column} IS NOT NULL")
 
 
 def _coefficients(fit: Regression) -> dict[str, Value]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from analysis.data.study import Group, Study
 from analysis.metrics import RULES_NOTE, HumanReference, Metric, shown_in
-from analysis.stats.group_scores import PAPER_RULE, ROBUST_RULE, Score, score, total, unjudged
-from analysis.stats.indicators import INDICATORS, TESTED, Verdict
+from analysis.stats.group_scores import Score, score, total, unjudged
+from analysis.stats.indicators import INDICATORS, TESTED, Verdict, disagree
 from analysis.stats.likeness import gains
 from analysis.stats.measures import (
     estimate_or_reference,
@@ -13,7 +13,7 @@ from analysis.stats.measures import (
     outcomes_note,
     undecided,
 )
-from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.model import Column, Row, Table, Value, row_of
 from analysis.tables.notes import ceiling_notes, intermittency_notes, no_ceiling, sample_notes
 from analysis.tables.profiles import gain_values
 
@@ -82,12 +82,20 @@ def indicators(study: Study) -> Table:
 
 def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value]:
     """An indicator by both rules, and whether they disagree."""
-    paper, robust = found.paper[name].passed, found.robust[name].passed
-    disagree = None not in {paper, robust} and paper != robust
+    paper, robust = found.paper[name], found.robust[name]
     return {
-        f"{prefix}paper": paper,
-        f"{prefix}robust": robust,
-        f"{prefix}differ": "≠" if disagree else None,
+        f"{prefix}paper": paper.passed,
+        f"{prefix}robust": robust.passed,
+        f"{prefix}differ": "≠" if disagree(paper, robust) else None,
+    }
+
+
+def ceiling_values(found: Score, name: str) -> dict[str, Value]:
+    """The shares in percent of human data sets that pass an indicator, or ``I1-I4`` together."""
+    by_rule = {"paper": found.ceiling.paper, "robust": found.ceiling.robust}
+    return {
+        f"ceiling_{rule}": 100 * shares[name] if name in shares else None
+        for rule, shares in by_rule.items()
     }
 
 
@@ -95,7 +103,8 @@ def verdict_note(found: Score, *names: str) -> str:
     """Why a verdict is missing or rests on something else than a test."""
     known: dict[str, dict[str, None]] = {}
     for name in names:
-        for verdict in (found.paper[name], found.robust[name]):
+        for judged in found.rules.values():
+            verdict = judged[name]
             if verdict.why and verdict.passed is not None:
                 known.setdefault(verdict.why, {})[name] = None
     return "; ".join(
@@ -109,17 +118,17 @@ def verdict_note(found: Score, *names: str) -> str:
     )
 
 
-def score_text(verdicts: dict[str, Verdict]) -> str | None:
+def score_text(judged: dict[str, Verdict]) -> str | None:
     """``3 of 4``, or None where no indicator can be judged."""
-    found = total(verdicts)
+    found = total(judged)
     return str(found) if found.judged else None
 
 
 def score_note(found: Score) -> str:
     """Which indicators are in neither number of a score, and of which."""
     rules: dict[tuple[str, ...], list[str]] = {}
-    for rule, verdicts in ((PAPER_RULE, found.paper), (ROBUST_RULE, found.robust)):
-        if left_out := total(verdicts).open:
+    for rule, judged in found.rules.items():
+        if left_out := total(judged).open:
             rules.setdefault(left_out, []).append(rule)
     return "; ".join(
         f"the score {' and '.join(which)} leaves out {', '.join(left_out)}"
@@ -139,19 +148,17 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
         outcomes_note(group),
         no_ceiling(group) if name in TESTED else "",
     )
-    return Row(
-        f"{group.id}/{name}",
-        (group.id,),
+    return row_of(
+        group,
         {
             "indicator": name,
-            "driver": group.label,
             **verdict_values(found, name),
             **(gain_values(study, group, "value", "interval") if name == "I5" else {}),
-            "ceiling_paper": percent(found.ceiling.paper.get(name)) if drawn else None,
-            "ceiling_robust": percent(found.ceiling.robust.get(name)) if drawn else None,
+            **(ceiling_values(found, name) if drawn else {}),
             "n": int((trials["status"] == "finished").sum()),
         },
-        "; ".join(filter(None, remarks)),
+        *remarks,
+        item=name,
         published=EVERY if of_outcomes else (),
     )
 
@@ -165,47 +172,39 @@ def _inaction(study: Study, group: Group, name: str) -> str:
 def _total_row(study: Study, group: Group) -> Row:
     found = score(study, group)
     of_both = outcomes_note(group)
-    return Row(
-        f"{group.id}/score",
-        (group.id,),
+    return row_of(
+        group,
         {
             "indicator": "Score",
-            "driver": group.label,
             "paper": score_text(found.paper),
             "robust": score_text(found.robust),
-            "ceiling_paper": None if of_both else percent(found.ceiling.paper.get("I1-I4")),
-            "ceiling_robust": None if of_both else percent(found.ceiling.robust.get("I1-I4")),
+            **({} if of_both else ceiling_values(found, "I1-I4")),
             "n": len(group.finished),
         },
-        "; ".join(filter(None, (score_note(found), of_both, no_ceiling(group)))),
+        score_note(found),
+        of_both,
+        no_ceiling(group),
+        item="score",
     )
 
 
 def _metric_row(group: Group, metric: Metric) -> Row:
-    key: dict[str, Value] = {"indicator": metric.heading, "driver": group.label}
-    row = f"{group.id}/{metric.name}"
+    item = metric.name
+    values: dict[str, Value] = {"indicator": metric.heading}
     found = estimate_or_reference(group, metric)
     if found is None:
-        return Row(row, (group.id,), key, no_human_value(metric))
-    values: dict[str, Value] = {**key, "value": found.value, "interval": found.bounds()}
+        return row_of(group, values, no_human_value(metric), item=item)
+    values |= {"value": found.value, "interval": found.bounds()}
     if isinstance(found, HumanReference):
         source = f"published value, no human traces are imported ({found.source})"
-        return Row(row, (group.id,), values, source, printed=("value",))
-    remarks = (
+        return row_of(group, values, source, item=item, printed=("value",))
+    return row_of(
+        group,
+        values | {"n": found.n},
         "" if found.value is not None else f"{metric.heading}: no trial has it",
         undecided(group, metric),
         outcomes_note(group),
-    )
-    return Row(
-        row,
-        (group.id,),
-        {**values, "n": found.n},
-        "; ".join(filter(None, remarks)),
-        metric.counts,
+        item=item,
+        counts=metric.counts,
         published=EVERY if metric.humans_from == "outcomes" else (),
     )
-
-
-def percent(share: float | None) -> float | None:
-    """A share in percent."""
-    return None if share is None else 100 * share

@@ -7,7 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from math import isnan
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from analysis.data.study import Group
 
 Kind = Literal["text", "count", "number", "percent", "p", "verdict", "interval"]
 Value = str | int | float | bool | tuple[float, float] | None
@@ -57,6 +60,30 @@ class Row:
     reference: str = ""
     published: tuple[str, ...] = ()
     cited: str = ""
+
+
+GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "setting"))
+
+
+def row_of(
+    group: Group,
+    values: Mapping[str, Value],
+    *remarks: str,
+    item: str = "",
+    counts: str = "",
+    printed: tuple[str, ...] = (),
+    published: tuple[str, ...] = (),
+) -> Row:
+    """A row of a group, named ``o3/A2/item``, with its GROUP_COLUMNS; the remarks are its note."""
+    return Row(
+        f"{group.id}/{item}" if item else group.id,
+        (group.id,),
+        {"driver": group.label, "setting": group.setting, **values},
+        "; ".join(filter(None, remarks)),
+        counts,
+        printed,
+        published=published,
+    )
 
 
 @dataclass(frozen=True, slots=True)

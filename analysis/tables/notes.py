@@ -36,6 +36,12 @@ def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) 
     return [*notes, *(f"{group.id}: {repeated_note(group)}" for group in shown if group.repeated)]
 
 
+def measured_notes(study: Study) -> list[str]:
+    """The notes of a table of all groups whose speeds are known."""
+    nothing = [] if study.measured else ["there is no measured trial to show"]
+    return [*nothing, *sample_notes(study, study.measured)]
+
+
 def _own_notes(study: Study, groups: list[Group]) -> list[str]:
     """Which of these trials are of conditions that no human drove."""
     notes = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from analysis.data.study import Group, Study, of_group
 from analysis.stats.likeness import NO_ACTION, difference, gains, mean_gain
-from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import intermittency_notes, sample_notes
 
 
@@ -14,8 +14,7 @@ def velocity_profiles(study: Study) -> Table:
         "velocity-profiles",
         "Piecewise-linear velocity profiles (I5) and plan revisions",
         (
-            Column("driver", "driver"),
-            Column("setting", "setting"),
+            *GROUP_COLUMNS,
             Column("n", "n", "count", 0, "finished trials"),
             Column("no_action", "no action", "count", 0, "trials in which no vehicle acted"),
             Column("gain", "gain", "number", 2, "mean gain of lines over cubics (I5)"),
@@ -58,14 +57,9 @@ def velocity_profiles(study: Study) -> Table:
 
 
 def _row(study: Study, group: Group) -> Row:
-    values: dict[str, Value] = {
-        "driver": group.label,
-        "setting": group.setting or None,
-        "n": len(group.finished),
-    }
+    values: dict[str, Value] = {"n": len(group.finished)}
     if not group.measured:
-        return Row(group.id, (group.id,), values | {"setting": ""}, "no human traces are imported")
-    values["setting"] = group.setting
+        return row_of(group, values, "no human traces are imported")
     trials = gains(study, group)
     judged = trials["gain"].dropna()
     values |= {"no_action": int(trials["steady"].sum())} | gain_values(study, group)
@@ -82,7 +76,7 @@ def _row(study: Study, group: Group) -> Row:
     if plans["revised_plans"]:
         values["revision"] = float(plans["total_revision"] / plans["revised_plans"])
         values["revised_percent"] = float(100 * plans["large_revisions"] / plans["revised_plans"])
-    return Row(group.id, (group.id,), values, "" if len(judged) else NO_ACTION)
+    return row_of(group, values, "" if len(judged) else NO_ACTION)
 
 
 def gain_values(

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 from analysis.data.reference_data import citation, published
 from analysis.data.study import Group, Study
 from analysis.stats.group_scores import fits
 from analysis.stats.indicators import GAP_MARGIN_M, LARGEST_VELOCITY_MPS, equivalence_p
+from analysis.stats.intervals import interval
 from analysis.stats.measures import outcomes_note
 from analysis.stats.mixed import gap_mixed, who_first_mixed
 from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
-from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.model import Column, Row, Table, Value, row_of
 from analysis.tables.notes import sample_notes
 
 TERM_NAMES = {
@@ -28,8 +30,8 @@ TESTED_ELSEWHERE = (
     "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
     "table differences tests it"
 )
-# Of Table III: the columns that rest on who merged first.
-EVERY = ("n", "b", "se", "z", "p", "firth_b", "firth_se", "firth_p")
+# Of Table III and its variants: the columns that rest on who merged first.
+OF_OUTCOMES = ("n", "b", "se", "z", "ci", "p", "firth_b", "firth_se", "firth_ci", "firth_p")
 RANDOM_INTERCEPT = "random intercept per pair"
 
 
@@ -38,28 +40,12 @@ def who_first(study: Study) -> Table:
     rows = []
     for term in WHO_FIRST_TERMS:
         for group in study.baselines:
-            fit = fits(group)
-            rows.append(
-                Row(
-                    f"{group.id}/{term}",
-                    (group.id,),
-                    {
-                        "term": TERM_NAMES[term],
-                        "driver": group.label,
-                        "n": fit.logit.n,
-                        **_wald(fit.logit, term, "z"),
-                        **_firth(fit.firth, term),
-                    },
-                    "; ".join(filter(None, (problems(fit.logit, fit.firth), outcomes_note(group)))),
-                    published=EVERY,
-                )
-            )
-            rows += _mixed_rows(group, term, "z")
+            rows += [who_first_row(group, term), *_mixed_rows(group, term, _who_first_mixed)]
     return Table(
         "who-first",
         "Logistic regression of which driver merged first (1: left)",
         (
-            *_key_columns(WITH_MERGER),
+            *key_columns(WITH_MERGER),
             *_wald_columns("z", WITH_MERGER),
             Column(
                 "firth_b", "Firth b", "number", 2, "Firth's penalised estimate", WITH_MERGER, True
@@ -82,30 +68,12 @@ def gap(study: Study) -> Table:
     rows = []
     for term in GAP_TERMS:
         for group in study.baselines:
-            if not group.measured:
-                rows.append(published_gap(group, term))
-                continue
-            fit = fits(group)
-            rows.append(
-                Row(
-                    f"{group.id}/{term}",
-                    (group.id,),
-                    {
-                        "term": TERM_NAMES[term],
-                        "driver": group.label,
-                        "n": fit.ols.n,
-                        **_wald(fit.ols, term, "t"),
-                        **_hc3(fit.hc3, term),
-                    },
-                    problems(fit.ols, fit.hc3),
-                )
-            )
-            rows += _mixed_rows(group, term, "t")
+            rows += [gap_row(group, term), *_mixed_rows(group, term, _gap_mixed)]
     return Table(
         "gap",
         "Linear regression of the gap at the merge point (m, net of the vehicle length)",
         (
-            *_key_columns(WITH_GAP),
+            *key_columns(WITH_GAP),
             *_wald_columns("t", WITH_GAP),
             Column("hc3_se", "HC3 SE", "number", 3, "HC3 standard error", WITH_GAP, True),
             Column("hc3_p", "HC3 p", "p", 3, "its t test", WITH_GAP, True),
@@ -131,10 +99,12 @@ def gap(study: Study) -> Table:
     )
 
 
-def _key_columns(counts: str) -> tuple[Column, ...]:
+def key_columns(counts: str, *more: Column) -> tuple[Column, ...]:
+    """What leads each row of a regression, with ``more`` columns behind the driver."""
     return (
         Column("term", "term"),
         Column("driver", "driver"),
+        *more,
         Column("n", "n", "count", 0, "trials in the regression", counts),
     )
 
@@ -148,26 +118,54 @@ def _wald_columns(statistic: str, counts: str) -> tuple[Column, ...]:
     )
 
 
-def _wald(fit: Regression, term: str, statistic: str) -> dict[str, Value]:
+def who_first_row(group: Group, term: str) -> Row:
+    """A term of who merged first: by maximum likelihood, and by Firth's fit."""
+    fit = fits(group)
+    return row_of(
+        group,
+        {
+            "term": TERM_NAMES[term],
+            "n": fit.logit.n,
+            **_values(fit.logit, term),
+            **_values(fit.firth, term, "firth_"),
+        },
+        problems(fit.logit, fit.firth),
+        outcomes_note(group),
+        item=term,
+        published=OF_OUTCOMES,
+    )
+
+
+def gap_row(group: Group, term: str) -> Row:
+    """A term of the gap: by least squares, and with HC3 errors; as printed before an import."""
+    if not group.measured:
+        return _published_gap(group, term)
+    fit = fits(group)
+    values: dict[str, Value] = {
+        "term": TERM_NAMES[term],
+        "n": fit.ols.n,
+        **_values(fit.ols, term),
+        **_values(fit.hc3, term, "hc3_"),
+    }
+    if term == "abs_relative_velocity" and term in fit.hc3.terms:
+        slope = fit.hc3.terms[term]
+        values["equivalence_p"] = float(equivalence_p(slope.b, slope.se, fit.hc3.freedom))
+    return row_of(group, values, problems(fit.ols, fit.hc3), item=term)
+
+
+def _values(fit: Regression, term: str, prefix: str = "") -> dict[str, Value]:
+    """All that is known of a coefficient; tables show its statistic as z or as t."""
     found = fit.terms.get(term)
     if found is None:
         return {}
-    return {"b": found.b, "se": found.se, statistic: found.statistic, "p": found.p}
-
-
-def _firth(fit: Regression, term: str) -> dict[str, Value]:
-    found = fit.terms.get(term)
-    return {"firth_b": found.b, "firth_se": found.se, "firth_p": found.p} if found else {}
-
-
-def _hc3(fit: Regression, term: str) -> dict[str, Value]:
-    found = fit.terms.get(term)
-    if found is None:
-        return {}
-    values: dict[str, Value] = {"hc3_se": found.se, "hc3_p": found.p}
-    if term == "abs_relative_velocity":
-        values["equivalence_p"] = float(equivalence_p(found.b, found.se, fit.freedom))
-    return values
+    return {
+        f"{prefix}b": found.b,
+        f"{prefix}se": found.se,
+        f"{prefix}z": found.statistic,
+        f"{prefix}t": found.statistic,
+        f"{prefix}ci": interval(found.b, found.se, fit.freedom),
+        f"{prefix}p": found.p,
+    }
 
 
 def problems(*found: Regression) -> str:
@@ -175,39 +173,44 @@ def problems(*found: Regression) -> str:
     return "; ".join(dict.fromkeys(fit.problem for fit in found if fit.problem))
 
 
-def _mixed_rows(group: Group, term: str, statistic: str) -> list[Row]:
+def _mixed_rows(
+    group: Group, term: str, mixed: Callable[[Group], dict[str, tuple[str, Regression]]]
+) -> list[Row]:
     """The humans again, with a random intercept per pair; after an import alone."""
     if group.setting or not group.measured:
         return []
     return [
-        Row(
-            f"{group.id}/{model}/{term}",
-            (group.id,),
+        row_of(
+            group,
             {
                 "term": TERM_NAMES[term],
                 "driver": f"{group.label}, {label}",
                 "n": fit.n,
-                **_wald(fit, term, statistic),
+                **_values(fit, term),
             },
             fit.problem or fit.remark,
+            item=f"{name}/{term}",
         )
-        for model, label, fit in _mixed(group, "who-first" if statistic == "z" else "gap")
+        for name, (label, fit) in mixed(group).items()
     ]
 
 
 @cache
-def _mixed(group: Group, name: str) -> list[tuple[str, str, Regression]]:
-    """Name, label and fit of the mixed models; the published gap is that at mean 100 m."""
-    if name == "who-first":
-        return [("mixed", RANDOM_INTERCEPT, who_first_mixed(group.trials))]
-    return [
-        ("mixed", RANDOM_INTERCEPT, gap_mixed(group.trials)),
-        (
-            "mixed-mean100",
+def _who_first_mixed(group: Group) -> dict[str, tuple[str, Regression]]:
+    """The mixed model by the name of its rows, with its label."""
+    return {"mixed": (RANDOM_INTERCEPT, who_first_mixed(group.trials))}
+
+
+@cache
+def _gap_mixed(group: Group) -> dict[str, tuple[str, Regression]]:
+    """The same of our gap, and of that which the published mixed model is of."""
+    return {
+        "mixed": (RANDOM_INTERCEPT, gap_mixed(group.trials)),
+        "mixed-mean100": (
             f"{RANDOM_INTERCEPT}, mean at 100 m",
             gap_mixed(group.trials, "gap_mean100_m"),
         ),
-    ]
+    }
 
 
 def _published_p(text: str) -> Value:
@@ -232,21 +235,22 @@ def _mixed_notes(study: Study, table: str) -> tuple[str, ...]:
     )
 
 
-def published_gap(group: Group, term: str) -> Row:
-    """The humans' row of Table IV as the paper prints it."""
-    values = published("paper_gap").query("driver == 'human' and term == @term").iloc[0]
-    return Row(
-        f"{group.id}/{term}",
-        (group.id,),
+def _published_gap(group: Group, term: str) -> Row:
+    """The humans' row of Table IV as the paper prints it; the interval is that of b and its SE."""
+    printed = published("paper_gap").query("driver == 'human' and term == @term").iloc[0]
+    n, b, se = int(printed["n"]), float(printed["b"]), float(printed["se"])
+    return row_of(
+        group,
         {
             "term": TERM_NAMES[term],
-            "driver": group.label,
-            "n": int(values["n"]),
-            "b": float(values["b"]),
-            "se": float(values["se"]),
-            "t": float(values["t"]),
-            "p": _published_p(str(values["p"])),
+            "n": n,
+            "b": b,
+            "se": se,
+            "t": float(printed["t"]),
+            "ci": interval(b, se, n - len(GAP_TERMS)),
+            "p": _published_p(str(printed["p"])),
         },
         f"published values, no human traces are imported ({citation('paper_gap')})",
+        item=term,
         printed=("n", "b", "se", "t", "p"),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import pandas as pd
 
@@ -10,8 +10,8 @@ from analysis.data.collision_rules import BOXES, READINGS, UNDECIDED, outcomes
 from analysis.data.load import load_each
 from analysis.data.study import Group, Study, of_group
 from analysis.stats.intervals import proportion
-from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import sample_notes
+from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from analysis.tables.notes import measured_notes
 
 # The size of a spec's vehicles in words.
 SIZES = "SELECT spec_hash, format('{:g} m x {:g} m', length_m, width_m) AS size FROM geometry"
@@ -19,18 +19,16 @@ SIZES = "SELECT spec_hash, format('{:g} m x {:g} m', length_m, width_m) AS size 
 
 def robustness(study: Study) -> Table:
     """One row a group and rule: collisions, who was first, and what cannot be known."""
-    measured = [group for group in study.groups if group.measured]
-    found = (
-        outcomes(study.db, pd.concat([group.trials for group in measured])) if measured else None
-    )
-    rows = [] if found is None else [r for group in measured for r in _rows(group, found)]
+    rows: list[Row] = []
+    if study.measured:
+        found = outcomes(study.db, pd.concat([group.trials for group in study.measured]))
+        rows = [row for group in study.measured for row in _rows(group, found)]
     everything = "status <> 'failed'"
     return Table(
         "robustness",
         "Outcomes under the readings of the collision rule, from the stored plans",
         (
-            Column("driver", "driver"),
-            Column("setting", "setting"),
+            *GROUP_COLUMNS,
             Column("rule", "rule"),
             Column("n", "n", "count", 0, "trials that ended", everything),
             Column("collided", "collided", "count", 0, "trials that collide", everything),
@@ -47,20 +45,19 @@ def robustness(study: Study) -> Table:
             "boxes overlap; shared_lane: closer than a vehicle length along the track once either "
             "vehicle has passed the merge point. They are looked for at the steps of the "
             f"simulation, of humans every 0.2 s. {BOXES}: the rule of the human experiment",
-            *_size_notes(study, measured),
+            *_size_notes(study),
             "undecided: the trial ended in a collision that this rule does not see, and the last "
             "plans, or the human trace, end before it is decided",
-            *([] if rows else ["there is no measured trial to show"]),
-            *sample_notes(study, measured),
+            *measured_notes(study),
         ),
     )
 
 
-def _size_notes(study: Study, groups: Iterable[Group]) -> Iterator[str]:
+def _size_notes(study: Study) -> Iterator[str]:
     """The vehicles that are judged, with the groups that drove them."""
     found = load_each({"sizes": SIZES}, study.db)["sizes"].set_index("spec_hash")["size"]
     driven: dict[str, list[str]] = {}
-    for group in groups:
+    for group in study.measured:
         for size in found.reindex(group.trials["spec_hash"].unique()).dropna().unique():
             driven.setdefault(size, []).append(group.id)
     for size, ids in driven.items():
@@ -77,8 +74,6 @@ def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
         collided, n = int(counts.get("collided", 0)), len(chosen)
         share = proportion(collided, n)
         values: dict[str, Value] = {
-            "driver": group.label,
-            "setting": group.setting,
             "rule": rule,
             "n": n,
             "collided": collided,
@@ -94,5 +89,5 @@ def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
                 "collided_percent_ci": share.bounds(100),
             }
             note = ""
-        rows.append(Row(f"{group.id}/{rule}", (group.id,), values, note))
+        rows.append(row_of(group, values, note, item=rule))
     return rows

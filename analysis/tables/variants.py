@@ -6,22 +6,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from analysis.data.study import Group, Study
-from analysis.stats.group_scores import fits
-from analysis.stats.intervals import POWER, interval
+from analysis.stats.group_scores import Fits, fits
+from analysis.stats.intervals import POWER
+from analysis.stats.penalised import firth_intervals
 from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
 from analysis.stats.variants import (
     Corrected,
     Differences,
     corrected_differences,
-    firth_intervals,
     gap_differences,
     variants,
     who_first_differences,
 )
 from analysis.tables.contrasts import shared_notes
-from analysis.tables.model import Column, Kind, Row, Table, Value
+from analysis.tables.model import Column, Kind, Row, Table
 from analysis.tables.notes import sample_notes
-from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER, problems, published_gap
+from analysis.tables.regressions import WITH_GAP, WITH_MERGER, gap_row, key_columns, who_first_row
 
 FAMILY_NOTE = (
     "difference: variant minus its driver's baseline; Holm, BH: corrected over the variants of a "
@@ -36,13 +36,13 @@ def who_first_variants(study: Study) -> Table:
         "who-first-variants",
         "Logistic regression of which driver merged first (1: left), for every prompt variant",
         (
-            *_key_columns(WITH_MERGER),
+            *key_columns(WITH_MERGER, Column("setting", "setting")),
             *_fit_columns("", "", "", "p", "Wald", WITH_MERGER),
             *_fit_columns("firth_", "Firth ", "", "LR p", "penalised likelihood", WITH_MERGER),
             *_difference_columns(WITH_MERGER),
             Column("by", "fits", meaning="the fits that are compared", optional=True),
         ),
-        _rows(study, WHO_FIRST_TERMS, _who_first_row, who_first_differences, _firth),
+        _rows(study, WHO_FIRST_TERMS, _who_first_row, who_first_differences, lambda fit: fit.firth),
         (
             FAMILY_NOTE,
             "differences are tested by Wald's test; where one of the two fits has no finite "
@@ -61,27 +61,18 @@ def gap_variants(study: Study) -> Table:
         "gap-variants",
         "Linear regression of the gap at the merge point (m), for every prompt variant",
         (
-            *_key_columns(WITH_GAP),
+            *key_columns(WITH_GAP, Column("setting", "setting")),
             *_fit_columns("", "", "", "p", "Student's t", WITH_GAP),
             *_fit_columns("hc3_", "", "HC3 ", "HC3 p", "Student's t, HC3 errors", WITH_GAP)[1:],
             *_difference_columns(WITH_GAP),
         ),
-        _rows(study, GAP_TERMS, _gap_row, gap_differences, _hc3),
+        _rows(study, GAP_TERMS, gap_row, gap_differences, lambda fit: fit.hc3),
         (
             FAMILY_NOTE,
             "differences are tested by Welch's t test with HC3 errors",
             *shared_notes(study),
             *sample_notes(study, study.groups),
         ),
-    )
-
-
-def _key_columns(counts: str) -> tuple[Column, ...]:
-    return (
-        Column("term", "term"),
-        Column("driver", "driver"),
-        Column("setting", "setting"),
-        Column("n", "n", "count", 0, "trials in the regression", counts),
     )
 
 
@@ -113,65 +104,9 @@ def _difference_columns(counts: str) -> tuple[Column, ...]:
 
 
 def _who_first_row(group: Group, term: str) -> Row:
-    fit, bounds = fits(group), firth_intervals(group)
-    penalised = _values("firth_", fit.firth, term)
-    return Row(
-        f"{group.id}/{term}",
-        (group.id,),
-        {
-            **_keys(group, term, fit.logit.n),
-            **_values("", fit.logit, term),
-            **penalised,
-            **({"firth_ci": bounds.get(term)} if penalised else {}),
-        },
-        problems(fit.logit, fit.firth),
-    )
-
-
-def _gap_row(group: Group, term: str) -> Row:
-    if not group.measured:
-        row = published_gap(group, term)
-        n, b, se = (row.values[name] for name in ("n", "b", "se"))
-        assert isinstance(n, int)
-        assert isinstance(b, float)
-        assert isinstance(se, float)
-        bounds = interval(b, se, n - len(GAP_TERMS))
-        return replace(row, values={**row.values, "ci": bounds})
-    fit = fits(group)
-    return Row(
-        f"{group.id}/{term}",
-        (group.id,),
-        {
-            **_keys(group, term, fit.ols.n),
-            **_values("", fit.ols, term),
-            **_values("hc3_", fit.hc3, term),
-        },
-        problems(fit.ols, fit.hc3),
-    )
-
-
-def _keys(group: Group, term: str, n: int) -> dict[str, Value]:
-    return {"term": TERM_NAMES[term], "driver": group.label, "setting": group.setting, "n": n}
-
-
-def _values(prefix: str, fit: Regression, term: str) -> dict[str, Value]:
-    found = fit.terms.get(term)
-    if found is None:
-        return {}
-    return {
-        f"{prefix}b": found.b,
-        f"{prefix}se": found.se,
-        f"{prefix}ci": interval(found.b, found.se, fit.freedom),
-        f"{prefix}p": found.p,
-    }
-
-
-def _firth(group: Group) -> Regression:
-    return fits(group).firth
-
-
-def _hc3(group: Group) -> Regression:
-    return fits(group).hc3
+    """That of Table III, with the profile interval of Firth's coefficient."""
+    row, profiles = who_first_row(group, term), firth_intervals(group)
+    return replace(row, values={**row.values, "firth_ci": profiles.get(term)})
 
 
 def _rows(
@@ -179,7 +114,7 @@ def _rows(
     terms: Sequence[str],
     row: Callable[[Group, str], Row],
     differences: Differences,
-    compared: Callable[[Group], Regression],
+    compared: Callable[[Fits], Regression],
 ) -> list[Row]:
     """Term by term a row a group; ``compared`` is the fit without which there is no difference."""
     found, baselines = corrected_differences(study, differences), dict(variants(study))
@@ -191,7 +126,7 @@ def _rows(
             if one is not None:
                 plain = _with_difference(plain, baselines[group], one)
             elif group in baselines:
-                why = _why_none(compared(group), baselines[group], compared)
+                why = _why_none(group, baselines[group], compared)
                 plain = replace(plain, note="; ".join(filter(None, (plain.note, why))))
             rows.append(plain)
     return rows
@@ -216,13 +151,11 @@ def _with_difference(row: Row, baseline: Group | None, one: Corrected) -> Row:
     )
 
 
-def _why_none(
-    own: Regression, baseline: Group | None, compared: Callable[[Group], Regression]
-) -> str:
+def _why_none(group: Group, baseline: Group | None, compared: Callable[[Fits], Regression]) -> str:
     """Why a variant has no difference from its baseline, as far as its own note does not say it."""
-    if own.problem:
+    if compared(fits(group)).problem:
         return ""
     if baseline is None:
         return "no difference: its driver has no baseline"
-    problem = compared(baseline).problem or "neither fit leaves an error"
+    problem = compared(fits(baseline)).problem or "neither fit leaves an error"
     return f"no difference from {baseline.id}: {problem}"

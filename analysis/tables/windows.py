@@ -6,8 +6,8 @@ from analysis.data.study import Group, Study, of_group
 from analysis.metrics import JOINT, RMSE, Metric
 from analysis.stats.intervals import mean, proportion
 from analysis.stats.measures import human_reference
-from analysis.tables.model import Column, Row, Table
-from analysis.tables.notes import sample_notes
+from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, row_of
+from analysis.tables.notes import measured_notes
 
 WINDOWS = {
     "first_merge": "to the first merge (ours)",
@@ -19,14 +19,11 @@ WINDOWS = {
 
 def speed_windows(study: Study) -> Table:
     """One row a group and window; the right window gives the published human values."""
-    measured = [group for group in study.groups if group.measured]
-    rows = [_row(study, group, window) for group in measured for window in WINDOWS]
     return Table(
         "speed-windows",
         "Speed deviation and joint rate by the window in which they are taken",
         (
-            Column("driver", "driver"),
-            Column("setting", "setting"),
+            *GROUP_COLUMNS,
             Column("window", "window"),
             Column("n", "n", "count", 0, "finished trials in which the window ends"),
             *(
@@ -34,13 +31,12 @@ def speed_windows(study: Study) -> Table:
                 for one in (RMSE, JOINT)
             ),
         ),
-        rows,
+        [_row(study, group, window) for group in study.measured for window in WINDOWS],
         (
             f"the paper prints {_printed(RMSE)} and {_printed(JOINT)} for humans; the window that "
             "gives both with the imported "
             "recordings is the paper's. Models have no tunnel: their trials start at its exit",
-            *([] if rows else ["there is no measured trial to show"]),
-            *sample_notes(study, measured),
+            *measured_notes(study),
         ),
     )
 
@@ -57,16 +53,14 @@ def _row(study: Study, group: Group, window: str) -> Row:
     # The view of the windows has the same columns as that of the metrics.
     rmse = mean(own[RMSE.value].to_numpy(float))
     joint = proportion(int(own[JOINT.value].sum()), len(own)).value
-    return Row(
-        f"{group.id}/{window}",
-        (group.id,),
+    return row_of(
+        group,
         {
-            "driver": group.label,
-            "setting": group.setting,
             "window": WINDOWS[window],
             "n": rmse.n,
             RMSE.name: rmse.value,
             JOINT.name: None if joint is None else 100 * joint,
         },
         "" if rmse.n else "no finished trial",
+        item=window,
     )

@@ -87,10 +87,14 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """The baseline without the blocks that it ``removes``, and with those that it ``adds``."""
+    """The baseline without the blocks that it ``removes``, and with those that it ``adds``.
+
+    Tables and figures show its ``title``, or its name where that is empty.
+    """
 
     removes: frozenset[str] = frozenset()
     adds: frozenset[str] = frozenset()
+    title: str = ""
 
 
 def _named(template: str) -> list[str]:
@@ -170,14 +174,20 @@ BLOCKS.register("C4", _of_paper("tactical decision", _TACTICAL, None))
 BLOCKS.register(OUTPUT_FORMAT, _of_paper("output format", _SCHEMA, _SCHEMA))
 
 VARIANTS = Registry[Variant]("variant")
-VARIANTS.register("baseline", Variant())
-VARIANTS.register("A1", Variant(removes=frozenset({"C1"})))
-VARIANTS.register("A2", Variant(removes=frozenset({"C2"})))
-VARIANTS.register("A3", Variant(removes=frozenset({"C3.safety"})))
-VARIANTS.register("A4", Variant(removes=frozenset({"C3.human"})))
-VARIANTS.register("A5", Variant(removes=frozenset({"C3.distance"})))
-VARIANTS.register("A6", Variant(removes=frozenset({"C3.reassess"})))
-VARIANTS.register("A7", Variant(removes=frozenset({"C4"})))
+VARIANTS.register("baseline", Variant(title="Baseline"))
+VARIANTS.register("A1", Variant(frozenset({"C1"}), title="A1 (-History)"))
+VARIANTS.register("A2", Variant(frozenset({"C2"}), title="A2 (-Prev. acc. plan)"))
+VARIANTS.register("A3", Variant(frozenset({"C3.safety"}), title="A3 (-Safety)"))
+VARIANTS.register("A4", Variant(frozenset({"C3.human"}), title="A4 (-Human)"))
+VARIANTS.register("A5", Variant(frozenset({"C3.distance"}), title="A5 (-Distance)"))
+VARIANTS.register("A6", Variant(frozenset({"C3.reassess"}), title="A6 (-Reassess)"))
+VARIANTS.register("A7", Variant(frozenset({"C4"}), title="A7 (-Tactical plan)"))
+
+
+def title_of(variant: str) -> str:
+    """How tables and figures name a variant, which need not be registered here any more."""
+    known = VARIANTS.get(variant)
+    return (known and known.title) or variant
 
 
 def blocks_of(variant: str) -> dict[str, Block]:

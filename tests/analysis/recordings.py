@@ -8,9 +8,6 @@ import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from scipy.io import savemat
-
 from analysis.human.archive import File
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -45,15 +42,6 @@ class Recording:
         padded = [values + [""] * (longest - len(values)) for values in self.columns.values()]
         writer.writerows(zip(*padded, strict=True))
         return text.getvalue().encode()
-
-    def mat(self, *, packed: bool = False) -> bytes:
-        content = io.BytesIO()
-        variables = {
-            name.replace(".", "_"): values[0] if len(values) == 1 else np.array(values)
-            for name, values in self.columns.items()
-        }
-        savemat(content, variables, do_compression=packed)
-        return content.getvalue()
 
 
 def drive(condition="L_4_0", *, yields="right", late=False) -> Recording:

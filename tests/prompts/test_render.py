@@ -239,6 +239,6 @@ def test_a_variant_keeps_the_digests_of_all_blocks_but_its_own(variant):
 
 def test_the_seven_ablations_remove_seven_different_blocks():
     assert set(VARIANTS) == {"baseline", *REMOVED}
-    assert VARIANTS["baseline"] == Variant()
+    assert not VARIANTS["baseline"].removes | VARIANTS["baseline"].adds
     removed = [variant.removes for variant in VARIANTS.values()]
     assert len(frozenset().union(*removed)) == len(REMOVED)

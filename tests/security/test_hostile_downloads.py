@@ -6,23 +6,20 @@ import os
 import pickle
 import random
 import stat
-import struct
 import zipfile
-import zlib
 from contextlib import suppress
 
 import pytest
 
 from analysis.human.archive import Unreadable, open_files
-from analysis.human.mat import MAX_BYTES, read_mat
 from merge_runner.errors import UsageError
 from merge_runner.results.store import query
 from tests.analysis.recordings import drive, write_folder, write_zip
 from tests.harness import Run, environment
 
-GOOD = {"a/experiment_4_iter_1.csv": drive("L_4_0").csv()}
+GOOD_CSV = drive("L_4_0").csv()
+GOOD = {"a/experiment_4_iter_1.csv": GOOD_CSV}
 TRIAL = "experiment_9_iter_9"
-MAT = drive("L_4_0").mat()
 
 
 class Bomb:
@@ -84,7 +81,7 @@ def test_a_link_in_a_zip_is_no_file(imported, tmp_path):
 def test_a_device_or_a_pipe_in_a_folder_is_not_read(tmp_path):
     folder = write_folder(tmp_path / "d", GOOD)
     (folder / f"{TRIAL}.csv").symlink_to("/dev/zero")
-    os.mkfifo(folder / f"{TRIAL}.mat")
+    os.mkfifo(folder / f"{TRIAL}8.csv")
     with open_files(folder) as files:
         for file in files:
             if TRIAL in file.name:
@@ -151,47 +148,9 @@ def test_text_that_looks_like_sql_or_a_formula_is_text(imported, tmp_path):
     assert trials(tmp_path) == 1
 
 
-def packed(content):
-    data = zlib.compress(content)
-    return struct.pack("<II", 15, len(data)) + data
-
-
-def numbers(name, count):
-    """A matrix of so many one-byte numbers."""
-    flags = struct.pack("<IIII", 6, 8, 6, 0)
-    dimensions = struct.pack("<IIii", 5, 8, 1, count)
-    label = struct.pack("<II", 1, 8) + name.ljust(8).encode()
-    values = struct.pack("<II", 2, count) + bytes(count + -count % 8)
-    inside = flags + dimensions + label + values
-    return struct.pack("<II", 14, len(inside)) + inside
-
-
-def test_many_compressed_elements_may_not_unpack_to_more_than_one_file_may():
-    one = packed(numbers("x", 2**20))
-    assert len(read_mat(MAT[:128] + one)["x       "]) == 2**20
-    # Of no known type, so that they are unpacked and no more.
-    element = packed(struct.pack("<II", 99, 2**23) + bytes(2**23))
-    assert len(element) < 10_000
-    assert read_mat(MAT[:128] + element + one)
-    with pytest.raises(Unreadable, match="far too large"):
-        read_mat(MAT[:128] + 2 * element)
-
-
-def test_where_nothing_is_left_to_unpack_that_is_a_limit_too():
-    full = packed(struct.pack("<II", 99, MAX_BYTES - 8) + bytes(MAX_BYTES - 8))
-    assert read_mat(MAT[:128] + full) == {}
-    with pytest.raises(Unreadable, match="far too large"):
-        read_mat(MAT[:128] + full + packed(b"\0"))
-
-
-def test_a_mat_file_that_is_far_too_large_is_not_turned_into_numbers():
-    with pytest.raises(Unreadable, match="far too large"):
-        read_mat(MAT[:128] + numbers("x", 17 * 2**20))
-
-
 def test_every_archive_that_is_damaged_is_refused_or_its_files_are(tmp_path):
     chance = random.Random(1)
-    whole = write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.mat": MAT[:2000]}).read_bytes()
+    whole = write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.csv": GOOD_CSV[:2000]}).read_bytes()
     # Near the ends are the headers.
     places = [*range(100), *range(len(whole) - 300, len(whole))]
     for _ in range(500):

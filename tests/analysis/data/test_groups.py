@@ -16,6 +16,7 @@ from analysis.tables import make_tables
 from analysis.tables.formats import value_rows
 from merge_runner.config import both_sides
 from merge_runner.drivers.registry import stand_in
+from merge_runner.errors import UsageError
 from tests.analysis.studies import changed, write_study, yielding
 
 pytestmark = pytest.mark.usefixtures("few_draws")
@@ -190,3 +191,21 @@ def test_answers_that_are_word_for_word_as_before_are_told_in_the_report(tmp_pat
     )
     titles = [alarm.title for alarm in alarms(study, provenance(db))]
     assert "Answers are word for word as before" in titles
+
+
+@pytest.mark.parametrize(
+    ("spec", "says"),
+    [
+        ("[]", "Input should be a valid dictionary"),
+        ('{"scenario": {"odd": 1}}', "scenario.odd: Extra inputs are not permitted"),
+        ('{"scenario": {"step_s": 0}}', "scenario.step_s: Input should be greater than 0"),
+        ('{"track": {"end_m": 9}}', "track: Value error, a track leads from its tunnels"),
+        ('{"left": {"body": 3}}', "left.body: Input should be a valid dictionary"),
+    ],
+)
+def test_a_stored_spec_that_cannot_be_read_is_named_with_a_trial_in_one_line(db, spec, says):
+    with pytest.raises(UsageError) as refused:
+        changed(db, f"UPDATE specs SET spec = '{spec}' WHERE spec_hash = 'other-baseline'")
+    (line,) = str(refused.value).splitlines()
+    assert line.startswith("the spec other-baseline, of other/baseline/L_0_-8/rep01, cannot be ")
+    assert says in line

@@ -12,7 +12,7 @@ from analysis.human.archive import Unreadable, open_files, refuse_bombs
 from merge_runner.errors import UsageError
 from tests.analysis.recordings import file, write_folder, write_zip
 
-FILES = {"a/experiment_4_iter_1.csv": b"first" * 50, "b/c/experiment_4_iter_2.mat": b"second"}
+FILES = {"a/experiment_4_iter_1.csv": b"first" * 50, "b/c/experiment_4_iter_2.csv": b"second"}
 
 
 def patched(path, signature, offset, layout, value):

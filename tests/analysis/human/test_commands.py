@@ -9,7 +9,7 @@ from tests.analysis.recordings import drive, write_folder, write_zip
 
 GOOD = {
     "data/experiment_4/experiment_4_iter_1.csv": drive("L_4_0").csv(),
-    "data/experiment_6/experiment_6_iter_2.mat": drive("N_0_0", yields="nobody").mat(),
+    "copy/experiment_6/experiment_6_iter_2.csv": drive("N_0_0", yields="nobody").csv(),
     "data/experiment_6/experiment_6_iter_2.csv": b"dt,end_state",
     "data/experiment_4/experiment_4_training_1.csv": b"",
     "data/experiment_4/participant_info.txt": b"left",
@@ -72,7 +72,7 @@ def test_what_cannot_be_read_is_listed_and_the_rest_is_imported(human, tmp_path)
         (None, "error: there is no download.zip"),
         (
             {"a/data.zip": b"", "readme.txt": b""},
-            "error: no trial is in download.zip: trials are experiment_N_iter_M.csv or .mat; "
+            "error: no trial is in download.zip: trials are experiment_N_iter_M.csv; "
             "unpack it, and import a/data.zip of it\n",
         ),
         ({"../experiment_4_iter_1.csv": b""}, "error: download.zip is unsafe"),

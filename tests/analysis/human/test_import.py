@@ -98,56 +98,48 @@ def test_copies_of_a_trial_are_stored_once_and_other_values_are_named(path):
     assert report.differing == ["human/pair1/L_4_0/iter001"]
 
 
-def test_a_mat_file_is_read_where_there_is_no_csv_and_is_the_same_trial(path):
-    assert imported(path, {"experiment_4_iter_1.mat": LEFT.mat()}).added == 1
-    report = imported(path, {"experiment_4_iter_1.csv": LEFT.csv()})
-    assert (report.there, report.replaced) == (1, [])
-
-
-def test_a_mat_file_is_not_read_beside_a_csv(path):
-    files = {"experiment_4_iter_1.mat": b"damaged", "experiment_4_iter_1.csv": LEFT.csv()}
-    report = imported(path, files)
-    assert (report.added, report.replaced, report.unreadable) == (1, [], [])
-
-
-def test_a_mat_file_is_read_where_the_csv_cannot_be_and_that_is_said(path):
-    files = {"experiment_4_iter_1.csv": LEFT.csv()[:9000], "experiment_4_iter_1.mat": LEFT.mat()}
+def test_of_copies_one_that_can_be_read_is_enough_and_the_other_is_named(path):
+    files = {
+        "a/experiment_4_iter_1.csv": LEFT.csv()[:9000],
+        "b/experiment_4_iter_1.csv": LEFT.csv(),
+    }
     report = imported(path, files)
     assert (report.added, report.unreadable) == (1, [])
     [(name, reason)] = report.replaced
-    assert name == "experiment_4_iter_1.csv"
+    assert name == "a/experiment_4_iter_1.csv"
     assert "it is cut off" in reason
 
 
-def test_where_neither_can_be_read_both_say_why_and_the_rest_is_imported(path):
+def test_where_no_copy_can_be_read_each_says_why_and_the_rest_is_imported(path):
     report = imported(
         path,
         {
-            "experiment_4_iter_1.csv": b"",
-            "experiment_4_iter_1.mat": b"",
+            "a/experiment_4_iter_1.csv": b"",
+            "b/experiment_4_iter_1.csv": b"",
             "experiment_4_iter_2.csv": RIGHT.csv(),
             "experiment_4_iter_3.csv": changed(LEFT, "travelled_distance.left", 0, 2.0).csv(),
         },
     )
     assert report.added == 1
     assert [name for name, _ in report.unreadable] == [
-        "experiment_4_iter_1.csv", "experiment_4_iter_1.mat", "experiment_4_iter_3.csv",
+        "a/experiment_4_iter_1.csv", "b/experiment_4_iter_1.csv", "experiment_4_iter_3.csv",
     ]  # fmt: skip
     assert "left at 2.00 m with 10.00 m/s, right at 0.00 m" in report.unreadable[2][1]
 
 
-def test_a_pickle_is_never_read(path):
+@pytest.mark.parametrize("suffix", ["pkl", "mat"])
+def test_only_a_csv_is_ever_read(path, suffix):
     def read():
         raise AssertionError
 
-    pickled = replace(file("experiment_4_iter_1.pkl", b""), read=read)
+    other = replace(file(f"experiment_4_iter_1.{suffix}", b""), read=read)
     beside = [file("experiment_4_iter_2.csv", LEFT.csv())]
-    beside.append(replace(pickled, name="pkl/experiment_4_iter_2.pkl"))
-    report = import_trials(sort_files([pickled, *beside]).trials, Store(path))
+    beside.append(replace(other, name=f"{suffix}/experiment_4_iter_2.{suffix}"))
+    report = import_trials(sort_files([other, *beside]).trials, Store(path))
     assert report.added == 1
     [(name, reason)] = report.unreadable
-    assert name == "experiment_4_iter_1.pkl"
-    assert "only as PKL" in reason
+    assert name == f"experiment_4_iter_1.{suffix}"
+    assert f"only as {suffix.upper()}" in reason
 
 
 def test_only_trials_are_trials():
@@ -168,10 +160,10 @@ def test_only_trials_are_trials():
 
 def test_only_what_would_be_read_can_be_a_bomb():
     sort_files([replace(file("auto_save.pkl", b""), size=10**9)])
-    sort_files([replace(file("experiment_4_iter_1.pkl", b""), size=10**9)])
-    for suffix in ("csv", "mat"):
-        with pytest.raises(UsageError, match="recordings never have"):
-            sort_files([replace(file(f"experiment_4_iter_1.{suffix}", b""), size=10**9)])
+    for suffix in ("mat", "pkl"):
+        sort_files([replace(file(f"experiment_4_iter_1.{suffix}", b""), size=10**9)])
+    with pytest.raises(UsageError, match="recordings never have"):
+        sort_files([replace(file("experiment_4_iter_1.csv", b""), size=10**9)])
 
 
 def test_what_is_stored_before_an_interruption_stays(path, monkeypatch):

@@ -24,7 +24,7 @@ from analysis.stats.ceiling import (
     passes,
     published_humans,
 )
-from analysis.stats.indicators import PAPER, ROBUST, paper_verdicts, robust_verdicts
+from analysis.stats.indicators import PAPER, ROBUST, verdicts
 from analysis.stats.regressions import Regression, gap_ols, who_first_firth, who_first_logit
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
@@ -98,8 +98,8 @@ def test_who_first_verdicts_equal_those_of_single_fits(sizes):
     outcomes = set()
     for number in range(COMPARED):
         trials = rows(draws, number)
-        paper = paper_verdicts(who_first_logit(trials), MISSING)
-        robust = robust_verdicts(who_first_firth(trials), MISSING)
+        paper = verdicts(PAPER, who_first_logit(trials), MISSING)
+        robust = verdicts(ROBUST, who_first_firth(trials), MISSING)
         for name in ("I1", "I2"):
             assert wald[name][number] == bool(paper[name].passed)
             assert firth[name][number] == bool(robust[name].passed)
@@ -154,7 +154,7 @@ def test_penalised_verdicts_equal_those_of_single_fits_also_where_they_fail():
     draws = drawn(HUMANS, even(2))
     _, firth = judged(draws)
     found = [
-        robust_verdicts(who_first_firth(rows(draws, number)), MISSING)["I2"].passed
+        verdicts(ROBUST, who_first_firth(rows(draws, number)), MISSING)["I2"].passed
         for number in range(COMPARED)
     ]
     assert list(firth["I2"][:COMPARED]) == [bool(passed) for passed in found]
@@ -175,13 +175,13 @@ def test_gap_verdicts_equal_those_of_single_fits(humans, sizes):
     for number in range(COMPARED):
         trials = rows(draws, number)
         both = (
-            (classic, paper_verdicts(MISSING, gap_ols(trials))),
-            (robust, robust_verdicts(MISSING, gap_ols(trials, robust=True))),
+            (classic, verdicts(PAPER, MISSING, gap_ols(trials))),
+            (robust, verdicts(ROBUST, MISSING, gap_ols(trials, robust=True))),
         )
-        for rule, (found, verdicts) in enumerate(both):
+        for rule, (found, each) in enumerate(both):
             for name in ("I3", "I4"):
-                assert found[name][number] == bool(verdicts[name].passed)
-                outcomes.add((rule, name, bool(verdicts[name].passed)))
+                assert found[name][number] == bool(each[name].passed)
+                outcomes.add((rule, name, bool(each[name].passed)))
     assert {(rule, "I3", passed) for rule in (0, 1) for passed in (True, False)} <= outcomes
     assert {(0, "I4", True), (1, "I4", False)} <= outcomes
 

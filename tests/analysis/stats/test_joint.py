@@ -17,7 +17,7 @@ from analysis.data.imported_humans import imported
 from analysis.data.reference_data import human_outcomes, published
 from analysis.data.study import Group
 from analysis.stats.intervals import detectable
-from analysis.stats.joint import GAP, WHO_FIRST, by_pairs, differences
+from analysis.stats.joint import GAP, WHO_FIRST, by_pairs, interactions
 from analysis.stats.regressions import gap_data, gap_ols, who_first_data
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
@@ -79,7 +79,7 @@ def joined(one, other):
 def test_it_is_the_logit_of_both_with_the_source_in_every_term():
     (x, left), (own, own_left) = (who_first_data(g.outcomes) for g in (not_imported(), driver()))
     fit = Logit(np.concatenate([left, own_left]), joined(x, own)).fit(disp=0)
-    found = of(differences(not_imported(), driver()), WHO_FIRST)
+    found = of(interactions(not_imported(), driver()), WHO_FIRST)
     assert [one.found.by for one in found] == ["ML"] * 3
     assert [one.found.value for one in found] == pytest.approx(fit.params[3:], abs=1e-6)
     assert [one.human for one in found] == pytest.approx(fit.params[:3], abs=1e-6)
@@ -94,7 +94,7 @@ def test_the_gaps_interactions_are_those_of_least_squares_over_both():
     human, own = humans(driven(np.random.default_rng(2), 9, 2)), driver()
     (x, gap, _), (z, own_gap, _) = gap_data(human.trials), gap_data(own.trials)
     fit = OLS(np.concatenate([gap, own_gap]), joined(x, z)).fit()
-    found = of(differences(human, own), GAP)
+    found = of(interactions(human, own), GAP)
     assert [one.found.value for one in found] == pytest.approx(fit.params[4:])
     assert [one.human for one in found] == pytest.approx(fit.params[:4])
 
@@ -126,7 +126,7 @@ def leverage_errors(trials):
 def test_errors_by_pairs_add_up_with_those_of_the_driver():
     human, own = humans(driven(np.random.default_rng(2), 9, 2)), driver()
     mine, theirs = gap_ols(own.trials, robust=True).terms.values(), leverage_errors(human.trials)
-    for one, term, se in zip(of(differences(human, own), GAP), mine, theirs, strict=True):
+    for one, term, se in zip(of(interactions(human, own), GAP), mine, theirs, strict=True):
         total = term.se**2 + se**2
         # Satterthwaite: 9 pairs have 8 degrees of freedom, 110 trials and 4 terms 106.
         freedom = total**2 / (term.se**4 / 106 + se**4 / 8)
@@ -142,7 +142,7 @@ def test_errors_by_pairs_add_up_with_those_of_the_driver():
 
 
 def test_before_an_import_the_gap_is_compared_with_the_published_regression():
-    found = of(differences(not_imported(), driver()), GAP)
+    found = of(interactions(not_imported(), driver()), GAP)
     rows = published("paper_gap").query("driver == 'human'").set_index("term")
     mine = gap_ols(driver().trials, robust=True).terms
     for one in found:
@@ -156,7 +156,7 @@ def test_before_an_import_the_gap_is_compared_with_the_published_regression():
 
 
 def test_unknown_pairs_are_said_to_make_the_intervals_too_narrow():
-    found = differences(not_imported(), driver())
+    found = interactions(not_imported(), driver())
     assert len(found) == 7
     assert all("not published" in one.remark and "too narrow" in one.remark for one in found)
 
@@ -168,17 +168,17 @@ def partly(pairs) -> Group:
 
 
 def test_of_a_partial_import_the_gaps_count_and_the_published_outcomes_stay():
-    found = differences(partly(3), driver())
+    found = interactions(partly(3), driver())
     assert {one.n_human for one in of(found, GAP)} == {33}
     assert {one.n_human for one in of(found, WHO_FIRST)} == {962}
     assert all("3 pairs" in one.remark for one in of(found, GAP))
-    assert of(found, WHO_FIRST) == of(differences(not_imported(), driver()), WHO_FIRST)
+    assert of(found, WHO_FIRST) == of(interactions(not_imported(), driver()), WHO_FIRST)
 
 
 def test_two_pairs_are_no_reference_for_the_gap():
-    found = differences(partly(2), driver())
+    found = interactions(partly(2), driver())
     assert {one.n_human for one in of(found, GAP)} == {962}
-    assert of(found, GAP) == of(differences(not_imported(), driver()), GAP)
+    assert of(found, GAP) == of(interactions(not_imported(), driver()), GAP)
 
 
 def separated() -> Group:
@@ -211,7 +211,7 @@ def best(design, left, start, term, value):
 
 def test_under_separation_the_joint_fit_is_firths_with_its_likelihood_ratios():
     human, own = not_imported(), separated()
-    found = of(differences(human, own), WHO_FIRST)
+    found = of(interactions(human, own), WHO_FIRST)
     assert [one.found.by for one in found] == ["Firth"] * 3
     (x, left), (z, own_left) = (who_first_data(g.outcomes) for g in (human, own))
     design, left = joined(x, z), np.concatenate([left, own_left])
@@ -227,7 +227,7 @@ def test_under_separation_the_joint_fit_is_firths_with_its_likelihood_ratios():
 
 def test_firths_fit_beside_pairs_says_that_it_takes_trials_as_independent():
     human = humans(driven(np.random.default_rng(2), 9, 2))
-    found = of(differences(human, separated()), WHO_FIRST)
+    found = of(interactions(human, separated()), WHO_FIRST)
     assert all(one.found.by == "Firth" and "independent" in one.remark for one in found)
 
 
@@ -248,7 +248,7 @@ DEGENERATE = {
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("reason", DEGENERATE)
 def test_data_that_allow_no_comparison_give_a_reason(reason):
-    found = differences(not_imported(), DEGENERATE[reason])
+    found = interactions(not_imported(), DEGENERATE[reason])
     lacking = [one for one in found if one.problem]
     assert {one.term for one in lacking} >= {"intercept", "projected_headway", "relative_velocity"}
     assert any(reason in one.problem for one in lacking)
@@ -259,12 +259,12 @@ def test_humans_whose_fit_hangs_on_one_pair_are_compared_by_firths():
     trials = driven(np.random.default_rng(2), 3, 2)
     ahead = np.where(trials["projected_headway_m"] > 0, "left", "right")
     trials.loc[trials["pair"] != "pair0", "merged_first"] = ahead[trials["pair"] != "pair0"]
-    found = of(differences(humans(trials), driver()), WHO_FIRST)
+    found = of(interactions(humans(trials), driver()), WHO_FIRST)
     assert {one.found.by for one in found} == {"Firth"}
 
 
 def test_the_detectable_difference_is_found_in_four_of_five_studies():
-    found = of(differences(not_imported(), driver()), WHO_FIRST)
+    found = of(interactions(not_imported(), driver()), WHO_FIRST)
     for one in found:
         se = (one.found.high - one.found.value) / stats.norm.ppf(0.975)
         assert stats.norm.sf(stats.norm.ppf(0.975) - one.found.detectable / se) == pytest.approx(
@@ -286,7 +286,7 @@ def alarms(tested, count, **kept):
 
 
 def jointly(human, own):
-    return [one.found.p for one in differences(humans(human), group(own)) if not one.problem]
+    return [one.found.p for one in interactions(humans(human), group(own)) if not one.problem]
 
 
 def pooled(human, own):

@@ -196,8 +196,8 @@ def test_before_an_import_the_number_stands_without_a_verdict(study):
     for group in study.models:
         found = score(study, group)
         why = "no human traces to compare with: the number alone"
-        assert found.robust["I5"] == Verdict(None, None, why)
-        assert found.paper["I5"] == Verdict(None, None, "the paper judged by eye")
+        assert found.robust["I5"] == Verdict(None, why)
+        assert found.paper["I5"] == Verdict(None, "the paper judged by eye")
     human = score(study, study.human)
-    assert human.paper["I5"] == Verdict(True, None, "by eye, the paper")
-    assert human.robust["I5"] == Verdict(None, None, "by eye, the paper")
+    assert human.paper["I5"] == Verdict(True, "by eye, the paper")
+    assert human.robust["I5"] == Verdict(None, "by eye, the paper")
