@@ -23,8 +23,9 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.cache import Entry
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
+from merge_runner.llm.shared_services import CachePort
 from merge_runner.records import Attempt
 
 PATIENCE_S = 90.0
@@ -57,15 +58,13 @@ class PaidAttempt:
 
     async def settle(self, attempts: Sequence[Attempt]) -> None:
         """The attempt, the last of these, brought no answer; its cost may be unknown."""
-        cost_usd = attempts[-1].cost_usd
-        await self.budget.ledger.settle(self.key, attempts, self.aside_usd, cost_usd)
-        if cost_usd == 0:
+        await self.budget.ledger.settle(self.key, attempts, self.aside_usd)
+        if attempts[-1].cost_usd == 0:
             self._freed_usd = self.aside_usd  # the trial needs it again
 
     async def keep(self, entry: Entry) -> Entry:
         """Keep the answer that the attempt brought, and what it cost, in one transaction."""
-        cost_usd = entry.attempts[-1].cost_usd
-        return await self.budget.ledger.keep(entry, self.aside_usd, cost_usd)
+        return await self.budget.ledger.keep(entry, self.aside_usd)
 
     def close(self) -> None:
         """The attempt has ended."""
@@ -248,7 +247,7 @@ class Budget:
 class Unpaid:
     """In the place of a budget for a model that costs nothing: replies and attempts are kept."""
 
-    cache: ResponseCache
+    cache: CachePort
 
     async def admit(self, trial: int) -> None:
         """Every trial may begin."""
@@ -266,7 +265,7 @@ class Unpaid:
 class UnpaidAttempt:
     """One attempt that costs nothing; see PaidAttempt."""
 
-    cache: ResponseCache
+    cache: CachePort
     key: str
     aside_usd: float = 0.0
 

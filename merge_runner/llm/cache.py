@@ -28,9 +28,10 @@ from merge_runner.llm.cache_db import (
     open_read_only,
     set_format,
 )
+from merge_runner.llm.claims import Claims
 from merge_runner.llm.keys import manner, without_prompt
 from merge_runner.llm.verify import DAMAGED, check_body, check_call
-from merge_runner.llm.write_batcher import BatchWriter, Operation
+from merge_runner.llm.write_batcher import BatchWriter, Operation, ResultT
 from merge_runner.records import Attempt, ChatRequest, is_scripted
 
 ENTRY_VERSION = 1
@@ -134,8 +135,23 @@ class ModelFacts:
 _FACTS = TypeAdapter(ModelFacts)
 
 
+@dataclass(frozen=True, slots=True)
+class KnownCall:
+    """What is recorded of a call: its entry, or the attempts of earlier runs.
+
+    ``damaged`` names what was found damaged and set aside.
+    """
+
+    entry: Entry | None
+    attempts: tuple[Attempt, ...]
+    damaged: tuple[str, ...] = ()
+
+
 class ResponseCache:
-    """The cache folder. Reads are direct; writes are batched in a thread and awaited."""
+    """The cache folder. Reads are direct; writes are batched in a thread and awaited.
+
+    Whoever makes a call has claimed it, so that no other process makes it too.
+    """
 
     def __init__(
         self,
@@ -150,6 +166,7 @@ class ResponseCache:
         in the folder, which must be there.
         """
         self.folder = folder
+        self.claims = Claims(folder)
         self._read_overlay = overlay
         self._disk = open_read_only(folder) if read_only else open_disk(folder)
         self._writer = BatchWriter(self.run_now)
@@ -172,6 +189,23 @@ class ResponseCache:
         except RecordingError:
             return False
 
+    async def claim(self, key: str) -> KnownCall | None:
+        """Claim a call and learn what is recorded of it; None while another one holds it.
+
+        What is damaged is set aside.
+        """
+        if not self.claims.take(key):
+            return None
+        try:
+            return KnownCall(self.get(key), self.unanswered(key))
+        except RecordingError:
+            damaged = tuple(self.set_damage_aside(key))
+            return KnownCall(self.get(key), self.unanswered(key), damaged)
+
+    def release(self, key: str) -> None:
+        """Give a claim up."""
+        self.claims.release(key)
+
     async def put(self, entry: Entry, also: Operation | None = None) -> Entry:
         """Keep an entry; returns the one that is kept when it is durable.
 
@@ -185,8 +219,7 @@ class ResponseCache:
                 also()
             return kept
 
-        kept: Entry = await self.write(operation)
-        return kept
+        return await self.write(operation)
 
     def put_now(self, entries: Iterable[Entry]) -> list[Entry]:
         """Keep entries in one transaction, in this thread; returns those that are kept."""
@@ -224,7 +257,7 @@ class ResponseCache:
         """Keep the attempts at a call that has no answer yet, durably."""
         await self.write(lambda: self.keep_unanswered(key, attempts))
 
-    async def write(self, operation: Callable[[], Any]) -> Any:  # noqa: ANN401 # the operation's own result
+    async def write(self, operation: Callable[[], ResultT]) -> ResultT:
         """Run an operation on this cache in the next durable batch; raises CacheFailed."""
         return await self._writer.write(operation)
 
@@ -312,7 +345,8 @@ class ResponseCache:
         return sum(self.facts(model).cost_usd for model in models)
 
     def close(self) -> None:
-        """Close the folder."""
+        """Close the folder, and give all claims up."""
+        self.claims.close()
         self._disk.close()
 
     def _keep(self, entry: Entry) -> Entry:

@@ -24,7 +24,7 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.budget import Unpaid
-from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.cache import Entry
 from merge_runner.llm.call import Call, Wait, slot_text
 from merge_runner.llm.consequences import Consequences
 from merge_runner.llm.first_call import FirstCall
@@ -40,14 +40,14 @@ from merge_runner.llm.http_outcome import (
 from merge_runner.llm.keys import make_request
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
 from merge_runner.llm.meter import Meter
-from merge_runner.llm.prices import Pricing
+from merge_runner.llm.prices import Pricing, pricing
 from merge_runner.llm.retry import Deadline, OutOfTime, RequestFailed, retries
 from merge_runner.llm.shared_services import (
     AttemptPort,
     BudgetPort,
-    ClaimPort,
-    PermitPort,
+    CachePort,
     RateLimitPort,
+    Settle,
 )
 from merge_runner.llm.transport import Transport, TransportFailure
 from merge_runner.records import (
@@ -71,7 +71,7 @@ class LlmClient:
 
     ``endpoint`` is the identity that enters the keys. A call that is under way is shared by all
     who ask for the same key, and goes on when they are cancelled, so that what is paid for is
-    kept; ``drain`` waits for it. ``claims`` keep other processes from making the same call.
+    kept; ``drain`` waits for it.
     ``budget`` is that of a model which costs money. ``first`` is the run's first call to the
     endpoint, which goes alone. ``sealed`` says that nothing may be asked anew; ``strict`` that an
     answer of another model stops the sweep.
@@ -80,18 +80,20 @@ class LlmClient:
     name: str
     entry: ModelEntry
     endpoint: str
-    cache: ResponseCache
+    cache: CachePort
     transport: Transport
     limiter: RateLimitPort
-    pricing: Pricing
     budget: BudgetPort | None = None
-    claims: ClaimPort | None = None
     sealed: bool = False
     strict: bool = False
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
     meter: Meter = field(default_factory=Meter)
+    _pricing: Pricing = field(init=False)
     _calls: dict[str, Call] = field(default_factory=dict)
     _stopping: bool = False
+
+    def __post_init__(self) -> None:
+        self._pricing = pricing(self.entry)
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """The model's reply for a slot; lower ``order`` is served first.
@@ -157,23 +159,6 @@ class LlmClient:
                 raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
             return None
 
-    def _known(self, request: ChatRequest) -> tuple[Entry | None, tuple[Attempt, ...]]:
-        """The recorded call, else the attempts of earlier runs; only who has claimed it may ask.
-
-        What is damaged is moved out of the way, and told.
-        """
-        key = request.key
-        try:
-            return self.cache.get(key), self.cache.unanswered(key)
-        except RecordingError:
-            for name in self.cache.set_damage_aside(key):
-                self.meter.damaged.append(name)
-                self.meter.notes.append(
-                    f"{self.driver}: {slot_text(request.slot)}: what is recorded is damaged; it is "
-                    f"set aside in the cache as 'damaged {name}', and asked again"
-                )
-            return self.cache.get(key), self.cache.unanswered(key)
-
     def _other_model(self, reply: ChatReply) -> str | None:
         """Who answered, where it is another model than was asked for."""
         served = reply.attempts[-1].model_served
@@ -193,7 +178,7 @@ class LlmClient:
 
     def _start(self, request: ChatRequest, order: int) -> Call:
         worst = self._worst_case(request)
-        worst_usd = self.pricing.cost_usd(worst) or 0.0
+        worst_usd = self._pricing.cost_usd(worst) or 0.0
         call = Call(request, order, self.driver, worst, worst_usd, self._stopping)
         call.task = asyncio.create_task(self._claimed(call))
         self._calls[request.key] = call
@@ -233,16 +218,21 @@ class LlmClient:
     async def _unless_made(self, call: Call) -> ChatReply:
         """Make a call unless another process does."""
         key = call.request.key
-        while self.claims is not None and not await self.claims.claim(key):
+        while (known := await self.cache.claim(key)) is None:
             with call.waiting("for another merge-runner that makes the same call"):
                 await asyncio.sleep(CLAIM_POLL_S)
         try:
-            made, earlier = self._known(call.request)  # another process may have made it just now
-            call.attempts, call.earlier = list(earlier), len(earlier)
-            return self._read(made) if made else await self._make(call)
+            for name in known.damaged:
+                self.meter.damaged.append(name)
+                self.meter.notes.append(
+                    f"{self.driver}: {call.who}: what is recorded is damaged; it is set aside in "
+                    f"the cache as 'damaged {name}', and asked again"
+                )
+            call.attempts, call.earlier = list(known.attempts), len(known.attempts)
+            # Another process may have made it just now.
+            return self._read(known.entry) if known.entry else await self._make(call)
         finally:
-            if self.claims is not None:
-                self.claims.release(key)
+            self.cache.release(key)
 
     async def _make(self, call: Call) -> ChatReply:
         """Make attempts until there is an answer, which is kept with all of them."""
@@ -272,10 +262,10 @@ class LlmClient:
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """One attempt: the answer, kept, or an error that says what follows."""
-        async with self._permitted(call) as (paid, permit):
+        async with self._permitted(call) as (paid, settle):
             await paid.begin(call.attempts)
             with deadline.attempt() as seconds_left:
-                outcome, raw = await self._send(call, permit, seconds_left)
+                outcome, raw = await self._send(call, settle, seconds_left)
             self._tell_overrun(call, paid.aside_usd)
             error = self._consequences.error(call, outcome, raw)
             if error is None:
@@ -286,8 +276,8 @@ class LlmClient:
             raise error
 
     @asynccontextmanager
-    async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, PermitPort]]:
-        """Money first: a permit must be used when it is given, or the limits do not hold."""
+    async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, Settle]]:
+        """Money first: a turn must be used when it is given, or the limits do not hold."""
         asked = Asked(self.driver, call.who, call.worst_usd)
         async with AsyncExitStack() as stack:
             with call.waiting("for calls in flight to be paid, under --max-cost"):
@@ -295,11 +285,11 @@ class LlmClient:
                     self._money.attempt(call.order, call.request.key, asked)
                 )
             with call.waiting("for a turn under the rate limits"):
-                permit = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
-            yield paid, permit
+                settle = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
+            yield paid, settle
 
     async def _send(
-        self, call: Call, permit: PermitPort, seconds_left: float
+        self, call: Call, settle: Settle, seconds_left: float
     ) -> tuple[AttemptOutcome, RawReply | None]:
         """Send the request; what comes of it is the last of the call's attempts."""
         number = len(call.attempts) + 1
@@ -311,7 +301,8 @@ class LlmClient:
             )
             outcome = judge(raw, self._format)
             record = self._record(number, raw, outcome, call.worst)
-            self._settle_tokens(permit, record.usage)
+            if record.usage.output_tokens is not None:
+                settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
         except TransportFailure as exc:
             outcome = AttemptOutcome(exc.action, exc.outcome, str(exc))
             free = self.entry.price == "free" or not exc.sent
@@ -375,9 +366,9 @@ class LlmClient:
         if self.entry.price == "free":
             return 0.0
         if usage.input_tokens and usage.output_tokens is not None:
-            return self.pricing.cost_usd(usage)
+            return self._pricing.cost_usd(usage)
         if (usage.output_tokens or 0) > (worst.output_tokens or 0):
-            return self.pricing.cost_usd(
+            return self._pricing.cost_usd(
                 Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
             )
         stray = raw.status == 200 and is_web_page(raw) and not self.first.known
@@ -392,10 +383,6 @@ class LlmClient:
         return Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
-
-    def _settle_tokens(self, permit: PermitPort, usage: Usage) -> None:
-        if usage.output_tokens is not None:
-            permit.settle((usage.input_tokens or 0) + usage.output_tokens)
 
     def _answer(self, call: Call, kept: Entry, outcome: AttemptOutcome) -> ChatReply:
         if kept.attempts[-1] != call.attempts[-1]:  # another process was first

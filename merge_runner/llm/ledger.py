@@ -157,29 +157,21 @@ class Ledger:
             self._cache.keep_unanswered(key, (*attempts, _begun(len(attempts) + 1)))
             return True
 
-        reserved: bool = await self._cache.write(operation)
-        return reserved
+        return await self._cache.write(operation)
 
-    async def settle(
-        self, key: str, attempts: Sequence[Attempt], worst_usd: float, actual_usd: float | None
-    ) -> None:
-        """An attempt brought no answer, or was not made after all; None: its cost is unknown.
-
-        ``attempts`` are all that were made up to now.
-        """
+    async def settle(self, key: str, attempts: Sequence[Attempt], worst_usd: float) -> None:
+        """The last of a call's attempts brought no answer; its cost may be unknown."""
 
         def operation() -> None:
-            self._settle(key, attempts, worst_usd, actual_usd)
+            self._settle(key, attempts, worst_usd)
             self._cache.keep_unanswered(key, tuple(attempts))
 
         await self._cache.write(operation)
 
-    async def keep(self, entry: Entry, worst_usd: float, actual_usd: float | None) -> Entry:
-        """Keep an answered call, and settle its last attempt with it."""
-        key, attempts = entry.request.key, entry.attempts
-        return await self._cache.put(
-            entry, lambda: self._settle(key, attempts, worst_usd, actual_usd)
-        )
+    async def keep(self, entry: Entry, worst_usd: float) -> Entry:
+        """Keep an answered call, and settle its last attempt in the same transaction."""
+        key = entry.request.key
+        return await self._cache.put(entry, lambda: self._settle(key, entry.attempts, worst_usd))
 
     def reasons(self) -> list[Reason]:
         """Why something is set aside, the largest sum first."""
@@ -212,14 +204,12 @@ class Ledger:
         released: Release = self._cache.run_now([operation])[0]
         return released
 
-    def _settle(
-        self, key: str, attempts: Sequence[Attempt], worst_usd: float, actual_usd: float | None
-    ) -> None:
+    def _settle(self, key: str, attempts: Sequence[Attempt], worst_usd: float) -> None:
+        actual_usd = attempts[-1].cost_usd
         # The row of reasons may be lost or damaged; the sums, which the cap needs, lie elsewhere.
         *earlier, one = self._opened(key) or [SetAside(worst_usd, UNNAMED, _now())]
         if actual_usd is None:
-            outcome = attempts[-1].outcome if attempts else IN_FLIGHT
-            self._write_open(key, [*earlier, replace(one, outcome=outcome)])
+            self._write_open(key, [*earlier, replace(one, outcome=attempts[-1].outcome)])
             return  # it stays set aside: it may have been charged
         self._write_open(key, earlier)
         spending = self.read()

@@ -19,14 +19,13 @@ from merge_runner.emulator.process import emulator_process
 from merge_runner.errors import UsageError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.claims import Claims
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.prices import pricing
 from merge_runner.llm.shared_limits import SharedLimits, limits_file
-from merge_runner.llm.shared_services import SharedServices
+from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.run.plan import Limits
 
@@ -63,11 +62,10 @@ class EndpointPlan:
 
 @dataclass(frozen=True, slots=True)
 class LocalServices:
-    """The services of this process; see SharedServices."""
+    """What the clients of a run share: the queue of each model, and the money."""
 
     limiters: Mapping[str, Limiter]
     budget: Budget
-    claims: Claims
 
 
 def sealed_clients(
@@ -85,7 +83,6 @@ def sealed_clients(
             cache=cache,
             transport=transport,
             limiter=Limiter(),
-            pricing=pricing(entry),
             sealed=True,
         )
         for name, entry in entries.items()
@@ -112,8 +109,8 @@ def open_services(
             )
     if any(entry.price != "free" for entry in entries.values()):
         terms.ledger.read()
-    claims = Claims(cache.folder)
-    stack.callback(claims.close)
+    cache.claims.open()  # now, not in the midst of the run, where the folder has no locks
+    stack.callback(cache.claims.close)
     pauses: dict[str, Pause] = {}
     return LocalServices(
         limiters={
@@ -126,7 +123,6 @@ def open_services(
             for name, entry in entries.items()
         },
         budget=Budget(terms.ledger, cap_usd=limits.max_cost_usd, trial_usd=terms.trial_usd),
-        claims=claims,
     )
 
 
@@ -163,8 +159,9 @@ async def start_endpoints(
 def live_clients(
     entries: Mapping[str, ModelEntry],
     endpoint_plan: EndpointPlan,
-    cache: ResponseCache,
-    services: SharedServices,
+    cache: CachePort,
+    limiters: Mapping[str, RateLimitPort],
+    budget: BudgetPort,
     *,
     connections: int,
     stack: AsyncExitStack,
@@ -187,10 +184,8 @@ def live_clients(
             endpoint=endpoint_plan.endpoints[name],
             cache=cache,
             transport=transport,
-            limiter=services.limiters[name],
-            pricing=pricing(entry),
-            budget=None if entry.price == "free" else services.budget,
-            claims=services.claims,
+            limiter=limiters[name],
+            budget=None if entry.price == "free" else budget,
             strict=endpoint_plan.strict,
             first=FirstCall(passed=name in endpoint_plan.passed, known=name in endpoint_plan.known),
         )

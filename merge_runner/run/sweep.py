@@ -312,7 +312,8 @@ class Sweep:
                 plan.entries,
                 endpoint_plan,
                 self._cache,
-                services,
+                services.limiters,
+                services.budget,
                 connections=options.limits.connections,
                 stack=stack,
             )

@@ -161,7 +161,6 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
             cache=cache,
             transport=transport,
             limiter=Limiter(),
-            pricing=pricing(entry),
         )
         worst = pricing(entry).cost_usd(client._worst_case(client._request(PROMPT, slot(0))))
         client.first = first or client.first

@@ -160,7 +160,7 @@ def test_a_link_in_the_folder_is_not_followed(folder, victim, tmp_path, name):
 def test_a_file_of_locks_that_leads_elsewhere_makes_none_there(folder, tmp_path):
     (folder / "claims.lock").symlink_to(tmp_path / "made")
     with pytest.raises(UsageError, match="cannot be locked"):
-        Claims(folder)
+        Claims(folder).open()
     assert not (tmp_path / "made").exists()
 
 

@@ -25,7 +25,6 @@ from distributed.scheduler import KilledWorker
 from merge_runner.errors import (
     ClusterFailed,
     MergeRunnerError,
-    RecordingError,
     TrialSuspended,
     UsageError,
 )
@@ -52,7 +51,6 @@ SCHEDULER_GONE = (
     "the Dask scheduler is gone. Every reply that the workers sent is saved; run the same command "
     "again to go on"
 )
-_IDENTITY = "identity"
 
 
 class Coordinator:
@@ -73,7 +71,6 @@ class Coordinator:
     ) -> None:
         self.services = services
         self.cache = cache
-        self.claimed: set[str] = set()
         self.answered: Counter[str] = Counter()
         self.meters = {name: Meter() for name in plan.entries}
         self.workers = 0
@@ -82,9 +79,7 @@ class Coordinator:
         self._plan = plan
         self._endpoint_plan = endpoint_plan
         self._in_flight = in_flight
-        self._limited = frozenset(n for n, turns in services.limiters.items() if turns.limited)
         self._token = secrets.token_hex(16)
-        self._folder = ""
         self._waiting: deque[TrialSpec] = deque()
         self._unfinished: set[int] = set()
         self._ended: Ended | None = None
@@ -100,7 +95,6 @@ class Coordinator:
 
     async def __aenter__(self) -> Coordinator:
         """Listen where the scheduler reaches this process."""
-        self._folder = f"merge-runner-{await _identity(self.cache)}"
         scheduler = self._client.scheduler.address
         protocol = scheduler.partition("://")[0]
         host = get_address_host(self._client.scheduler_comm.comm.local_address)
@@ -190,12 +184,6 @@ class Coordinator:
         except MergeRunnerError as exc:
             self.fail(exc)
 
-    def tell_pause(self, told_by: Session, name: str, seconds: float) -> None:
-        """A server asked one worker to wait, and all others wait with it."""
-        for session in self._sessions:
-            if session is not told_by and name not in self._limited:
-                session.link.tell("pause", name, seconds)
-
     async def admit(self, session: Session, token: str, theirs: str, host: str) -> Batch | None:
         """The batch of a worker that joins; None: there is nothing to do."""
         if not secrets.compare_digest(token, self._token):
@@ -232,13 +220,6 @@ class Coordinator:
             in_flight=session.in_flight,
             plan=self._plan,
             endpoint_plan=replace(self._endpoint_plan, passed=self._passed()),
-            folder=self._folder,
-            limited=self._limited,
-            pauses_s={
-                name: turns.paused_s
-                for name, turns in self.services.limiters.items()
-                if name not in self._limited
-            },
         )
 
     def _passed(self) -> frozenset[str]:
@@ -307,18 +288,3 @@ async def _finished(batch: Future) -> None:
         )
     if error is not None:
         raise error
-
-
-async def _identity(cache: ResponseCache) -> str:
-    """What tells this cache from others, and from one that was here before."""
-
-    def operation() -> str:
-        known = None
-        with contextlib.suppress(RecordingError):  # a damaged one counts as missing
-            known = cache.read(_IDENTITY)
-        if known is None:
-            cache.replace(_IDENTITY, known := secrets.token_hex(8))
-        return known
-
-    identity: str = await cache.write(operation)
-    return identity

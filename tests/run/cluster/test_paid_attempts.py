@@ -10,12 +10,11 @@ from distributed.comm import connect, listen
 
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.claims import Claims
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt
 from merge_runner.run.clients import LocalServices
 from merge_runner.run.cluster.link import Link, LinkLost
-from merge_runner.run.cluster.remote import RemoteBudget, WorkerCache
+from merge_runner.run.cluster.remote import RemoteBudget
 from merge_runner.run.cluster.session import Session
 
 WORST = Asked("o3", "L_4_0 rep 1 left, decision 3", 0.5)
@@ -35,12 +34,9 @@ def budget(cache):
 
 
 @pytest.fixture
-async def worker(cache, budget, tmp_path):
+async def worker(cache, budget):
     """The worker's end: its link, and the budget that it asks over it."""
-    claims = Claims(cache.folder)
-    run = SimpleNamespace(
-        services=LocalServices({}, budget, claims), cache=cache, claimed=set(), meters={}
-    )
+    run = SimpleNamespace(services=LocalServices({}, budget), cache=cache, meters={})
     sessions = []
 
     async def serve(comm):
@@ -53,17 +49,14 @@ async def worker(cache, budget, tmp_path):
     await listener.start()
     link = Link(await connect(listener.contact_address), {})
     serving = asyncio.create_task(link.serve())
-    own = WorkerCache(tmp_path / "own", link)
 
     async def dies():
         link.abort()
         await asyncio.gather(serving, *sessions)
 
-    yield SimpleNamespace(link=link, budget=RemoteBudget(link, own), dies=dies)
+    yield SimpleNamespace(link=link, budget=RemoteBudget(link), dies=dies)
     await dies()
     listener.stop()
-    own.close()
-    claims.close()
 
 
 def money(budget):
