@@ -7,8 +7,7 @@ from itertools import islice
 from pathlib import Path
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import ResponseCache, entries_of
-from merge_runner.llm.cache_db import open_read_only, usable
+from merge_runner.llm.cache import ResponseCache
 
 BATCH = 1_000
 
@@ -22,8 +21,8 @@ def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
         raise UsageError(f"{folder} is the cache itself: name another one with --cache")
     added = there = 0
     left_out: list[str] = []
-    with usable(folder), contextlib.closing(open_read_only(folder)) as disk:
-        entries = entries_of(disk, left_out)
+    with contextlib.closing(ResponseCache(folder, read_only=True)) as source:
+        entries = source.entries(left_out)
         while batch := list(islice(entries, BATCH)):
             new = [entry for entry in batch if not cache.holds(entry.request.key)]
             cache.put_now(new)

@@ -33,9 +33,6 @@ class Asked:
     honest_usd: float = 0.0
 
 
-UNNAMED = Asked()
-
-
 @dataclass(frozen=True, slots=True)
 class SetAside:
     """One attempt of unknown cost; ``outcome`` is IN_FLIGHT also where its process died."""
@@ -141,7 +138,7 @@ class Ledger:
         attempts: Sequence[Attempt],
         worst_usd: float,
         cap_usd: float | None,
-        asked: Asked = UNNAMED,
+        asked: Asked,
     ) -> bool:
         """Set the worst case of a call's next attempt aside; False if that exceeds the cap."""
 
@@ -207,7 +204,7 @@ class Ledger:
     def _settle(self, key: str, attempts: Sequence[Attempt], worst_usd: float) -> None:
         actual_usd = attempts[-1].cost_usd
         # The row of reasons may be lost or damaged; the sums, which the cap needs, lie elsewhere.
-        *earlier, one = self._opened(key) or [SetAside(worst_usd, UNNAMED, _now())]
+        *earlier, one = self._opened(key) or [SetAside(worst_usd, Asked(), _now())]
         if actual_usd is None:
             self._write_open(key, [*earlier, replace(one, outcome=attempts[-1].outcome)])
             return  # it stays set aside: it may have been charged
