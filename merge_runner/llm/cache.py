@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -22,7 +23,6 @@ from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.cache_db import (
     FAILURES,
     FORMAT,
-    TextDisk,
     format_of,
     open_disk,
     open_read_only,
@@ -324,9 +324,12 @@ class ResponseCache:
             self._disk.set(each, _behind_checksum(text))
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[Entry]:
-        """All entries, of the folder and of the overlay; see ``entries_of``."""
+        """All entries, of the folder and of the overlay, each verified.
+
+        What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
+        """
         with self._readable():
-            yield from entries_of(self._disk, [] if left_out is None else left_out)
+            yield from self._own_entries([] if left_out is None else left_out)
         yield from self._overlay.values()
 
     def recorded_endpoints(self, model: str) -> list[str]:
@@ -337,7 +340,7 @@ class ResponseCache:
 
     def facts(self, model: str) -> ModelFacts:
         """What the folder knows of a model."""
-        return self._facts(model) or self._counted_anew(model)
+        return self._facts(model) or self._counted_anew()[model]
 
     def cost_usd(self) -> float:
         """What all entries of the folder cost when they were made."""
@@ -396,7 +399,7 @@ class ResponseCache:
         for model, new in by_model.items():
             known = self._facts(model)
             if known is None:
-                known = self._counted_anew(model)  # with the new ones, which lie there already
+                known = self._counted_anew()[model]  # with the new ones, which lie there already
             else:
                 for entry in new:
                     known.add(entry)
@@ -407,10 +410,7 @@ class ResponseCache:
         if format_of(self._disk) < 3:  # or another process was quicker
             for name in self._disk.names(_OLD_ENDPOINTS) + self._disk.names(_MODEL):
                 self._disk.delete(name)
-            facts: dict[str, ModelFacts] = {}
-            for entry in entries_of(self._disk, []):
-                facts.setdefault(entry.request.model, ModelFacts()).add(entry)
-            for model, known in facts.items():
+            for model, known in self._counted_anew().items():
                 self._keep_facts(model, known)
         set_format(self._disk)
 
@@ -425,28 +425,24 @@ class ResponseCache:
         except (RecordingError, ValidationError):
             return None
 
-    def _counted_anew(self, model: str) -> ModelFacts:
-        facts = ModelFacts()
-        for entry in entries_of(self._disk, []):  # a damaged one is reported when it is needed
-            if entry.request.model == model:
-                facts.add(entry)
+    def _counted_anew(self) -> defaultdict[str, ModelFacts]:
+        """The facts about each model, from all entries; those it has none of are empty."""
+        facts: defaultdict[str, ModelFacts] = defaultdict(ModelFacts)
+        for entry in self._own_entries([]):  # a damaged one is reported when it is needed
+            facts[entry.request.model].add(entry)
         return facts
 
-
-def entries_of(disk: TextDisk, left_out: list[str]) -> Iterator[Entry]:
-    """The entries of a folder, maybe somebody else's, each verified.
-
-    What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
-    """
-    for row in disk.calls():
-        try:
-            if isinstance(row, RecordingError):
-                raise row
-            entry = _verified(*row)
-            check_body(entry.request.body)
-            yield entry
-        except (RecordingError, UsageError, *DAMAGED) as exc:
-            left_out.append(str(exc))
+    def _own_entries(self, left_out: list[str]) -> Iterator[Entry]:
+        """The entries of the folder; see ``entries``."""
+        for row in self._disk.calls():
+            try:
+                if isinstance(row, RecordingError):
+                    raise row
+                entry = _verified(*row)
+                check_body(entry.request.body)
+                yield entry
+            except (RecordingError, UsageError, *DAMAGED) as exc:
+                left_out.append(str(exc))
 
 
 def _verified(key: str, text: str) -> Entry:
