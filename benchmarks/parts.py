@@ -14,8 +14,8 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.drivers.language_model import LanguageModel
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.keys import make_request
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.models import load_models
 from merge_runner.llm.shared_limits import BURST_S

@@ -443,7 +443,7 @@ def recording_export(
 def recording_import(file: ImportedFile, cache: CacheOption = DEFAULT_CACHE) -> None:
     """Verify a recording, or the cache folder of somebody else, and add it to the cache."""
     from merge_runner.llm.cache import ResponseCache
-    from merge_runner.llm.foreign import import_folder
+    from merge_runner.llm.cache_import import import_folder
     from merge_runner.results.recording import import_recording
 
     take = import_folder if file.is_dir() else import_recording

@@ -16,8 +16,8 @@ from merge_runner.audit.expected import SweepConfig
 from merge_runner.audit.findings import Audit, Finding
 from merge_runner.audit.ids import CONSTANT_IDS, identified, repetition_note
 from merge_runner.errors import RecordingError
-from merge_runner.llm.cache import Entry
-from merge_runner.llm.keys import canonical_json, without_prompt
+from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.content_hashes import canonical_json, without_prompt
 from merge_runner.records import SIDES, Side, Slot
 from merge_runner.results.recording import read_recording, summarise
 from merge_runner.served_model import others_among
@@ -103,7 +103,7 @@ def audit_recording(file: Path) -> Audit:
     )
 
 
-def _gather(entry: Entry, contents: Contents) -> None:
+def _gather(entry: CachedCall, contents: Contents) -> None:
     request, slot = entry.request, entry.request.slot
     template = canonical_json(
         [

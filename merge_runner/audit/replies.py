@@ -12,7 +12,7 @@ from merge_runner.results.database import streamed
 
 SHOWN = 3
 
-# A place, a hash, and the parts of the text that has it; that of a key is in llm/keys.py.
+# A place, a hash, and the parts of the text that has it; that of a key is in llm/content_hashes.py.
 KEYS = """
 SELECT trial_id, side, decision, call_key, '{"body":', request::VARCHAR,
     ',' || between_body_and_slot || '{"condition":' || to_json(condition)::VARCHAR

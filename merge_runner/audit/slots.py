@@ -10,7 +10,7 @@ import duckdb
 
 from merge_runner.audit.expected import Cell, Spec, SweepConfig
 from merge_runner.audit.findings import Finding
-from merge_runner.llm.keys import spec_hash
+from merge_runner.llm.content_hashes import spec_hash
 from merge_runner.records import SIDES
 
 TRIALS = """

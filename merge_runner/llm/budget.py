@@ -23,7 +23,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.cache import Entry
+from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.shared_services import CachePort
 from merge_runner.records import Attempt
@@ -62,7 +62,7 @@ class PaidAttempt:
         if attempts[-1].cost_usd == 0:
             self._freed_usd = self.aside_usd  # the trial needs it again
 
-    async def keep(self, entry: Entry) -> Entry:
+    async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer that the attempt brought, and what it cost, in one transaction."""
         return await self.budget.ledger.keep(entry, self.aside_usd)
 
@@ -276,6 +276,6 @@ class UnpaidAttempt:
         """Keep the attempts for a later run."""
         await self.cache.put_unanswered(self.key, tuple(attempts))
 
-    async def keep(self, entry: Entry) -> Entry:
+    async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer."""
         return await self.cache.put(entry)

@@ -29,7 +29,7 @@ from merge_runner.llm.cache_db import (
     set_format,
 )
 from merge_runner.llm.claims import Claims
-from merge_runner.llm.keys import manner, without_prompt
+from merge_runner.llm.content_hashes import manner, without_prompt
 from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.llm.write_batcher import BatchWriter, Operation, ResultT
 from merge_runner.records import Attempt, ChatRequest, is_scripted
@@ -43,7 +43,7 @@ _OLD_ENDPOINTS = "endpoints "
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class CachedCall:
     """A recorded call: its request, and all attempts, the answering one last."""
 
     request: ChatRequest
@@ -54,7 +54,7 @@ class Entry:
         return _STORED.dump_json(_Stored(ENTRY_VERSION, self)).decode()
 
     @classmethod
-    def from_json(cls, text: str) -> Entry:
+    def from_json(cls, text: str) -> CachedCall:
         """Read an entry; raises RecordingError, or UsageError for one of a newer version."""
         try:
             stored = _STORED.validate_json(text, strict=True)
@@ -77,7 +77,7 @@ class _Stored:
     """An entry as it lies in the cache."""
 
     version: int
-    entry: Entry
+    entry: CachedCall
 
 
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
@@ -85,7 +85,7 @@ _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 
 @dataclass(slots=True)
 class CallTotals:
-    """Sums over entries of one model, at one endpoint, asked in one manner (see keys.py).
+    """Sums over entries of one model, at one endpoint, asked in one manner (see content_hashes.py).
 
     Tokens and latencies are those of the ``measured`` answers: they tell both, and are the model's
     own and no stand-in's.
@@ -97,7 +97,7 @@ class CallTotals:
     output_tokens: int = 0
     latency_s: float = 0.0
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: CachedCall) -> None:
         """Count an entry."""
         self.cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
         last = entry.attempts[-1]
@@ -111,12 +111,12 @@ class CallTotals:
 
 
 @dataclass(slots=True)
-class ModelFacts:
+class ModelStats:
     """What the cache knows of a model: totals by endpoint, and there by how it was asked."""
 
     totals: dict[str, dict[str, CallTotals]] = field(default_factory=dict)
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: CachedCall) -> None:
         """Count an entry."""
         request = entry.request
         asked = manner(request.path, without_prompt(request.body))
@@ -132,7 +132,7 @@ class ModelFacts:
         return sum(each.cost_usd for manners in self.totals.values() for each in manners.values())
 
 
-_FACTS = TypeAdapter(ModelFacts)
+_STATS = TypeAdapter(ModelStats)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ class KnownCall:
     ``damaged`` names what was found damaged and set aside.
     """
 
-    entry: Entry | None
+    entry: CachedCall | None
     attempts: tuple[Attempt, ...]
     damaged: tuple[str, ...] = ()
 
@@ -157,7 +157,7 @@ class ResponseCache:
         self,
         folder: Path,
         *,
-        overlay: Callable[[], Mapping[str, Entry]] | None = None,
+        overlay: Callable[[], Mapping[str, CachedCall]] | None = None,
         read_only: bool = False,
     ) -> None:
         """Open or make the folder; ``overlay`` reads a recording, entries by key.
@@ -170,15 +170,15 @@ class ResponseCache:
         self._read_overlay = overlay
         self._disk = open_read_only(folder) if read_only else open_disk(folder)
         self._writer = BatchWriter(self.run_now)
-        self._new: list[Entry] = []
+        self._new: list[CachedCall] = []
         if not read_only and format_of(self._disk) < FORMAT:
             self.run_now([self._bring_up_to_date])
 
     @cached_property
-    def _overlay(self) -> Mapping[str, Entry]:
+    def _overlay(self) -> Mapping[str, CachedCall]:
         return self._read_overlay() if self._read_overlay else {}
 
-    def get(self, key: str) -> Entry | None:
+    def get(self, key: str) -> CachedCall | None:
         """The entry of a call key; raises RecordingError for one that is damaged or made up."""
         return self._overlay.get(key) or self._kept(key)
 
@@ -206,14 +206,14 @@ class ResponseCache:
         """Give a claim up."""
         self.claims.release(key)
 
-    async def put(self, entry: Entry, also: Operation | None = None) -> Entry:
+    async def put(self, entry: CachedCall, also: Operation | None = None) -> CachedCall:
         """Keep an entry; returns the one that is kept when it is durable.
 
         That is another one where another process was first: a kept reply is never replaced.
         ``also`` runs in the same transaction.
         """
 
-        def operation() -> Entry:
+        def operation() -> CachedCall:
             kept = self._keep(entry)
             if also is not None:
                 also()
@@ -221,7 +221,7 @@ class ResponseCache:
 
         return await self.write(operation)
 
-    def put_now(self, entries: Iterable[Entry]) -> list[Entry]:
+    def put_now(self, entries: Iterable[CachedCall]) -> list[CachedCall]:
         """Keep entries in one transaction, in this thread; returns those that are kept."""
         return self.run_now([partial(self._keep, entry) for entry in entries])
 
@@ -323,7 +323,7 @@ class ResponseCache:
         for each in (name, _AGAIN + name):
             self._disk.set(each, _behind_checksum(text))
 
-    def entries(self, left_out: list[str] | None = None) -> Iterator[Entry]:
+    def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
         """All entries, of the folder and of the overlay, each verified.
 
         What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
@@ -336,23 +336,23 @@ class ResponseCache:
         """The endpoint identities of a model's replies: the recording's, else the folder's."""
         requests = (entry.request for entry in self._overlay.values())
         overlaid = sorted({r.endpoint for r in requests if r.model == model})
-        return overlaid or sorted(self.facts(model).totals)
+        return overlaid or sorted(self.stats(model).totals)
 
-    def facts(self, model: str) -> ModelFacts:
+    def stats(self, model: str) -> ModelStats:
         """What the folder knows of a model."""
-        return self._facts(model) or self._counted_anew()[model]
+        return self._stats(model) or self._counted_anew()[model]
 
     def cost_usd(self) -> float:
         """What all entries of the folder cost when they were made."""
         models = (name.removeprefix(_MODEL) for name in self.names_kept_twice(_MODEL))
-        return sum(self.facts(model).cost_usd for model in models)
+        return sum(self.stats(model).cost_usd for model in models)
 
     def close(self) -> None:
         """Close the folder, and give all claims up."""
         self.claims.close()
         self._disk.close()
 
-    def _keep(self, entry: Entry) -> Entry:
+    def _keep(self, entry: CachedCall) -> CachedCall:
         key = entry.request.key
         try:
             if kept := self._kept(key):
@@ -364,7 +364,7 @@ class ResponseCache:
         self._new.append(entry)
         return entry
 
-    def _kept(self, key: str) -> Entry | None:
+    def _kept(self, key: str) -> CachedCall | None:
         text = self.read(key)
         return None if text is None else _verified(key, text)
 
@@ -391,19 +391,19 @@ class ResponseCache:
             "no cache is asked again. The database is not affected"
         )
 
-    def _count(self, entries: Iterable[Entry]) -> None:
-        """Within a transaction: add entries to the facts about their models."""
-        by_model: dict[str, list[Entry]] = {}
+    def _count(self, entries: Iterable[CachedCall]) -> None:
+        """Within a transaction: add entries to the stats of their models."""
+        by_model: dict[str, list[CachedCall]] = {}
         for entry in entries:
             by_model.setdefault(entry.request.model, []).append(entry)
         for model, new in by_model.items():
-            known = self._facts(model)
+            known = self._stats(model)
             if known is None:
                 known = self._counted_anew()[model]  # with the new ones, which lie there already
             else:
                 for entry in new:
                     known.add(entry)
-            self._keep_facts(model, known)
+            self._keep_stats(model, known)
 
     def _bring_up_to_date(self) -> None:
         """An operation: those before the third knew less of each model, so count anew."""
@@ -411,28 +411,28 @@ class ResponseCache:
             for name in self._disk.names(_OLD_ENDPOINTS) + self._disk.names(_MODEL):
                 self._disk.delete(name)
             for model, known in self._counted_anew().items():
-                self._keep_facts(model, known)
+                self._keep_stats(model, known)
         set_format(self._disk)
 
-    def _keep_facts(self, model: str, facts: ModelFacts) -> None:
-        self.replace_twice(_MODEL + model, _FACTS.dump_json(facts).decode())
+    def _keep_stats(self, model: str, stats: ModelStats) -> None:
+        self.replace_twice(_MODEL + model, _STATS.dump_json(stats).decode())
 
-    def _facts(self, model: str) -> ModelFacts | None:
-        """The facts about a model; None where they are damaged."""
+    def _stats(self, model: str) -> ModelStats | None:
+        """The stats of a model; None where they are damaged."""
         try:
             text = self.read_twice(_MODEL + model)
-            return ModelFacts() if text is None else _FACTS.validate_json(text)
+            return ModelStats() if text is None else _STATS.validate_json(text)
         except (RecordingError, ValidationError):
             return None
 
-    def _counted_anew(self) -> defaultdict[str, ModelFacts]:
-        """The facts about each model, from all entries; those it has none of are empty."""
-        facts: defaultdict[str, ModelFacts] = defaultdict(ModelFacts)
+    def _counted_anew(self) -> defaultdict[str, ModelStats]:
+        """The stats of each model, from all entries; those it has none of are empty."""
+        stats: defaultdict[str, ModelStats] = defaultdict(ModelStats)
         for entry in self._own_entries([]):  # a damaged one is reported when it is needed
-            facts[entry.request.model].add(entry)
-        return facts
+            stats[entry.request.model].add(entry)
+        return stats
 
-    def _own_entries(self, left_out: list[str]) -> Iterator[Entry]:
+    def _own_entries(self, left_out: list[str]) -> Iterator[CachedCall]:
         """The entries of the folder; see ``entries``."""
         for row in self._disk.calls():
             try:
@@ -445,12 +445,12 @@ class ResponseCache:
                 left_out.append(str(exc))
 
 
-def _verified(key: str, text: str) -> Entry:
+def _verified(key: str, text: str) -> CachedCall:
     """A stored entry; those of the first format have no checksum.
 
     Raises RecordingError unless it is whole and that of its key, so that none is used for another.
     """
-    entry = Entry.from_json(_checked(text))
+    entry = CachedCall.from_json(_checked(text))
     try:
         check_call(key, entry.request, entry.attempts)
     except DAMAGED as exc:

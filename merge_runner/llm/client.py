@@ -24,9 +24,10 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.budget import Unpaid
-from merge_runner.llm.cache import Entry
+from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.call import Call, Wait, slot_text
 from merge_runner.llm.consequences import Consequences
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import WireFormat
@@ -37,7 +38,6 @@ from merge_runner.llm.http_outcome import (
     judge,
     may_be_charged,
 )
-from merge_runner.llm.keys import make_request
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
 from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import Pricing, pricing
@@ -150,7 +150,7 @@ class LlmClient:
         """Its name, with the endpoint where that is not the provider's own."""
         return self._consequences.driver
 
-    def _recorded(self, request: ChatRequest) -> Entry | None:
+    def _recorded(self, request: ChatRequest) -> CachedCall | None:
         """The recorded call, None for a damaged one; in a replay that raises CallFailed."""
         try:
             return self.cache.get(request.key)
@@ -269,7 +269,7 @@ class LlmClient:
             self._tell_overrun(call, paid.aside_usd)
             error = self._consequences.error(call, outcome, raw)
             if error is None:
-                kept = await paid.keep(Entry(call.request, tuple(call.attempts)))
+                kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
                 return self._answer(call, kept, outcome)
             self._pause(call, outcome)
             await paid.settle(call.attempts)  # first, since the error may end the whole run
@@ -384,13 +384,13 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
 
-    def _answer(self, call: Call, kept: Entry, outcome: AttemptOutcome) -> ChatReply:
+    def _answer(self, call: Call, kept: CachedCall, outcome: AttemptOutcome) -> ChatReply:
         if kept.attempts[-1] != call.attempts[-1]:  # another process was first
             return self._read(kept, call.earlier)
         text = outcome.reading.text
         return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
 
-    def _read(self, entry: Entry, earlier: int | None = None) -> ChatReply:
+    def _read(self, entry: CachedCall, earlier: int | None = None) -> ChatReply:
         """A recorded reply; all its attempts are ``earlier`` ones unless it says otherwise."""
         last = entry.attempts[-1]
         payload: Any = json.loads(last.reply or "{}") if last.http_status == 200 else {}

@@ -16,8 +16,8 @@ from merge_runner.config import LOOPBACK, Endpoint
 from merge_runner.errors import UsageError
 from merge_runner.llm.bodies import ENCODING, read_body
 from merge_runner.llm.connections import Connections, Trust
+from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.keys import canonical_json
 from merge_runner.llm.masking import Mask
 from merge_runner.llm.transport import TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest

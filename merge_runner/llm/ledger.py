@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
@@ -165,7 +165,7 @@ class Ledger:
 
         await self._cache.write(operation)
 
-    async def keep(self, entry: Entry, worst_usd: float) -> Entry:
+    async def keep(self, entry: CachedCall, worst_usd: float) -> CachedCall:
         """Keep an answered call, and settle its last attempt in the same transaction."""
         key = entry.request.key
         return await self._cache.put(entry, lambda: self._settle(key, entry.attempts, worst_usd))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Protocol
 
-from merge_runner.llm.cache import Entry, KnownCall
+from merge_runner.llm.cache import CachedCall, KnownCall
 from merge_runner.llm.ledger import Asked
 from merge_runner.records import Attempt
 
@@ -21,7 +21,7 @@ Settle = Callable[[int], None]
 class CachePort(Protocol):
     """See cache.ResponseCache."""
 
-    def get(self, key: str) -> Entry | None:
+    def get(self, key: str) -> CachedCall | None:
         """What is recorded of a call, as far as that is known before it is claimed."""
         ...
 
@@ -33,7 +33,7 @@ class CachePort(Protocol):
         """Give a claim up."""
         ...
 
-    async def put(self, entry: Entry) -> Entry:
+    async def put(self, entry: CachedCall) -> CachedCall:
         """Keep an answered call durably; returns the one that is kept."""
         ...
 
@@ -70,7 +70,7 @@ class AttemptPort(Protocol):
         """The attempt, the last of these, brought no answer."""
         ...
 
-    async def keep(self, entry: Entry) -> Entry:
+    async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer that the attempt brought; returns the one that is kept."""
         ...
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from datetime import datetime
 
-from merge_runner.llm.keys import call_key, canonical_json
+from merge_runner.llm.content_hashes import call_key, canonical_json
 from merge_runner.records import Attempt, ChatRequest
 
 # What content can raise that no program of ours wrote; RecursionError where JSON is nested deeply.

@@ -22,9 +22,9 @@ from merge_runner.errors import (
     TrialSuspended,
     UsageError,
 )
-from merge_runner.llm.cache import CallTotals, Entry, ResponseCache
+from merge_runner.llm.cache import CachedCall, CallTotals, ResponseCache
+from merge_runner.llm.content_hashes import canonical_json, manner, spec_hash
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.keys import canonical_json, manner, spec_hash
 from merge_runner.llm.ledger import Ledger, Spending
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.records import TrialRecord, TrialSpec
@@ -252,7 +252,7 @@ class Sweep:
         """What is known of answers to requests like those of this sweep."""
         sent = FORMATS[entry.format].request(entry, "")
         asked = manner(sent.path, canonical_json(sent.body))
-        return self._cache.facts(entry.id).of(self._endpoints[name], asked)
+        return self._cache.stats(entry.id).of(self._endpoints[name], asked)
 
     def close(self) -> None:
         """Close what was opened, where the sweep is not run."""
@@ -304,7 +304,7 @@ class Sweep:
         known = frozenset(
             name
             for name, entry in plan.entries.items()
-            if self._endpoints[name] in self._cache.facts(entry.id).totals
+            if self._endpoints[name] in self._cache.stats(entry.id).totals
         )
         endpoint_plan = EndpointPlan(self._endpoints, urls, options.strict_model, known)
         if options.dask is None:
@@ -441,5 +441,5 @@ async def _drained(runner: TrialRunner, work: asyncio.Task[None]) -> None:
     await runner.drain()
 
 
-def _overlay(recording: Path | None) -> Mapping[str, Entry]:
+def _overlay(recording: Path | None) -> Mapping[str, CachedCall]:
     return {} if recording is None else Spilled(recording)

@@ -18,8 +18,8 @@ from merge_runner.emulator.server import serve
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.content_hashes import call_key, canonical_json, make_request
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.keys import call_key, canonical_json, make_request
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.transport import TransportFailure
 from merge_runner.prompts.parse import parse_reply

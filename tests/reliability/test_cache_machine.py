@@ -26,8 +26,8 @@ from hypothesis.stateful import (
 
 from merge_runner.errors import TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget, PaidAttempt
-from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.keys import make_request
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, Slot
 
@@ -80,7 +80,7 @@ class CacheMachine(RuleBasedStateMachine):
         self.place = Path(tempfile.mkdtemp(dir=IN_MEMORY))
         self.cap_usd = 3.0 * WORST_USD
         self.charged_usd = 0.0
-        self.answered: dict[int, Entry] = {}
+        self.answered: dict[int, CachedCall] = {}
         self.tried: dict[int, tuple[Attempt, ...]] = {}
         self.bent: str | None = None
         self.made = 0
@@ -169,7 +169,7 @@ class CacheMachine(RuleBasedStateMachine):
         self.charged_usd += cost
         reply = f'{{"text": "ä {self.made}"}}'
         attempts.append(Attempt(len(attempts) + 1, "ok", 200, reply=reply, cost_usd=float(cost)))
-        entry = Entry(REQUESTS[question], tuple(attempts))
+        entry = CachedCall(REQUESTS[question], tuple(attempts))
         kept = self.wait(paid.keep(entry))
         paid.close()
         process.cache.release(REQUESTS[question].key)

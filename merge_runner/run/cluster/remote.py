@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 
-from merge_runner.llm.cache import Entry, KnownCall
+from merge_runner.llm.cache import CachedCall, KnownCall
 from merge_runner.llm.ledger import Asked
 from merge_runner.llm.shared_services import Settle
 from merge_runner.records import Attempt
@@ -33,9 +33,9 @@ class RemoteCache:
         """Give a claim up."""
         self.link.tell("release", key)
 
-    async def put(self, entry: Entry, paid: int | None = None) -> Entry:
+    async def put(self, entry: CachedCall, paid: int | None = None) -> CachedCall:
         """Keep an entry, and the cost of the paid attempt that the coordinator holds so."""
-        other: Entry | None = await self.link.ask("keep", entry, paid)
+        other: CachedCall | None = await self.link.ask("keep", entry, paid)
         return other or entry
 
     async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
@@ -76,7 +76,7 @@ class RemoteAttempt:
         """The attempt brought no answer."""
         await self.link.ask("settle", self.number, attempts)
 
-    async def keep(self, entry: Entry) -> Entry:
+    async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer, and what it cost."""
         return await RemoteCache(self.link).put(entry, self.number)
 

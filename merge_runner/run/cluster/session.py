@@ -10,7 +10,7 @@ from distributed.comm import Comm
 
 from merge_runner.errors import CacheFailed, TrialSuspended
 from merge_runner.llm.budget import PaidAttempt
-from merge_runner.llm.cache import Entry, KnownCall
+from merge_runner.llm.cache import CachedCall, KnownCall
 from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Asked
 from merge_runner.llm.meter import Meter
@@ -122,7 +122,7 @@ class Session:
         self._claimed.remove(key)
         self._cache.release(key)
 
-    async def _keep(self, entry: Entry, paid: int | None) -> Entry | None:
+    async def _keep(self, entry: CachedCall, paid: int | None) -> CachedCall | None:
         """Keep a reply, and the cost of the attempt; returns another one that was there before."""
         keep = self._cache.put if paid is None else self._attempts[paid].keep
         try:

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ModelEntry
 from merge_runner.llm import keys
+from merge_runner.llm.content_hashes import call_key, canonical_json, make_request
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.keys import call_key, canonical_json, make_request
 from merge_runner.records import Slot
 
 SLOT = Slot(condition="A1", repetition=1, side="left", decision=0, sample_set=0)
