@@ -351,16 +351,15 @@ def models() -> None:
     from merge_runner.config import Price, key_status
     from merge_runner.drivers.registry import PROGRAMS
     from merge_runner.llm.models import load_models
-    from merge_runner.llm.prices import pricing
+    from merge_runner.llm.prices import cost_usd
     from merge_runner.records import Usage
     from merge_runner.results.query_output import write_table
 
     million = 1_000_000
     rows = []
     for name, entry in load_models().items():
-        price = pricing(entry)
         costs = [
-            price.cost_usd(Usage(input_tokens=i, output_tokens=o))
+            cost_usd(entry, Usage(input_tokens=i, output_tokens=o))
             for i, o in ((1000, 0), (0, 1000))
         ]
         shown = ["unknown" if c is None else f"{c * million / 1000:g}" for c in costs]

@@ -40,7 +40,7 @@ from merge_runner.llm.http_outcome import (
 )
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
 from merge_runner.llm.meter import Meter
-from merge_runner.llm.prices import Pricing, pricing
+from merge_runner.llm.prices import cost_usd
 from merge_runner.llm.retry import Deadline, OutOfTime, RequestFailed, retries
 from merge_runner.llm.shared_services import (
     AttemptPort,
@@ -88,12 +88,8 @@ class LlmClient:
     strict: bool = False
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
     meter: Meter = field(default_factory=Meter)
-    _pricing: Pricing = field(init=False)
     _calls: dict[str, Call] = field(default_factory=dict)
     _stopping: bool = False
-
-    def __post_init__(self) -> None:
-        self._pricing = pricing(self.entry)
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """The model's reply for a slot; lower ``order`` is served first.
@@ -178,7 +174,7 @@ class LlmClient:
 
     def _start(self, request: ChatRequest, order: int) -> Call:
         worst = self._worst_case(request)
-        worst_usd = self._pricing.cost_usd(worst) or 0.0
+        worst_usd = cost_usd(self.entry, worst) or 0.0
         call = Call(request, order, self.driver, worst, worst_usd, self._stopping)
         call.task = asyncio.create_task(self._claimed(call))
         self._calls[request.key] = call
@@ -366,11 +362,10 @@ class LlmClient:
         if self.entry.price == "free":
             return 0.0
         if usage.input_tokens and usage.output_tokens is not None:
-            return self._pricing.cost_usd(usage)
+            return cost_usd(self.entry, usage)
         if (usage.output_tokens or 0) > (worst.output_tokens or 0):
-            return self._pricing.cost_usd(
-                Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
-            )
+            dearer = Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
+            return cost_usd(self.entry, dearer)
         stray = raw.status == 200 and is_web_page(raw) and not self.first.known
         return (
             0.0

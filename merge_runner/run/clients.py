@@ -23,7 +23,7 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
-from merge_runner.llm.prices import pricing
+from merge_runner.llm.prices import is_known
 from merge_runner.llm.shared_limits import SharedLimits, limits_file
 from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
 from merge_runner.llm.transport import SealedTransport
@@ -102,7 +102,7 @@ def open_services(
     """
     limits = terms.limits
     for name, entry in entries.items():
-        if limits.max_cost_usd is not None and not pricing(entry).known:
+        if limits.max_cost_usd is not None and not is_known(entry):
             raise UsageError(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
