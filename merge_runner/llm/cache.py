@@ -1,9 +1,9 @@
 """Recorded replies on disk: one text entry per call key, never evicted, never pickled.
 
 An entry is the JSON of a request, its slot and every attempt, the answering one last, behind a
-checksum. It is durable before anyone sees it: writes are batched into one synchronous SQLite
-transaction each. Beside the entries lie what is known of each model, what each sweep has spent
-(see ledger.py), the attempts of calls that have no answer yet, and damaged entries set aside.
+checksum. It is durable before anyone sees it: each batch of writes is one synchronous SQLite
+transaction. Beside the entries lie what is known of each model, what each sweep has spent (see
+ledger.py), the attempts of calls that have no answer yet, and damaged entries set aside.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 class CallTotals:
     """Sums over entries of one model, at one endpoint, asked in one manner (see content_hashes.py).
 
-    Tokens and latencies are those of the ``measured`` answers: they tell both, and are the model's
-    own and no stand-in's.
+    ``measured`` counts the answers that state their tokens and are the model's own, no stand-in's:
+    tokens and latencies are theirs.
     """
 
     cost_usd: float = 0.0
@@ -183,7 +183,7 @@ class ResponseCache:
         return self._overlay.get(key) or self._kept(key)
 
     def holds(self, key: str) -> bool:
-        """Whether there is an entry of a call key, and a whole one."""
+        """Whether there is an undamaged entry of a call key."""
         try:
             return self.get(key) is not None
         except RecordingError:
@@ -196,6 +196,7 @@ class ResponseCache:
         """
         if not self.claims.take(key):
             return None
+        # Read after the lock is taken, or a call could be made between the two.
         try:
             return KnownCall(self.get(key), self.unanswered(key))
         except RecordingError:
@@ -228,7 +229,7 @@ class ResponseCache:
     def set_damage_aside(self, key: str) -> list[str]:
         """Move a damaged entry, or list of attempts, to where it can still be looked at.
 
-        Returns the names of those that were.
+        Returns the names of what was moved.
         """
         checks = {key: self._kept, _UNANSWERED + key: self.unanswered}
 
@@ -236,7 +237,7 @@ class ResponseCache:
             return [name for name, check in checks.items() if _is_damaged(check, key)]
 
         def operation() -> list[str]:
-            found = damaged()  # another process may have repaired it
+            found = damaged()  # again: another process may have moved it since
             for name in found:
                 self._disk.set_aside(name, _DAMAGED + name)
             return found
@@ -305,7 +306,7 @@ class ResponseCache:
         return sorted({*self.names(prefix), *again})
 
     def read_twice(self, name: str) -> str | None:
-        """A text that was kept twice: one is enough. Raises RecordingError where none is whole."""
+        """A text that was kept twice, of which one must be whole; else raises RecordingError."""
         damage: RecordingError | None = None
         for each in (name, _AGAIN + name):
             try:
@@ -319,7 +320,7 @@ class ResponseCache:
         return None
 
     def replace_twice(self, name: str, text: str) -> None:
-        """An operation: keep a text that must not be lost with a damaged row."""
+        """An operation: keep a text in two rows, so that one damaged row does not lose it."""
         for each in (name, _AGAIN + name):
             self._disk.set(each, _behind_checksum(text))
 
@@ -356,7 +357,7 @@ class ResponseCache:
         key = entry.request.key
         try:
             if kept := self._kept(key):
-                return kept
+                return kept  # a kept reply is never replaced
         except RecordingError:
             self._disk.set_aside(key, _DAMAGED + key)
         self._disk.add(key, _behind_checksum(entry.to_json()))
@@ -406,8 +407,10 @@ class ResponseCache:
             self._keep_stats(model, known)
 
     def _bring_up_to_date(self) -> None:
-        """An operation: those before the third knew less of each model, so count anew."""
-        if format_of(self._disk) < 3:  # or another process was quicker
+        """An operation: bring a folder of an earlier format up to date."""
+        # Formats before the third knew less of each model. Read again: another process may have
+        # been quicker.
+        if format_of(self._disk) < 3:
             for name in self._disk.names(_OLD_ENDPOINTS) + self._disk.names(_MODEL):
                 self._disk.delete(name)
             for model, known in self._counted_anew().items():
@@ -446,9 +449,10 @@ class ResponseCache:
 
 
 def _verified(key: str, text: str) -> CachedCall:
-    """A stored entry; those of the first format have no checksum.
+    """The entry that a row holds; those of the first format have no checksum.
 
-    Raises RecordingError unless it is whole and that of its key, so that none is used for another.
+    Raises RecordingError unless it is whole and belongs to its key: a reply to one request must
+    never answer another.
     """
     entry = CachedCall.from_json(_checked(text))
     try:

@@ -14,7 +14,7 @@ from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Who waits for what, and until when on the wall clock, UTC; None: until it happens."""
+    """Who waits for what, and until when (UTC); None: until it happens."""
 
     who: str
     what: str
@@ -62,7 +62,7 @@ class Call:
 
     @contextmanager
     def waiting(self, what: str, until: datetime | None = None) -> Iterator[Wait]:
-        """Within this nothing of the call is in flight, so that it can be given up."""
+        """While this lasts, nothing of the call is in flight, so that it can be given up."""
         if self.stopping:
             raise CallFailed("the sweep was stopped", self.request)
         self.wait = wait = Wait(f"{self.driver}: {self.who}", what, until)
@@ -72,8 +72,9 @@ class Call:
             self.wait = None
 
     def stop(self) -> None:
-        """Give the call up, now where it waits, else as soon as it would."""
+        """Give the call up: at once if it waits, otherwise as soon as it would wait again."""
         self.stopping = True
+        # What is in flight may be charged whether or not anybody takes the answer: it goes on.
         if self.wait is not None:
             self.task.cancel()
 

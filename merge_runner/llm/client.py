@@ -61,7 +61,9 @@ from merge_runner.records import (
 )
 from merge_runner.served_model import is_other_model
 
+# Kernel locks cannot be awaited; beside a call that takes seconds this delay is nothing.
 CLAIM_POLL_S = 0.1
+# A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
 
 
@@ -71,10 +73,9 @@ class LlmClient:
 
     ``endpoint`` is the identity that enters the keys. A call that is under way is shared by all
     who ask for the same key, and goes on when they are cancelled, so that what is paid for is
-    kept; ``drain`` waits for it.
-    ``budget`` is that of a model which costs money. ``first`` is the run's first call to the
-    endpoint, which goes alone. ``sealed`` says that nothing may be asked anew; ``strict`` that an
-    answer of another model stops the sweep.
+    kept; ``drain`` waits for it. ``budget`` is None for a model that costs nothing. ``first`` is
+    the run's first call to the endpoint, which goes alone. ``sealed`` says that nothing may be
+    asked anew; ``strict`` that an answer of another model stops the sweep.
     """
 
     name: str
@@ -101,8 +102,10 @@ class LlmClient:
             reply = self._read(recorded)
         elif call := self._calls.get(request.key):
             reply = await asyncio.shield(call.task)
-            reply = replace(reply, earlier=len(reply.attempts))  # whoever asked first tells of them
+            # The attempts are counted once, for whoever asked first.
+            reply = replace(reply, earlier=len(reply.attempts))
         else:
+            # Shielded: the call may be paid for already when its trial is cancelled.
             reply = await asyncio.shield(self._start(request, order).task)
         other_model = self._other_model(reply)
         self.meter.count_reply(reply, other_model)
@@ -176,43 +179,43 @@ class LlmClient:
         worst = self._worst_case(request)
         worst_usd = cost_usd(self.entry, worst) or 0.0
         call = Call(request, order, self.driver, worst, worst_usd, self._stopping)
-        call.task = asyncio.create_task(self._claimed(call))
+        call.task = asyncio.create_task(self._in_turn(call))
         self._calls[request.key] = call
 
         def forget(done: asyncio.Task[ChatReply]) -> None:
             del self._calls[request.key]
             if not done.cancelled():
-                done.exception()  # all who asked may be gone by now
+                done.exception()  # retrieved, since all who asked may be gone by now
 
         call.task.add_done_callback(forget)
         return call
 
-    async def _claimed(self, call: Call) -> ChatReply:
-        """Make a call when its turn has come."""
-        # Before the claim: nobody waits for money with a call that another process needs.
+    async def _in_turn(self, call: Call) -> ChatReply:
+        """Make a call when there is money for its trial, and the first call has been answered."""
+        # Both before the claim: else another process would wait for a call that waits here.
         with call.waiting("for trials before it to end, under --max-cost"):
             await self._money.admit(call.order)
         if self.sealed:
             return await self._make(call)
         alone, stopped = await self._goes_alone(call), False
         try:
-            return await self._unless_made(call)
+            return await self._claimed(call)
         except SweepStopped:
-            stopped = True  # nobody else is to try the same
+            stopped = True  # the next call would only be refused in the same way
             raise
         finally:
             if alone and not stopped:
                 self.first.give_turn()
 
     async def _goes_alone(self, call: Call) -> bool:
-        """Wait for the first answer of the run; True: it is for this call to bring it."""
+        """Wait for the first answer of the run; True if this call is to bring it."""
         if self.first.passed:
             return False
         with call.waiting(f"for the first answer of {self.driver}"):
             return await self.first.turn()
 
-    async def _unless_made(self, call: Call) -> ChatReply:
-        """Make a call unless another process does."""
+    async def _claimed(self, call: Call) -> ChatReply:
+        """Claim a call, and make it unless it is recorded by now."""
         key = call.request.key
         while (known := await self.cache.claim(key)) is None:
             with call.waiting("for another merge-runner that makes the same call"):
@@ -225,13 +228,13 @@ class LlmClient:
                     f"the cache as 'damaged {name}', and asked again"
                 )
             call.attempts, call.earlier = list(known.attempts), len(known.attempts)
-            # Another process may have made it just now.
+            # Whoever held the claim before may have made the call.
             return self._read(known.entry) if known.entry else await self._make(call)
         finally:
             self.cache.release(key)
 
     async def _make(self, call: Call) -> ChatReply:
-        """Make attempts until there is an answer, which is kept with all of them."""
+        """Make attempts until one brings an answer, which is kept together with all of them."""
         call.began_s = asyncio.get_running_loop().time()
         deadline = Deadline(self.entry.deadline_s)
 
@@ -257,7 +260,7 @@ class LlmClient:
         return answer
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
-        """One attempt: the answer, kept, or an error that says what follows."""
+        """Make one attempt; returns its answer, which is kept, or raises what follows from it."""
         async with self._permitted(call) as (paid, settle):
             await paid.begin(call.attempts)
             with deadline.attempt() as seconds_left:
@@ -268,12 +271,13 @@ class LlmClient:
                 kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
                 return self._answer(call, kept, outcome)
             self._pause(call, outcome)
-            await paid.settle(call.attempts)  # first, since the error may end the whole run
+            await paid.settle(call.attempts)  # before the error, which may end the whole run
             raise error
 
     @asynccontextmanager
     async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, Settle]]:
-        """Money first: a turn must be used when it is given, or the limits do not hold."""
+        """What an attempt needs before it is sent: its money, then its turn."""
+        # A turn must be used as soon as it is given, or the limits do not hold.
         asked = Asked(self.driver, call.who, call.worst_usd)
         async with AsyncExitStack() as stack:
             with call.waiting("for calls in flight to be paid, under --max-cost"):
@@ -287,7 +291,7 @@ class LlmClient:
     async def _send(
         self, call: Call, settle: Settle, seconds_left: float
     ) -> tuple[AttemptOutcome, RawReply | None]:
-        """Send the request; what comes of it is the last of the call's attempts."""
+        """Send the request once, and add what came of it to the call's attempts."""
         number = len(call.attempts) + 1
         started_at, started = datetime.now(UTC), time.perf_counter()
         raw: RawReply | None = None
@@ -310,7 +314,7 @@ class LlmClient:
         return outcome, raw
 
     def _pause(self, call: Call, outcome: AttemptOutcome) -> None:
-        """Let all calls with the same key wait, where the server asks for it."""
+        """Let all calls with the same API key wait, where the server asks for it."""
         pause_s = self._consequences.pause_s(call, outcome)
         if pause_s is None:
             return
@@ -355,9 +359,9 @@ class LlmClient:
         )
 
     def _cost_usd(self, raw: RawReply, usage: Usage, worst: Usage) -> float | None:
-        """What a reply cost: by its usage, also in an error; None where that is not known.
+        """What a reply cost, by its usage, which an error may have too; None if nobody knows.
 
-        More output than there can be is charged, whatever the server says of the input.
+        Output beyond the cap is charged even where the server does not say what was read.
         """
         if self.entry.price == "free":
             return 0.0
@@ -374,7 +378,7 @@ class LlmClient:
         )
 
     def _worst_case(self, request: ChatRequest) -> Usage:
-        """An upper bound on a request's tokens: no tokeniser makes more tokens than bytes."""
+        """An upper bound on an attempt's tokens: no tokeniser makes more tokens than bytes."""
         return Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
@@ -386,7 +390,7 @@ class LlmClient:
         return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
 
     def _read(self, entry: CachedCall, earlier: int | None = None) -> ChatReply:
-        """A recorded reply; all its attempts are ``earlier`` ones unless it says otherwise."""
+        """A recorded reply; without ``earlier`` all its attempts were made by earlier runs."""
         last = entry.attempts[-1]
         payload: Any = json.loads(last.reply or "{}") if last.http_status == 200 else {}
         return ChatReply(
@@ -399,7 +403,8 @@ class LlmClient:
 
 
 def _estimated_tokens(worst: Usage) -> int:
-    """What the provider charges at admission: about four bytes a token, and the output cap."""
+    """What a provider counts when it admits a request: its text, and the whole output cap."""
+    # About four bytes of English make a token.
     return (worst.input_tokens or 0) // 4 + (worst.output_tokens or 0)
 
 

@@ -44,7 +44,7 @@ class _Waiter:
 
 @dataclass(slots=True)
 class Pause:
-    """Until when nothing is dispatched, on the event loop's clock; shared by all of one key."""
+    """Until when nothing is dispatched, on the loop's clock; shared by all limiters of one key."""
 
     until: float = 0.0
 
@@ -52,7 +52,8 @@ class Pause:
 class Limiter:
     """Hands out turns: lowest ``order`` first, first come first served within one order.
 
-    A waiter whose tokens do not fit yet holds back all behind it, so a heavy request never
+    The oldest trial goes first so that trials end, and their memory and money are free again. A
+    waiter whose tokens do not fit yet holds back all behind it, so that a heavy request never
     starves behind light ones.
     """
 
@@ -87,7 +88,7 @@ class Limiter:
                 "experiments/models.toml"
             )
         loop = asyncio.get_running_loop()
-        # No limit and nobody before it: the dispatcher, a task of its own, is not worth its time.
+        # Without a limit, and with nobody before it, it needs no dispatcher, which is a task more.
         if not self._limited and not self._waiters and loop.time() >= self._pause.until:
             return partial(self._settle, _Turn(loop.time(), tokens, counts=False))
         waiter = _Waiter(order, self._arrivals, tokens, loop.create_future())
@@ -120,7 +121,7 @@ class Limiter:
         loop = asyncio.get_running_loop()
         while waiter := self._head():
             wait = self._blocked_for(waiter, loop.time())
-            # The others' file last: who takes a turn there counts for everybody at once.
+            # The others' file last: a turn that is taken there counts for everybody at once.
             if wait <= 0 and self._shared is not None:
                 wait = self._shared.take(waiter.tokens)
             if wait > 0:
@@ -136,7 +137,7 @@ class Limiter:
             waiter.turn.set_result(turn)
 
     def _head(self) -> _Waiter | None:
-        # Whoever was cancelled while waiting has a done turn that nobody will use.
+        # A waiter that was cancelled has a turn that is done and that nobody will use.
         while self._waiters and self._waiters[0].turn.done():
             heapq.heappop(self._waiters)
         return self._waiters[0] if self._waiters else None
@@ -149,7 +150,7 @@ class Limiter:
             self._tokens_in_window -= expired.tokens
         free_at = max(self._pause.until, *(throttle.free_at for throttle in self._throttles), 0.0)
         if self._tpm is not None and self._tokens_in_window + waiter.tokens > self._tpm:
-            # At least until the oldest leaves the window; if that frees too little, looked at anew.
+            # At least until the oldest leaves the window; if that frees too little, once more.
             free_at = max(free_at, self._window[0].dispatched_at + self._window_s)
         return free_at - now
 
@@ -162,13 +163,13 @@ class Limiter:
 
 
 class _Throttle(Throttler):
-    """asyncio-throttle, and when it has room again, which it does not tell."""
+    """asyncio-throttle, which also says when it has room again."""
 
     @property
     def free_at(self) -> float:
         """The earliest next turn, on the event loop's clock, which is the throttle's too."""
         full = len(self._task_logs) >= self.rate_limit
-        # A little later than that, since it holds a turn for longer than its period.
+        # A little later, since it keeps a turn until more than its period has passed.
         return self._task_logs[0] + self.period + CLOCK_STEP_S if full else 0.0
 
 
