@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from merge_runner.records import Attempt, ChatRequest, is_scripted
 
 ENTRY_VERSION = 1
 CHECKSUM_LENGTH = 32
+BATCH = 1_000
 ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 # Prefixes of keys that are no call keys.
 _MODEL, _UNANSWERED, _DAMAGED, _AGAIN = "model ", "attempts ", "damaged ", "again "
@@ -182,13 +184,6 @@ class ResponseCache:
         """The entry of a call key; raises RecordingError for one that is damaged or made up."""
         return self._overlay.get(key) or self._kept(key)
 
-    def holds(self, key: str) -> bool:
-        """Whether there is an undamaged entry of a call key."""
-        try:
-            return self.get(key) is not None
-        except RecordingError:
-            return False
-
     async def claim(self, key: str) -> KnownCall | None:
         """Claim a call and learn what is recorded of it; None while another one holds it.
 
@@ -225,6 +220,17 @@ class ResponseCache:
     def put_now(self, entries: Iterable[CachedCall]) -> list[CachedCall]:
         """Keep entries in one transaction, in this thread; returns those that are kept."""
         return self.run_now([partial(self._keep, entry) for entry in entries])
+
+    def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
+        """Keep the entries that the cache lacks; returns (added, already there)."""
+        added = there = 0
+        waiting = iter(entries)
+        while batch := list(islice(waiting, BATCH)):
+            new = [entry for entry in batch if not self._holds(entry.request.key)]
+            self.put_now(new)
+            added += len(new)
+            there += len(batch) - len(new)
+        return added, there
 
     def set_damage_aside(self, key: str) -> list[str]:
         """Move a damaged entry, or list of attempts, to where it can still be looked at.
@@ -282,10 +288,8 @@ class ResponseCache:
 
         Raises RecordingError where it is no text, CacheFailed where the folder cannot be read.
         """
-        try:
+        with self._readable():
             return self._disk.get(name)
-        except FAILURES as exc:
-            raise self._unreadable(exc) from exc
 
     def replace(self, name: str, text: str) -> None:
         """An operation: keep a text under a name that is no call key."""
@@ -365,6 +369,12 @@ class ResponseCache:
         self._new.append(entry)
         return entry
 
+    def _holds(self, key: str) -> bool:
+        try:
+            return self.get(key) is not None
+        except RecordingError:
+            return False  # a damaged one is set aside when another is kept in its place
+
     def _kept(self, key: str) -> CachedCall | None:
         text = self.read(key)
         return None if text is None else _verified(key, text)
@@ -374,14 +384,11 @@ class ResponseCache:
         try:
             yield
         except FAILURES as exc:
-            raise self._unreadable(exc) from exc
-
-    def _unreadable(self, exc: Exception) -> CacheFailed:
-        return self._failed(
-            f"read: {exc}. Repair or move it; the database and any exported recording are not "
-            f"affected, and `merge-runner recording import {self.folder}` takes what can be read "
-            "of it into another, named with --cache"
-        )
+            raise self._failed(
+                f"read: {exc}. Repair or move it; the database and any exported recording are not "
+                f"affected, and `merge-runner recording import {self.folder}` takes what can be "
+                "read of it into another, named with --cache"
+            ) from exc
 
     def _failed(self, how: str) -> CacheFailed:
         if self._disk.in_place:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from itertools import islice
 from pathlib import Path
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ResponseCache
-
-BATCH = 1_000
 
 
 def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
@@ -19,15 +16,9 @@ def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
     """
     if folder.resolve() == cache.folder.resolve():
         raise UsageError(f"{folder} is the cache itself: name another one with --cache")
-    added = there = 0
     left_out: list[str] = []
     with contextlib.closing(ResponseCache(folder, read_only=True)) as source:
-        entries = source.entries(left_out)
-        while batch := list(islice(entries, BATCH)):
-            new = [entry for entry in batch if not cache.holds(entry.request.key)]
-            cache.put_now(new)
-            added += len(new)
-            there += len(batch) - len(new)
+        added, there = cache.add_missing(source.entries(left_out))
     if left_out:
         raise RecordingError(
             f"{added} calls of {folder} added to {cache.folder}, {there} were there already, and "

@@ -178,7 +178,8 @@ class LlmClient:
     def _start(self, request: ChatRequest, order: int) -> Call:
         worst = self._worst_case(request)
         worst_usd = cost_usd(self.entry, worst) or 0.0
-        call = Call(request, order, self.driver, worst, worst_usd, self._stopping)
+        asked = Asked(self.driver, slot_text(request.slot), worst_usd)
+        call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._in_turn(call))
         self._calls[request.key] = call
 
@@ -224,8 +225,8 @@ class LlmClient:
             for name in known.damaged:
                 self.meter.damaged.append(name)
                 self.meter.notes.append(
-                    f"{self.driver}: {call.who}: what is recorded is damaged; it is set aside in "
-                    f"the cache as 'damaged {name}', and asked again"
+                    f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set "
+                    f"aside in the cache as 'damaged {name}', and asked again"
                 )
             call.attempts, call.earlier = list(known.attempts), len(known.attempts)
             # Whoever held the claim before may have made the call.
@@ -278,11 +279,10 @@ class LlmClient:
     async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, Settle]]:
         """What an attempt needs before it is sent: its money, then its turn."""
         # A turn must be used as soon as it is given, or the limits do not hold.
-        asked = Asked(self.driver, call.who, call.worst_usd)
         async with AsyncExitStack() as stack:
             with call.waiting("for calls in flight to be paid, under --max-cost"):
                 paid = await stack.enter_async_context(
-                    self._money.attempt(call.order, call.request.key, asked)
+                    self._money.attempt(call.order, call.request.key, call.asked)
                 )
             with call.waiting("for a turn under the rate limits"):
                 settle = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
@@ -330,8 +330,8 @@ class LlmClient:
         if spent_usd <= aside_usd + TOLERANCE_USD:
             return
         self.meter.notes.append(
-            f"{self.driver}: {call.who}: the reply cost {spent_usd:.4f} USD, and {aside_usd:.4f} "
-            "were set aside for it: the server does not keep to the cap of "
+            f"{self.driver}: {call.asked.slot}: the reply cost {spent_usd:.4f} USD, and "
+            f"{aside_usd:.4f} were set aside for it: the server does not keep to the cap of "
             f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
         )
 

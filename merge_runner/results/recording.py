@@ -274,19 +274,7 @@ def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
     """Verify the whole file, then add what the cache lacks; returns (added, already there)."""
     for _ in read_recording(file):
         pass
-    added = there = 0
-    batch: list[CachedCall] = []
-    for entry in read_recording(file):
-        if cache.holds(entry.request.key):
-            there += 1
-        else:
-            batch.append(entry)
-            added += 1
-        if len(batch) == BATCH:
-            cache.put_now(batch)
-            batch = []
-    cache.put_now(batch)
-    return added, there
+    return cache.add_missing(read_recording(file))
 
 
 def summarise(file: Path) -> Summary:
