@@ -15,8 +15,8 @@ MINUTE_S = 60.0
 class Meter:
     """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts.
 
-    ``stand_ins`` counts the answers that one gave in the model's name; ``damaged`` are the keys of
-    recorded replies that could not be read.
+    ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name; ``damaged``
+    are the keys of recorded replies that could not be read.
     """
 
     calls_live: int = 0
@@ -54,7 +54,7 @@ class Meter:
             self.stand_ins += is_scripted(reply.request, reply.attempts[-1])
 
     def add(self, other: Meter) -> None:
-        """Count what another one has counted."""
+        """Add what another meter has counted."""
         # The other's clock may be another machine's: what it has just counted counts as of now.
         now = time.monotonic()
         counted = replace(other, events=deque((now, tokens) for _, tokens in other.events))

@@ -10,10 +10,10 @@ from merge_runner.records import ChatRequest
 
 
 class TransportFailure(MergeRunnerError):
-    """An attempt brought no reply; ``outcome`` names it in the calls table.
+    """An attempt brought no reply; ``outcome`` names the failure in the calls table.
 
-    ``sent`` is False where the request surely never left: nobody can charge for it. ``action`` is
-    that of an AttemptOutcome.
+    ``sent`` is False where the request was certainly never sent, so that nobody can charge for it.
+    ``action`` is that of an AttemptOutcome.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Transport(Protocol):
 
 
 class SealedTransport:
-    """Refuses every request and keeps what was asked for, so that a replay stays offline."""
+    """Refuses every request, so that a replay stays offline, and notes what was asked for."""
 
     def __init__(self) -> None:
         self.misses: list[ChatRequest] = []

@@ -72,13 +72,13 @@ Meaning = Literal[
 class WireFormat(ABC):
     """One format of requests and replies, with all that is particular to it.
 
-    What a format knows of errors may be said by a server of any format, since gateways pass on
-    the errors of others; None leaves a question to the rules for all servers (http_outcome.py,
+    What a format says of errors may be asked of a reply in any format, since gateways pass on the
+    errors of others. None leaves a question to the rules for all servers (http_outcome.py,
     delays.py).
     """
 
     members: ClassVar[frozenset[str]]
-    """Those of which an answer has one, whatever it says."""
+    """Members of a body: an answer has at least one of them, whatever it says."""
 
     retries_empty: ClassVar[bool] = False
     """Whether an empty answer is a known fault of the service that asking again may mend."""
@@ -143,7 +143,7 @@ def as_list(value: object) -> list[Any]:
 
 
 def as_dicts(value: object) -> list[dict[str, Any]]:
-    """The objects of a JSON array; what is none is an empty one in its place."""
+    """The objects of a JSON array; anything else in it counts as an empty object."""
     return [as_dict(item) for item in as_list(value)]
 
 
@@ -181,7 +181,7 @@ def total(*counts: int | None) -> int | None:
 
 
 def read_error(status: int, headers: Mapping[str, str], body: str, payload: object) -> ServerError:
-    """Read an error body of any known shape; the text itself serves where it is no JSON."""
+    """Read an error body of any known shape; one that is no JSON is its own message."""
     top = as_dict(payload)
     nested = top.get("error")
     if nested is None:

@@ -1,9 +1,8 @@
 """Hands batches of trials to the workers of a cluster, and alone keeps what they bring.
 
-Dask decides where a batch is played, and starts one anew whose worker died. Which trials it holds
-is decided when it begins: the next ones in the order of the sweep, many at first and fewer toward
-the end, so that no worker is left with a long rest. The trials of a lost worker go back to the
-front.
+Dask decides where a batch is played, and begins it again elsewhere when its worker dies. Which
+trials it holds is decided when it begins: the next ones in the order of the sweep. Those of a lost
+worker go back to the front.
 """
 
 from __future__ import annotations
@@ -44,7 +43,9 @@ if TYPE_CHECKING:
     from merge_runner.run.local_runner import Ended, Room
     from merge_runner.run.plan import Plan
 
+# Workers may come and go: how often they are counted.
 LOOK_EVERY_S = 1.0
+# A scheduler that hangs must not keep Ctrl-C from ending the run.
 GOODBYE_S = 5.0
 BATCHES_PER_WORKER = 4
 SCHEDULER_GONE = (
@@ -79,6 +80,7 @@ class Coordinator:
         self._plan = plan
         self._endpoint_plan = endpoint_plan
         self._in_flight = in_flight
+        # Whoever finds the open port must not get the plan, nor add replies.
         self._token = secrets.token_hex(16)
         self._waiting: deque[TrialSpec] = deque()
         self._unfinished: set[int] = set()
@@ -90,7 +92,7 @@ class Coordinator:
         self._freed = asyncio.Event()
         self._batches: dict[asyncio.Task[None], Future] = {}
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._failure.add_done_callback(lambda failed: failed.exception())
+        self._failure.add_done_callback(lambda failed: failed.exception())  # it is retrieved
         self._stopping = False
 
     async def __aenter__(self) -> Coordinator:
@@ -175,8 +177,6 @@ class Coordinator:
 
     def ended(self, spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
         """A trial has ended at a worker."""
-        if spec.order not in self._unfinished:
-            return
         self._unfinished.remove(spec.order)
         assert self._ended is not None
         try:
@@ -205,8 +205,8 @@ class Coordinator:
         slots = max(1, min(self._slots, self._in_flight))
         share = min(self._free, max(1, self._in_flight // slots))
         idle = max(1, slots - sum(bool(other.trials) for other in self._sessions))
-        # Many at first, so that little is said, and fewer toward the end, so that no worker is left
-        # with a long rest; never fewer than it plays at once.
+        # Large batches at first, so that little is said, and smaller ones toward the end, so that
+        # no worker still has many when the others have none; never fewer than it plays at once.
         size = min(
             math.ceil(len(self._waiting) / idle),
             max(share, math.ceil(len(self._waiting) / (BATCHES_PER_WORKER * slots))),
@@ -239,8 +239,8 @@ class Coordinator:
             self.fail(error)  # a fault of ours: the run raises it
         if self._stopping:
             return
-        # What it had not ended goes to the front, in order: a trial is played where its replies are
-        # found, in the main cache, whoever plays it.
+        # What it had not ended goes to the front, in order. Whoever plays it next finds its replies
+        # in the cache.
         rest = sorted(session.trials.values(), key=lambda spec: spec.order)
         self._waiting.extendleft(reversed(rest))
         if rest and not session.ended:

@@ -22,15 +22,16 @@ from merge_runner.run.cluster.link import Link, rebuilt
 if TYPE_CHECKING:
     from merge_runner.run.cluster.coordinator import Coordinator
 
-# What a dead worker had sent is kept, and what it had paid for is booked; whatever it waited for is
-# given up.
+# What a dead worker had sent is still kept, and what it had paid for is booked; whatever it waited
+# for is given up.
 SURVIVES_DISCONNECT = frozenset({"keep", "unanswered", "settle", "begin", "end"})
 
 
 class Session:
     """One batch at one worker.
 
-    ``trials`` are those it holds, by their order in the sweep; ``ended`` that it said so itself.
+    ``trials`` are those it holds, by their order in the sweep; ``ended`` is True once the worker
+    has said that the batch has ended.
     """
 
     def __init__(self, coordinator: Coordinator, comm: Comm) -> None:
@@ -74,7 +75,7 @@ class Session:
         )
 
     async def serve(self) -> None:
-        """Serve the worker until it hangs up; ``ended`` if it said that it had ended."""
+        """Serve the worker until it hangs up, then give back whatever it held."""
         try:
             await self.link.serve()
         finally:
@@ -90,7 +91,7 @@ class Session:
         return await self._run.admit(self, token, fingerprint, host)
 
     def _trial(self, order: int, told: TrialRecord | str) -> None:
-        """A trial has ended, or is suspended for the reason that is told."""
+        """A trial has ended: its record, or the reason for which it is suspended."""
         spec = self.trials.pop(order)
         self._run.ended(spec, TrialSuspended(told) if isinstance(told, str) else told)
 

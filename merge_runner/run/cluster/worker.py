@@ -47,7 +47,7 @@ class _Worker:
         try:
             comm = await connect(address, **dask.security.get_connection_args("worker"))
         except OSError:
-            return  # the coordinator is gone, and with it whoever would read an error
+            return  # the coordinator is gone, and nobody would read an error
         link = Link(comm, {"stop": self._stop})
         serving = asyncio.create_task(link.serve())
         serving.add_done_callback(lambda _: self._stop())
@@ -82,7 +82,7 @@ class _Worker:
             )
             runner = LocalRunner(batch.plan, clients, batch.in_flight)
             self._work = asyncio.create_task(runner.play(batch.specs, partial(_tell, link)))
-            if self._stopping:
+            if self._stopping:  # told so before there was anything to cancel
                 self._work.cancel()
             reporting = asyncio.create_task(_report(runner, link))
             try:
@@ -100,10 +100,8 @@ class _Worker:
 
 
 def _stop_profiler(dask: Worker) -> None:
-    """Stop Dask's look at all threads a hundred times a second.
-
-    Python 3.11 can deadlock there when it collects a threading.local, as those of the cache are.
-    """
+    """Stop Dask from looking at all threads a hundred times a second."""
+    # Python 3.11 can deadlock there when it collects a threading.local.
     if (profiler := dask.periodic_callbacks.get("profile")) is not None:
         dask.loop.add_callback(profiler.stop)
 
