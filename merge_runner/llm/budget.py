@@ -28,7 +28,8 @@ from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.shared_services import CachePort
 from merge_runner.records import Attempt
 
-# Longer than most attempts take: after that the money is likely to be held by who waits for us.
+# A trial of ours that could free money may wait for another process that waits for us: after this
+# long it is no longer counted on.
 PATIENCE_S = 90.0
 
 

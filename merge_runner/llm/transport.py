@@ -32,10 +32,6 @@ class Transport(Protocol):
         """The raw reply; raises TransportFailure."""
         ...
 
-    async def close(self) -> None:
-        """Close all connections."""
-        ...
-
 
 class SealedTransport:
     """Refuses every request, so that a replay stays offline, and notes what was asked for."""
@@ -47,6 +43,3 @@ class SealedTransport:
         """Raise ReplayMiss."""
         self.misses.append(request)
         raise ReplayMiss("no recorded reply", request)
-
-    async def close(self) -> None:
-        """Do nothing: there is no connection."""

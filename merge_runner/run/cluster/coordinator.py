@@ -80,7 +80,7 @@ class Coordinator:
         self._plan = plan
         self._endpoint_plan = endpoint_plan
         self._in_flight = in_flight
-        # Whoever finds the open port must not get the plan, nor add replies.
+        # A task that an earlier run has left must not join this one, should it use the same port.
         self._token = secrets.token_hex(16)
         self._waiting: deque[TrialSpec] = deque()
         self._unfinished: set[int] = set()
