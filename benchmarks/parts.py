@@ -14,8 +14,8 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.drivers.language_model import LanguageModel
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.keys import make_request
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.models import load_models
 from merge_runner.llm.shared_limits import BURST_S
@@ -37,8 +37,8 @@ async def limiter() -> dict[str, float]:
     loop = asyncio.get_running_loop()
 
     async def wait(order: int) -> None:
-        permit = await limit.acquire(0, order=order)
-        served.append((permit.dispatched_at, order))
+        await limit.acquire(0, order=order)
+        served.append((loop.time(), order))
 
     cpu_s, began = time.process_time(), loop.time()
     await asyncio.gather(*(wait(order) for order in range(WAITERS)))

@@ -11,8 +11,8 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 
-from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.keys import call_key
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.content_hashes import call_key
 
 BATCH = 500
 _ID = re.compile(r'"id": "(\d+)"')
@@ -54,7 +54,7 @@ def _words() -> str:
     return " ".join(drawn.choices(words, k=1_200_000))
 
 
-def _copies(entries: list[Entry], repetitions: int, reply_bytes: int) -> Iterator[Entry]:
+def _copies(entries: list[CachedCall], repetitions: int, reply_bytes: int) -> Iterator[CachedCall]:
     for repetition in range(2, repetitions + 1):
         for entry in entries:
             request = entry.request
@@ -69,4 +69,4 @@ def _copies(entries: list[Entry], repetitions: int, reply_bytes: int) -> Iterato
             (attempt,) = entry.attempts
             reply = _ID.sub(rf'"id": "\1-{repetition}"', attempt.reply or "", count=1)
             reply = longer(reply, reply_bytes, key)
-            yield Entry(replace(request, key=key, slot=slot), (replace(attempt, reply=reply),))
+            yield CachedCall(replace(request, key=key, slot=slot), (replace(attempt, reply=reply),))

@@ -29,7 +29,7 @@ from benchmarks.cases import Bench, Figures
 from benchmarks.processes import PROJECT, RUNNER
 from merge_runner.emulator.faults import FaultPlan, transient_faults
 from merge_runner.emulator.server import HOST, Emulator
-from merge_runner.llm.keys import call_key
+from merge_runner.llm.content_hashes import call_key
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot
 from merge_runner.results.store import results_digest
 

@@ -355,16 +355,15 @@ def models() -> None:
     from merge_runner.config import Price, key_status
     from merge_runner.drivers.registry import PROGRAMS
     from merge_runner.llm.models import load_models
-    from merge_runner.llm.prices import pricing
+    from merge_runner.llm.prices import cost_usd
     from merge_runner.records import Usage
     from merge_runner.results.query_output import write_table
 
     million = 1_000_000
     rows = []
     for name, entry in load_models().items():
-        price = pricing(entry)
         costs = [
-            price.cost_usd(Usage(input_tokens=i, output_tokens=o))
+            cost_usd(entry, Usage(input_tokens=i, output_tokens=o))
             for i, o in ((1000, 0), (0, 1000))
         ]
         shown = ["unknown" if c is None else f"{c * million / 1000:g}" for c in costs]
@@ -447,7 +446,7 @@ def recording_export(
 def recording_import(file: ImportedFile, cache: CacheOption = DEFAULT_CACHE) -> None:
     """Verify a recording, or the cache folder of somebody else, and add it to the cache."""
     from merge_runner.llm.cache import ResponseCache
-    from merge_runner.llm.foreign import import_folder
+    from merge_runner.llm.cache_import import import_folder
     from merge_runner.results.recording import import_recording
 
     take = import_folder if file.is_dir() else import_recording

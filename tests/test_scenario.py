@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from merge_runner.config import ScenarioConfig, load_sweep
 from merge_runner.errors import UsageError
-from merge_runner.llm.keys import canonical_json
+from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.scenarios.registry import task_of
 
 

@@ -26,9 +26,9 @@ from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.pace import Pace
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed
+from merge_runner.llm.content_hashes import SPEC_VERSION
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import WireFormat
-from merge_runner.llm.keys import SPEC_VERSION
 from merge_runner.prompts.blocks import VARIANTS, block_digests
 from merge_runner.records import (
     SIDES,

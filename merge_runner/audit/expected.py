@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.errors import UsageError
-from merge_runner.llm.keys import between_body_and_slot
+from merge_runner.llm.content_hashes import between_body_and_slot
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.geometry import Track, track_of
 

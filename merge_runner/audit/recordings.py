@@ -19,8 +19,8 @@ from merge_runner.audit.findings import Audit, Finding
 from merge_runner.audit.ids import REPEATED_IDS, identified, meaningless_ids
 from merge_runner.audit.replies import shared_replies
 from merge_runner.errors import RecordingError
-from merge_runner.llm.cache import Entry
-from merge_runner.llm.keys import canonical_json, without_prompt
+from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.content_hashes import canonical_json, without_prompt
 from merge_runner.records import SIDES, Side, Slot
 from merge_runner.results.database import SETTINGS, append, in_memory
 from merge_runner.results.recording import (
@@ -108,7 +108,7 @@ def audit_recording(file: Path) -> Audit:
     return audit
 
 
-def _drive(entry: Entry) -> Drive:
+def _drive(entry: CachedCall) -> Drive:
     request, slot = entry.request, entry.request.slot
     asked = (request.endpoint, request.model, request.path, request.headers)
     template = canonical_json([*asked, without_prompt(request.body)])
@@ -124,7 +124,7 @@ def _trial(condition: str, repetition: int, sample_set: int) -> str:
     return f"{condition}/rep{repetition:02d}" + (f"/set{sample_set}" if sample_set else "")
 
 
-def _calls(entry: Entry) -> Iterator[Row]:
+def _calls(entry: CachedCall) -> Iterator[Row]:
     """Rows of ``calls``, without the texts: all attempts at a call have its one request."""
     request = entry.request
     trial, side, decision = _place(request.slot)
@@ -136,7 +136,7 @@ def _calls(entry: Entry) -> Iterator[Row]:
         yield (*call, *told, *(found or (None, None)))
 
 
-def _exchanged(entry: Entry) -> Iterator[Finding]:
+def _exchanged(entry: CachedCall) -> Iterator[Finding]:
     request = entry.request
     asked = hashlib.sha256(request.body.encode()).hexdigest()
     slot = request.slot.as_dict()

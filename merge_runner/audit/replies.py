@@ -12,7 +12,8 @@ from merge_runner.results.database import fetched
 
 SHOWN = 3
 
-# A place, a hash, and the parts of the text that should have it; see llm/keys.py for that of a key.
+# A place, a hash, and the parts of the text that should have it; llm/content_hashes.py has that
+# of a key.
 KEYS = """
 SELECT trial_id, side, decision, call_key, '{"body":', request::VARCHAR,
     ',' || between_body_and_slot || '{"condition":' || to_json(condition)::VARCHAR

@@ -9,7 +9,7 @@ import duckdb
 
 from merge_runner.audit.expected import Spec, SweepConfig
 from merge_runner.audit.findings import Audit, Finding
-from merge_runner.llm.keys import spec_hash
+from merge_runner.llm.content_hashes import spec_hash
 from merge_runner.records import SIDES
 from merge_runner.results.database import by_name
 

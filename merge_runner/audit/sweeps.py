@@ -26,7 +26,7 @@ from merge_runner.audit.replies import (
 from merge_runner.audit.slots import check_slots
 from merge_runner.audit.traces import GAPS, check_traces, reach_m
 from merge_runner.errors import StoreError, UsageError
-from merge_runner.llm.keys import canonical_json
+from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.records import SIDES
 from merge_runner.results.database import append, by_name, read_database, room_for_texts
 from merge_runner.served_model import other_models

@@ -1,4 +1,4 @@
-"""Reads the body of a reply within bounds: its size, also unpacked, and how deep it nests."""
+"""Reads the body of a reply within bounds: of its size, also unpacked, and of its nesting."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from itertools import accumulate
 
 from merge_runner.llm.transport import TransportFailure
 
-# What is asked for; whatever else a server chooses is refused.
+# What is asked for.
 ENCODING = "gzip"
 PIECE = 2**18
 # No provider's reply has ten levels, and each program that reads one has a limit of its own.
@@ -23,7 +23,7 @@ _NO_BRACKETS = re.compile(r'"[^"]*"|[^][{}"]+')
 async def read_body(chunks: AsyncIterator[bytes], encoding: str, most_bytes: int) -> str:
     """The text of a body that comes in chunks; raises TransportFailure.
 
-    JSON is UTF-8, whatever a header says. The event loop goes on between any two pieces.
+    It is read as UTF-8, the encoding of JSON, whatever a header says.
     """
     pieces, size = [], 0
     async for piece in _unpacked(chunks, encoding):
@@ -64,7 +64,7 @@ async def _unpacked(chunks: AsyncIterator[bytes], encoding: str) -> AsyncIterato
                 raise TransportFailure("connection_lost", f"the reply is no {encoding}") from exc
             packed = unpacking.unconsumed_tail
             cut = not unpacking.eof
-            await asyncio.sleep(0)
+            await asyncio.sleep(0)  # other calls go on while a large body is unpacked
         if unpacking.unused_data:
             raise refused(f"it goes on after the end of its {encoding}")
     if cut:
@@ -72,7 +72,7 @@ async def _unpacked(chunks: AsyncIterator[bytes], encoding: str) -> AsyncIterato
 
 
 def _why_refused(text: str) -> str | None:
-    """What makes JSON too much to be read in little time and memory; what is none is not read."""
+    """Why a text is too much JSON to be read in little time and memory; None if it is not."""
     if text.lstrip()[:1] not in ("[", "{"):
         return None
     if sum(map(text.count, "[{,")) > MOST_VALUES:

@@ -1,17 +1,17 @@
 """A cap on what a sweep spends, over all its runs, that holds whatever happens.
 
 The worst case of an attempt is set aside when it queues for its turn, and durably, in the ledger,
-right before it is sent. ``async with budget.attempt(...)`` stands around all that; PaidAttempt says
+right before it is sent. ``async with budget.attempt(...)`` surrounds all that; PaidAttempt says
 where the money goes when the attempt ends, however it ends.
 
-So that money ends trials instead of beginning ever more of them, a trial gets an allowance when it
-first spends: the worst case of a whole trial. Trials get theirs in the order of the sweep, as those
-before them end.
+So that money finishes trials instead of beginning ever more of them, a trial gets an allowance when
+it first spends: the worst case of a whole trial. Trials get theirs in the order of the sweep, as
+those before them end.
 
-A server may ignore the output cap. What a reply cost more is taken from what is left, and from then
-on as many times the worst case is set aside as the dearest reply of that driver has cost. Several
-attempts are in flight only while twice their worst cases fit, so that one reply at most, the last
-one, can pass the cap.
+A server may ignore the output cap. What a reply cost beyond its worst case is taken from what is
+left, and from then on the worst case is multiplied by as much as that driver's dearest reply
+exceeded it. Several attempts are in flight only while twice their worst cases fit, so that one
+reply at most, the last one, can pass the cap.
 """
 
 from __future__ import annotations
@@ -23,10 +23,13 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
+from merge_runner.llm.shared_services import CachePort
 from merge_runner.records import Attempt
 
+# A trial of ours that could free money may wait for another process that waits for us: after this
+# long it is no longer counted on.
 PATIENCE_S = 90.0
 
 
@@ -39,7 +42,8 @@ class PaidAttempt:
 
     - before ``begin`` (cancelled while waiting, refused by the cap) gives all of it back;
     - after it (it may have been charged) leaves it in the ledger, until a user releases it;
-    - after ``settle`` or ``keep`` has told the ledger its cost, where that is known.
+    - after ``settle`` or ``keep`` has what is not spent of it given back by the ledger, where the
+      cost is known.
     """
 
     budget: Budget
@@ -57,15 +61,13 @@ class PaidAttempt:
 
     async def settle(self, attempts: Sequence[Attempt]) -> None:
         """The attempt, the last of these, brought no answer; its cost may be unknown."""
-        cost_usd = attempts[-1].cost_usd
-        await self.budget.ledger.settle(self.key, attempts, self.aside_usd, cost_usd)
-        if cost_usd == 0:
+        await self.budget.ledger.settle(self.key, attempts, self.aside_usd)
+        if attempts[-1].cost_usd == 0:
             self._freed_usd = self.aside_usd  # the trial needs it again
 
-    async def keep(self, entry: Entry) -> Entry:
+    async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer that the attempt brought, and what it cost, in one transaction."""
-        cost_usd = entry.attempts[-1].cost_usd
-        return await self.budget.ledger.keep(entry, self.aside_usd, cost_usd)
+        return await self.budget.ledger.keep(entry, self.aside_usd)
 
     def close(self) -> None:
         """The attempt has ended."""
@@ -75,7 +77,7 @@ class PaidAttempt:
 
 
 class Budget:
-    """Spending of one sweep in USD; without a cap everything passes, and is recorded.
+    """Spending of one sweep in USD; without a cap nothing is refused, and all of it recorded.
 
     A trial is named by its order in the sweep.
     """
@@ -97,14 +99,14 @@ class Budget:
         self._changed = asyncio.Event()
 
     async def admit(self, trial: int) -> None:
-        """Wait for a trial's allowance; raises TrialSuspended when no ending trial can free it."""
+        """Wait for a trial's allowance; raises TrialSuspended when no trial's end can free it."""
         if self.cap_usd is None:
             return
         if trial in self._left:
             raise TrialSuspended("its trial is suspended")
         self._at_the_door.append(trial)
         try:
-            # Only the oldest trial takes an allowance: were others let by, it might wait for ever.
+            # The oldest trial first: if younger ones were let by, it might wait for ever.
             while trial not in self._allowances:
                 allowed = sum(self._allowances.values())
                 fits = (
@@ -127,7 +129,7 @@ class Budget:
             self._tell()
 
     def readmit(self, trials: Iterable[int]) -> None:
-        """Whoever played these trials is gone, and they may be admitted anew."""
+        """The worker that played these trials is gone, and they may be admitted anew."""
         for trial in trials:
             self._allowances.pop(trial, None)
             self._left.discard(trial)
@@ -143,16 +145,16 @@ class Budget:
             paid.close()
 
     async def set_aside(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
-        """Set an attempt's worst case aside; waits for others, else raises TrialSuspended.
+        """Set an attempt's worst case aside, more where its server ignores the output cap.
 
-        That is more where the driver's server ignores the output cap. Whoever calls this closes
-        what it returns; ``attempt`` does so by itself.
+        Waits while other attempts or trials may free money, then raises TrialSuspended. The caller
+        closes what is returned; ``attempt`` does so by itself.
         """
         waited_s = 0.0
         while not self._taken(trial, aside_usd := self._expected_usd(asked)):
             self._stuck.add(trial)
             try:
-                # Nothing in flight can free money any more, and no trial but stuck ones will end.
+                # Nothing in flight can free money any more, and each trial that could is stuck.
                 if not self._in_flight and (
                     self._allowances.keys() <= self._stuck or waited_s >= PATIENCE_S
                 ):
@@ -174,9 +176,9 @@ class Budget:
         self._queued_usd -= paid.aside_usd
 
     def give_back(self, trial: int, *, queued_usd: float, freed_usd: float) -> None:
-        """An attempt has ended: so much was set aside in this process alone.
+        """An attempt has ended: ``queued_usd`` was set aside for it in this process alone.
 
-        ``freed_usd`` was taken from the trial's allowance, and not spent.
+        ``freed_usd`` of the trial's allowance was not spent.
         """
         self._in_flight -= 1
         self._queued_usd -= queued_usd
@@ -193,7 +195,7 @@ class Budget:
         return self.ledger.read().committed_usd + self._queued_usd
 
     def _taken(self, trial: int, worst_usd: float) -> bool:
-        """Take an attempt's worst case, from the trial's allowance as far as that goes."""
+        """Whether there is money for an attempt; taken from the trial's allowance if it lasts."""
         if self.cap_usd is None:
             return True
         own = min(worst_usd, self._allowances.get(trial, 0.0))
@@ -211,10 +213,9 @@ class Budget:
         return True
 
     async def _change(self) -> float:
-        """Wait for a change, a while; returns how long in s.
-
-        Another process may hold a claim that a trial of ours waits for, and wait for ours.
-        """
+        """Wait for a change, for a while only; returns for how long in s."""
+        # For ever it could be that another process holds a claim that a trial of ours waits for,
+        # and waits for one of ours.
         loop = asyncio.get_running_loop()
         began = loop.time()
         with contextlib.suppress(TimeoutError):
@@ -223,7 +224,7 @@ class Budget:
         return loop.time() - began
 
     def _tell(self) -> None:
-        # A fresh event: who waits for the next change does not see this one again.
+        # A new event for the next change: whoever waits for that must not see this one again.
         self._changed.set()
         self._changed = asyncio.Event()
 
@@ -246,15 +247,15 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Unpaid:
-    """In the place of a budget for a model that costs nothing: replies and attempts are kept."""
+    """The budget of a model that costs nothing: only replies and attempts are kept."""
 
-    cache: ResponseCache
+    cache: CachePort
 
     async def admit(self, trial: int) -> None:
         """Every trial may begin."""
 
     def leave(self, trial: int) -> None:
-        """Nothing was kept for the trial."""
+        """The trial has no allowance."""
 
     @asynccontextmanager
     async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[UnpaidAttempt]:
@@ -266,17 +267,17 @@ class Unpaid:
 class UnpaidAttempt:
     """One attempt that costs nothing; see PaidAttempt."""
 
-    cache: ResponseCache
+    cache: CachePort
     key: str
     aside_usd: float = 0.0
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
-        """What a process that dies had in flight is no loss."""
+        """Nothing is noted: what a process that dies has in flight costs nothing."""
 
     async def settle(self, attempts: Sequence[Attempt]) -> None:
         """Keep the attempts for a later run."""
         await self.cache.put_unanswered(self.key, tuple(attempts))
 
-    async def keep(self, entry: Entry) -> Entry:
+    async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer."""
         return await self.cache.put(entry)

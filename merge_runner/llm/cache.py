@@ -1,18 +1,20 @@
 """Recorded replies on disk: one text entry per call key, never evicted, never pickled.
 
 An entry is the JSON of a request, its slot and every attempt, the answering one last, behind a
-checksum. It is durable before anyone sees it: writes are batched into one synchronous SQLite
-transaction each. Beside the entries lie what is known of each model, what each sweep has spent
-(see ledger.py), the attempts of calls that have no answer yet, and damaged entries set aside.
+checksum. It is durable before anyone sees it: each batch of writes is one synchronous SQLite
+transaction. Beside the entries lie what is known of each model, what each sweep has spent (see
+ledger.py), the attempts of calls that have no answer yet, and damaged entries set aside.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +24,20 @@ from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.cache_db import (
     FAILURES,
     FORMAT,
-    TextDisk,
     format_of,
     open_disk,
     open_read_only,
     set_format,
 )
-from merge_runner.llm.keys import manner, without_prompt
+from merge_runner.llm.claims import Claims
+from merge_runner.llm.content_hashes import manner, without_prompt
 from merge_runner.llm.verify import DAMAGED, check_body, check_call
-from merge_runner.llm.write_batcher import BatchWriter, Operation
+from merge_runner.llm.write_batcher import BatchWriter, Operation, ResultT
 from merge_runner.records import Attempt, ChatRequest, is_scripted
 
 ENTRY_VERSION = 1
 CHECKSUM_LENGTH = 32
+BATCH = 1_000
 ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 # Prefixes of keys that are no call keys.
 _MODEL, _UNANSWERED, _DAMAGED, _AGAIN = "model ", "attempts ", "damaged ", "again "
@@ -42,7 +45,7 @@ _OLD_ENDPOINTS = "endpoints "
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class CachedCall:
     """A recorded call: its request, and all attempts, the answering one last."""
 
     request: ChatRequest
@@ -53,7 +56,7 @@ class Entry:
         return _STORED.dump_json(_Stored(ENTRY_VERSION, self)).decode()
 
     @classmethod
-    def from_json(cls, text: str) -> Entry:
+    def from_json(cls, text: str) -> CachedCall:
         """Read an entry; raises RecordingError, or UsageError for one of a newer version."""
         try:
             stored = _STORED.validate_json(text, strict=True)
@@ -76,7 +79,7 @@ class _Stored:
     """An entry as it lies in the cache."""
 
     version: int
-    entry: Entry
+    entry: CachedCall
 
 
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
@@ -84,10 +87,10 @@ _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 
 @dataclass(slots=True)
 class CallTotals:
-    """Sums over entries of one model, at one endpoint, asked in one manner (see keys.py).
+    """Sums over entries of one model, at one endpoint, asked in one manner (see content_hashes.py).
 
-    Tokens and latencies are those of the ``measured`` answers: they tell both, and are the model's
-    own and no stand-in's.
+    ``measured`` counts the answers that state their tokens and are the model's own, no stand-in's:
+    tokens and latencies are theirs.
     """
 
     cost_usd: float = 0.0
@@ -96,7 +99,7 @@ class CallTotals:
     output_tokens: int = 0
     latency_s: float = 0.0
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: CachedCall) -> None:
         """Count an entry."""
         self.cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
         last = entry.attempts[-1]
@@ -110,12 +113,12 @@ class CallTotals:
 
 
 @dataclass(slots=True)
-class ModelFacts:
+class ModelStats:
     """What the cache knows of a model: totals by endpoint, and there by how it was asked."""
 
     totals: dict[str, dict[str, CallTotals]] = field(default_factory=dict)
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: CachedCall) -> None:
         """Count an entry."""
         request = entry.request
         asked = manner(request.path, without_prompt(request.body))
@@ -131,17 +134,32 @@ class ModelFacts:
         return sum(each.cost_usd for manners in self.totals.values() for each in manners.values())
 
 
-_FACTS = TypeAdapter(ModelFacts)
+_STATS = TypeAdapter(ModelStats)
+
+
+@dataclass(frozen=True, slots=True)
+class KnownCall:
+    """What is recorded of a call: its entry, or the attempts of earlier runs.
+
+    ``damaged`` names what was found damaged and set aside.
+    """
+
+    entry: CachedCall | None
+    attempts: tuple[Attempt, ...]
+    damaged: tuple[str, ...] = ()
 
 
 class ResponseCache:
-    """The cache folder. Reads are direct; writes are batched in a thread and awaited."""
+    """The cache folder. Reads are direct; writes are batched in a thread and awaited.
+
+    Whoever makes a call has claimed it, so that no other process makes it too.
+    """
 
     def __init__(
         self,
         folder: Path,
         *,
-        overlay: Callable[[], Mapping[str, Entry]] | None = None,
+        overlay: Callable[[], Mapping[str, CachedCall]] | None = None,
         read_only: bool = False,
     ) -> None:
         """Open or make the folder; ``overlay`` reads a recording, entries by key.
@@ -150,52 +168,74 @@ class ResponseCache:
         in the folder, which must be there.
         """
         self.folder = folder
+        self.claims = Claims(folder)
         self._read_overlay = overlay
         self._disk = open_read_only(folder) if read_only else open_disk(folder)
         self._writer = BatchWriter(self.run_now)
-        self._new: list[Entry] = []
+        self._new: list[CachedCall] = []
         if not read_only and format_of(self._disk) < FORMAT:
             self.run_now([self._bring_up_to_date])
 
     @cached_property
-    def _overlay(self) -> Mapping[str, Entry]:
+    def _overlay(self) -> Mapping[str, CachedCall]:
         return self._read_overlay() if self._read_overlay else {}
 
-    def get(self, key: str) -> Entry | None:
+    def get(self, key: str) -> CachedCall | None:
         """The entry of a call key; raises RecordingError for one that is damaged or made up."""
         return self._overlay.get(key) or self._kept(key)
 
-    def holds(self, key: str) -> bool:
-        """Whether there is an entry of a call key, and a whole one."""
-        try:
-            return self.get(key) is not None
-        except RecordingError:
-            return False
+    async def claim(self, key: str) -> KnownCall | None:
+        """Claim a call and learn what is recorded of it; None while another one holds it.
 
-    async def put(self, entry: Entry, also: Operation | None = None) -> Entry:
+        What is damaged is set aside.
+        """
+        if not self.claims.take(key):
+            return None
+        # Read after the lock is taken, or a call could be made between the two.
+        try:
+            return KnownCall(self.get(key), self.unanswered(key))
+        except RecordingError:
+            damaged = tuple(self.set_damage_aside(key))
+            return KnownCall(self.get(key), self.unanswered(key), damaged)
+
+    def release(self, key: str) -> None:
+        """Give a claim up."""
+        self.claims.release(key)
+
+    async def put(self, entry: CachedCall, also: Operation | None = None) -> CachedCall:
         """Keep an entry; returns the one that is kept when it is durable.
 
         That is another one where another process was first: a kept reply is never replaced.
         ``also`` runs in the same transaction.
         """
 
-        def operation() -> Entry:
+        def operation() -> CachedCall:
             kept = self._keep(entry)
             if also is not None:
                 also()
             return kept
 
-        kept: Entry = await self.write(operation)
-        return kept
+        return await self.write(operation)
 
-    def put_now(self, entries: Iterable[Entry]) -> list[Entry]:
+    def put_now(self, entries: Iterable[CachedCall]) -> list[CachedCall]:
         """Keep entries in one transaction, in this thread; returns those that are kept."""
         return self.run_now([partial(self._keep, entry) for entry in entries])
+
+    def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
+        """Keep the entries that the cache lacks; returns (added, already there)."""
+        added = there = 0
+        waiting = iter(entries)
+        while batch := list(islice(waiting, BATCH)):
+            new = [entry for entry in batch if not self._holds(entry.request.key)]
+            self.put_now(new)
+            added += len(new)
+            there += len(batch) - len(new)
+        return added, there
 
     def set_damage_aside(self, key: str) -> list[str]:
         """Move a damaged entry, or list of attempts, to where it can still be looked at.
 
-        Returns the names of those that were.
+        Returns the names of what was moved.
         """
         checks = {key: self._kept, _UNANSWERED + key: self.unanswered}
 
@@ -203,7 +243,7 @@ class ResponseCache:
             return [name for name, check in checks.items() if _is_damaged(check, key)]
 
         def operation() -> list[str]:
-            found = damaged()  # another process may have repaired it
+            found = damaged()  # again: another process may have moved it since
             for name in found:
                 self._disk.set_aside(name, _DAMAGED + name)
             return found
@@ -224,7 +264,7 @@ class ResponseCache:
         """Keep the attempts at a call that has no answer yet, durably."""
         await self.write(lambda: self.keep_unanswered(key, attempts))
 
-    async def write(self, operation: Callable[[], Any]) -> Any:  # noqa: ANN401 # the operation's own result
+    async def write(self, operation: Callable[[], ResultT]) -> ResultT:
         """Run an operation on this cache in the next durable batch; raises CacheFailed."""
         return await self._writer.write(operation)
 
@@ -248,10 +288,8 @@ class ResponseCache:
 
         Raises RecordingError where it is no text, CacheFailed where the folder cannot be read.
         """
-        try:
+        with self._readable():
             return self._disk.get(name)
-        except FAILURES as exc:
-            raise self._unreadable(exc) from exc
 
     def replace(self, name: str, text: str) -> None:
         """An operation: keep a text under a name that is no call key."""
@@ -272,7 +310,7 @@ class ResponseCache:
         return sorted({*self.names(prefix), *again})
 
     def read_twice(self, name: str) -> str | None:
-        """A text that was kept twice: one is enough. Raises RecordingError where none is whole."""
+        """A text that was kept twice, of which one must be whole; else raises RecordingError."""
         damage: RecordingError | None = None
         for each in (name, _AGAIN + name):
             try:
@@ -286,40 +324,44 @@ class ResponseCache:
         return None
 
     def replace_twice(self, name: str, text: str) -> None:
-        """An operation: keep a text that must not be lost with a damaged row."""
+        """An operation: keep a text in two rows, so that one damaged row does not lose it."""
         for each in (name, _AGAIN + name):
             self._disk.set(each, _behind_checksum(text))
 
-    def entries(self, left_out: list[str] | None = None) -> Iterator[Entry]:
-        """All entries, of the folder and of the overlay; see ``entries_of``."""
+    def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
+        """All entries, of the folder and of the overlay, each verified.
+
+        What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
+        """
         with self._readable():
-            yield from entries_of(self._disk, [] if left_out is None else left_out)
+            yield from self._own_entries([] if left_out is None else left_out)
         yield from self._overlay.values()
 
     def recorded_endpoints(self, model: str) -> list[str]:
         """The endpoint identities of a model's replies: the recording's, else the folder's."""
         requests = (entry.request for entry in self._overlay.values())
         overlaid = sorted({r.endpoint for r in requests if r.model == model})
-        return overlaid or sorted(self.facts(model).totals)
+        return overlaid or sorted(self.stats(model).totals)
 
-    def facts(self, model: str) -> ModelFacts:
+    def stats(self, model: str) -> ModelStats:
         """What the folder knows of a model."""
-        return self._facts(model) or self._counted_anew(model)
+        return self._stats(model) or self._counted_anew()[model]
 
     def cost_usd(self) -> float:
         """What all entries of the folder cost when they were made."""
         models = (name.removeprefix(_MODEL) for name in self.names_kept_twice(_MODEL))
-        return sum(self.facts(model).cost_usd for model in models)
+        return sum(self.stats(model).cost_usd for model in models)
 
     def close(self) -> None:
-        """Close the folder."""
+        """Close the folder, and give all claims up."""
+        self.claims.close()
         self._disk.close()
 
-    def _keep(self, entry: Entry) -> Entry:
+    def _keep(self, entry: CachedCall) -> CachedCall:
         key = entry.request.key
         try:
             if kept := self._kept(key):
-                return kept
+                return kept  # a kept reply is never replaced
         except RecordingError:
             self._disk.set_aside(key, _DAMAGED + key)
         self._disk.add(key, _behind_checksum(entry.to_json()))
@@ -327,7 +369,13 @@ class ResponseCache:
         self._new.append(entry)
         return entry
 
-    def _kept(self, key: str) -> Entry | None:
+    def _holds(self, key: str) -> bool:
+        try:
+            return self.get(key) is not None
+        except RecordingError:
+            return False  # a damaged one is set aside when another is kept in its place
+
+    def _kept(self, key: str) -> CachedCall | None:
         text = self.read(key)
         return None if text is None else _verified(key, text)
 
@@ -336,14 +384,11 @@ class ResponseCache:
         try:
             yield
         except FAILURES as exc:
-            raise self._unreadable(exc) from exc
-
-    def _unreadable(self, exc: Exception) -> CacheFailed:
-        return self._failed(
-            f"read: {exc}. Repair or move it; the database and any exported recording are not "
-            f"affected, and `merge-runner recording import {self.folder}` takes what can be read "
-            "of it into another, named with --cache"
-        )
+            raise self._failed(
+                f"read: {exc}. Repair or move it; the database and any exported recording are not "
+                f"affected, and `merge-runner recording import {self.folder}` takes what can be "
+                "read of it into another, named with --cache"
+            ) from exc
 
     def _failed(self, how: str) -> CacheFailed:
         if self._disk.in_place:
@@ -354,73 +399,69 @@ class ResponseCache:
             "no cache is asked again. The database is not affected"
         )
 
-    def _count(self, entries: Iterable[Entry]) -> None:
-        """Within a transaction: add entries to the facts about their models."""
-        by_model: dict[str, list[Entry]] = {}
+    def _count(self, entries: Iterable[CachedCall]) -> None:
+        """Within a transaction: add entries to the stats of their models."""
+        by_model: dict[str, list[CachedCall]] = {}
         for entry in entries:
             by_model.setdefault(entry.request.model, []).append(entry)
         for model, new in by_model.items():
-            known = self._facts(model)
+            known = self._stats(model)
             if known is None:
-                known = self._counted_anew(model)  # with the new ones, which lie there already
+                known = self._counted_anew()[model]  # with the new ones, which lie there already
             else:
                 for entry in new:
                     known.add(entry)
-            self._keep_facts(model, known)
+            self._keep_stats(model, known)
 
     def _bring_up_to_date(self) -> None:
-        """An operation: those before the third knew less of each model, so count anew."""
-        if format_of(self._disk) < 3:  # or another process was quicker
+        """An operation: bring a folder of an earlier format up to date."""
+        # Formats before the third knew less of each model. Read again: another process may have
+        # been quicker.
+        if format_of(self._disk) < 3:
             for name in self._disk.names(_OLD_ENDPOINTS) + self._disk.names(_MODEL):
                 self._disk.delete(name)
-            facts: dict[str, ModelFacts] = {}
-            for entry in entries_of(self._disk, []):
-                facts.setdefault(entry.request.model, ModelFacts()).add(entry)
-            for model, known in facts.items():
-                self._keep_facts(model, known)
+            for model, known in self._counted_anew().items():
+                self._keep_stats(model, known)
         set_format(self._disk)
 
-    def _keep_facts(self, model: str, facts: ModelFacts) -> None:
-        self.replace_twice(_MODEL + model, _FACTS.dump_json(facts).decode())
+    def _keep_stats(self, model: str, stats: ModelStats) -> None:
+        self.replace_twice(_MODEL + model, _STATS.dump_json(stats).decode())
 
-    def _facts(self, model: str) -> ModelFacts | None:
-        """The facts about a model; None where they are damaged."""
+    def _stats(self, model: str) -> ModelStats | None:
+        """The stats of a model; None where they are damaged."""
         try:
             text = self.read_twice(_MODEL + model)
-            return ModelFacts() if text is None else _FACTS.validate_json(text)
+            return ModelStats() if text is None else _STATS.validate_json(text)
         except (RecordingError, ValidationError):
             return None
 
-    def _counted_anew(self, model: str) -> ModelFacts:
-        facts = ModelFacts()
-        for entry in entries_of(self._disk, []):  # a damaged one is reported when it is needed
-            if entry.request.model == model:
-                facts.add(entry)
-        return facts
+    def _counted_anew(self) -> defaultdict[str, ModelStats]:
+        """The stats of each model, from all entries; those it has none of are empty."""
+        stats: defaultdict[str, ModelStats] = defaultdict(ModelStats)
+        for entry in self._own_entries([]):  # a damaged one is reported when it is needed
+            stats[entry.request.model].add(entry)
+        return stats
+
+    def _own_entries(self, left_out: list[str]) -> Iterator[CachedCall]:
+        """The entries of the folder; see ``entries``."""
+        for row in self._disk.calls():
+            try:
+                if isinstance(row, RecordingError):
+                    raise row
+                entry = _verified(*row)
+                check_body(entry.request.body)
+                yield entry
+            except (RecordingError, UsageError, *DAMAGED) as exc:
+                left_out.append(str(exc))
 
 
-def entries_of(disk: TextDisk, left_out: list[str]) -> Iterator[Entry]:
-    """The entries of a folder, maybe somebody else's, each verified.
+def _verified(key: str, text: str) -> CachedCall:
+    """The entry that a row holds; those of the first format have no checksum.
 
-    What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
+    Raises RecordingError unless it is whole and belongs to its key: a reply to one request must
+    never answer another.
     """
-    for row in disk.calls():
-        try:
-            if isinstance(row, RecordingError):
-                raise row
-            entry = _verified(*row)
-            check_body(entry.request.body)
-            yield entry
-        except (RecordingError, UsageError, *DAMAGED) as exc:
-            left_out.append(str(exc))
-
-
-def _verified(key: str, text: str) -> Entry:
-    """A stored entry; those of the first format have no checksum.
-
-    Raises RecordingError unless it is whole and that of its key, so that none is used for another.
-    """
-    entry = Entry.from_json(_checked(text))
+    entry = CachedCall.from_json(_checked(text))
     try:
         check_call(key, entry.request, entry.attempts)
     except DAMAGED as exc:

@@ -25,9 +25,9 @@ from merge_runner.text_safety import one_line
 FILE = "cache.db"
 FORMAT = 4
 _FORMAT, _OPENED = "format", "opened"
-BUSY_S = 600.0
+BUSY_S = 600.0  # another process may be writing long replies to a slow disk
 LONGEST = 2**28
-"""A row of more bytes was made to harm."""
+"""A row of more bytes was made to do harm."""
 # How reading and writing fail; UnicodeDecodeError where SQLite quotes what is damaged.
 FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
 # How a journal ends that names a file which SQLite deletes once it has rolled the journal back.
@@ -109,7 +109,7 @@ class TextDisk:
     """The texts of a folder's file."""
 
     def __init__(self, folder: Path, *, read_only: bool = False) -> None:
-        """Open the file; raises UsageError for one that no cache has, sqlite3.Error, OSError."""
+        """Open the file; raises UsageError for one that is no cache's, sqlite3.Error, OSError."""
         self._file = folder / FILE
         _refuse_traps(self._file)
         self._store: _Store | None = None
@@ -117,7 +117,7 @@ class TextDisk:
         try:
             _refuse_other_layout(self._file, self._reading)
         except (UsageError, *FAILURES):
-            self.close()  # and nothing is left beside it
+            self.close()  # so that SQLite leaves no file beside it
             raise
         self._own = _identity(self._file)  # that of the file which was opened to be written
         if not read_only:
@@ -297,7 +297,7 @@ def usable(folder: Path) -> Iterator[None]:
 
 
 def _make(file: Path) -> None:
-    """Make the file whole or not at all, so that an empty one was not just made by somebody."""
+    """Make the file whole or not at all, so that an empty one is never one that is being made."""
     with tempfile.TemporaryDirectory(prefix="new-", dir=file.parent) as folder:
         _lay_out(Path(folder))
         try:
@@ -306,6 +306,7 @@ def _make(file: Path) -> None:
             pass  # another process was quicker
         except OSError:  # a file system without links
             _lay_out(file.parent)
+    # The name of a new file is durable only when its folder is.
     descriptor = os.open(file.parent, os.O_RDONLY)
     os.fsync(descriptor)
     os.close(descriptor)
@@ -335,6 +336,7 @@ def _drop_other_settings(file: Path) -> None:
 def _reading(file: Path) -> sqlite3.Connection:
     """A connection that writes nothing, neither to the file nor beside it."""
     uri = f"file:{quote(str(file.resolve()))}?mode=ro"
+    # Without a log of recent writes the file is all there is, and SQLite need not make one.
     if not _size(_beside(file, "-wal")):
         uri += "&immutable=1"
     connection = sqlite3.connect(uri, uri=True, timeout=BUSY_S, isolation_level=None)
@@ -344,7 +346,7 @@ def _reading(file: Path) -> sqlite3.Connection:
 
 
 def _guard(connection: sqlite3.Connection) -> None:
-    """Read what may be damaged as it is, and follow nothing."""
+    """Let a connection read what may be damaged as it is, and follow nothing that it names."""
     connection.text_factory = _as_it_is
     connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
     connection.execute("PRAGMA trusted_schema = OFF")

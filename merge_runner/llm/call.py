@@ -9,12 +9,13 @@ from dataclasses import dataclass, field
 from datetime import datetime
 
 from merge_runner.errors import CallFailed
+from merge_runner.llm.ledger import Asked
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
 
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Who waits for what, and until when on the wall clock, UTC; None: until it happens."""
+    """Who waits for what, and until when (UTC); None: until it happens."""
 
     who: str
     what: str
@@ -25,29 +26,23 @@ class Wait:
 class Call:
     """A call that somebody waits for.
 
-    ``attempts`` are all that were made, the first ``earlier`` of them by earlier runs. ``worst``
-    bounds the tokens of one attempt, and ``worst_usd`` its cost where the server keeps to the
-    output cap. ``began_s`` is when the first attempt was due, on the event loop's clock. While
-    the call waits, ``wait`` says for what; otherwise it is in flight, or being saved. A call that
-    is ``stopping`` waits for nothing any more. ``task`` makes it.
+    ``asked`` names it for a reader and bounds the cost of an attempt, ``worst`` bounds its tokens.
+    ``attempts`` are all that were made, the first ``earlier`` of them by earlier runs. ``began_s``
+    is when the first attempt was due, on the event loop's clock. While the call waits, ``wait``
+    says for what; otherwise it is in flight, or being saved. A call that is ``stopping`` waits for
+    nothing any more. ``task`` makes it.
     """
 
     request: ChatRequest
     order: int
-    driver: str
+    asked: Asked
     worst: Usage
-    worst_usd: float
     stopping: bool
     attempts: list[Attempt] = field(default_factory=list)
     earlier: int = 0
     began_s: float = 0.0
     wait: Wait | None = None
     task: asyncio.Task[ChatReply] = field(init=False)
-
-    @property
-    def who(self) -> str:
-        """Whose decision it is, for a reader."""
-        return slot_text(self.request.slot)
 
     @property
     def own_attempts(self) -> list[Attempt]:
@@ -62,18 +57,19 @@ class Call:
 
     @contextmanager
     def waiting(self, what: str, until: datetime | None = None) -> Iterator[Wait]:
-        """Within this nothing of the call is in flight, so that it can be given up."""
+        """While this lasts, nothing of the call is in flight, so that it can be given up."""
         if self.stopping:
             raise CallFailed("the sweep was stopped", self.request)
-        self.wait = wait = Wait(f"{self.driver}: {self.who}", what, until)
+        self.wait = wait = Wait(f"{self.asked.driver}: {self.asked.slot}", what, until)
         try:
             yield wait
         finally:
             self.wait = None
 
     def stop(self) -> None:
-        """Give the call up, now where it waits, else as soon as it would."""
+        """Give the call up: at once if it waits, otherwise as soon as it would wait again."""
         self.stopping = True
+        # What is in flight may be charged whether or not anybody takes the answer: it goes on.
         if self.wait is not None:
             self.task.cancel()
 

@@ -24,9 +24,10 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.budget import Unpaid
-from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.call import Call, Wait, slot_text
 from merge_runner.llm.consequences import Consequences
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import WireFormat
@@ -37,17 +38,16 @@ from merge_runner.llm.http_outcome import (
     judge,
     may_be_charged,
 )
-from merge_runner.llm.keys import make_request
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
 from merge_runner.llm.meter import Meter
-from merge_runner.llm.prices import Pricing
+from merge_runner.llm.prices import cost_usd
 from merge_runner.llm.retry import Deadline, OutOfTime, RequestFailed, retries
 from merge_runner.llm.shared_services import (
     AttemptPort,
     BudgetPort,
-    ClaimPort,
-    PermitPort,
+    CachePort,
     RateLimitPort,
+    Settle,
 )
 from merge_runner.llm.transport import Transport, TransportFailure
 from merge_runner.records import (
@@ -61,7 +61,9 @@ from merge_runner.records import (
 )
 from merge_runner.served_model import is_other_model
 
+# Kernel locks cannot be awaited; beside a call that takes seconds this delay is nothing.
 CLAIM_POLL_S = 0.1
+# A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
 
 
@@ -71,21 +73,18 @@ class LlmClient:
 
     ``endpoint`` is the identity that enters the keys. A call that is under way is shared by all
     who ask for the same key, and goes on when they are cancelled, so that what is paid for is
-    kept; ``drain`` waits for it. ``claims`` keep other processes from making the same call.
-    ``budget`` is that of a model which costs money. ``first`` is the run's first call to the
-    endpoint, which goes alone. ``sealed`` says that nothing may be asked anew; ``strict`` that an
-    answer of another model stops the sweep.
+    kept; ``drain`` waits for it. ``budget`` is None for a model that costs nothing. ``first`` is
+    the run's first call to the endpoint, which goes alone. ``sealed`` says that nothing may be
+    asked anew; ``strict`` that an answer of another model stops the sweep.
     """
 
     name: str
     entry: ModelEntry
     endpoint: str
-    cache: ResponseCache
+    cache: CachePort
     transport: Transport
     limiter: RateLimitPort
-    pricing: Pricing
     budget: BudgetPort | None = None
-    claims: ClaimPort | None = None
     sealed: bool = False
     strict: bool = False
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
@@ -103,8 +102,10 @@ class LlmClient:
             reply = self._read(recorded)
         elif call := self._calls.get(request.key):
             reply = await asyncio.shield(call.task)
-            reply = replace(reply, earlier=len(reply.attempts))  # whoever asked first tells of them
+            # The attempts are counted once, for whoever asked first.
+            reply = replace(reply, earlier=len(reply.attempts))
         else:
+            # Shielded: the call may be paid for already when its trial is cancelled.
             reply = await asyncio.shield(self._start(request, order).task)
         other_model = self._other_model(reply)
         self.meter.count_reply(reply, other_model)
@@ -148,7 +149,7 @@ class LlmClient:
         """Its name, with the endpoint where that is not the provider's own."""
         return self._consequences.driver
 
-    def _recorded(self, request: ChatRequest) -> Entry | None:
+    def _recorded(self, request: ChatRequest) -> CachedCall | None:
         """The recorded call, None for a damaged one; in a replay that raises CallFailed."""
         try:
             return self.cache.get(request.key)
@@ -156,23 +157,6 @@ class LlmClient:
             if self.sealed:
                 raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
             return None
-
-    def _known(self, request: ChatRequest) -> tuple[Entry | None, tuple[Attempt, ...]]:
-        """The recorded call, else the attempts of earlier runs; only who has claimed it may ask.
-
-        What is damaged is moved out of the way, and told.
-        """
-        key = request.key
-        try:
-            return self.cache.get(key), self.cache.unanswered(key)
-        except RecordingError:
-            for name in self.cache.set_damage_aside(key):
-                self.meter.damaged.append(name)
-                self.meter.notes.append(
-                    f"{self.driver}: {slot_text(request.slot)}: what is recorded is damaged; it is "
-                    f"set aside in the cache as 'damaged {name}', and asked again"
-                )
-            return self.cache.get(key), self.cache.unanswered(key)
 
     def _other_model(self, reply: ChatReply) -> str | None:
         """Who answered, where it is another model than was asked for."""
@@ -193,59 +177,65 @@ class LlmClient:
 
     def _start(self, request: ChatRequest, order: int) -> Call:
         worst = self._worst_case(request)
-        worst_usd = self.pricing.cost_usd(worst) or 0.0
-        call = Call(request, order, self.driver, worst, worst_usd, self._stopping)
-        call.task = asyncio.create_task(self._claimed(call))
+        worst_usd = cost_usd(self.entry, worst) or 0.0
+        asked = Asked(self.driver, slot_text(request.slot), worst_usd)
+        call = Call(request, order, asked, worst, self._stopping)
+        call.task = asyncio.create_task(self._in_turn(call))
         self._calls[request.key] = call
 
         def forget(done: asyncio.Task[ChatReply]) -> None:
             del self._calls[request.key]
             if not done.cancelled():
-                done.exception()  # all who asked may be gone by now
+                done.exception()  # retrieved, since all who asked may be gone by now
 
         call.task.add_done_callback(forget)
         return call
 
-    async def _claimed(self, call: Call) -> ChatReply:
-        """Make a call when its turn has come."""
-        # Before the claim: nobody waits for money with a call that another process needs.
+    async def _in_turn(self, call: Call) -> ChatReply:
+        """Make a call when there is money for its trial, and the first call has been answered."""
+        # Both before the claim: else another process would wait for a call that waits here.
         with call.waiting("for trials before it to end, under --max-cost"):
             await self._money.admit(call.order)
         if self.sealed:
             return await self._make(call)
         alone, stopped = await self._goes_alone(call), False
         try:
-            return await self._unless_made(call)
+            return await self._claimed(call)
         except SweepStopped:
-            stopped = True  # nobody else is to try the same
+            stopped = True  # the next call would only be refused in the same way
             raise
         finally:
             if alone and not stopped:
                 self.first.give_turn()
 
     async def _goes_alone(self, call: Call) -> bool:
-        """Wait for the first answer of the run; True: it is for this call to bring it."""
+        """Wait for the first answer of the run; True if this call is to bring it."""
         if self.first.passed:
             return False
         with call.waiting(f"for the first answer of {self.driver}"):
             return await self.first.turn()
 
-    async def _unless_made(self, call: Call) -> ChatReply:
-        """Make a call unless another process does."""
+    async def _claimed(self, call: Call) -> ChatReply:
+        """Claim a call, and make it unless it is recorded by now."""
         key = call.request.key
-        while self.claims is not None and not await self.claims.claim(key):
+        while (known := await self.cache.claim(key)) is None:
             with call.waiting("for another merge-runner that makes the same call"):
                 await asyncio.sleep(CLAIM_POLL_S)
         try:
-            made, earlier = self._known(call.request)  # another process may have made it just now
-            call.attempts, call.earlier = list(earlier), len(earlier)
-            return self._read(made) if made else await self._make(call)
+            for name in known.damaged:
+                self.meter.damaged.append(name)
+                self.meter.notes.append(
+                    f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set "
+                    f"aside in the cache as 'damaged {name}', and asked again"
+                )
+            call.attempts, call.earlier = list(known.attempts), len(known.attempts)
+            # Whoever held the claim before may have made the call.
+            return self._read(known.entry) if known.entry else await self._make(call)
         finally:
-            if self.claims is not None:
-                self.claims.release(key)
+            self.cache.release(key)
 
     async def _make(self, call: Call) -> ChatReply:
-        """Make attempts until there is an answer, which is kept with all of them."""
+        """Make attempts until one brings an answer, which is kept together with all of them."""
         call.began_s = asyncio.get_running_loop().time()
         deadline = Deadline(self.entry.deadline_s)
 
@@ -271,37 +261,37 @@ class LlmClient:
         return answer
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
-        """One attempt: the answer, kept, or an error that says what follows."""
-        async with self._permitted(call) as (paid, permit):
+        """Make one attempt; returns its answer, which is kept, or raises what follows from it."""
+        async with self._permitted(call) as (paid, settle):
             await paid.begin(call.attempts)
             with deadline.attempt() as seconds_left:
-                outcome, raw = await self._send(call, permit, seconds_left)
+                outcome, raw = await self._send(call, settle, seconds_left)
             self._tell_overrun(call, paid.aside_usd)
             error = self._consequences.error(call, outcome, raw)
             if error is None:
-                kept = await paid.keep(Entry(call.request, tuple(call.attempts)))
+                kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
                 return self._answer(call, kept, outcome)
             self._pause(call, outcome)
-            await paid.settle(call.attempts)  # first, since the error may end the whole run
+            await paid.settle(call.attempts)  # before the error, which may end the whole run
             raise error
 
     @asynccontextmanager
-    async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, PermitPort]]:
-        """Money first: a permit must be used when it is given, or the limits do not hold."""
-        asked = Asked(self.driver, call.who, call.worst_usd)
+    async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, Settle]]:
+        """What an attempt needs before it is sent: its money, then its turn."""
+        # A turn must be used as soon as it is given, or the limits do not hold.
         async with AsyncExitStack() as stack:
             with call.waiting("for calls in flight to be paid, under --max-cost"):
                 paid = await stack.enter_async_context(
-                    self._money.attempt(call.order, call.request.key, asked)
+                    self._money.attempt(call.order, call.request.key, call.asked)
                 )
             with call.waiting("for a turn under the rate limits"):
-                permit = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
-            yield paid, permit
+                settle = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
+            yield paid, settle
 
     async def _send(
-        self, call: Call, permit: PermitPort, seconds_left: float
+        self, call: Call, settle: Settle, seconds_left: float
     ) -> tuple[AttemptOutcome, RawReply | None]:
-        """Send the request; what comes of it is the last of the call's attempts."""
+        """Send the request once, and add what came of it to the call's attempts."""
         number = len(call.attempts) + 1
         started_at, started = datetime.now(UTC), time.perf_counter()
         raw: RawReply | None = None
@@ -311,7 +301,8 @@ class LlmClient:
             )
             outcome = judge(raw, self._format)
             record = self._record(number, raw, outcome, call.worst)
-            self._settle_tokens(permit, record.usage)
+            if record.usage.output_tokens is not None:
+                settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
         except TransportFailure as exc:
             outcome = AttemptOutcome(exc.action, exc.outcome, str(exc))
             free = self.entry.price == "free" or not exc.sent
@@ -323,7 +314,7 @@ class LlmClient:
         return outcome, raw
 
     def _pause(self, call: Call, outcome: AttemptOutcome) -> None:
-        """Let all calls with the same key wait, where the server asks for it."""
+        """Let all calls with the same API key wait, where the server asks for it."""
         pause_s = self._consequences.pause_s(call, outcome)
         if pause_s is None:
             return
@@ -339,8 +330,8 @@ class LlmClient:
         if spent_usd <= aside_usd + TOLERANCE_USD:
             return
         self.meter.notes.append(
-            f"{self.driver}: {call.who}: the reply cost {spent_usd:.4f} USD, and {aside_usd:.4f} "
-            "were set aside for it: the server does not keep to the cap of "
+            f"{self.driver}: {call.asked.slot}: the reply cost {spent_usd:.4f} USD, and "
+            f"{aside_usd:.4f} were set aside for it: the server does not keep to the cap of "
             f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
         )
 
@@ -368,18 +359,17 @@ class LlmClient:
         )
 
     def _cost_usd(self, raw: RawReply, usage: Usage, worst: Usage) -> float | None:
-        """What a reply cost: by its usage, also in an error; None where that is not known.
+        """What a reply cost, by its usage, which an error may have too; None if nobody knows.
 
-        More output than there can be is charged, whatever the server says of the input.
+        Output beyond the cap is charged even where the server does not say what was read.
         """
         if self.entry.price == "free":
             return 0.0
         if usage.input_tokens and usage.output_tokens is not None:
-            return self.pricing.cost_usd(usage)
+            return cost_usd(self.entry, usage)
         if (usage.output_tokens or 0) > (worst.output_tokens or 0):
-            return self.pricing.cost_usd(
-                Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
-            )
+            dearer = Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
+            return cost_usd(self.entry, dearer)
         stray = raw.status == 200 and is_web_page(raw) and not self.first.known
         return (
             0.0
@@ -388,23 +378,19 @@ class LlmClient:
         )
 
     def _worst_case(self, request: ChatRequest) -> Usage:
-        """An upper bound on a request's tokens: no tokeniser makes more tokens than bytes."""
+        """An upper bound on an attempt's tokens: no tokeniser makes more tokens than bytes."""
         return Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
 
-    def _settle_tokens(self, permit: PermitPort, usage: Usage) -> None:
-        if usage.output_tokens is not None:
-            permit.settle((usage.input_tokens or 0) + usage.output_tokens)
-
-    def _answer(self, call: Call, kept: Entry, outcome: AttemptOutcome) -> ChatReply:
+    def _answer(self, call: Call, kept: CachedCall, outcome: AttemptOutcome) -> ChatReply:
         if kept.attempts[-1] != call.attempts[-1]:  # another process was first
             return self._read(kept, call.earlier)
         text = outcome.reading.text
         return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
 
-    def _read(self, entry: Entry, earlier: int | None = None) -> ChatReply:
-        """A recorded reply; all its attempts are ``earlier`` ones unless it says otherwise."""
+    def _read(self, entry: CachedCall, earlier: int | None = None) -> ChatReply:
+        """A recorded reply; without ``earlier`` all its attempts were made by earlier runs."""
         last = entry.attempts[-1]
         payload: Any = json.loads(last.reply or "{}") if last.http_status == 200 else {}
         return ChatReply(
@@ -417,7 +403,8 @@ class LlmClient:
 
 
 def _estimated_tokens(worst: Usage) -> int:
-    """What the provider charges at admission: about four bytes a token, and the output cap."""
+    """What a provider counts when it admits a request: its text, and the whole output cap."""
+    # About four bytes of English make a token.
     return (worst.input_tokens or 0) // 4 + (worst.output_tokens or 0)
 
 

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Trust:
-    """How an endpoint has kept to the order of requests and answers.
+    """Whether an endpoint has kept to one answer for each request.
 
-    ``doubted`` once an answer was late or cut, or something was said unasked; ``tied`` while its
-    answers name their requests.
+    ``doubted`` is True once an answer was late or cut, or something came unasked; ``tied`` while
+    its answers name their requests.
     """
 
     doubted: bool = False
@@ -29,7 +29,7 @@ class Trust:
 
     @property
     def one_each(self) -> bool:
-        """Whether a connection is for one request alone: what is late can be nobody's answer."""
+        """Whether a connection serves one request alone, so that nothing late is taken."""
         return self.doubted and not self.tied
 
 
@@ -55,7 +55,7 @@ class Listener(ResponseHandler):
             super().data_received(data)
 
     def fall_silent(self) -> bool:
-        """The answer is whole: until the next request nothing may come; False if more has."""
+        """The answer is complete; False if more than that has come with it."""
         self._asked = False
         if len(self) or self._begins_another():
             self._trust.doubted = True
@@ -63,8 +63,9 @@ class Listener(ResponseHandler):
         return True
 
     def is_silent(self) -> bool:
-        """Whether nothing has arrived that the loop had no time to read, not even the end."""
+        """Whether nothing waits to be read, neither bytes nor the end of the connection."""
         assert self.transport is not None
+        # The event loop may have had no time to read what has arrived: so ask the system.
         arrived = select.poll()
         arrived.register(self.transport.get_extra_info("socket").fileno(), select.POLLIN)
         return not arrived.poll(0)
@@ -74,7 +75,8 @@ class Listener(ResponseHandler):
         if self._parser is None:
             return False
         try:
-            # At its end a parser tells what it has begun; the next request gets another.
+            # At the end of its input a parser says what it has begun; the next request gets a new
+            # parser, so that this one can be spent.
             return self._parser.feed_eof() is not None
         except (aiohttp.http_exceptions.HttpProcessingError, ValueError):
             return True

@@ -1,4 +1,4 @@
-"""What follows from an attempt: the answer, another one, the end of the call or of the sweep."""
+"""What follows from an attempt: its answer, another attempt, the end of the call or the sweep."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MODELS = "`merge-runner models`"
 
 @dataclass(frozen=True, slots=True)
 class Consequences:
-    """Of attempts at one model; see LlmClient for the fields."""
+    """What follows from attempts at one model; see LlmClient for the fields."""
 
     name: str
     entry: ModelEntry
@@ -53,7 +53,10 @@ class Consequences:
         return (outcome.delay_s or 0.0) > self.entry.deadline_s
 
     def _nobody(self, call: Call) -> MergeRunnerError | None:
-        """Where nothing was ever answered and nobody listens, waiting helps for seconds at most."""
+        """The end of the run where nobody listens and nothing was ever answered.
+
+        A server that is just starting is waited for, but only for seconds.
+        """
         waited_s = asyncio.get_running_loop().time() - call.began_s
         refused = call.attempts[-1].outcome == "no_connection"
         if self.first.passed or not refused or waited_s < NOBODY_S:
@@ -97,7 +100,7 @@ class Consequences:
         return TryAgain("empty answer") if self._is_asked_again(call, outcome) else None
 
     def _is_asked_again(self, call: Call, outcome: AttemptOutcome) -> bool:
-        """Whether an empty answer is no answer yet, as servers of some formats give them."""
+        """Whether an empty answer is a passing fault, as servers of some formats have."""
         if outcome.name != "empty" or not FORMATS[self.entry.format].retries_empty:
             return False
         return sum(a.outcome == "empty" for a in call.own_attempts) <= EMPTY_RETRIES
@@ -109,7 +112,7 @@ class Consequences:
         if outcome.name == "bad_certificate":
             return (
                 "the endpoint's certificate cannot be trusted, and nothing was sent; check the "
-                "base URL, or set SSL_CERT_FILE to the certificates of who signed it"
+                "base URL, or set SSL_CERT_FILE to the certificates of whoever signed it"
             )
         shutdown = self.entry.shutdown
         retired = f", which was announced to shut down on {shutdown}" if shutdown else ""

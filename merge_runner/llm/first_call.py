@@ -29,9 +29,9 @@ class FirstCall:
         self._alone = asyncio.Lock()
 
     async def turn(self) -> bool:
-        """Wait until a call may go; True: it goes alone, until ``give_turn``."""
+        """Wait until a call may go; True if it goes alone, until ``give_turn``."""
         await self._alone.acquire()
-        if self.passed:  # answered while this one waited: nobody goes alone any more
+        if self.passed:  # it was answered while this call waited: nobody goes alone any more
             self._alone.release()
         return not self.passed
 
@@ -40,7 +40,11 @@ class FirstCall:
         self._alone.release()
 
     def is_final(self, outcome: AttemptOutcome) -> bool:
-        """Whether a refusal is of all calls: who has answered before may mean this one alone."""
+        """Whether a refusal holds for all calls.
+
+        An endpoint that has answered before may mean this prompt alone; several refusals mean
+        the configuration.
+        """
         self._refused += outcome.action == "fail"
         return not self.known or self._refused >= SEVERAL or outcome.action == "accept"
 
@@ -63,7 +67,7 @@ def refusal(name: str, entry: ModelEntry, raw: RawReply, outcome: AttemptOutcome
 
 
 def set_base_url(name: str, entry: ModelEntry) -> str:
-    """Where the base URL of an entry stands."""
+    """What to do about the base URL of an entry, and where it is set."""
     provider = PROVIDERS[entry.provider]
     if entry.base_url is not None or provider.base_url_env is None:
         return f"correct `base_url` of [{name}] in {REGISTRY}"
@@ -73,13 +77,13 @@ def set_base_url(name: str, entry: ModelEntry) -> str:
 
 
 def set_key(name: str, entry: ModelEntry) -> str:
-    """Where the key of an entry stands."""
+    """What to do about the key of an entry, and where it is set."""
     variables = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
     return f"set {' or '.join(variables) or f'`key_env` of [{name}] in {REGISTRY}'} to a valid one"
 
 
 def _set_parameter(name: str, entry: ModelEntry, raw: RawReply) -> str:
-    """Where the parameter stands that an error names."""
+    """Where to look for the parameter that an error names."""
     error = as_dict(as_dict(raw.payload).get("error"))
     said = f"{as_text(error.get('param'))} {as_text(error.get('message'))}"
     named = next((f"parameters.{each}" for each in entry.parameters if each in said), None)

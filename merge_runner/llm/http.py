@@ -16,22 +16,22 @@ from merge_runner.config import LOOPBACK, Endpoint
 from merge_runner.errors import UsageError
 from merge_runner.llm.bodies import ENCODING, read_body
 from merge_runner.llm.connections import Connections, Trust
+from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.keys import canonical_json
 from merge_runner.llm.masking import Mask
 from merge_runner.llm.transport import TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
-# A shorter dummy key may be part of any text.
+# A shorter one is a dummy, and may occur in any text.
 SHORTEST_SECRET = 8
 NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
-# By these many servers and gateways say back what they were sent.
+# Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
 
 
 class NoCookies(httpx.Cookies):
-    """Takes none: one would tie calls together that should be independent samples."""
+    """Takes no cookie: one would tie calls together that should be independent samples."""
 
     def extract_cookies(self, response: httpx.Response) -> None:
         """Leave them where they are."""
@@ -73,8 +73,8 @@ class HttpTransport:
     """Sends requests to one endpoint over at most ``connections`` connections.
 
     A reply of more than ``most_bytes`` is refused. Proxies are those that httpx reads from the
-    environment; loopback never goes through one. Our own emulator, and nobody else, is told the
-    slot; all are told a random id of the attempt, and an answer that names another is none.
+    environment; loopback never goes through one. Only our own emulator is told the slot. Each
+    attempt has a random id; an answer that names another one is not taken.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class HttpTransport:
         return RawReply(reply.status_code, headers, self._mask(body))
 
     def _http_request(self, request: ChatRequest, attempt: int, own_id: str) -> httpx.Request:
-        """The request, made without the client, which would put it together anew each time."""
+        """The request, made without the client, which would compose all its headers each time."""
         headers = {**self._headers, **request.headers, **self._endpoint.auth_headers}
         headers |= dict.fromkeys(ID_HEADERS, own_id)
         if self._endpoint.provider == "emulator":
@@ -152,11 +152,8 @@ class HttpTransport:
             raise TransportFailure("wrong_answer", "the server sent the answer to another request")
 
     def _failure(self, error: Exception) -> TransportFailure:
-        """What an error of the libraries means.
-
-        They report refused, reset and cut connections alike, and pass on some errors of the
-        other's: whatever it is, there is no reply.
-        """
+        """What an error of the libraries means: whatever it is, there is no reply."""
+        # httpx reports refused, reset and cut connections alike; what aiohttp said is its cause.
         reason = self._mask(str(error)) or type(error).__name__
         cause = error.__cause__ or error
         if isinstance(cause, aiohttp.ClientConnectorCertificateError):
@@ -185,7 +182,7 @@ def _client(base_url: str, connections: int, trust: Trust) -> StrictClient:
     """A client with the proxies and certificates of the environment; raises UsageError."""
     url = httpx.URL(base_url)
     by_loopback = url.host in LOOPBACK
-    # One that trusts nobody, where there is nobody to trust: to load the certificates takes long.
+    # An empty one where there is no TLS, since to load the certificates takes long.
     trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
         if url.scheme == "https" or not by_loopback:
@@ -199,7 +196,7 @@ def _client(base_url: str, connections: int, trust: Trust) -> StrictClient:
         return StrictClient(
             trust,
             verify=trusted,
-            trust_env=not by_loopback,  # of which there are left the proxies
+            trust_env=not by_loopback,  # the proxies, since the certificates are given
             limits=httpx.Limits(max_connections=connections, max_keepalive_connections=connections),
             timeout=None,  # every attempt runs under its own timeout
         )

@@ -116,7 +116,7 @@ def may_be_charged(raw: RawReply, wire: WireFormat, provider: str | None) -> boo
 
 
 def is_web_page(raw: RawReply) -> bool:
-    """Whether what answers is a web site: no service of any format sends this as an answer."""
+    """Whether a web site answers: no service of any format sends this as an answer."""
     return raw.body.lstrip("\ufeff \t\r\n")[:9].lower().startswith(("<!doctype", "<html"))
 
 
@@ -131,7 +131,7 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if raw.status == 200:
         return _judge_success(raw, wire)
     outcome = _judge_error(raw.error, wire)
-    # What an error says to have used is billed.
+    # The usage that an error states is billed.
     usage = wire.read(as_dict(raw.first)).usage
     return replace(outcome, reading=replace(outcome.reading, usage=usage))
 
@@ -149,7 +149,7 @@ def _judge_success(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
 
 
 def _status_within(error: ServerError, wire: WireFormat) -> int:
-    """The status that an error within a 200 stands for."""
+    """The status that an error within a 200 stands for: 400 or 500 if nobody knows it."""
     if status := _told(wire, lambda each: each.status_of(error)):
         return status
     numbers = [int(name) for name in error.names if re.fullmatch("[45][0-9][0-9]", name)]
@@ -157,7 +157,7 @@ def _status_within(error: ServerError, wire: WireFormat) -> int:
 
 
 def _told(wire: WireFormat, ask: Callable[[WireFormat], T | None]) -> T | None:
-    """What a format knows of an error, else what one knows whose errors gateways pass on."""
+    """What a format knows of an error, else what a format knows that gateways pass on."""
     answers = (ask(each) for each in (wire, *PASSED_ON))
     return next((answer for answer in answers if answer is not None), None)
 

@@ -2,7 +2,7 @@
 
 Before each attempt at a paid call the worst case is set aside, in one transaction with a note of
 the attempt and of the reason. A process that dies leaves them: its attempt counts with the worst
-case until a user releases it, and is found in the call's list of attempts as one of unknown fate.
+case until a user releases it, and stands in the call's list of attempts with an unknown outcome.
 """
 
 from __future__ import annotations
@@ -15,30 +15,27 @@ from datetime import UTC, datetime
 from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
 IN_FLIGHT, UNRECORDED = "in flight", "not recorded"
-EXAMPLES = 3
+EXAMPLES = 3  # slots that are named for a reason: enough to find the trials
 _SPENT, _OPEN = "spent ", "open "
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Who is asked, for which slot, and what that costs at most where the output cap is kept."""
+    """Who is asked, for which slot, and the most that costs if the output cap is respected."""
 
     driver: str = ""
     slot: str = ""
     honest_usd: float = 0.0
 
 
-UNNAMED = Asked()
-
-
 @dataclass(frozen=True, slots=True)
 class SetAside:
-    """One attempt of unknown cost; ``outcome`` is IN_FLIGHT also where its process died."""
+    """One attempt of unknown cost; ``outcome`` stays IN_FLIGHT where its process died."""
 
     usd: float
     asked: Asked
@@ -73,7 +70,7 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """What a user no longer counts, on his own responsibility, and why it had been set aside."""
+    """What a user has released at their own risk, and why it had been set aside."""
 
     at: str
     usd: float
@@ -132,7 +129,8 @@ class Ledger:
         self._cache = cache
         self._name = _SPENT + scope
         self._open = f"{_OPEN}{scope} "
-        with contextlib.suppress(UsageError):  # told where money is spent
+        # A damaged record is an error only where money is to be spent: a replay needs none.
+        with contextlib.suppress(UsageError):
             self.read()
 
     async def reserve(
@@ -141,11 +139,12 @@ class Ledger:
         attempts: Sequence[Attempt],
         worst_usd: float,
         cap_usd: float | None,
-        asked: Asked = UNNAMED,
+        asked: Asked,
     ) -> bool:
         """Set the worst case of a call's next attempt aside; False if that exceeds the cap."""
 
         def operation() -> bool:
+            # Read within the transaction: another process may have spent since.
             spending = self.read()
             allowed = None if cap_usd is None else cap_usd + TOLERANCE_USD
             if allowed is not None and spending.committed_usd + worst_usd > allowed:
@@ -157,29 +156,21 @@ class Ledger:
             self._cache.keep_unanswered(key, (*attempts, _begun(len(attempts) + 1)))
             return True
 
-        reserved: bool = await self._cache.write(operation)
-        return reserved
+        return await self._cache.write(operation)
 
-    async def settle(
-        self, key: str, attempts: Sequence[Attempt], worst_usd: float, actual_usd: float | None
-    ) -> None:
-        """An attempt brought no answer, or was not made after all; None: its cost is unknown.
-
-        ``attempts`` are all that were made up to now.
-        """
+    async def settle(self, key: str, attempts: Sequence[Attempt], worst_usd: float) -> None:
+        """The last of a call's attempts brought no answer; its cost may be unknown."""
 
         def operation() -> None:
-            self._settle(key, attempts, worst_usd, actual_usd)
+            self._settle(key, attempts, worst_usd)
             self._cache.keep_unanswered(key, tuple(attempts))
 
         await self._cache.write(operation)
 
-    async def keep(self, entry: Entry, worst_usd: float, actual_usd: float | None) -> Entry:
-        """Keep an answered call, and settle its last attempt with it."""
-        key, attempts = entry.request.key, entry.attempts
-        return await self._cache.put(
-            entry, lambda: self._settle(key, attempts, worst_usd, actual_usd)
-        )
+    async def keep(self, entry: CachedCall, worst_usd: float) -> CachedCall:
+        """Keep an answered call, and settle its last attempt in the same transaction."""
+        key = entry.request.key
+        return await self._cache.put(entry, lambda: self._settle(key, entry.attempts, worst_usd))
 
     def reasons(self) -> list[Reason]:
         """Why something is set aside, the largest sum first."""
@@ -206,20 +197,18 @@ class Ledger:
             spending.releases.append(released)
             self._write(spending)
             for name in self._cache.names(self._open):
-                self._cache.remove(name)
+                self._cache.remove(name)  # its reasons are those of the release now
             return released
 
         released: Release = self._cache.run_now([operation])[0]
         return released
 
-    def _settle(
-        self, key: str, attempts: Sequence[Attempt], worst_usd: float, actual_usd: float | None
-    ) -> None:
-        # The row of reasons may be lost or damaged; the sums, which the cap needs, lie elsewhere.
-        *earlier, one = self._opened(key) or [SetAside(worst_usd, UNNAMED, _now())]
+    def _settle(self, key: str, attempts: Sequence[Attempt], worst_usd: float) -> None:
+        actual_usd = attempts[-1].cost_usd
+        # The row of reasons may be damaged; the sums, which the cap needs, lie elsewhere.
+        *earlier, one = self._opened(key) or [SetAside(worst_usd, Asked(), _now())]
         if actual_usd is None:
-            outcome = attempts[-1].outcome if attempts else IN_FLIGHT
-            self._write_open(key, [*earlier, replace(one, outcome=outcome)])
+            self._write_open(key, [*earlier, replace(one, outcome=attempts[-1].outcome)])
             return  # it stays set aside: it may have been charged
         self._write_open(key, earlier)
         spending = self.read()
@@ -251,7 +240,7 @@ class Ledger:
             self._cache.remove(self._open + key)
 
     def read(self) -> Spending:
-        """The state of now."""
+        """The current state; raises UsageError where its record is damaged."""
         try:
             text = self._cache.read_twice(self._name)
             self.spending = Spending() if text is None else _SPENDING.validate_json(text)

@@ -14,27 +14,24 @@ import contextlib
 import heapq
 from collections import deque
 from dataclasses import dataclass, field
+from functools import partial
 
 from asyncio_throttle.throttler import Throttler
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.shared_limits import WINDOW_S, SharedLimits, request_rules
+from merge_runner.llm.shared_services import Settle
 
 CLOCK_STEP_S, POLL_S = 1e-6, 1e-3
 
 
 @dataclass(slots=True, eq=False)
-class Permit:
+class _Turn:
     """A dispatched request's tokens; they count while the window holds it."""
 
     dispatched_at: float
     tokens: int
-    limiter: Limiter
-    counts: bool = True
-
-    def settle(self, tokens: int) -> None:
-        """Replace the estimate by the actual usage."""
-        self.limiter.settle(self, tokens)
+    counts: bool
 
 
 @dataclass(order=True, slots=True)
@@ -42,20 +39,21 @@ class _Waiter:
     order: int
     arrival: int
     tokens: int = field(compare=False)
-    turn: asyncio.Future[Permit] = field(compare=False)
+    turn: asyncio.Future[_Turn] = field(compare=False)
 
 
 @dataclass(slots=True)
 class Pause:
-    """Until when nothing is dispatched, on the event loop's clock; shared by all of one key."""
+    """Until when nothing is dispatched, on the loop's clock; shared by all limiters of one key."""
 
     until: float = 0.0
 
 
 class Limiter:
-    """Hands out permits: lowest ``order`` first, first come first served within one order.
+    """Hands out turns: lowest ``order`` first, first come first served within one order.
 
-    A waiter whose tokens do not fit yet holds back all behind it, so a heavy request never
+    The oldest trial goes first so that trials end, and their memory and money are free again. A
+    waiter whose tokens do not fit yet holds back all behind it, so that a heavy request never
     starves behind light ones.
     """
 
@@ -69,19 +67,19 @@ class Limiter:
         shared: SharedLimits | None = None,
     ) -> None:
         self._shared = shared
-        self.limited = rpm is not None or tpm is not None
+        self._limited = rpm is not None or tpm is not None
         self._tpm = tpm
         self._window_s = window_s
         self._throttles = [] if rpm is None else _throttles(rpm, window_s)
         self._waiters: list[_Waiter] = []
         self._arrivals = 0
-        self._window: deque[Permit] = deque()
+        self._window: deque[_Turn] = deque()
         self._tokens_in_window = 0
         self._pause = pause or Pause()
         self._changed = asyncio.Event()
         self._dispatcher: asyncio.Task[None] | None = None
 
-    async def acquire(self, tokens: int, *, order: int = 0) -> Permit:
+    async def acquire(self, tokens: int, *, order: int = 0) -> Settle:
         """Wait for a turn; ``tokens`` is the estimate of what the request will use."""
         if self._tpm is not None and tokens > self._tpm:
             raise UsageError(
@@ -90,9 +88,9 @@ class Limiter:
                 "experiments/models.toml"
             )
         loop = asyncio.get_running_loop()
-        # No limit and nobody before it: the dispatcher, a task of its own, is not worth its time.
-        if not self.limited and not self._waiters and not self.paused_s:
-            return Permit(loop.time(), tokens, self, counts=False)
+        # Without a limit, and with nobody before it, it needs no dispatcher, which is a task more.
+        if not self._limited and not self._waiters and loop.time() >= self._pause.until:
+            return partial(self._settle, _Turn(loop.time(), tokens, counts=False))
         waiter = _Waiter(order, self._arrivals, tokens, loop.create_future())
         self._arrivals += 1
         waiter.turn.add_done_callback(lambda _: self._changed.set())
@@ -100,16 +98,7 @@ class Limiter:
         self._changed.set()
         if self._dispatcher is None or self._dispatcher.done():
             self._dispatcher = asyncio.create_task(self._dispatch())
-        return await waiter.turn
-
-    def settle(self, permit: Permit, tokens: int) -> None:
-        """Correct a permit's tokens; see Permit.settle."""
-        if permit.counts:
-            self._tokens_in_window += tokens - permit.tokens
-            if self._shared is not None:
-                self._shared.settle(permit.dispatched_at, tokens - permit.tokens)
-        permit.tokens = tokens
-        self._changed.set()
+        return partial(self._settle, await waiter.turn)
 
     def pause(self, seconds: float) -> None:
         """Dispatch nothing for a while: the server asked everybody on this key to wait."""
@@ -118,17 +107,21 @@ class Limiter:
         if self._shared is not None:
             self._shared.pause(seconds)
 
-    @property
-    def paused_s(self) -> float:
-        """How long in s nothing will be dispatched, 0 where there is no pause."""
-        return max(0.0, self._pause.until - asyncio.get_running_loop().time())
+    def _settle(self, turn: _Turn, tokens: int) -> None:
+        """Replace the estimate of a turn by the tokens that its request used."""
+        if turn.counts:
+            self._tokens_in_window += tokens - turn.tokens
+            if self._shared is not None:
+                self._shared.settle(turn.dispatched_at, tokens - turn.tokens)
+        turn.tokens = tokens
+        self._changed.set()
 
     async def _dispatch(self) -> None:
         """Serve the queue until it is empty."""
         loop = asyncio.get_running_loop()
         while waiter := self._head():
             wait = self._blocked_for(waiter, loop.time())
-            # The others' file last: who takes a turn there counts for everybody at once.
+            # The others' file last: a turn that is taken there counts for everybody at once.
             if wait <= 0 and self._shared is not None:
                 wait = self._shared.take(waiter.tokens)
             if wait > 0:
@@ -137,14 +130,14 @@ class Limiter:
             for throttle in self._throttles:
                 await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
             heapq.heappop(self._waiters)
-            permit = Permit(loop.time(), waiter.tokens, self, counts=self._tpm is not None)
-            if permit.counts:
-                self._window.append(permit)
-                self._tokens_in_window += permit.tokens
-            waiter.turn.set_result(permit)
+            turn = _Turn(loop.time(), waiter.tokens, counts=self._tpm is not None)
+            if turn.counts:
+                self._window.append(turn)
+                self._tokens_in_window += turn.tokens
+            waiter.turn.set_result(turn)
 
     def _head(self) -> _Waiter | None:
-        # Whoever was cancelled while waiting has a done turn that nobody will use.
+        # A waiter that was cancelled has a turn that is done and that nobody will use.
         while self._waiters and self._waiters[0].turn.done():
             heapq.heappop(self._waiters)
         return self._waiters[0] if self._waiters else None
@@ -157,7 +150,7 @@ class Limiter:
             self._tokens_in_window -= expired.tokens
         free_at = max(self._pause.until, *(throttle.free_at for throttle in self._throttles), 0.0)
         if self._tpm is not None and self._tokens_in_window + waiter.tokens > self._tpm:
-            # At least until the oldest leaves the window; if that frees too little, looked at anew.
+            # At least until the oldest leaves the window; if that frees too little, once more.
             free_at = max(free_at, self._window[0].dispatched_at + self._window_s)
         return free_at - now
 
@@ -170,13 +163,13 @@ class Limiter:
 
 
 class _Throttle(Throttler):
-    """asyncio-throttle, and when it has room again, which it does not tell."""
+    """asyncio-throttle, which also says when it has room again."""
 
     @property
     def free_at(self) -> float:
         """The earliest next turn, on the event loop's clock, which is the throttle's too."""
         full = len(self._task_logs) >= self.rate_limit
-        # A little later than that, since it holds a turn for longer than its period.
+        # A little later, since it keeps a turn until more than its period has passed.
         return self._task_logs[0] + self.period + CLOCK_STEP_S if full else 0.0
 
 

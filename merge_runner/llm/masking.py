@@ -1,4 +1,4 @@
-"""Takes a secret out of what a server says back, however it is spelt."""
+"""Takes a secret out of what a server echoes, however it is spelt."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from base64 import b64encode
 from collections.abc import Iterable
 
 MASK = "[key]"
-# Few replies have one, and to look for every spelling takes longer than all other reading.
+# Looking for every spelling takes longer than all other reading: only where there is an escape.
 _UNSEEN = r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\u200b-\u200f\u2060-\u2064\ufeff]"
 _ESCAPE = re.compile(rf"\\+(?:/|u00|x)|%(?:25)*[2-7][0-9A-Fa-f]|&(?:amp;)*#|{_UNSEEN}")
 
@@ -15,9 +15,9 @@ _ESCAPE = re.compile(rf"\\+(?:/|u00|x)|%(?:25)*[2-7][0-9A-Fa-f]|&(?:amp;)*#|{_UN
 class Mask:
     """Replaces secrets in texts.
 
-    Found are they as they are, with any of their characters escaped as in JSON (also in JSON within
-    JSON), in URLs (also twice) or as numbers in HTML, with characters between that nobody sees (as
-    in UTF-16), and within what is base64, say of ``user:key``.
+    They are found as they are; with any of their characters escaped as in JSON (also in JSON within
+    JSON), in URLs (also twice) or as numbers in HTML; with invisible characters between (as in
+    UTF-16); and within base64, say of ``user:key``.
     """
 
     def __init__(self, secrets: Iterable[str]) -> None:
@@ -34,7 +34,7 @@ class Mask:
             text = self._escaped.sub(MASK, text)
         for core in self._coded:
             if core in text:
-                # With what belongs to it alone in the neighbouring characters.
+                # With the neighbouring characters, which hold the rest of its bits.
                 text = re.sub(rf"[\w+/-]?{re.escape(core)}(?:[\w+/-]{{1,2}}=*)?", MASK, text)
         return text
 
@@ -53,8 +53,8 @@ def _spellings(character: str) -> str:
 def _base64_cores(secret: str) -> Iterable[str]:
     """What the base64 of any text with the secret contains, in both alphabets.
 
-    A secret begins at one of three places in a group; the characters that it shares with its
-    neighbours are left out.
+    Base64 codes three bytes at a time, so that a secret begins at one of three places in a group;
+    the characters that it shares with its neighbours are left out.
     """
     for before in range(3):
         coded = b64encode(b"\0" * before + secret.encode()).decode()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 from merge_runner.records import Attempt, ChatReply, is_scripted
 
@@ -15,8 +15,8 @@ MINUTE_S = 60.0
 class Meter:
     """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts.
 
-    ``stand_ins`` counts the answers that one gave in the model's name; ``damaged`` are the keys of
-    recorded replies that could not be read.
+    ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name; ``damaged``
+    are the keys of recorded replies that could not be read.
     """
 
     calls_live: int = 0
@@ -54,19 +54,12 @@ class Meter:
             self.stand_ins += is_scripted(reply.request, reply.attempts[-1])
 
     def add(self, other: Meter) -> None:
-        """Count what another one has counted."""
-        now = time.monotonic()
-        self.calls_live += other.calls_live
-        self.calls_cached += other.calls_cached
-        self.cost_usd += other.cost_usd
-        self.cost_unknown += other.cost_unknown
-        self.outcomes += other.outcomes
-        self.mismatches += other.mismatches
-        self.stand_ins += other.stand_ins
-        self.notes += other.notes
-        self.damaged += other.damaged
+        """Add what another meter has counted."""
         # The other's clock may be another machine's: what it has just counted counts as of now.
-        self.events += ((now, tokens) for _, tokens in other.events)
+        now = time.monotonic()
+        counted = replace(other, events=deque((now, tokens) for _, tokens in other.events))
+        for each in fields(self):
+            setattr(self, each.name, getattr(self, each.name) + getattr(counted, each.name))
 
     def last_minute(self) -> tuple[int, int]:
         """Requests and tokens of the last minute."""

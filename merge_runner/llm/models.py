@@ -18,8 +18,8 @@ from merge_runner.text_safety import one_line
 
 
 def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
-    """The entries by name, of which each names a format and a provider; raises UsageError."""
-    load_plugins()  # here, since what fails in one is no fault of this file
+    """The entries by name, each with a known format and provider; raises UsageError."""
+    load_plugins()  # before the file is read: an error in a plug-in is none of the file's
     path = path or find_experiments() / "models.toml"
     entries = {}
     for name, table in read_toml(path).items():

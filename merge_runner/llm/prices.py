@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from decimal import Decimal
 
 from merge_runner.config import ModelEntry, Price
@@ -13,58 +12,44 @@ GENAI_PRICES_PROVIDER = {"gemini": "google"}
 PER_MILLION = Decimal(1_000_000)
 
 
-@dataclass(frozen=True, slots=True)
-class Pricing:
-    """The price of one model's tokens; ``known`` is False where nobody knows it."""
-
-    provider: str
-    model: str
-    price: Price | str
-    known: bool
-
-    def cost_usd(self, usage: Usage) -> float | None:
-        """The cost of an attempt in USD, None where the price or the tokens are unknown."""
-        if self.price == "free":
-            return 0.0
-        if not self.known or usage.input_tokens is None or usage.output_tokens is None:
-            return None
-        cached = usage.cached_input_tokens or 0
-        if cached > usage.input_tokens:
-            cached = 0  # the server counts wrongly: none is taken for cheap
-        if isinstance(self.price, Price):
-            cached_price = self.price.cached_input
-            cost = (
-                (usage.input_tokens - cached) * Decimal(str(self.price.input))
-                + cached * Decimal(str(self.price.input if cached_price is None else cached_price))
-                + usage.output_tokens * Decimal(str(self.price.output))
-            ) / PER_MILLION
-            return float(cost)
-        from genai_prices import Usage as PricedUsage
-        from genai_prices import calc_price
-
-        priced = PricedUsage(
-            input_tokens=usage.input_tokens,
-            cache_read_tokens=cached,
-            output_tokens=usage.output_tokens,
-        )
-        return float(
-            calc_price(priced, model_ref=self.model, provider_id=self.provider).total_price
-        )
+def is_known(entry: ModelEntry) -> bool:
+    """Whether anybody knows the price of a model."""
+    return cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is not None
 
 
-def pricing(entry: ModelEntry) -> Pricing:
-    """The pricing of a model of the registry."""
-    provider = GENAI_PRICES_PROVIDER.get(entry.provider, entry.provider)
-    known = entry.price != "genai-prices" or _listed(provider, entry.id)
-    return Pricing(provider, entry.id, entry.price, known)
+def cost_usd(entry: ModelEntry, usage: Usage) -> float | None:
+    """The cost of an attempt in USD, None where the price or the tokens are unknown."""
+    if entry.price == "free":
+        return 0.0
+    if usage.input_tokens is None or usage.output_tokens is None:
+        return None
+    cached = usage.cached_input_tokens or 0
+    if cached > usage.input_tokens:
+        cached = 0  # the server counts wrongly: none is taken for cheap
+    if isinstance(entry.price, Price):
+        return _by_figures(entry.price, usage.input_tokens, cached, usage.output_tokens)
+    return _by_table(entry, usage.input_tokens, cached, usage.output_tokens)
 
 
-def _listed(provider: str, model: str) -> bool:
-    from genai_prices import Usage as PricedUsage
+def _by_figures(price: Price, read: int, cached: int, written: int) -> float:
+    cached_price = price.input if price.cached_input is None else price.cached_input
+    # Decimals of the written figures, so that sums of costs have no digits that nobody wrote.
+    cost = (
+        (read - cached) * Decimal(str(price.input))
+        + cached * Decimal(str(cached_price))
+        + written * Decimal(str(price.output))
+    )
+    return float(cost / PER_MILLION)
+
+
+def _by_table(entry: ModelEntry, read: int, cached: int, written: int) -> float | None:
+    from genai_prices import Usage as PricedUsage  # here, since it takes long to load
     from genai_prices import calc_price
 
+    priced = PricedUsage(input_tokens=read, cache_read_tokens=cached, output_tokens=written)
+    provider = GENAI_PRICES_PROVIDER.get(entry.provider, entry.provider)
     try:
-        calc_price(PricedUsage(input_tokens=1), model_ref=model, provider_id=provider)
+        found = calc_price(priced, model_ref=entry.id, provider_id=provider)
     except LookupError:
-        return False
-    return True
+        return None
+    return float(found.total_price)

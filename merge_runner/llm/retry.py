@@ -1,8 +1,7 @@
 """When a call is tried again: after what, for how long, and when to give up.
 
-tenacity's loop carries this; what it is given are our wait, which no server can shorten, and our
-deadline, from which the wait for a turn is left out: standing in the limiter's queue is no fault of
-the provider.
+The loop is tenacity's. Ours are the wait, which no server can shorten, and the deadline, which does
+not count the wait for a turn: standing in the limiter's queue is no fault of the provider.
 """
 
 from __future__ import annotations
@@ -38,13 +37,17 @@ class OutOfTime(MergeRunnerError):
 
 def backoff_s(attempts: int) -> float:
     """The wait after so many failed attempts, without jitter."""
+    # The exponent is bounded: after a thousand attempts the power would fit in no float.
     return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
 
 
 def retries(
     deadline: Deadline, *, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
 ) -> AsyncRetrying:
-    """Called with a coroutine function: makes attempts while it raises TryAgain, or OutOfTime."""
+    """A loop that calls a coroutine function until it does not raise TryAgain.
+
+    Raises OutOfTime when the deadline would pass before the next attempt.
+    """
     return AsyncRetrying(
         retry=retry_if_exception_type(TryAgain),
         wait=_wait_s,
@@ -64,7 +67,7 @@ class Deadline:
 
     @contextmanager
     def attempt(self) -> Iterator[float]:
-        """Within this time counts; yields the seconds that are left."""
+        """The time within this counts; yields the seconds that are left for it."""
         loop = asyncio.get_running_loop()
         began = loop.time()
         try:
@@ -83,6 +86,7 @@ class Deadline:
     def give_up(self, state: RetryCallState) -> NoReturn:
         """Tenacity's ``retry_error_callback``: raises OutOfTime."""
         last = _failure(state)
+        # Where the server's own wish made the wait too long, that is what to tell.
         asked_s = last.delay_s
         if asked_s is None or asked_s < self._seconds:
             raise OutOfTime(f"no answer within {self._seconds:.0f} s") from last
@@ -93,18 +97,16 @@ class Deadline:
 
 
 def _wait_s(state: RetryCallState) -> float:
-    """Tenacity's ``wait``: the backoff, or longer where the server asks for it.
-
-    Its own waits cannot be joined by the longer of two, and 9.2 renames their parameters.
-    """
-    # Calls that failed together, as when a server restarts, do not return together.
+    """Tenacity's ``wait``: the backoff, or longer where the server asks for it."""
+    # Not made of tenacity's waits: those can be added, but not joined by the longer of two.
+    # The jitter lets calls that failed together, as when a server restarts, not return together.
     jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
     backoff = min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
     return max(_failure(state).delay_s or 0.0, backoff)
 
 
 def _failure(state: RetryCallState) -> TryAgain:
-    """What the last attempt raised; tenacity asks only after what is tried again."""
+    """What the last attempt raised; tenacity calls these hooks after a TryAgain alone."""
     error = state.outcome.exception() if state.outcome else None
     assert isinstance(error, TryAgain)
     return error

@@ -1,8 +1,9 @@
 """The limits of one key, kept by all processes of a user together.
 
 What was sent within a window lies in a small file, which processes change in turn under a lock that
-none of them waits for: who finds it taken tries again soon. Its clock is that of the machine, and
-its name a hash: nothing of the key can be read from it.
+none of them waits for: whoever finds it taken tries again soon. The kernel frees the lock of a
+process that dies. Times are those of the machine's clock since it was started, and the file's name
+is a hash: nothing of the key can be read from it.
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ from merge_runner.errors import UsageError
 
 WINDOW_S = 60.0
 BURST_S = 0.5
-# Who may send more a minute than this is held by no account's limit.
+# No account's limit lets more be sent in a minute.
 MOST_REQUESTS = 2**16
+# The others hold the file for microseconds.
 BUSY_S = 0.002
+# Tokens are counted by the half second: the file stays small, and the window errs by no more.
 BUCKET_S = 0.5
 BUCKETS = 128
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -81,7 +84,7 @@ class SharedLimits:
         return max(0.0, free_at - now)
 
     def settle(self, taken_at: float, more_tokens: int) -> None:
-        """So many tokens more, or less, were used than a turn had counted."""
+        """A request used so many tokens more than its turn had counted; less if negative."""
         # Kept here until the file is free: an unused estimate must not be lost for the others.
         self._owed.append((int(taken_at / BUCKET_S), more_tokens))
         self._tell()
@@ -120,7 +123,7 @@ class SharedLimits:
     def _head(self, now: float) -> tuple[int, float]:
         """How many were sent ever, and until when all wait."""
         sent, paused_until = _HEAD.unpack(os.pread(self._file, _HEAD.size, 0))
-        if self._sent_at(sent, 1) > now:  # by a clock that has begun anew since
+        if self._sent_at(sent, 1) > now:  # the machine was restarted, and its clock with it
             sent, paused_until = 0, 0.0
         return sent, max(paused_until, self._paused_until)
 
@@ -164,7 +167,7 @@ class SharedLimits:
 
 
 def request_rules(rpm: int, window_s: float) -> list[tuple[int, float]]:
-    """How many in how many s: an even flow, and at most ``rpm`` in a window wherever it begins.
+    """How many in how many s: an even flow, and at most ``rpm`` in any window.
 
     Half a second's worth goes at a time: a whole window at once would trip finer limits.
     """
@@ -174,13 +177,14 @@ def request_rules(rpm: int, window_s: float) -> list[tuple[int, float]]:
 
 def limits_file(base_url: str, model: str, secrets: Mapping[str, str]) -> Path:
     """The file of one endpoint, model and key. Raises UsageError where it cannot be ours alone."""
+    # The clock begins anew when the machine is started: then it is another file.
     boot = BOOT_ID.read_text() if BOOT_ID.is_file() else ""
     what = json.dumps([base_url, model, sorted(secrets.items()), boot])
     return _own_folder() / hashlib.sha256(what.encode()).hexdigest()[:32]
 
 
 def _opened(file: Path) -> int:
-    """The file, at its whole size, so that no full disk is found in the midst of a run."""
+    """The file at its full size, so that the disk cannot be found full in the midst of a run."""
     try:
         opened = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         if hasattr(os, "posix_fallocate"):  # not on macOS

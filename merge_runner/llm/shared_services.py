@@ -1,49 +1,56 @@
-"""What a client shares with others: limits, claims and money, in this process or elsewhere.
+"""What a client shares with others: replies, limits and money, in this process or elsewhere.
 
-Limiter, Claims and Budget are those of one process; on a cluster they are the coordinator's, and
-stand-ins at each worker ask there (run/cluster/remote.py).
+ResponseCache, Limiter and Budget are those of one process; on a cluster they are the coordinator's,
+and stand-ins at each worker ask there (run/cluster/remote.py).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Protocol
 
-from merge_runner.llm.cache import Entry
+from merge_runner.llm.cache import CachedCall, KnownCall
 from merge_runner.llm.ledger import Asked
 from merge_runner.records import Attempt
 
+# Replaces the estimate with which a request was let through by the tokens that it used.
+Settle = Callable[[int], None]
 
-class PermitPort(Protocol):
-    """See limiter.Permit."""
 
-    def settle(self, tokens: int) -> None:
-        """Replace the estimate by the actual usage."""
+class CachePort(Protocol):
+    """See cache.ResponseCache."""
+
+    def get(self, key: str) -> CachedCall | None:
+        """What is recorded of a call, as far as that is known before it is claimed."""
+        ...
+
+    async def claim(self, key: str) -> KnownCall | None:
+        """Claim a call and learn what is recorded of it; None while another one holds it."""
+        ...
+
+    def release(self, key: str) -> None:
+        """Give a claim up."""
+        ...
+
+    async def put(self, entry: CachedCall) -> CachedCall:
+        """Keep an answered call durably; returns the one that is kept."""
+        ...
+
+    async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
+        """Keep the attempts at a call without an answer durably."""
         ...
 
 
 class RateLimitPort(Protocol):
     """See limiter.Limiter."""
 
-    async def acquire(self, tokens: int, *, order: int = 0) -> PermitPort:
+    async def acquire(self, tokens: int, *, order: int = 0) -> Settle:
         """Wait for a turn."""
         ...
 
     def pause(self, seconds: float) -> None:
         """Dispatch nothing for a while."""
-        ...
-
-
-class ClaimPort(Protocol):
-    """See claims.Claims."""
-
-    async def claim(self, key: str) -> bool:
-        """Claim a key; False while another one holds it."""
-        ...
-
-    def release(self, key: str) -> None:
-        """Give a claim up."""
         ...
 
 
@@ -63,7 +70,7 @@ class AttemptPort(Protocol):
         """The attempt, the last of these, brought no answer."""
         ...
 
-    async def keep(self, entry: Entry) -> Entry:
+    async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer that the attempt brought; returns the one that is kept."""
         ...
 
@@ -83,23 +90,4 @@ class BudgetPort(Protocol):
         self, trial: int, key: str, asked: Asked
     ) -> AbstractAsyncContextManager[AttemptPort]:
         """The money of one attempt at the call with this key."""
-        ...
-
-
-class SharedServices(Protocol):
-    """Where clients get turns, by model, and money and claims."""
-
-    @property
-    def limiters(self) -> Mapping[str, RateLimitPort]:
-        """The queue of each model."""
-        ...
-
-    @property
-    def budget(self) -> BudgetPort:
-        """That of the models that cost money."""
-        ...
-
-    @property
-    def claims(self) -> ClaimPort:
-        """Who asks what."""
         ...

@@ -10,10 +10,10 @@ from merge_runner.records import ChatRequest
 
 
 class TransportFailure(MergeRunnerError):
-    """An attempt brought no reply; ``outcome`` names it in the calls table.
+    """An attempt brought no reply; ``outcome`` names the failure in the calls table.
 
-    ``sent`` is False where the request surely never left: nobody can charge for it. ``action`` is
-    that of an AttemptOutcome.
+    ``sent`` is False where the request was certainly never sent, so that nobody can charge for it.
+    ``action`` is that of an AttemptOutcome.
     """
 
     def __init__(
@@ -32,10 +32,6 @@ class Transport(Protocol):
         """The raw reply; raises TransportFailure."""
         ...
 
-    async def close(self) -> None:
-        """Close all connections."""
-        ...
-
 
 class SealedTransport:
     """Refuses every request, so that a replay stays offline."""
@@ -43,6 +39,3 @@ class SealedTransport:
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Raise ReplayMiss."""
         raise ReplayMiss("no recorded reply", request)
-
-    async def close(self) -> None:
-        """Do nothing: there is no connection."""

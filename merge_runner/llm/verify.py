@@ -1,21 +1,21 @@
-"""What a recorded call must be to be used, whoever wrote it: it may be damaged, or made up."""
+"""What a recorded call must be in order to be used: it may be damaged, or made up."""
 
 from __future__ import annotations
 
 import json
 from datetime import datetime
 
-from merge_runner.llm.keys import call_key, canonical_json
+from merge_runner.llm.content_hashes import call_key, canonical_json
 from merge_runner.records import Attempt, ChatRequest
 
-# What content can raise that no program of ours wrote; RecursionError where JSON is nested deeply.
+# What reading content of others can raise; RecursionError where JSON is nested deeply.
 DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
 LARGEST_NUMBER = 2**31 - 1
 MOST_TOKENS = 2**33
 
 
 def check_call(key: str, request: ChatRequest, attempts: tuple[Attempt, ...]) -> None:
-    """Raise one of DAMAGED unless it is the call of a key, with attempts that can be."""
+    """Raise one of DAMAGED unless a call belongs to its key and its attempts are possible."""
     content = call_key(
         endpoint=request.endpoint,
         path=request.path,
@@ -36,7 +36,7 @@ def check_body(body: str) -> None:
 
 
 def check_attempts(attempts: tuple[Attempt, ...]) -> None:
-    """Raise one of DAMAGED for what no attempts hold and a replay or a table cannot take."""
+    """Raise one of DAMAGED for values that no attempt has, and no replay or table can take."""
     for attempt in attempts:
         _check_numbers(attempt)
         if attempt.started_at is not None:

@@ -1,4 +1,8 @@
-"""Batches of small durable writes: one thread and one transaction for all that has gathered."""
+"""Batches of small durable writes: one transaction for all that gathers during the last one.
+
+A durable write waits some milliseconds for the disk however little it writes, so that one for each
+reply would bound a sweep to a few hundred calls a second.
+"""
 
 from __future__ import annotations
 
@@ -21,17 +25,18 @@ class BatchWriter:
 
     async def write(self, operation: Callable[[], ResultT]) -> ResultT:
         """Run an operation in the next batch; returns its result once the batch is durable."""
-        # Whoever comes first begins a batch; all who come until it is written travel with it.
+        # Whoever comes first begins a batch; all who come until its writing begins join it.
         if self._next_batch is None:
             self._next_batch = asyncio.create_task(self._write_batch())
         batch, place = self._next_batch, len(self._pending)
         self._pending.append(operation)
-        # Shielded: whoever gives up waiting takes nobody else's write with it.
+        # Shielded: if one gives up waiting, the writes of the others go on.
         result: ResultT = (await asyncio.shield(batch))[place]
         return result
 
     async def _write_batch(self) -> list[Any]:
-        """Write all that has gathered while the batch before this one was written."""
+        """Write all that has gathered while the previous batch was written."""
         async with self._one_batch_at_a_time:
             operations, self._pending, self._next_batch = self._pending, [], None
+            # In a thread, since the event loop must not wait for a disk.
             return await asyncio.to_thread(self._run, operations)

@@ -26,8 +26,8 @@ import duckdb
 from pydantic import TypeAdapter
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import ATTEMPTS, Entry, ResponseCache
-from merge_runner.llm.keys import KEY_VERSION, call_key, canonical_json
+from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
+from merge_runner.llm.content_hashes import KEY_VERSION, call_key, canonical_json
 from merge_runner.llm.verify import DAMAGED, check_attempts, check_body
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
@@ -123,7 +123,7 @@ def export_recording(
 
 
 def _write_parts(
-    folder: Path, file: Path, entries: Iterable[Entry | None], provenance: dict[str, str]
+    folder: Path, file: Path, entries: Iterable[CachedCall | None], provenance: dict[str, str]
 ) -> None:
     """Write the entries part by part into the folder, and all of them as the file."""
     partial = file.with_name(file.name + ".partial")  # no reader sees half a file
@@ -204,7 +204,7 @@ def _size(row: tuple[Any, ...]) -> int:
     return len(row[-2]) + len(row[-1])
 
 
-def read_recording(file: Path) -> Iterator[Entry]:
+def read_recording(file: Path) -> Iterator[CachedCall]:
     """All entries of a recording, each verified against its key; raises RecordingError."""
     with _opened(file) as connection:
         with _readable(file):
@@ -234,7 +234,7 @@ def read_recording(file: Path) -> Iterator[Entry]:
         )
 
 
-class Spilled(Mapping[str, Entry]):
+class Spilled(Mapping[str, CachedCall]):
     """The verified entries of a recording by key; SQLite keeps large ones in a temporary file.
 
     Raises RecordingError.
@@ -246,11 +246,11 @@ class Spilled(Mapping[str, Entry]):
         rows = ((entry.request.key, entry.to_json()) for entry in read_recording(file))
         self._db.executemany("INSERT INTO entries VALUES (?, ?)", rows)
 
-    def __getitem__(self, key: str) -> Entry:
+    def __getitem__(self, key: str) -> CachedCall:
         row = self._db.execute("SELECT entry FROM entries WHERE key = ?", [key]).fetchone()
         if row is None:
             raise KeyError(key)
-        return Entry.from_json(row[0])
+        return CachedCall.from_json(row[0])
 
     def __contains__(self, key: object) -> bool:
         found = self._db.execute("SELECT 1 FROM entries WHERE key = ?", [key])
@@ -271,19 +271,7 @@ def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
     """
     for _ in read_recording(file):
         pass
-    added = there = 0
-    batch: list[Entry] = []
-    for entry in read_recording(file):
-        if cache.holds(entry.request.key):
-            there += 1
-        else:
-            batch.append(entry)
-            added += 1
-        if len(batch) == BATCH:
-            cache.put_now(batch)
-            batch = []
-    cache.put_now(batch)
-    return added, there
+    return cache.add_missing(read_recording(file))
 
 
 def summarise(file: Path) -> Summary:
@@ -340,7 +328,7 @@ def _provenance_hash(metadata: dict[str, str]) -> str:
     return hashlib.sha256(canonical_json(told).encode()).hexdigest()
 
 
-def _row(entry: Entry) -> tuple[Any, ...]:
+def _row(entry: CachedCall) -> tuple[Any, ...]:
     request, slot = entry.request, entry.request.slot
     return (
         request.key,
@@ -359,7 +347,7 @@ def _row(entry: Entry) -> tuple[Any, ...]:
     )
 
 
-def _verified(file: Path, number: int, row: dict[str, Any]) -> Entry:
+def _verified(file: Path, number: int, row: dict[str, Any]) -> CachedCall:
     try:
         entry = _entry(row)
     except DAMAGED as exc:
@@ -371,7 +359,7 @@ def _verified(file: Path, number: int, row: dict[str, Any]) -> Entry:
     return entry
 
 
-def _entry(row: dict[str, Any]) -> Entry:
+def _entry(row: dict[str, Any]) -> CachedCall:
     """The entry of a row, under the key of its content; raises one of DAMAGED."""
     if empty := [name for name, value in row.items() if value is None]:
         raise ValueError(f"it has no {', '.join(empty)}")
@@ -401,7 +389,7 @@ def _entry(row: dict[str, Any]) -> Entry:
         body=row["body"],
         slot=slot,
     )
-    return Entry(request, attempts)
+    return CachedCall(request, attempts)
 
 
 def _opened(file: Path) -> duckdb.DuckDBPyConnection:

@@ -19,14 +19,13 @@ from merge_runner.emulator.process import emulator_process
 from merge_runner.errors import UsageError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.claims import Claims
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
-from merge_runner.llm.prices import pricing
+from merge_runner.llm.prices import is_known
 from merge_runner.llm.shared_limits import SharedLimits, limits_file
-from merge_runner.llm.shared_services import SharedServices
+from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.run.estimate import worst_trial_usd
 from merge_runner.run.plan import Options, Plan
@@ -51,11 +50,10 @@ class EndpointPlan:
 
 @dataclass(frozen=True, slots=True)
 class LocalServices:
-    """The services of this process; see SharedServices."""
+    """What the clients of a run share: the queue of each model, and the money."""
 
     limiters: Mapping[str, Limiter]
     budget: Budget
-    claims: Claims
 
 
 def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
@@ -68,7 +66,6 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
             cache=cache,
             transport=SealedTransport(),
             limiter=Limiter(),
-            pricing=pricing(entry),
             sealed=True,
         )
         for name, entry in plan.entries.items()
@@ -83,15 +80,15 @@ def open_services(
     Raises UsageError where a cap could not hold.
     """
     for name, entry in plan.entries.items():
-        if options.max_cost_usd is not None and not pricing(entry).known:
+        if options.max_cost_usd is not None and not is_known(entry):
             raise UsageError(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
-    claims = Claims(cache.folder)
-    stack.callback(claims.close)
+    cache.claims.open()  # now, not in the midst of the run, where the folder has no locks
+    stack.callback(cache.claims.close)
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
     limiters = {}
@@ -102,7 +99,7 @@ def open_services(
             rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]], shared=shared
         )
     budget = Budget(ledger, cap_usd=options.max_cost_usd, trial_usd=worst_trial_usd(plan))
-    return LocalServices(limiters=limiters, budget=budget, claims=claims)
+    return LocalServices(limiters=limiters, budget=budget)
 
 
 def _shared_limits(
@@ -137,8 +134,9 @@ async def start_endpoints(
 def live_clients(
     plan: Plan,
     endpoint_plan: EndpointPlan,
-    cache: ResponseCache,
-    services: SharedServices,
+    cache: CachePort,
+    limiters: Mapping[str, RateLimitPort],
+    budget: BudgetPort,
     *,
     connections: int,
     stack: AsyncExitStack,
@@ -161,10 +159,8 @@ def live_clients(
             endpoint=plan.endpoints[name],
             cache=cache,
             transport=transport,
-            limiter=services.limiters[name],
-            pricing=pricing(entry),
-            budget=None if entry.price == "free" else services.budget,
-            claims=services.claims,
+            limiter=limiters[name],
+            budget=None if entry.price == "free" else budget,
             strict=endpoint_plan.strict,
             first=FirstCall(passed=name in endpoint_plan.passed, known=name in endpoint_plan.known),
         )

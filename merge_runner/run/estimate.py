@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from merge_runner.config import ModelEntry, driver_name
 from merge_runner.drivers.pace import model_pace
 from merge_runner.llm.cache import CallTotals
-from merge_runner.llm.prices import pricing
+from merge_runner.llm.prices import cost_usd
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
 from merge_runner.run.plan import Options, Plan
@@ -67,7 +67,7 @@ def estimate(
     for name, entry in plan.entries.items():
         made = round(calls[name])
         each = _per_call(plan, entry, facts[name])
-        price = pricing(entry).cost_usd(each.usage)
+        price = cost_usd(entry, each.usage)
         tokens_in, tokens_out = each.usage.input_tokens or 0, each.usage.output_tokens or 0
         all_calls += made
         input_tokens += made * tokens_in
@@ -99,8 +99,9 @@ def worst_trial_usd(plan: Plan) -> float:
     return sum(
         math.ceil(plan.scenario.timeout_steps / model_pace(plan.scenario).interval_steps)
         * (
-            pricing(entry).cost_usd(
-                Usage(input_tokens=int(prompt_bytes), output_tokens=entry.max_output_tokens)
+            cost_usd(
+                entry,
+                Usage(input_tokens=int(prompt_bytes), output_tokens=entry.max_output_tokens),
             )
             or 0.0
         )

@@ -21,8 +21,8 @@ from merge_runner.config import (
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
+from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.keys import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import Side, TrialSpec

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from merge_runner.llm.cache import Entry
+from merge_runner.llm.cache import CachedCall
 from merge_runner.records import ChatRequest, Slot
 
 SHOWN = 70
@@ -23,7 +23,7 @@ class Miss:
     request: ChatRequest
 
 
-def explain(misses: list[Miss], recorded: Iterable[Entry]) -> list[str]:
+def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
     """What differs from the nearest request: one text for all misses that differ alike.
 
     It names the first trial, side and decision, and how many more there are. Nearest is a request

@@ -10,7 +10,6 @@ from typing import Any
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.claims import Claims
 from merge_runner.llm.ledger import IN_FLIGHT, UNRECORDED, Ledger, Reason, Release, Spending, scopes
 
 MEANING = {
@@ -70,17 +69,13 @@ def release(folder: Path, sweep: str) -> Account:
     """Count no longer what is set aside for a sweep. Raises UsageError while anybody asks."""
     account(folder, sweep)
     with _opened(folder) as cache:
-        claims = Claims(folder)
-        try:
-            if not claims.take_all():
-                raise UsageError(
-                    f"another merge-runner works with {folder}: what it has in flight cannot be "
-                    "released; try again when it has ended"
-                )
-            Ledger(cache, sweep).release()
-            return _account(cache, sweep)
-        finally:
-            claims.close()
+        if not cache.claims.take_all():
+            raise UsageError(
+                f"another merge-runner works with {folder}: what it has in flight cannot be "
+                "released; try again when it has ended"
+            )
+        Ledger(cache, sweep).release()
+        return _account(cache, sweep)
 
 
 @contextmanager

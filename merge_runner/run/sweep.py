@@ -22,8 +22,8 @@ from merge_runner.errors import (
     UsageError,
 )
 from merge_runner.llm.cache import CallTotals, ResponseCache
+from merge_runner.llm.content_hashes import canonical_json, manner, spec_hash
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.keys import canonical_json, manner, spec_hash
 from merge_runner.llm.ledger import Ledger, Spending
 from merge_runner.llm.meter import Meter
 from merge_runner.records import TrialRecord, TrialSpec
@@ -199,7 +199,7 @@ class Sweep:
         """What is known of answers to requests like those of this sweep."""
         sent = FORMATS[entry.format].request(entry, "")
         asked = manner(sent.path, canonical_json(sent.body))
-        return self._cache.facts(entry.id).of(self._plan.endpoints[name], asked)
+        return self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
 
     def close(self) -> None:
         """Close what was opened, where the sweep is not run."""
@@ -249,7 +249,7 @@ class Sweep:
         known = frozenset(
             name
             for name, entry in plan.entries.items()
-            if plan.endpoints[name] in self._cache.facts(entry.id).totals
+            if plan.endpoints[name] in self._cache.stats(entry.id).totals
         )
         endpoint_plan = EndpointPlan(urls, options.strict_model, known)
         if options.dask is None:
@@ -257,7 +257,8 @@ class Sweep:
                 plan,
                 endpoint_plan,
                 self._cache,
-                services,
+                services.limiters,
+                services.budget,
                 connections=options.connections,
                 stack=stack,
             )

@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from merge_runner.audit import audit_database, audit_sweep
 from merge_runner.cli import app
 from merge_runner.errors import StoreError
-from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.keys import make_request
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.records import SCRIPTED_FIELD
 from merge_runner.results.recording import export_recording, read_recording
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -759,12 +759,12 @@ def exported(prepare, made, tmp_path_factory):
     return list(read_recording(file)), {k.decode(): v.decode() for _, k, v in told}
 
 
-def answered(entry: Entry, **changes: object) -> Entry:
+def answered(entry: CachedCall, **changes: object) -> CachedCall:
     """The entry with something else in its answer."""
     return replace(entry, attempts=(*entry.attempts[:-1], replace(entry.attempts[-1], **changes)))
 
 
-def asked_anew(entry: Entry, **changes: object) -> Entry:
+def asked_anew(entry: CachedCall, **changes: object) -> CachedCall:
     """Another request in the same slot, or in a changed one."""
     old = entry.request
     body = json.loads(old.body)
@@ -800,7 +800,7 @@ RECORDINGS = {
 }  # fmt: skip
 
 
-def recorded(folder: Path, entries: list[Entry], provenance: dict[str, str]) -> Path:
+def recorded(folder: Path, entries: list[CachedCall], provenance: dict[str, str]) -> Path:
     """A recording of these entries."""
     cache, file = ResponseCache(folder / "cache"), folder / "changed.parquet"
     cache.put_now(entries)

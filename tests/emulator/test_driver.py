@@ -11,7 +11,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.emulator.chance import draw, draw_between, draw_index
 from merge_runner.emulator.driver import answer
-from merge_runner.llm.keys import make_request
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt

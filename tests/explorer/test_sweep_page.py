@@ -22,10 +22,10 @@ from analysis.explorer.sweeps import Config, ListedSweep, assessment_of, config_
 from merge_runner.audit.expected import ModelFacts
 from merge_runner.results.progress_file import ProgressFile
 from merge_runner.results.store import Store, sweep_facts
-from merge_runner.run.progress import Progress
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import held
+from tests.run.standings import progress, runner
 
 URL = "/sweeps/sweep-1"
 CONFIG = {
@@ -83,9 +83,9 @@ def text_of(client, url=URL):
 
 def running(db, **changes):
     """Say that the sweep runs, in this process."""
-    progress = Progress("t", 33, planned={("baseline", name): 3 for name in CONDITIONS})
-    progress.by_cell["baseline", "N_0_0"] = Counter(changes.pop("ended", {"finished": 2}))
-    standing = replace(progress.standing("sweep-1"), left_s=20.0, **changes)
+    shown = progress(runner(), planned={("baseline", name): 3 for name in CONDITIONS})
+    shown.by_cell["baseline", "N_0_0"] = Counter(changes.pop("ended", {"finished": 2}))
+    standing = replace(shown.standing("sweep-1"), left_s=20.0, **changes)
     file = ProgressFile(db, "sweep-1")
     file.write(standing)
     return file

@@ -13,7 +13,6 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.prices import pricing
 from merge_runner.records import Slot
 
 WIRES = {
@@ -56,7 +55,6 @@ async def client_of(llmock, tmp_path, monkeypatch):
             cache=cache,
             transport=transports[wire],
             limiter=Limiter(),
-            pricing=pricing(entry),
         )
 
     yield make

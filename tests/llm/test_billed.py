@@ -28,7 +28,7 @@ from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.prices import pricing
+from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Slot, Usage
 from tests.emulator.scenarios import SCENARIOS
 from tests.emulator.scenarios.playing import ScenarioPlan, playing
@@ -59,7 +59,7 @@ class Till:
 
     wire: str
     tells: bool
-    pricing: object
+    entry: ModelEntry
     writes: Iterator[int] | None = None
     usd: float = 0.0
 
@@ -79,7 +79,7 @@ class Till:
         return reply
 
     def price(self, tokens_in, tokens_out):
-        return self.pricing.cost_usd(Usage(input_tokens=tokens_in, output_tokens=tokens_out))
+        return cost_usd(self.entry, Usage(input_tokens=tokens_in, output_tokens=tokens_out))
 
     def told(self, reply):
         """The body, with what this server adds to it; None where it is no JSON."""
@@ -103,7 +103,7 @@ class Till:
     def billed(self, reply, body, most):
         part = body[0] if isinstance(body, list) else body
         if part is not None:
-            cost = self.pricing.cost_usd(FORMATS[self.wire].read(part).usage)
+            cost = cost_usd(self.entry, FORMATS[self.wire].read(part).usage)
             if cost is not None:
                 return cost
         return 0.0 if reply.status in BEFORE_ANY_WORK else most
@@ -161,9 +161,8 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
             cache=cache,
             transport=transport,
             limiter=Limiter(),
-            pricing=pricing(entry),
         )
-        worst = pricing(entry).cost_usd(client._worst_case(client._request(PROMPT, slot(0))))
+        worst = cost_usd(entry, client._worst_case(client._request(PROMPT, slot(0))))
         client.first = first or client.first
         ledger = Ledger(cache, name)
         client.budget = Budget(ledger, cap_usd=cap * worst, trial_usd=worst)
@@ -192,7 +191,7 @@ def slot(number):
 @pytest.mark.parametrize(("scenario", "wire"), EVERY)
 @in_virtual_time
 async def test_no_scenario_bills_more_than_the_cap(cache, shares, scenario, wire, tells):
-    till = Till(wire, tells, pricing(entry_of(wire)))
+    till = Till(wire, tells, entry_of(wire))
     faults = ScenarioPlan(seed=3, scenario=scenario, rate=0.7, hang_s=600)
     name = f"https://gateway/{scenario}/{wire}/{tells}"
     client, cap_usd = await asked(cache, till, faults, cap=4.5, name=name)
@@ -222,7 +221,7 @@ def after(honest, *dear):
 async def test_a_server_that_ignores_the_output_cap_does_not_pass_the_other_one(
     cache, shares, wire, writes, from_now_on
 ):
-    till = Till(wire, tells=False, pricing=pricing(entry_of(wire)), writes=writes())
+    till = Till(wire, tells=False, entry=entry_of(wire), writes=writes())
     name = f"https://endless/{from_now_on}/{wire}"
     client, cap_usd = await asked(
         cache, till, FaultPlan(), cap=10.5, name=name, calls=60, first=FirstCall()
@@ -238,7 +237,7 @@ async def test_a_server_that_ignores_the_output_cap_does_not_pass_the_other_one(
 @pytest.mark.parametrize("wire", MODELS)
 @in_virtual_time
 async def test_the_last_reply_alone_can_pass_the_cap_and_nothing_is_asked_after_it(cache, wire):
-    till = Till(wire, tells=False, pricing=pricing(entry_of(wire)), writes=after(3, 64_000))
+    till = Till(wire, tells=False, entry=entry_of(wire), writes=after(3, 64_000))
     name = f"https://at-the-end/{wire}"
     client, cap_usd = await asked(cache, till, FaultPlan(), cap=1.5, name=name, first=FirstCall())
     dearest = till.price(40, 64_000)

@@ -261,10 +261,10 @@ O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
 async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
     for key, outcome in (("a", "timeout"), ("b", "timeout"), ("c", "server_error")):
         await ledger.reserve(key, [], 0.25, None, O3)
-        await ledger.settle(key, [Attempt(1, outcome)], 0.25, None)
+        await ledger.settle(key, tried(None, outcome), 0.25)
     await ledger.reserve("d", [], 0.125, None, O3)
     await ledger.reserve("paid", [], 0.25, None, O3)
-    await ledger.settle("paid", [Attempt(1, "server_error")], 0.25, 0.1)
+    await ledger.settle("paid", tried(0.1), 0.25)
     reasons = ledger.reasons()
     assert [(r.outcome, r.attempts, r.usd) for r in reasons] == [
         ("timeout", 2, 0.5),
@@ -281,7 +281,8 @@ async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
         attempts = [Attempt(n, "x") for n in range(1, number)]
         await ledger.reserve("key", attempts, 0.25, None, O3)
         actual = 0.0 if outcome == "connection_lost" else None
-        await ledger.settle("key", [*attempts, Attempt(number, outcome)], 0.25, actual)
+        last = Attempt(number, outcome, cost_usd=actual)
+        await ledger.settle("key", [*attempts, last], 0.25)
     assert {r.outcome: r.attempts for r in ledger.reasons()} == {"timeout": 1, "bad_body": 1}
 
 

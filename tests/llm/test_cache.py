@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.keys import make_request, manner
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.content_hashes import make_request, manner
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage
 
 
@@ -33,7 +33,7 @@ def entry(number=0, *, model="m", endpoint="openai", reply="{}", **attempt):
         body={"prompt": number},
         slot=Slot("A1", 1, "left", number, 0),
     )
-    return Entry(request, (Attempt(1, "ok", 200, reply=reply, **attempt),))
+    return CachedCall(request, (Attempt(1, "ok", 200, reply=reply, **attempt),))
 
 
 def said(text):
@@ -111,10 +111,10 @@ requests = st.builds(
 
 @settings(deadline=None)
 @given(
-    st.builds(Entry, requests, st.lists(attempts, min_size=1, max_size=3).map(tuple)),
+    st.builds(CachedCall, requests, st.lists(attempts, min_size=1, max_size=3).map(tuple)),
 )
 def test_an_entry_survives_its_text_form(recorded):
-    assert Entry.from_json(recorded.to_json()) == recorded
+    assert CachedCall.from_json(recorded.to_json()) == recorded
 
 
 async def test_a_reply_is_readable_by_others_as_soon_as_put_returns(cache, folder):
@@ -128,8 +128,8 @@ async def test_a_reply_is_readable_by_others_as_soon_as_put_returns(cache, folde
 PUT_AND_DIE = """
 import asyncio, os, sys
 from pathlib import Path
-from merge_runner.llm.cache import Entry, ResponseCache
-asyncio.run(ResponseCache(Path(sys.argv[1])).put(Entry.from_json(sys.argv[2])))
+from merge_runner.llm.cache import CachedCall, ResponseCache
+asyncio.run(ResponseCache(Path(sys.argv[1])).put(CachedCall.from_json(sys.argv[2])))
 os._exit(7)
 """
 
@@ -328,13 +328,13 @@ def test_damaged_facts_about_a_model_are_counted_anew(cache, stock):
     cache.put_now(
         [entry(1, cost_usd=1), entry(2, cost_usd=2), entry(3, model="another", cost_usd=3)]
     )
-    before = cache.facts("m")
+    before = cache.stats("m")
     assert before.cost_usd == 3
     for name in [name for name in stock if name.startswith("model ")]:
         stock[name] = "no JSON"
-    assert cache.facts("m") == before
+    assert cache.stats("m") == before
     cache.put_now([entry(4, cost_usd=4)])
-    assert cache.facts("m").cost_usd == 7
+    assert cache.stats("m").cost_usd == 7
 
 
 async def test_damaged_attempts_are_set_aside_and_good_ones_are_not(cache, stock):
@@ -357,7 +357,7 @@ def test_a_folder_of_an_earlier_format_is_counted_once(folder, stock, version):
     stock["model m"] = '{"endpoints": ["openai"], "answers": 9, "cost_usd": 9.0}'
     for _ in range(2):  # as two processes do that saw the old mark at once
         cache._bring_up_to_date()
-        assert cache.facts("m").cost_usd == 3
+        assert cache.stats("m").cost_usd == 3
         assert cache.recorded_endpoints("m") == ["openai"]
     cache.close()
 
@@ -375,7 +375,7 @@ def told(number, *, model="m", endpoint="openai", effort="low", **attempt):
         slot=Slot("A1", 1, "left", number, 0),
     )
     usage = Usage(input_tokens=100, output_tokens=10)
-    return Entry(request, (Attempt(1, "ok", 200, usage=usage, reply="{}", **attempt),))
+    return CachedCall(request, (Attempt(1, "ok", 200, usage=usage, reply="{}", **attempt),))
 
 
 def test_what_is_measured_is_of_one_endpoint_and_one_way_to_ask(cache):
@@ -390,11 +390,11 @@ def test_what_is_measured_is_of_one_endpoint_and_one_way_to_ask(cache):
     )
     empty = '{"messages":[{"content":""}],"model":"m","reasoning_effort":"%s"}'
     low, high = (manner("/chat/completions", empty % effort) for effort in ("low", "high"))
-    facts = cache.facts("m")
-    assert (facts.of("openai", low).measured, facts.of("openai", low).output_tokens) == (3, 30)
-    assert facts.of("openai", high).measured == 1
-    assert facts.of("http://localhost:8080", low).measured == 1
-    assert facts.of("openai", manner("/responses", empty % "low")).measured == 0
+    stats = cache.stats("m")
+    assert (stats.of("openai", low).measured, stats.of("openai", low).output_tokens) == (3, 30)
+    assert stats.of("openai", high).measured == 1
+    assert stats.of("http://localhost:8080", low).measured == 1
+    assert stats.of("openai", manner("/responses", empty % "low")).measured == 0
     assert cache.recorded_endpoints("m") == ["http://localhost:8080", "openai"]
 
 
@@ -482,7 +482,7 @@ def model_folder(tmp_path_factory):
     cache.put_now(FULL)
     cache.run_now([lambda: cache.keep_unanswered(entry(9).request.key, entry(9).attempts)])
     ledger = Ledger(cache, "s")
-    asyncio.run(ledger.reserve("0" * 64, [], 3.0, None))
+    asyncio.run(ledger.reserve("0" * 64, [], 3.0, None, Asked()))
     cache.close()
     gc.collect()  # the connections of other threads, or their files go while they are copied
     return folder

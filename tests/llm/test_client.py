@@ -22,7 +22,6 @@ from merge_runner.llm.http_outcome import RawReply
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.meter import Meter
-from merge_runner.llm.prices import pricing
 from merge_runner.llm.transport import SealedTransport, TransportFailure
 from merge_runner.records import Slot
 from tests.virtual_time import in_virtual_time, now_s
@@ -118,7 +117,6 @@ def make(cache):
             cache=cache,
             transport=transport or Server(*replies),
             limiter=limiter or Limiter(),
-            pricing=pricing(entry),
             budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), cap_usd=cap),
         )
 
@@ -254,6 +252,14 @@ async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, t
     assert replies[0].attempts == replies[1].attempts
     for own in caches:
         own.close()
+
+
+@in_virtual_time
+async def test_two_entries_of_one_model_that_ask_the_same_make_one_call(make):
+    clients = [make(answer(f"from {n}")) for n in range(2)]
+    replies = await asyncio.gather(*(client.ask("prompt", slot()) for client in clients))
+    assert sum(len(client.transport.sent) for client in clients) == 1
+    assert replies[0].text == replies[1].text
 
 
 @in_virtual_time

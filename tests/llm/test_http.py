@@ -18,10 +18,9 @@ from merge_runner.emulator.server import serve
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.content_hashes import call_key, canonical_json, make_request
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.keys import call_key, canonical_json, make_request
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.prices import pricing
 from merge_runner.llm.transport import TransportFailure
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
@@ -436,7 +435,6 @@ async def client_for(wire, url, folder):
             cache=cache,
             transport=transport,
             limiter=Limiter(),
-            pricing=pricing(entry),
         )
     cache.close()
 

@@ -2,7 +2,7 @@ import pytest
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.prices import pricing
+from merge_runner.llm.prices import cost_usd, is_known
 from merge_runner.records import Usage
 
 PRICE = Price(input=2.0, cached_input=0.5, output=8.0, source="contract")
@@ -27,17 +27,17 @@ def entry(provider="openai", model="o3-2025-04-16", **changes):
     ],
 )
 def test_the_table_of_prices_knows_the_models_of_the_registry(provider, model, rates):
-    price = pricing(entry(provider, model))
-    assert price.known
+    priced = entry(provider, model)
+    assert is_known(priced)
     new, cached, output = (rate / 1e6 for rate in rates)
     usage = Usage(1000, 500, 1000, 640)
-    assert price.cost_usd(usage) == pytest.approx(500 * new + 500 * cached + 1000 * output)
-    assert price.cost_usd(Usage(1000, None, 0)) == pytest.approx(1000 * new)
+    assert cost_usd(priced, usage) == pytest.approx(500 * new + 500 * cached + 1000 * output)
+    assert cost_usd(priced, Usage(1000, None, 0)) == pytest.approx(1000 * new)
 
 
 def test_o3_with_half_the_input_cached():
     usage = Usage(input_tokens=1000, cached_input_tokens=500, output_tokens=1000)
-    assert pricing(entry()).cost_usd(usage) == pytest.approx(0.001 + 0.00025 + 0.008)
+    assert cost_usd(entry(), usage) == pytest.approx(0.001 + 0.00025 + 0.008)
 
 
 def test_thoughts_of_gemini_are_paid_for():
@@ -50,52 +50,51 @@ def test_thoughts_of_gemini_are_paid_for():
             }
         }
     )
-    price = pricing(entry("gemini", "gemini-2.5-pro", format="gemini"))
-    assert price.cost_usd(reading.usage) == pytest.approx((100 * 1.25 + 900 * 10) / 1e6)
+    priced = entry("gemini", "gemini-2.5-pro", format="gemini")
+    assert cost_usd(priced, reading.usage) == pytest.approx((100 * 1.25 + 900 * 10) / 1e6)
 
 
 def test_explicit_figures_are_believed():
-    price = pricing(entry("local", "anything", price=PRICE))
-    assert price.known
-    assert price.cost_usd(Usage(1000, 400, 100)) == (600 * 2.0 + 400 * 0.5 + 100 * 8.0) / 1e6
+    priced = entry("local", "anything", price=PRICE)
+    assert is_known(priced)
+    assert cost_usd(priced, Usage(1000, 400, 100)) == (600 * 2.0 + 400 * 0.5 + 100 * 8.0) / 1e6
 
 
 def test_explicit_figures_go_before_the_table():
-    assert pricing(entry(price=PRICE.model_copy(update={"output": 1.0}))).cost_usd(
-        Usage(0, None, 1_000_000)
+    assert cost_usd(
+        entry(price=PRICE.model_copy(update={"output": 1.0})), Usage(0, None, 1_000_000)
     ) == pytest.approx(1.0)
 
 
 def test_without_a_price_for_cached_input_it_costs_as_any_other():
     plain = Price(input=2.0, output=8.0, source="contract")
-    assert pricing(entry(price=plain)).cost_usd(Usage(1000, 400, 0)) == pytest.approx(0.002)
+    assert cost_usd(entry(price=plain), Usage(1000, 400, 0)) == pytest.approx(0.002)
     free = Price(input=2.0, cached_input=0.0, output=8.0, source="contract")
-    assert pricing(entry(price=free)).cost_usd(Usage(1000, 400, 0)) == pytest.approx(0.0012)
+    assert cost_usd(entry(price=free), Usage(1000, 400, 0)) == pytest.approx(0.0012)
 
 
 @pytest.mark.parametrize(
     "model", [entry("openai", "no-such-model"), entry("local", "anything")], ids=str
 )
 def test_an_unknown_price_is_said_and_not_guessed(model):
-    price = pricing(model)
-    assert not price.known
-    assert price.cost_usd(Usage(1000, 0, 1000)) is None
+    assert not is_known(model)
+    assert cost_usd(model, Usage(1000, 0, 1000)) is None
 
 
 @pytest.mark.parametrize("model", [entry(), entry(price=PRICE)], ids=["table", "explicit"])
 @pytest.mark.parametrize("usage", [Usage(), Usage(1000), Usage(output_tokens=1000)], ids=str)
 def test_tokens_that_are_not_told_have_no_cost(model, usage):
-    assert pricing(model).cost_usd(usage) is None
+    assert cost_usd(model, usage) is None
 
 
 @pytest.mark.parametrize("usage", [Usage(), Usage(10**9, 0, 10**9)], ids=str)
 def test_what_is_free_costs_nothing(usage):
-    price = pricing(entry("local", "anything", price="free"))
-    assert price.known
-    assert price.cost_usd(usage) == 0.0
+    priced = entry("local", "anything", price="free")
+    assert is_known(priced)
+    assert cost_usd(priced, usage) == 0.0
 
 
 def test_more_cached_input_than_input_is_taken_for_none():
     """A server that counts wrongly neither ends a sweep nor makes it cheap."""
-    price = pricing(entry())
-    assert price.cost_usd(Usage(100, 500, 10)) == price.cost_usd(Usage(100, 0, 10))
+    priced = entry()
+    assert cost_usd(priced, Usage(100, 500, 10)) == cost_usd(priced, Usage(100, 0, 10))

@@ -19,7 +19,6 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.prices import pricing
 from merge_runner.llm.retry import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
 from merge_runner.records import Slot
 from tests.emulator.scenarios import SCENARIOS
@@ -199,7 +198,6 @@ async def client_of(cache, wire, plan):
                 cache=cache,
                 transport=transport,
                 limiter=Limiter(),
-                pricing=pricing(entry),
             )
         finally:
             await transport.close()

@@ -60,8 +60,8 @@ async def test_two_sweeps_on_one_key_use_no_more_tokens_than_one_may(tmp_path):
 @on_a_clock
 async def test_tokens_that_were_not_used_are_free_for_the_other_sweep(tmp_path):
     one, other = queues(tmp_path, tpm=100)
-    permit = await one.ask(tokens=90)
-    permit.settle(20)
+    settle = await one.ask(tokens=90)
+    settle(20)
     other.ask(tokens=70)
     await other.all_served()
     assert other.times == [0]

@@ -24,11 +24,10 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from merge_runner.errors import RecordingError, TrialSuspended, UsageError
+from merge_runner.errors import TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget, PaidAttempt
-from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.claims import Claims
-from merge_runner.llm.keys import make_request
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, Slot
 
@@ -60,22 +59,11 @@ class Process:
 
     def __init__(self, folder: Path, cap_usd: float) -> None:
         self.cache = ResponseCache(folder)
-        self.claims = Claims(folder)
         self.budget = Budget(Ledger(self.cache, "s"), cap_usd=cap_usd)
         self.in_flight_calls: dict[int, tuple[PaidAttempt, list[Attempt]]] = {}
 
-    def known(self, question: int) -> tuple[Entry | None, tuple[Attempt, ...]]:
-        """What a client that has claimed a call knows of it."""
-        key = REQUESTS[question].key
-        try:
-            return self.cache.get(key), self.cache.unanswered(key)
-        except RecordingError:
-            self.cache.set_damage_aside(key)
-            return self.cache.get(key), self.cache.unanswered(key)
-
     def die(self) -> None:
         """Leave everything as it lies: the kernel closes the files, and nothing is put in order."""
-        self.claims.close()
         self.cache.close()
 
 
@@ -92,7 +80,7 @@ class CacheMachine(RuleBasedStateMachine):
         self.place = Path(tempfile.mkdtemp(dir=IN_MEMORY))
         self.cap_usd = 3.0 * WORST_USD
         self.charged_usd = 0.0
-        self.answered: dict[int, Entry] = {}
+        self.answered: dict[int, CachedCall] = {}
         self.tried: dict[int, tuple[Attempt, ...]] = {}
         self.bent: str | None = None
         self.made = 0
@@ -121,20 +109,22 @@ class CacheMachine(RuleBasedStateMachine):
     def ask(self, number, question):
         """Begin an attempt, where no entry is kept, nobody else asks, and the cap allows it."""
         process = self.process(number)
-        if not self.claimed(number, question) or not process.claims.take(REQUESTS[question].key):
+        if not self.claimed(number, question):
             return
-        entry, earlier = process.known(question)
+        key = REQUESTS[question].key
+        known = self.wait(process.cache.claim(key))
         if question in self.answered:
-            assert entry == self.answered[question], "what is answered is not asked again"
-            process.claims.release(REQUESTS[question].key)
+            assert known.entry == self.answered[question], "what is answered is not asked again"
+            process.cache.release(key)
             return
-        assert entry is None
-        if paid := self.paid_for(process, question, list(earlier)):
+        assert known.entry is None
+        earlier = list(known.attempts)
+        if paid := self.paid_for(process, question, earlier):
             self.tried.pop(question, None)
             self.bent = None
-            process.in_flight_calls[question] = paid, list(earlier)
+            process.in_flight_calls[question] = paid, earlier
         else:
-            process.claims.release(REQUESTS[question].key)
+            process.cache.release(key)
 
     def paid_for(
         self, process: Process, question: int, earlier: list[Attempt]
@@ -179,10 +169,10 @@ class CacheMachine(RuleBasedStateMachine):
         self.charged_usd += cost
         reply = f'{{"text": "ä {self.made}"}}'
         attempts.append(Attempt(len(attempts) + 1, "ok", 200, reply=reply, cost_usd=float(cost)))
-        entry = Entry(REQUESTS[question], tuple(attempts))
+        entry = CachedCall(REQUESTS[question], tuple(attempts))
         kept = self.wait(paid.keep(entry))
         paid.close()
-        process.claims.release(REQUESTS[question].key)
+        process.cache.release(REQUESTS[question].key)
         self.bent = None
         assert kept == entry
         self.answered[question] = entry
@@ -201,7 +191,7 @@ class CacheMachine(RuleBasedStateMachine):
         key = REQUESTS[question].key
         self.wait(paid.settle(attempts))
         paid.close()
-        process.claims.release(key)
+        process.cache.release(key)
         if known:
             self.bent = None
         self.tried[question] = tuple(attempts)

@@ -3,28 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
-from types import SimpleNamespace
 
-from merge_runner.llm.ledger import Spending
 from merge_runner.llm.meter import Meter
 from merge_runner.records import Attempt, Usage
-from merge_runner.run.plan import make_plan
-from merge_runner.run.progress import Progress
-
-CELL = ("baseline", "N_0_0")
-LEDGER = SimpleNamespace(spending=Spending(spent_usd=4.0, reserved_usd=0.25))
-
-
-def runner(*meters, running=0):
-    named = {str(number): meter for number, meter in enumerate(meters)}
-    return SimpleNamespace(meters=named, waits=(), running=running, workers=None)
-
-
-def progress(runner, **changes):
-    """Of ten trials, so that about 210 calls are expected."""
-    plan = make_plan("baseline", "emulator", conditions=["N_0_0"])
-    return Progress(plan, Counter({CELL: 10}), runner, LEDGER, **changes)
+from tests.run.standings import CELL, progress, runner
 
 
 def test_every_figure_is_that_of_the_meters():

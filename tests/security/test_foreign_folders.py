@@ -13,10 +13,10 @@ import diskcache
 import pytest
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import Entry, ResponseCache
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache_import import import_folder
 from merge_runner.llm.claims import Claims
-from merge_runner.llm.foreign import import_folder
-from merge_runner.llm.keys import make_request
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.records import Attempt, Slot
 
 SECRET = "what nobody else may read"
@@ -33,7 +33,7 @@ def entry(number=0, reply="{}"):
         body={"prompt": number},
         slot=Slot("A1", 1, "left", number, 0),
     )
-    return Entry(request, (Attempt(1, "ok", 200, reply=reply),))
+    return CachedCall(request, (Attempt(1, "ok", 200, reply=reply),))
 
 
 FIRST, SECOND = entry(1), entry(2)
@@ -160,7 +160,7 @@ def test_a_link_in_the_folder_is_not_followed(folder, victim, tmp_path, name):
 def test_a_file_of_locks_that_leads_elsewhere_makes_none_there(folder, tmp_path):
     (folder / "claims.lock").symlink_to(tmp_path / "made")
     with pytest.raises(UsageError, match="cannot be locked"):
-        Claims(folder)
+        Claims(folder).open()
     assert not (tmp_path / "made").exists()
 
 
@@ -240,7 +240,7 @@ def test_settings_in_the_file_are_not_applied(folder, tmp_path):
 
 def test_stock_diskcache_still_reads_what_is_written(folder):
     with diskcache.Cache(str(folder)) as stock:
-        assert Entry.from_json(stock[FIRST.request.key][32:]) == FIRST
+        assert CachedCall.from_json(stock[FIRST.request.key][32:]) == FIRST
         assert len(stock) == len(list(stock))
         assert stock.check() == []
 
@@ -390,7 +390,7 @@ def test_a_request_that_nobody_sends_is_refused(folder, own):
     with database(folder) as opened:
         opened.execute(
             "UPDATE Cache SET key = ?, value = ? WHERE key = ?",
-            [made.key, Entry(made, FIRST.attempts).to_json(), FIRST.request.key],
+            [made.key, CachedCall(made, FIRST.attempts).to_json(), FIRST.request.key],
         )
     with pytest.raises(RecordingError, match="not a canonical JSON object"):
         import_folder(folder, own)

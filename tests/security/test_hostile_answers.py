@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import io
 import json
-from types import SimpleNamespace
 
 from aiohttp import web
 from rich.console import Console
 
 from merge_runner.llm.call import Wait
 from merge_runner.llm.meter import Meter
-from merge_runner.run.progress import Progress, _table
+from merge_runner.run.progress import _table
 from tests.harness import watched
+from tests.run.standings import progress, runner
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202e"
 ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0")
@@ -64,7 +64,7 @@ async def test_an_error_in_a_servers_words_speaks_to_no_terminal(merge_runner):
 def test_a_servers_words_are_no_markup_in_the_display():
     wait = Wait("m: L_4_0", f"after HTTP 503: [/nope] {ESCAPE}")
     shown = io.StringIO()
-    runner = SimpleNamespace(meters={"m": Meter()}, waits=[wait], running=1, workers=None)
-    Console(file=shown, width=200).print(_table(Progress("title", 1, runner=runner)))
+    waiting = progress(runner(Meter(), running=1, waits=[wait]))
+    Console(file=shown, width=200).print(_table(waiting))
     assert "[/nope]" in shown.getvalue()
     assert "\x1b" not in shown.getvalue()

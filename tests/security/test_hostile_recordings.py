@@ -15,8 +15,8 @@ import duckdb
 import pytest
 
 from merge_runner.errors import MergeRunnerError, RecordingError
-from merge_runner.llm.cache import Entry, ResponseCache
-from merge_runner.llm.keys import call_key, make_request
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.content_hashes import call_key, make_request
 from merge_runner.records import Attempt, Slot
 from merge_runner.results.recording import COLUMNS, export_recording, import_recording, summarise
 
@@ -34,7 +34,7 @@ def entry(number, **changes):
         body={"prompt": number, **changes},
         slot=Slot("N_0_0", 1, "left", number, 0),
     )
-    return Entry(request, (Attempt(1, "ok", 200, reply=ANSWER),))
+    return CachedCall(request, (Attempt(1, "ok", 200, reply=ANSWER),))
 
 
 @pytest.fixture

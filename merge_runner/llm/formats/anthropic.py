@@ -15,8 +15,9 @@ from merge_runner.llm.formats.base import (
     WireRequest,
     as_count,
     as_dict,
-    as_list,
+    as_dicts,
     as_text,
+    joined,
     outcome_of,
     total,
 )
@@ -51,19 +52,15 @@ class AnthropicMessages(WireFormat):
 
     def read(self, payload: dict[str, Any]) -> Reading:
         """Join the text blocks; thinking blocks are left out."""
-        text = "".join(
-            as_text(as_dict(block).get("text")) or ""
-            for block in as_list(payload.get("content"))
-            if as_dict(block).get("type") == "text"
-        )
+        blocks = as_dicts(payload.get("content"))
+        text = joined(block for block in blocks if block.get("type") == "text")
         finish = as_text(payload.get("stop_reason"))
         usage = as_dict(payload.get("usage"))
         cached = as_count(usage.get("cache_read_input_tokens"))
         return Reading(
-            outcome="error"
-            if payload.get("type") == "error"
-            else outcome_of(
+            outcome=outcome_of(
                 text,
+                failed=payload.get("type") == "error",
                 truncated=finish in ("max_tokens", "model_context_window_exceeded"),
                 refused=finish == "refusal",
             ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, ClassVar, Literal
@@ -72,13 +72,13 @@ Meaning = Literal[
 class WireFormat(ABC):
     """One format of requests and replies, with all that is particular to it.
 
-    What a format knows of errors may be said by a server of any format, since gateways pass on
-    the errors of others; None leaves a question to the rules for all servers (http_outcome.py,
+    What a format says of errors may be asked of a reply in any format, since gateways pass on the
+    errors of others. None leaves a question to the rules for all servers (http_outcome.py,
     delays.py).
     """
 
     members: ClassVar[frozenset[str]]
-    """Those of which an answer has one, whatever it says."""
+    """Members of a body: an answer has at least one of them, whatever it says."""
 
     retries_empty: ClassVar[bool] = False
     """Whether an empty answer is a known fault of the service that asking again may mend."""
@@ -116,8 +116,15 @@ def is_answer(payload: dict[str, Any], members: frozenset[str]) -> bool:
     return any(payload.get(name) not in (None, [], {}) for name in members)
 
 
-def outcome_of(text: str, *, truncated: bool, refused: bool) -> str:
-    """The outcome of an answer, from its text and what its finish reason means."""
+def outcome_of(
+    text: str, *, failed: object = False, truncated: bool = False, refused: bool = False
+) -> str:
+    """The outcome of an answer, from its text and what its finish reason means.
+
+    ``failed`` is what the body reports as an error, where it does.
+    """
+    if failed:
+        return "error"
     if refused:
         return "refusal"
     if truncated:
@@ -133,6 +140,21 @@ def as_dict(value: object) -> dict[str, Any]:
 def as_list(value: object) -> list[Any]:
     """A JSON array, or an empty one where the server sent something else."""
     return value if isinstance(value, list) else []
+
+
+def as_dicts(value: object) -> list[dict[str, Any]]:
+    """The objects of a JSON array; anything else in it counts as an empty object."""
+    return [as_dict(item) for item in as_list(value)]
+
+
+def first_of(value: object) -> dict[str, Any]:
+    """The first object of a JSON array, or an empty one."""
+    return next(iter(as_dicts(value)), {})
+
+
+def joined(parts: Iterable[dict[str, Any]], member: str = "text") -> str:
+    """The text of all parts of an answer that have some."""
+    return "".join(as_text(part.get(member)) or "" for part in parts)
 
 
 def as_text(value: object) -> str | None:
@@ -159,15 +181,14 @@ def total(*counts: int | None) -> int | None:
 
 
 def read_error(status: int, headers: Mapping[str, str], body: str, payload: object) -> ServerError:
-    """Read an error body of any known shape; the text itself serves where it is no JSON."""
+    """Read an error body of any known shape; one that is no JSON is its own message."""
     top = as_dict(payload)
     nested = top.get("error")
     if nested is None:
-        choice = as_dict(next(iter(as_list(top.get("choices"))), None))
-        nested = choice.get("error")
+        nested = first_of(top.get("choices")).get("error")
     error = as_dict(nested) or ({"message": nested} if isinstance(nested, str) else top)
     details = error.get("details")
-    listed = [as_dict(detail) for detail in as_list(details)] or [as_dict(details)]
+    listed = as_dicts(details) or [as_dict(details)]
     names = {
         str(name)
         for name in (

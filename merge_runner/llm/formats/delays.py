@@ -20,7 +20,7 @@ _PARTS = re.compile(_PART, re.I)
 _DURATION = re.compile(rf"{_PART}(?:(?:,|\s|and)*{_PART})*", re.I)
 # A header that is sent several times has all its values in one, and a date has a comma of its own.
 _LISTED = re.compile(r"(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*,)?[^,]+", re.I)
-# A server that asks for longer means for good, and no clock counts that far.
+# A server that asks for longer means for ever, and dates end somewhere.
 MOST_S = 366 * 86400.0
 _IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_DURATION.pattern})", re.I)
 # Azure counts on below zero.
@@ -84,7 +84,7 @@ def _retry_after(text: str, now: datetime) -> float | None:
         return seconds
     try:
         return until_s(parsedate_to_datetime(text), now)
-    except (ValueError, OverflowError):  # the latter: a zone that is further away than time is long
+    except (ValueError, OverflowError):  # the latter: a zone beyond the first or last date
         return None
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from pydantic import JsonValue
-
 from merge_runner.config import ModelEntry
 from merge_runner.llm.formats.base import (
     Meaning,
@@ -16,8 +14,10 @@ from merge_runner.llm.formats.base import (
     WireRequest,
     as_count,
     as_dict,
-    as_list,
+    as_dicts,
     as_text,
+    first_of,
+    joined,
     outcome_of,
     total,
 )
@@ -51,35 +51,30 @@ class GeminiGenerateContent(WireFormat):
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
         """One user turn; the cap covers thoughts and visible tokens."""
-        config: dict[str, JsonValue] = {
-            "maxOutputTokens": entry.max_output_tokens,
-            **entry.parameters,
-        }
         return WireRequest(
             path=entry.path or f"/v1beta/models/{entry.id}:generateContent",
             body={
                 "contents": [{"role": "user", "parts": [{"text": prompt}]}],
-                "generationConfig": config,
+                "generationConfig": {
+                    "maxOutputTokens": entry.max_output_tokens,
+                    **entry.parameters,
+                },
             },
         )
 
     def read(self, payload: dict[str, Any]) -> Reading:
         """Join the parts of the first candidate that are no thoughts."""
-        candidate = as_dict(next(iter(as_list(payload.get("candidates"))), None))
-        text = "".join(
-            as_text(as_dict(part).get("text")) or ""
-            for part in as_list(as_dict(candidate.get("content")).get("parts"))
-            if not as_dict(part).get("thought")
-        )
+        candidate = first_of(payload.get("candidates"))
+        parts = as_dicts(as_dict(candidate.get("content")).get("parts"))
+        text = joined(part for part in parts if not part.get("thought"))
         finish = as_text(candidate.get("finishReason"))
         blocked = as_text(as_dict(payload.get("promptFeedback")).get("blockReason"))
         usage = as_dict(payload.get("usageMetadata"))
         thoughts = as_count(usage.get("thoughtsTokenCount"))
         return Reading(
-            outcome="error"
-            if payload.get("error")
-            else outcome_of(
+            outcome=outcome_of(
                 text,
+                failed=payload.get("error"),
                 truncated=finish == "MAX_TOKENS",
                 refused=bool(blocked) or finish in REFUSALS,
             ),
@@ -99,9 +94,9 @@ class GeminiGenerateContent(WireFormat):
         if error.status == 400 and "API_KEY_INVALID" in error.names:
             return "not_allowed"
         per_day = any(
-            "PerDay" in str(as_dict(violation).get("quotaId"))
+            "PerDay" in str(violation.get("quotaId"))
             for detail in error.details
-            for violation in as_list(detail.get("violations"))
+            for violation in as_dicts(detail.get("violations"))
         )
         return "quota_exhausted" if error.status == 429 and per_day else None
 

@@ -8,17 +8,17 @@ from merge_runner.config import ModelEntry
 from merge_runner.llm.formats.base import (
     Reading,
     WireRequest,
-    as_count,
     as_dict,
-    as_list,
+    as_dicts,
     as_text,
+    first_of,
+    joined,
     outcome_of,
 )
-from merge_runner.llm.formats.openai_errors import OpenAIErrors
-from merge_runner.records import Usage
+from merge_runner.llm.formats.openai import OpenAI, usage_of
 
 
-class OpenAIChat(OpenAIErrors):
+class OpenAIChat(OpenAI):
     """``POST /chat/completions``; the path can be overridden, as Azure's classic form needs."""
 
     members = frozenset({"choices"})
@@ -37,35 +37,24 @@ class OpenAIChat(OpenAIErrors):
 
     def read(self, payload: dict[str, Any]) -> Reading:
         """Read the first choice."""
-        choice = as_dict(next(iter(as_list(payload.get("choices"))), None))
+        choice = first_of(payload.get("choices"))
         message = as_dict(choice.get("message"))
         finish = as_text(choice.get("finish_reason"))
         text = _content(message.get("content"))
         refusal = as_text(message.get("refusal"))
-        usage = as_dict(payload.get("usage"))
         # Routers answer 200 and put the failure of a generation into the body.
         failed = payload.get("error") or choice.get("error") or finish == "error"
         return Reading(
-            outcome="error"
-            if failed
-            else outcome_of(
+            outcome=outcome_of(
                 text,
+                failed=failed,
                 truncated=finish == "length",
                 refused=bool(refusal) or finish == "content_filter",
             ),
             text=text or refusal or "",
             finish_reason=finish,
             model_served=as_text(payload.get("model")),
-            usage=Usage(
-                input_tokens=as_count(usage.get("prompt_tokens")),
-                cached_input_tokens=as_count(
-                    as_dict(usage.get("prompt_tokens_details")).get("cached_tokens")
-                ),
-                output_tokens=as_count(usage.get("completion_tokens")),
-                reasoning_tokens=as_count(
-                    as_dict(usage.get("completion_tokens_details")).get("reasoning_tokens")
-                ),
-            ),
+            usage=usage_of(payload, "prompt", "completion"),
         )
 
 
@@ -73,4 +62,4 @@ def _content(content: object) -> str:
     """The text of a message, which some servers send as a list of parts."""
     if isinstance(content, str):
         return content
-    return "".join(as_text(as_dict(part).get("text")) or "" for part in as_list(content))
+    return joined(as_dicts(content))

@@ -8,17 +8,16 @@ from merge_runner.config import ModelEntry
 from merge_runner.llm.formats.base import (
     Reading,
     WireRequest,
-    as_count,
     as_dict,
-    as_list,
+    as_dicts,
     as_text,
+    joined,
     outcome_of,
 )
-from merge_runner.llm.formats.openai_errors import OpenAIErrors
-from merge_runner.records import Usage
+from merge_runner.llm.formats.openai import OpenAI, usage_of
 
 
-class OpenAIResponses(OpenAIErrors):
+class OpenAIResponses(OpenAI):
     """``POST /responses``, not stored at the provider."""
 
     members = frozenset({"output", "status"})
@@ -39,39 +38,24 @@ class OpenAIResponses(OpenAIErrors):
     def read(self, payload: dict[str, Any]) -> Reading:
         """Join the text parts of all messages; a failed response arrives with status 200."""
         parts = [
-            as_dict(part)
-            for item in as_list(payload.get("output"))
-            if as_dict(item).get("type") == "message"
-            for part in as_list(as_dict(item).get("content"))
+            part
+            for item in as_dicts(payload.get("output"))
+            if item.get("type") == "message"
+            for part in as_dicts(item.get("content"))
         ]
-        text = "".join(
-            as_text(part.get("text")) or "" for part in parts if part.get("type") == "output_text"
-        )
-        refusal = "".join(
-            as_text(part.get("refusal")) or "" for part in parts if part.get("type") == "refusal"
-        )
+        text = joined(part for part in parts if part.get("type") == "output_text")
+        refusal = joined((part for part in parts if part.get("type") == "refusal"), "refusal")
         status = as_text(payload.get("status"))
         reason = as_text(as_dict(payload.get("incomplete_details")).get("reason"))
-        usage = as_dict(payload.get("usage"))
         return Reading(
-            outcome="error"
-            if status == "failed" or payload.get("error")
-            else outcome_of(
+            outcome=outcome_of(
                 text,
+                failed=status == "failed" or payload.get("error"),
                 truncated=reason == "max_output_tokens" or status == "incomplete",
                 refused=bool(refusal) or reason == "content_filter",
             ),
             text=text or refusal,
             finish_reason=reason or status,
             model_served=as_text(payload.get("model")),
-            usage=Usage(
-                input_tokens=as_count(usage.get("input_tokens")),
-                cached_input_tokens=as_count(
-                    as_dict(usage.get("input_tokens_details")).get("cached_tokens")
-                ),
-                output_tokens=as_count(usage.get("output_tokens")),
-                reasoning_tokens=as_count(
-                    as_dict(usage.get("output_tokens_details")).get("reasoning_tokens")
-                ),
-            ),
+            usage=usage_of(payload, "input", "output"),
         )

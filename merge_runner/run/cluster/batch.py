@@ -1,16 +1,14 @@
-"""What the coordinator tells a worker: a batch of trials, and what is known of a call."""
+"""What the coordinator gives a worker to play, if both are the same program."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import merge_runner
-from merge_runner.llm.cache import Entry
-from merge_runner.records import Attempt, TrialSpec
+from merge_runner.records import TrialSpec
 from merge_runner.registry import plugin_sources
 from merge_runner.run.clients import EndpointPlan
 from merge_runner.run.plan import Plan
@@ -18,32 +16,12 @@ from merge_runner.run.plan import Plan
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Whole trials to play, at most ``in_flight`` at once, and how.
-
-    ``folder`` names the worker's own cache, that of one main cache alone. ``limited`` are the
-    models whose calls need a turn from the coordinator, ``pauses_s`` how long the calls of each
-    other one have to wait at first.
-    """
+    """Whole trials to play, at most ``in_flight`` at once, and how."""
 
     specs: tuple[TrialSpec, ...]
     in_flight: int
     plan: Plan
     endpoint_plan: EndpointPlan
-    folder: str
-    limited: frozenset[str]
-    pauses_s: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class KnownCall:
-    """What the main cache holds of a call: its entry, or earlier attempts.
-
-    ``damaged`` names what was found damaged and set aside.
-    """
-
-    entry: Entry | None
-    attempts: tuple[Attempt, ...]
-    damaged: tuple[str, ...] = ()
 
 
 @cache

@@ -65,12 +65,12 @@ async def connected(where: str) -> AsyncIterator[Client]:
 
 @asynccontextmanager
 async def _local_cluster(workers: int) -> AsyncIterator[object]:
-    """Worker processes; Ctrl-C is for us alone, who stop them in order."""
+    """Worker processes; Ctrl-C reaches this process alone, which stops them in order."""
     import dask
     from distributed import LocalCluster
 
     _choose_how_workers_start()
-    # None is what was set there: asked for a forkserver by name, Dask would have it import pandas.
+    # None leaves the method that was chosen: if Dask is told "forkserver", it has it import pandas.
     with dask.config.set({"distributed.worker.multiprocessing-method": None}):
         cluster = LocalCluster(
             n_workers=workers,
@@ -97,7 +97,7 @@ def _choose_how_workers_start() -> None:
 
 @contextmanager
 def _for_children() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach, and that import nothing from this folder."""
+    """Processes that are started within ignore Ctrl-C and import nothing from this folder."""
     resource_tracker.ensure_running()  # else it starts within, and lets Ctrl-C through again
     name = "PYTHONSAFEPATH"
     kept = os.environ.get(name)
@@ -120,7 +120,7 @@ def _silence() -> None:
 
 
 def _local_workers(where: str) -> int:
-    """How many workers are to be started on this machine; none where a scheduler is named."""
+    """How many workers are to be started on this machine; 0 where a scheduler is named."""
     kind, _, number = where.partition(":")
     if kind != "local":
         return 0
@@ -130,7 +130,7 @@ def _local_workers(where: str) -> int:
 
 
 def _scheduler(where: str) -> dict[str, str]:
-    """How the Dask client calls what is named: an address, or a scheduler file."""
+    """What tells the Dask client where the scheduler is: an address, or a scheduler file."""
     if not where.endswith(".json"):
         return {"address": _address(where)}
     if not Path(where).is_file():

@@ -1,9 +1,8 @@
 """Hands batches of trials to the workers of a cluster, and alone keeps what they bring.
 
-Dask decides where a batch is played, and starts one anew whose worker died. Which trials it holds
-is decided when it begins: the next ones in the order of the sweep, many at first and fewer toward
-the end, so that no worker is left with a long rest. The trials of a lost worker go back to the
-front.
+Dask decides where a batch is played, and begins it again elsewhere when its worker dies. Which
+trials it holds is decided when it begins: the next ones in the order of the sweep. Those of a lost
+worker go back to the front.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from distributed.scheduler import KilledWorker
 from merge_runner.errors import (
     ClusterFailed,
     MergeRunnerError,
-    RecordingError,
     TrialSuspended,
     UsageError,
 )
@@ -45,14 +43,15 @@ if TYPE_CHECKING:
     from merge_runner.run.local_runner import Ended, Room
     from merge_runner.run.plan import Plan
 
+# Workers may come and go: how often they are counted.
 LOOK_EVERY_S = 1.0
+# A scheduler that hangs must not keep Ctrl-C from ending the run.
 GOODBYE_S = 5.0
 BATCHES_PER_WORKER = 4
 SCHEDULER_GONE = (
     "the Dask scheduler is gone. Every reply that the workers sent is saved; run the same command "
     "again to go on"
 )
-_IDENTITY = "identity"
 
 
 class Coordinator:
@@ -73,7 +72,6 @@ class Coordinator:
     ) -> None:
         self.services = services
         self.cache = cache
-        self.claimed: set[str] = set()
         self.answered: Counter[str] = Counter()
         self.meters = {name: Meter() for name in plan.entries}
         self.workers = 0
@@ -82,9 +80,8 @@ class Coordinator:
         self._plan = plan
         self._endpoint_plan = endpoint_plan
         self._in_flight = in_flight
-        self._limited = frozenset(n for n, turns in services.limiters.items() if turns.limited)
+        # A task that an earlier run has left must not join this one, should it use the same port.
         self._token = secrets.token_hex(16)
-        self._folder = ""
         self._waiting: deque[TrialSpec] = deque()
         self._unfinished: set[int] = set()
         self._ended: Ended | None = None
@@ -95,12 +92,11 @@ class Coordinator:
         self._freed = asyncio.Event()
         self._batches: dict[asyncio.Task[None], Future] = {}
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._failure.add_done_callback(lambda failed: failed.exception())
+        self._failure.add_done_callback(lambda failed: failed.exception())  # it is retrieved
         self._stopping = False
 
     async def __aenter__(self) -> Coordinator:
         """Listen where the scheduler reaches this process."""
-        self._folder = f"merge-runner-{await _identity(self.cache)}"
         scheduler = self._client.scheduler.address
         protocol = scheduler.partition("://")[0]
         host = get_address_host(self._client.scheduler_comm.comm.local_address)
@@ -181,20 +177,12 @@ class Coordinator:
 
     def ended(self, spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
         """A trial has ended at a worker."""
-        if spec.order not in self._unfinished:
-            return
         self._unfinished.remove(spec.order)
         assert self._ended is not None
         try:
             self._ended(spec, record)
         except MergeRunnerError as exc:
             self.fail(exc)
-
-    def tell_pause(self, told_by: Session, name: str, seconds: float) -> None:
-        """A server asked one worker to wait, and all others wait with it."""
-        for session in self._sessions:
-            if session is not told_by and name not in self._limited:
-                session.link.tell("pause", name, seconds)
 
     async def admit(self, session: Session, token: str, theirs: str, host: str) -> Batch | None:
         """The batch of a worker that joins; None: there is nothing to do."""
@@ -217,8 +205,8 @@ class Coordinator:
         slots = max(1, min(self._slots, self._in_flight))
         share = min(self._free, max(1, self._in_flight // slots))
         idle = max(1, slots - sum(bool(other.trials) for other in self._sessions))
-        # Many at first, so that little is said, and fewer toward the end, so that no worker is left
-        # with a long rest; never fewer than it plays at once.
+        # Large batches at first, so that little is said, and smaller ones toward the end, so that
+        # no worker still has many when the others have none; never fewer than it plays at once.
         size = min(
             math.ceil(len(self._waiting) / idle),
             max(share, math.ceil(len(self._waiting) / (BATCHES_PER_WORKER * slots))),
@@ -232,13 +220,6 @@ class Coordinator:
             in_flight=session.in_flight,
             plan=self._plan,
             endpoint_plan=replace(self._endpoint_plan, passed=self._passed()),
-            folder=self._folder,
-            limited=self._limited,
-            pauses_s={
-                name: turns.paused_s
-                for name, turns in self.services.limiters.items()
-                if name not in self._limited
-            },
         )
 
     def _passed(self) -> frozenset[str]:
@@ -258,8 +239,8 @@ class Coordinator:
             self.fail(error)  # a fault of ours: the run raises it
         if self._stopping:
             return
-        # What it had not ended goes to the front, in order: a trial is played where its replies are
-        # found, in the main cache, whoever plays it.
+        # What it had not ended goes to the front, in order. Whoever plays it next finds its replies
+        # in the cache.
         rest = sorted(session.trials.values(), key=lambda spec: spec.order)
         self._waiting.extendleft(reversed(rest))
         if rest and not session.ended:
@@ -307,18 +288,3 @@ async def _finished(batch: Future) -> None:
         )
     if error is not None:
         raise error
-
-
-async def _identity(cache: ResponseCache) -> str:
-    """What tells this cache from others, and from one that was here before."""
-
-    def operation() -> str:
-        known = None
-        with contextlib.suppress(RecordingError):  # a damaged one counts as missing
-            known = cache.read(_IDENTITY)
-        if known is None:
-            cache.replace(_IDENTITY, known := secrets.token_hex(8))
-        return known
-
-    identity: str = await cache.write(operation)
-    return identity

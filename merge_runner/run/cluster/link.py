@@ -26,6 +26,7 @@ from distributed.protocol import pickle
 from merge_runner import errors
 from merge_runner.errors import MergeRunnerError, SweepStopped
 
+# Short beside a call that takes a second, and long enough to gather hundreds of messages.
 TOGETHER = "2ms"
 ANSWER, ERROR, CANCEL = "answer", "error", "cancel"
 
@@ -37,7 +38,7 @@ class LinkLost(SweepStopped):
 class Link:
     """One end. ``handlers`` answer what the other end asks or tells, by name.
 
-    Those named in ``survives_disconnect`` end also when the other side is gone meanwhile; the
+    When the other side is gone, those named in ``survives_disconnect`` are still finished; the
     others wait for something on its behalf, and are cancelled.
     """
 
@@ -59,7 +60,7 @@ class Link:
         self._broken: BaseException | None = None
 
     def tell(self, what: str, *content: object) -> None:
-        """Say something that needs no answer; nobody hears it where the other side is gone."""
+        """Say something that needs no answer; it is lost where the other side is gone."""
         self._send(0, what, content)
 
     async def ask(self, what: str, *content: object) -> Any:  # noqa: ANN401 # what the handler returns
@@ -95,7 +96,7 @@ class Link:
             for task in self._answering.values():
                 if task.get_name() not in self._survives_disconnect:
                     task.cancel()
-            # Only then does serve return, and what the other side held is given back.
+            # Before serve returns, since then what the other side held is given back.
             await asyncio.gather(*self._answering.values(), return_exceptions=True)
         if self._broken is not None:
             raise self._broken

@@ -2,34 +2,36 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from distributed.comm import Comm
 
-from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended
+from merge_runner.errors import CacheFailed, TrialSuspended
 from merge_runner.llm.budget import PaidAttempt
-from merge_runner.llm.cache import Entry
+from merge_runner.llm.cache import CachedCall, KnownCall
 from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Asked
-from merge_runner.llm.limiter import Permit
 from merge_runner.llm.meter import Meter
-from merge_runner.records import Attempt, TrialRecord, TrialSpec
-from merge_runner.run.cluster.batch import Batch, KnownCall
+from merge_runner.llm.shared_services import Settle
+from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.run.cluster.batch import Batch
 from merge_runner.run.cluster.link import Link, rebuilt
 
 if TYPE_CHECKING:
     from merge_runner.run.cluster.coordinator import Coordinator
 
-# What a dead worker had sent is kept, and what it had paid for is booked; whatever it waited for is
-# given up.
+# What a dead worker had sent is still kept, and what it had paid for is booked; whatever it waited
+# for is given up.
 SURVIVES_DISCONNECT = frozenset({"keep", "unanswered", "settle", "begin", "end"})
 
 
 class Session:
     """One batch at one worker.
 
-    ``trials`` are those it holds, by their order in the sweep; ``ended`` that it said so itself.
+    ``trials`` are those it holds, by their order in the sweep; ``ended`` is True once the worker
+    has said that the batch has ended.
     """
 
     def __init__(self, coordinator: Coordinator, comm: Comm) -> None:
@@ -40,14 +42,14 @@ class Session:
         self.waits: Sequence[Wait] = ()
         self.worker = ""
         self._run = coordinator
-        self._services = coordinator.services
+        self._budget = coordinator.services.budget
+        self._limiters = coordinator.services.limiters
         self._cache = coordinator.cache
         self._claimed: set[str] = set()
-        self._permits: dict[int, Permit] = {}
-        self._permit_number = 0
+        self._turns: dict[int, Settle] = {}
+        self._numbers = itertools.count()
         self._attempts: dict[int, PaidAttempt] = {}
         self.ended = False
-        budget = self._services.budget
         self.link = Link(
             comm,
             {
@@ -61,19 +63,19 @@ class Session:
                 "unanswered": self._cache.put_unanswered,
                 "turn": self._turn,
                 "used": self._used,
-                "pause": self._pause,
-                "admit": budget.admit,
-                "leave": budget.leave,
+                "pause": lambda name, seconds: self._limiters[name].pause(seconds),
+                "admit": self._budget.admit,
+                "leave": self._budget.leave,
                 "set_aside": self._set_aside,
-                "begin": self._begin,
-                "settle": self._settle,
+                "begin": lambda number, attempts: self._attempts[number].begin(attempts),
+                "settle": lambda number, attempts: self._attempts[number].settle(attempts),
                 "close": self._close,
             },
             survives_disconnect=SURVIVES_DISCONNECT,
         )
 
     async def serve(self) -> None:
-        """Serve the worker until it hangs up; ``ended`` if it said that it had ended."""
+        """Serve the worker until it hangs up, then give back whatever it held."""
         try:
             await self.link.serve()
         finally:
@@ -82,14 +84,14 @@ class Session:
             # What was sent stays aside in the ledger; see PaidAttempt.
             for number in list(self._attempts):
                 self._close(number)
-            self._services.budget.readmit(self.trials)
+            self._budget.readmit(self.trials)
 
     async def _join(self, token: str, fingerprint: str, worker: str, host: str) -> Batch | None:
         self.worker = worker
         return await self._run.admit(self, token, fingerprint, host)
 
     def _trial(self, order: int, told: TrialRecord | str) -> None:
-        """A trial has ended, or is suspended for the reason that is told."""
+        """A trial has ended: its record, or the reason for which it is suspended."""
         spec = self.trials.pop(order)
         self._run.ended(spec, TrialSuspended(told) if isinstance(told, str) else told)
 
@@ -111,60 +113,41 @@ class Session:
             name, text = error
             self._run.fail(rebuilt(name, f"{text} (told by the worker {self.worker})"))
 
-    def _claim(self, key: str) -> KnownCall | None:
-        """What is known of a call; None: somebody else is making it, maybe another worker."""
-        if key in self._run.claimed or not self._services.claims.take(key):
-            return None
-        self._run.claimed.add(key)
-        self._claimed.add(key)
-        try:
-            return KnownCall(self._cache.get(key), self._cache.unanswered(key))
-        except RecordingError:
-            damaged = tuple(self._cache.set_damage_aside(key))
-            return KnownCall(self._cache.get(key), self._cache.unanswered(key), damaged)
+    async def _claim(self, key: str) -> KnownCall | None:
+        known = await self._cache.claim(key)
+        if known is not None:
+            self._claimed.add(key)
+        return known
 
     def _release(self, key: str) -> None:
         self._claimed.remove(key)
-        self._run.claimed.remove(key)
-        self._services.claims.release(key)
+        self._cache.release(key)
 
-    async def _keep(self, text: str, attempt: int | None) -> None:
-        """Keep a reply in the main cache; ``attempt`` is the number of the one that paid for it."""
-        entry = Entry.from_json(text)
+    async def _keep(self, entry: CachedCall, paid: int | None) -> CachedCall | None:
+        """Keep a reply, and the cost of the attempt; returns another one that was there before."""
+        keep = self._cache.put if paid is None else self._attempts[paid].keep
         try:
-            if attempt is None:
-                await self._cache.put(entry)
-            else:
-                await self._attempts[attempt].keep(entry)
+            kept = await keep(entry)
         except CacheFailed as exc:
-            self._run.fail(exc)
+            self._run.fail(exc)  # here, not as told by a worker: it is no cache of the worker's
             raise
         self._run.answered[entry.request.model] += 1
+        return None if kept == entry else kept
 
     async def _turn(self, name: str, tokens: int, order: int) -> int:
-        permit = await self._services.limiters[name].acquire(tokens, order=order)
-        self._permit_number += 1
-        self._permits[self._permit_number] = permit
-        return self._permit_number
+        settle = await self._limiters[name].acquire(tokens, order=order)
+        number = next(self._numbers)
+        self._turns[number] = settle
+        return number
 
     def _used(self, number: int, tokens: int) -> None:
-        self._permits.pop(number).settle(tokens)
-
-    def _pause(self, name: str, seconds: float) -> None:
-        self._services.limiters[name].pause(seconds)
-        self._run.tell_pause(self, name, seconds)
+        self._turns.pop(number)(tokens)
 
     async def _set_aside(self, number: int, trial: int, key: str, asked: Asked) -> float:
         """Set money aside for an attempt, and hold it under a number that the worker chose."""
-        paid = await self._services.budget.set_aside(trial, key, asked)
+        paid = await self._budget.set_aside(trial, key, asked)
         self._attempts[number] = paid
         return paid.aside_usd
-
-    async def _begin(self, number: int, attempts: Sequence[Attempt]) -> None:
-        await self._attempts[number].begin(attempts)
-
-    async def _settle(self, number: int, attempts: Sequence[Attempt]) -> None:
-        await self._attempts[number].settle(attempts)
 
     def _close(self, number: int) -> None:
         """An attempt has ended; nothing is held where its worker gave up waiting for money."""

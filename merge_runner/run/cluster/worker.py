@@ -8,7 +8,6 @@ import signal
 import socket
 from contextlib import AsyncExitStack
 from functools import partial
-from pathlib import Path
 
 from distributed import Worker, get_worker
 from distributed.comm import connect
@@ -19,14 +18,7 @@ from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.run.clients import live_clients
 from merge_runner.run.cluster.batch import Batch, fingerprint
 from merge_runner.run.cluster.link import Link, LinkLost, taken_apart
-from merge_runner.run.cluster.remote import (
-    RemoteBudget,
-    RemoteClaims,
-    RemoteRateLimit,
-    RemoteServices,
-    UnlimitedRate,
-    WorkerCache,
-)
+from merge_runner.run.cluster.remote import RemoteBudget, RemoteCache, RemoteRateLimit
 from merge_runner.run.local_runner import LocalRunner
 
 REPORT_EVERY_S = 0.5
@@ -48,8 +40,6 @@ class _Worker:
     def __init__(self) -> None:
         self._work: asyncio.Task[None] | None = None
         self._stopping = False
-        self._turns: dict[str, UnlimitedRate] = {}
-        self._early_pauses: dict[str, float] = {}
 
     async def play(self, address: str, token: str) -> None:
         dask = get_worker()
@@ -57,8 +47,8 @@ class _Worker:
         try:
             comm = await connect(address, **dask.security.get_connection_args("worker"))
         except OSError:
-            return  # the coordinator is gone, and with it whoever would read an error
-        link = Link(comm, {"stop": self._stop, "pause": self._pause})
+            return  # the coordinator is gone, and nobody would read an error
+        link = Link(comm, {"stop": self._stop})
         serving = asyncio.create_task(link.serve())
         serving.add_done_callback(lambda _: self._stop())
         error: MergeRunnerError | None = None
@@ -68,10 +58,8 @@ class _Worker:
             )
             if batch is None:
                 return
-            # Beside Dask's folders of single workers, which go when their worker does.
-            folder = Path(dask.local_directory).parent / batch.folder
             with contextlib.suppress(asyncio.CancelledError):
-                await self._play(batch, link, folder)
+                await self._play(batch, link)
         except MergeRunnerError as exc:
             error = exc
         finally:
@@ -80,36 +68,26 @@ class _Worker:
             await link.close()
             await serving
 
-    async def _play(self, batch: Batch, link: Link, folder: Path) -> None:
+    async def _play(self, batch: Batch, link: Link) -> None:
+        entries = batch.plan.entries
         async with AsyncExitStack() as stack:
-            cache = WorkerCache(folder, link)
-            stack.callback(cache.close)
-            self._turns = {name: UnlimitedRate(link, name) for name in batch.pauses_s}
-            for name, seconds in {**batch.pauses_s, **self._early_pauses}.items():
-                self._pause(name, seconds)
-            limited = {name: RemoteRateLimit(link, name) for name in batch.limited}
-            services = RemoteServices(
-                limiters={**limited, **self._turns},
-                budget=RemoteBudget(link, cache),
-                claims=RemoteClaims(link, cache),
-            )
             clients = live_clients(
                 batch.plan,
                 batch.endpoint_plan,
-                cache,
-                services,
+                RemoteCache(link),
+                {name: RemoteRateLimit(link, name) for name in entries},
+                RemoteBudget(link),
                 connections=2 * batch.in_flight,
                 stack=stack,
             )
             runner = LocalRunner(batch.plan, clients, batch.in_flight)
             self._work = asyncio.create_task(runner.play(batch.specs, partial(_tell, link)))
-            if self._stopping:
+            if self._stopping:  # told so before there was anything to cancel
                 self._work.cancel()
             reporting = asyncio.create_task(_report(runner, link))
             try:
                 await asyncio.wait([self._work])
                 await runner.drain()
-                await cache.sent()
             finally:
                 reporting.cancel()
                 _tell_progress(runner, link)
@@ -120,18 +98,10 @@ class _Worker:
         if self._work is not None:
             self._work.cancel()
 
-    def _pause(self, name: str, seconds: float) -> None:
-        if name in self._turns:
-            self._turns[name].hold(seconds)
-        else:
-            self._early_pauses[name] = seconds
-
 
 def _stop_profiler(dask: Worker) -> None:
-    """Stop Dask's look at all threads a hundred times a second.
-
-    Python 3.11 can deadlock there when it collects a threading.local, as those of the cache are.
-    """
+    """Stop Dask from looking at all threads a hundred times a second."""
+    # Python 3.11 can deadlock there when it collects a threading.local.
     if (profiler := dask.periodic_callbacks.get("profile")) is not None:
         dask.loop.add_callback(profiler.stop)
 

@@ -1,21 +1,22 @@
-"""What a worker holds of the coordinator's money, over a real connection, however it ends."""
+"""What a worker holds of the coordinator's, over a real connection, however it ends."""
 
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from types import SimpleNamespace
 
 import pytest
 from distributed.comm import connect, listen
 
 from merge_runner.llm.budget import Budget
-from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.claims import Claims
+from merge_runner.llm.cache import CachedCall, KnownCall, ResponseCache
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.records import Attempt
+from merge_runner.records import Attempt, Slot
 from merge_runner.run.clients import LocalServices
 from merge_runner.run.cluster.link import Link, LinkLost
-from merge_runner.run.cluster.remote import RemoteBudget, WorkerCache
+from merge_runner.run.cluster.remote import RemoteBudget, RemoteCache
 from merge_runner.run.cluster.session import Session
 
 WORST = Asked("o3", "L_4_0 rep 1 left, decision 3", 0.5)
@@ -35,12 +36,10 @@ def budget(cache):
 
 
 @pytest.fixture
-async def worker(cache, budget, tmp_path):
-    """The worker's end: its link, and the budget that it asks over it."""
-    claims = Claims(cache.folder)
-    run = SimpleNamespace(
-        services=LocalServices({}, budget, claims), cache=cache, claimed=set(), meters={}
-    )
+async def worker(cache, budget):
+    """The worker's end: its link, and the budget and the cache that it asks over it."""
+    services = LocalServices({}, budget)
+    run = SimpleNamespace(services=services, cache=cache, meters={}, answered=Counter())
     sessions = []
 
     async def serve(comm):
@@ -53,17 +52,14 @@ async def worker(cache, budget, tmp_path):
     await listener.start()
     link = Link(await connect(listener.contact_address), {})
     serving = asyncio.create_task(link.serve())
-    own = WorkerCache(tmp_path / "own", link)
 
     async def dies():
         link.abort()
         await asyncio.gather(serving, *sessions)
 
-    yield SimpleNamespace(link=link, budget=RemoteBudget(link, own), dies=dies)
+    yield SimpleNamespace(link=link, budget=RemoteBudget(link), cache=RemoteCache(link), dies=dies)
     await dies()
     listener.stop()
-    own.close()
-    claims.close()
 
 
 def money(budget):
@@ -120,3 +116,46 @@ async def test_who_gives_up_when_the_answer_is_under_way_holds_no_money(worker, 
         await asyncio.gather(asking, return_exceptions=True)
     await worker.link.ask("leave", TRIAL)  # all that was told before it has been heard
     assert (budget._in_flight, money(budget)) == (0, (0, 0, 0))
+
+
+def answered(reply):
+    request = make_request(
+        provider="openai",
+        endpoint="openai",
+        model="m",
+        path="/p",
+        headers={},
+        body={"prompt": "p"},
+        slot=Slot("A1", 1, "left", 0, 0),
+    )
+    return CachedCall(request, (Attempt(1, "ok", 200, reply=reply, cost_usd=0.25),))
+
+
+CALL = answered('{"text": "M"}')
+KEY = CALL.request.key
+
+
+async def test_a_reply_is_in_the_main_cache_before_its_worker_sees_it(worker, cache):
+    assert await worker.cache.claim(KEY) == KnownCall(None, ())
+    assert await worker.cache.put(CALL) == CALL
+    assert cache.get(KEY) == CALL
+
+
+async def test_a_paid_reply_is_kept_and_booked_at_once(worker, cache, budget):
+    async with worker.budget.attempt(TRIAL, KEY, WORST) as paid:
+        await paid.begin([])
+        assert await paid.keep(CALL) == CALL
+        assert (cache.get(KEY), money(budget)) == (CALL, (0, 0, 0.25))
+
+
+async def test_a_reply_that_was_there_before_is_the_one_that_is_used(worker, cache):
+    cache.put_now([CALL])
+    assert await worker.cache.put(answered('{"text": "Y"}')) == CALL
+
+
+async def test_what_a_lost_worker_had_claimed_can_be_claimed_by_others(worker, cache):
+    await worker.cache.put_unanswered(KEY, (Attempt(1, "timeout"),))
+    assert await worker.cache.claim(KEY)
+    assert await cache.claim(KEY) is None
+    await worker.dies()
+    assert await cache.claim(KEY) == KnownCall(None, (Attempt(1, "timeout"),))

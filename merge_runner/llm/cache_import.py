@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from itertools import islice
 from pathlib import Path
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import ResponseCache, entries_of
-from merge_runner.llm.cache_db import open_read_only, usable
-
-BATCH = 1_000
+from merge_runner.llm.cache import ResponseCache
 
 
 def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
@@ -20,15 +16,9 @@ def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
     """
     if folder.resolve() == cache.folder.resolve():
         raise UsageError(f"{folder} is the cache itself: name another one with --cache")
-    added = there = 0
     left_out: list[str] = []
-    with usable(folder), contextlib.closing(open_read_only(folder)) as disk:
-        entries = entries_of(disk, left_out)
-        while batch := list(islice(entries, BATCH)):
-            new = [entry for entry in batch if not cache.holds(entry.request.key)]
-            cache.put_now(new)
-            added += len(new)
-            there += len(batch) - len(new)
+    with contextlib.closing(ResponseCache(folder, read_only=True)) as source:
+        added, there = cache.add_missing(source.entries(left_out))
     if left_out:
         raise RecordingError(
             f"{added} calls of {folder} added to {cache.folder}, {there} were there already, and "

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.config import ModelEntry
-from merge_runner.llm import keys
+from merge_runner.llm import content_hashes
+from merge_runner.llm.content_hashes import call_key, canonical_json, make_request
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.keys import call_key, canonical_json, make_request
 from merge_runner.records import Slot
 
 SLOT = Slot(condition="A1", repetition=1, side="left", decision=0, sample_set=0)
@@ -174,10 +174,10 @@ def test_numbers_that_are_equal_but_spelt_differently_are_different_requests():
 
 def test_another_key_version_is_another_key(monkeypatch):
     before = key()
-    monkeypatch.setattr(keys, "KEY_VERSION", keys.KEY_VERSION + 1)
-    keys.between_body_and_slot.cache_clear()
+    monkeypatch.setattr(content_hashes, "KEY_VERSION", content_hashes.KEY_VERSION + 1)
+    content_hashes.between_body_and_slot.cache_clear()
     assert key() != before
-    keys.between_body_and_slot.cache_clear()
+    content_hashes.between_body_and_slot.cache_clear()
 
 
 def test_labels_do_not_enter_the_key():

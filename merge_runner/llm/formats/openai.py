@@ -1,12 +1,14 @@
-"""What both formats of OpenAI share: errors and limits, with those of servers that speak them."""
+"""What both formats of OpenAI share: usage, errors and limits, also of servers that speak them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import datetime
+from typing import Any
 
-from merge_runner.llm.formats.base import Meaning, ServerError, WireFormat
+from merge_runner.llm.formats.base import Meaning, ServerError, WireFormat, as_count, as_dict
 from merge_runner.llm.formats.delays import NONE_REMAINS, duration_s
+from merge_runner.records import Usage
 
 QUOTA = frozenset(
     {
@@ -21,8 +23,8 @@ QUOTA = frozenset(
 )
 
 
-class OpenAIErrors(WireFormat):
-    """The errors of OpenAI, Azure, OpenRouter and LiteLLM."""
+class OpenAI(WireFormat):
+    """A format of OpenAI, with the errors of Azure, OpenRouter and LiteLLM."""
 
     # Azure charges for a prompt that it has looked at, also where it then refuses it.
     charged_errors = frozenset({"content_filter", "context_length_exceeded"})
@@ -47,7 +49,7 @@ class OpenAIErrors(WireFormat):
         """A failed response arrives with status 200."""
         if "rate_limit_exceeded" in error.names:
             return 429
-        return 500 if error.names <= {"server_error"} else None
+        return 500 if error.names == {"server_error"} else None
 
     def reset_s(self, headers: Mapping[str, str], now: datetime) -> float | None:
         """The longest reset among the limits of which nothing remains."""
@@ -57,6 +59,19 @@ class OpenAIErrors(WireFormat):
             if NONE_REMAINS.fullmatch(headers.get(f"x-ratelimit-remaining-{kind}", ""))
         ]
         return max((delay for delay in delays if delay is not None), default=None)
+
+
+def usage_of(payload: dict[str, Any], read: str, written: str) -> Usage:
+    """The usage of an answer, by the format's words for what was read and written."""
+    usage = as_dict(payload.get("usage"))
+    read_details = as_dict(usage.get(f"{read}_tokens_details"))
+    written_details = as_dict(usage.get(f"{written}_tokens_details"))
+    return Usage(
+        input_tokens=as_count(usage.get(f"{read}_tokens")),
+        cached_input_tokens=as_count(read_details.get("cached_tokens")),
+        output_tokens=as_count(usage.get(f"{written}_tokens")),
+        reasoning_tokens=as_count(written_details.get("reasoning_tokens")),
+    )
 
 
 def _is_filtered(error: ServerError) -> bool:

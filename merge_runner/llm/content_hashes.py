@@ -66,7 +66,7 @@ def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, sl
 
 @cache
 def between_body_and_slot(endpoint: str, path: str, headers: tuple[tuple[str, str], ...]) -> str:
-    """What stands there in the text of a key: it is the same for all calls of a model.
+    """The part of a key's text between body and slot: the same for all calls of a model.
 
     "body" sorts before the other names and "slot" after them, so that the whole is canonical.
     """
@@ -75,13 +75,13 @@ def between_body_and_slot(endpoint: str, path: str, headers: tuple[tuple[str, st
 
 
 def without_prompt(body: str) -> str:
-    """A canonical body with an empty text in place of its prompt, by far the longest text of it."""
+    """A canonical body with an empty text in place of its longest one, which is the prompt."""
     prompt = max(_texts(json.loads(body)), key=len, default="")
     return body.replace(canonical_json(prompt), '""')
 
 
 def manner(path: str, empty_body: str) -> str:
-    """The short hash of how a model is asked, whatever the prompt: of what is sent besides."""
+    """The short hash of how a model is asked: of all that is sent but the prompt."""
     return hashlib.sha256(f"{path} {empty_body}".encode()).hexdigest()[:16]
 
 
