@@ -100,10 +100,9 @@ DECISIONS = """
 SELECT trial_id, spec_hash, fallback, count(*) AS decisions
 FROM decisions GROUP BY ALL ORDER BY ALL
 """
-SPECS = "SELECT spec_hash, spec FROM specs"
-SPECS_WITH_A_TRIAL = """
+SPECS = """
 SELECT spec_hash, spec, min(trial_id) AS trial_id
-FROM specs LEFT JOIN trials USING (spec_hash) GROUP BY ALL ORDER BY ALL
+FROM specs JOIN trials USING (spec_hash) GROUP BY ALL ORDER BY ALL
 """
 
 
@@ -145,9 +144,9 @@ def load_each(queries: Mapping[str, str], db: Path | str = DEFAULT_DB) -> dict[s
 
 
 def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:
-    """Every stored spec by its hash; raises UsageError for one that cannot be read."""
+    """The specs of all trials by their hash; raises UsageError for one that cannot be read."""
     found = {}
-    for row in load_each({"specs": SPECS_WITH_A_TRIAL}, db)["specs"].itertuples():
+    for row in load_each({"specs": SPECS}, db)["specs"].itertuples():
         found[row.spec_hash] = json.loads(row.spec)
         try:
             _Spec.model_validate(found[row.spec_hash])

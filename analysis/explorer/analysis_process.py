@@ -17,7 +17,7 @@ Request = tuple[str, ...]
 REMEMBERED = 100
 # What the fits of these tables take on their own, in s on a slow machine.
 LONG_S = {"who-first": 8, "gap": 13, "indicators": 15, "ablation-qualitative": 15}
-# Nobody has to wait for more; an export waits so long.
+# Nobody has to wait for more: an export waits so long, and the process is killed then.
 LONGEST_S = 3600.0
 MOST_BYTES = 2**30
 
@@ -104,13 +104,15 @@ class Computing:
     def _run(self, request: Request, state: State, since: float) -> Result:
         # A cell is looked up in the state that its table shows, unless a later one is wanted.
         stays = self._state == state or (request[0] == "cell" and not since)
-        if self._child is None or not stays:
+        alive = self._child is not None and self._child.process.poll() is None
+        if not (alive and stays):
             self._end()
             # Another process for another state: all that was made of the old one ends with it.
             self._child, self._state = self.start(self.db), state
         if self._closed:
             self._end()
             raise NoAnswer("the explorer ends")
+        assert self._child is not None
         assert self._state is not None
         made_in = self._state
         try:

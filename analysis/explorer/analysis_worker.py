@@ -5,7 +5,6 @@ pandas and the fits hold a Python process for seconds, and no page may wait for 
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -152,12 +151,12 @@ def human_panels(study: Study) -> dict[str, Any]:
     ``published`` holds what is published of the rest, by the metric's name: ``values`` by
     condition, as far as there are such, and a ``text`` that says what they are.
     """
-    from analysis.data.load import SPECS, load
+    from analysis.data.load import load_specs
     from analysis.data.reference_data import HUMAN_TRIALS, citation
     from analysis.stats.measures import known, outcomes_note
     from analysis.tables.notes import sample_notes
 
-    specs = {row.spec_hash: json.loads(row.spec) for row in load(SPECS, study.db).itertuples()}
+    specs = load_specs(study.db)
     there = study.human in study.groups
     unknown = [metric for metric in shown_in("humans") if not known(study.human, metric)]
     return {

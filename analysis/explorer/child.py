@@ -78,6 +78,9 @@ class Child:
         try:
             said, body = self._exchange(request, most_bytes)
         except (EOFError, OSError, ValueError) as exc:  # it is dead, or another thread closed it
+            # Its pipe closes before it is gone: killed now, it would not tell its exit code.
+            with suppress(subprocess.TimeoutExpired):
+                self.process.wait(1)
             self.close()
             raise Ended(self.process.returncode, late=late.is_set()) from exc
         finally:

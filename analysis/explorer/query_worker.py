@@ -69,7 +69,8 @@ def answer(told: dict[str, Any]) -> Answer:
     query = Query(**{**told, "caps": Caps(**told["caps"])})
     try:
         return _run(query)
-    except (MergeRunnerError, duckdb.Error, OSError, MemoryError) as exc:
+    # Python has no values for some of DuckDB's, such as intervals of millions of years.
+    except (MergeRunnerError, duckdb.Error, OSError, MemoryError, OverflowError, ValueError) as exc:
         memory = (MemoryError, duckdb.OutOfMemoryException)
         if isinstance(exc, memory) or isinstance(exc.__cause__, memory):
             return {"error": f"the query needed more than {query.caps.memory_mb} MB"}, b""

@@ -211,8 +211,9 @@ def list_sweeps(catalogue: Catalogue) -> list[ListedSweep]:
     catalogue.refresh()
     entries = _entries(catalogue)
     # A sweep notes its end in the database before its file goes: one that seems to be lost may have
-    # ended since the database was read.
-    if any(entry.state == "lost" for entry in entries) and catalogue.refresh():
+    # ended since the rows were read, by whoever refreshed the catalogue since.
+    if any(entry.state == "lost" for entry in entries):
+        catalogue.refresh()
         return _entries(catalogue)
     return entries
 

@@ -55,7 +55,8 @@ def identified(reply: str, provider: str | None) -> tuple[str, str] | None:
     # In an unknown format everything counts: else any two of its answers would be equal.
     known = any(name in body for name in ANSWERS)
     answer = json.dumps([body.get(name) for name in ANSWERS] if known else body)
-    return found, hashlib.blake2b(answer.encode(), digest_size=16).hexdigest()
+    safe = found.encode(errors="replace").decode()  # half a surrogate pair is no UTF-8
+    return safe, hashlib.blake2b(answer.encode(), digest_size=16).hexdigest()
 
 
 def find_ids(connection: duckdb.DuckDBPyConnection) -> None:

@@ -192,6 +192,13 @@ class ResponseCache:
         if not self.claims.take(key):
             return None
         # Read after the lock is taken, or a call could be made between the two.
+        with contextlib.ExitStack() as claimed:
+            claimed.callback(self.release, key)
+            known = self._known(key)
+            claimed.pop_all()  # what cannot be read is not claimed
+        return known
+
+    def _known(self, key: str) -> KnownCall:
         try:
             return KnownCall(self.get(key), self.unanswered(key))
         except RecordingError:

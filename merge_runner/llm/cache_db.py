@@ -242,7 +242,7 @@ def open_disk(folder: Path) -> TextDisk:
 
     Raises UsageError for a folder that cannot be used, is damaged, or is of a newer format.
     """
-    with usable(folder):
+    with _usable(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)
         if not (folder / FILE).exists():
@@ -265,7 +265,7 @@ def open_read_only(folder: Path) -> TextDisk:
     """Open a folder, maybe somebody else's, to read it alone; raises UsageError."""
     if not (folder / FILE).exists():
         raise UsageError(f"there is no cache in {folder}")
-    with usable(folder):
+    with _usable(folder):
         return TextDisk(folder, read_only=True)
 
 
@@ -284,7 +284,7 @@ def set_format(disk: TextDisk) -> None:
 
 
 @contextlib.contextmanager
-def usable(folder: Path) -> Iterator[None]:
+def _usable(folder: Path) -> Iterator[None]:
     """Raise UsageError for what SQLite and the system say of a folder."""
     try:
         yield

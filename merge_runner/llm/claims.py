@@ -34,6 +34,7 @@ class Claims:
                 if self.take(_TRIED):
                     self.release(_TRIED)
             except OSError as exc:
+                self.close()
                 raise UsageError(
                     f"the cache {self._folder} cannot be shared safely: {LOCK_FILE} cannot be "
                     f"locked ({exc.strerror}). Name a folder on a local disk with --cache"

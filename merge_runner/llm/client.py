@@ -219,7 +219,7 @@ class LlmClient:
         """Claim a call, and make it unless it is recorded by now."""
         key = call.request.key
         while (known := await self.cache.claim(key)) is None:
-            with call.waiting("for another merge-runner that makes the same call"):
+            with call.waiting("for the same call, which is being made already"):
                 await asyncio.sleep(CLAIM_POLL_S)
         try:
             for name in known.damaged:
@@ -284,7 +284,7 @@ class LlmClient:
                 paid = await stack.enter_async_context(
                     self._money.attempt(call.order, call.request.key, call.asked)
                 )
-            with call.waiting("for a turn under the rate limits"):
+            with call.waiting("for its turn"):
                 settle = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
             yield paid, settle
 

@@ -764,6 +764,12 @@ def answered(entry: CachedCall, **changes: object) -> CachedCall:
     return replace(entry, attempts=(*entry.attempts[:-1], replace(entry.attempts[-1], **changes)))
 
 
+def renamed(entry: CachedCall, reply_id: str) -> CachedCall:
+    """The entry with another id of its reply."""
+    told = json.loads(entry.attempts[-1].reply) | {"id": reply_id}
+    return answered(entry, reply=json.dumps(told))
+
+
 def asked_anew(entry: CachedCall, **changes: object) -> CachedCall:
     """Another request in the same slot, or in a changed one."""
     old = entry.request
@@ -788,6 +794,9 @@ RECORDINGS = {
     "a reply was given to two samples": (
         lambda e: [answered(e[0], reply=e[1].attempts[-1].reply), *e[1:]],
         "shared", "with the provider's id of it, is also that of N_0_0/rep01, left, decision 1",
+    ),
+    "the id of a reply is half a surrogate pair": (
+        lambda e: [renamed(e[0], "\ud800"), *e[1:]], None, "",
     ),
     "another model answered": (
         lambda e: [answered(e[0], model_served="gpt-0"), *e[1:]],

@@ -90,6 +90,6 @@ def track_of(spec: Mapping[str, Any]) -> Track:
                 + ", ".join(names)
             )
     try:
-        return Track(**told)
-    except ValueError as exc:
+        return Track(**{name: float(number) for name, number in told.items()})
+    except (ValueError, OverflowError) as exc:
         raise UsageError(f"a stored spec has no track: {exc}") from exc

@@ -74,6 +74,7 @@ def test_the_bounds_of_the_experiments_vehicles_are_the_known_ones(database):
         ({"end_m": None}, "track.end_m is None"),
         ({"merge_point": 120.0}, "track.merge_point is 120.0"),
         ({"tunnel_exit_m": True}, "track.tunnel_exit_m is True"),
+        ({"end_m": 10**400}, "too large"),
         ({"merge_point_m": 200.0}, "leads from its tunnels to the merge point"),
     ],
 )
