@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 
 from analysis.data.collision_rules import judged
+from analysis.data.derived_cache import finished
 from analysis.data.imported_humans import Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
@@ -135,12 +136,16 @@ class Group:
 
 
 class Study:
-    """The groups of a database, humans first, and what is computed from their traces once."""
+    """The groups of a database, humans first, and what is computed from their traces once.
+
+    ``state`` is that of the results before they were read: rows may be stored meanwhile.
+    """
 
     def __init__(self, db: Path | str = DEFAULT_DB, models: Sequence[str] | None = None) -> None:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
         self.db = Path(db)
         self.chosen = models
+        self.state, _ = finished(self.db, "", ())
         specs = load_specs(self.db)
         trials = trials_with_metrics(self.db).merge(
             self._read(TRACES), on=["trial_id", "spec_hash"], how="left"

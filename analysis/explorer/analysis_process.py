@@ -104,7 +104,7 @@ class Computing:
     def _run(self, request: Request, state: State, since: float) -> Result:
         # A cell is looked up in the state that its table shows, unless a later one is wanted.
         stays = self._state == state or (request[0] == "cell" and not since)
-        alive = self._child is not None and self._child.process.poll() is None
+        alive = self._child is not None and self._child.alive
         if not (alive and stays):
             self._end()
             # Another process for another state: all that was made of the old one ends with it.

@@ -51,21 +51,15 @@ class Numbers:
                 return self._counted() | human_panels(self.study) | self._tables(["contrasts"])
         raise UsageError(f"nothing answers {request!r}")
 
-    @property
+    @cached_property
     def study(self) -> Study:
         """The study, once it is read."""
-        return self._read[0]
-
-    @cached_property
-    def _read(self) -> tuple[Study, str]:
-        """The study, and the state of the results before it was read."""
         from analysis.data.study import Study
 
-        state, _ = finished(self.db, "", [])
-        return Study(self.db), state
+        return Study(self.db)
 
     def _counted(self) -> dict[str, Any]:
-        if "_read" in self.__dict__:
+        if "study" in self.__dict__:
             groups = [group for group in self.study.groups if group.measured]
             return {"counted": sum(len(group.trials) for group in groups)}
         with read_database(self.db) as connection:
@@ -82,10 +76,11 @@ class Numbers:
         _, kept = finished(self.db, options, names)
         found = {name: from_text(text) for name, text in kept.items()}
         if missing := [name for name in names if name not in found]:
-            study, state = self._read
+            study = self.study
             made = dict(zip(missing, make_tables(study, missing), strict=True))
-            # They show the state in which the study was read; if it is past, they are not kept.
-            keep_finished(self.db, state, options, {name: to_text(made[name]) for name in missing})
+            # If the state in which the study was read is past, they are not kept.
+            texts = {name: to_text(made[name]) for name in missing}
+            keep_finished(self.db, study.state, options, texts)
             found |= made
         return found
 

@@ -64,6 +64,11 @@ class Child:
         except OSError as exc:
             raise NoAnswer(f"no process can be started: {exc.strerror}") from exc
 
+    @property
+    def alive(self) -> bool:
+        """Whether it can be asked."""
+        return self.process.poll() is None
+
     def ask(self, request: object, *, seconds: float, most_bytes: int) -> Answer:
         """The answer; raises NoAnswer where it is an error or too large, and Ended."""
         late = threading.Event()

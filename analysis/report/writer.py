@@ -50,12 +50,12 @@ def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
 
 def finished_figures(study: Study, options: str) -> dict[str, str]:
     """Every figure by name as SVG in Base64, as it is kept in the database or drawn now."""
-    state, found = finished(study.db, options, list(FIGURES))
+    _, found = finished(study.db, options, list(FIGURES))
     drawn = {
         name: base64.b64encode(rendered(study, name, "svg")).decode()
         for name in FIGURES
         if name not in found
     }
     if drawn:
-        keep_finished(study.db, state, options, drawn)
+        keep_finished(study.db, study.state, options, drawn)
     return found | drawn

@@ -56,14 +56,15 @@ def finished_tables(
     """
     wanted = _valid(names)
     options = options_text(db, models)
-    state, kept = finished(db, options, wanted)
+    _, kept = finished(db, options, wanted)
     found = {name: from_text(text) for name, text in kept.items()}
     missing = [name for name in dict.fromkeys(wanted) if name not in found]
     if missing:
         from analysis.data.study import Study
 
-        made = dict(zip(missing, make_tables(study or Study(db, models), missing), strict=True))
-        keep_finished(db, state, options, {name: to_text(made[name]) for name in missing})
+        study = study or Study(db, models)
+        made = dict(zip(missing, make_tables(study, missing), strict=True))
+        keep_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})
         found |= made
     return [found[name] for name in wanted]
 

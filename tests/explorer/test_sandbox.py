@@ -300,6 +300,22 @@ def test_an_answer_is_whole_or_refused_and_one_that_is_no_answer_is_an_end(tmp_p
         said("no JSON\n")
 
 
+def test_a_child_that_fails_tells_its_own_exit_code(tmp_path, monkeypatch):
+    (tmp_path / "failing.py").write_text(
+        "from analysis.explorer.child import serve\nserve(lambda told: 1 / 0)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    with contextlib.closing(child.Child("failing", quiet=True)) as failing:
+        with pytest.raises(Ended) as ended:
+            failing.ask("", seconds=LOADED_S, most_bytes=100)
+        assert (ended.value.code, ended.value.late) == (1, False)
+
+
+def test_a_value_that_python_has_not_is_told(queries):
+    with pytest.raises(NoAnswer, match="must have magnitude"):
+        queries.result("SELECT INTERVAL '3000000 years'")
+
+
 def test_what_lies_in_the_log_beside_the_database_is_read(own, tmp_path):
     crashed = tmp_path / "crashed.duckdb"
     with duckdb.connect(str(own)) as connection:

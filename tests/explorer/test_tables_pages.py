@@ -37,6 +37,8 @@ HOSTILE = '<img src=x onerror="alert(1)">'
 class InProcess:
     """Computes where the test runs; a process of its own takes seconds to begin."""
 
+    alive = True
+
     def __init__(self, db):
         self._numbers = Numbers(db)
 
@@ -352,7 +354,7 @@ def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
     computing.close()
 
 
-def test_a_process_of_its_own_answers_alike_and_its_end_is_a_failure(db):
+def test_a_process_of_its_own_answers_alike_and_another_one_takes_its_place(db):
     computing = Computing(db)
     request = ("tables", "attempts")
     while isinstance(found := computing.ask(request, (1, 1), wait_s=30), Waiting):
@@ -361,13 +363,26 @@ def test_a_process_of_its_own_answers_alike_and_its_end_is_a_failure(db):
     with pytest.raises(NoAnswer, match=re.escape("nothing answers ['nothing']")):
         computing.ask(("nothing",), (1, 1), wait_s=30)
     computing._child.process.kill()
-    with pytest.raises(NoAnswer, match=r"without an answer \(exit code -9\)"):
-        computing.ask(("tables", "fallbacks"), (1, 1), wait_s=30)
+    computing._child.process.wait()
+    while isinstance(found := computing.ask(("tables", "fallbacks"), (1, 1), wait_s=30), Waiting):
+        pass
+    assert found.content == Numbers(db).answer(("tables", "fallbacks"))
     computing.close()
     child = worker(db)
     child.close()
     with pytest.raises(Ended):
         child.ask(request, seconds=1, most_bytes=1000)
+
+
+def test_a_process_that_ends_amid_a_request_is_a_failure(db):
+    class Killed(InProcess):
+        def ask(self, request, **limits):
+            raise Ended(-9, late=False)
+
+    computing = Computing(db, Killed)
+    with pytest.raises(NoAnswer, match=r"without an answer \(exit code -9\)"):
+        computing.ask(("tables", "fallbacks"), (1, 1), wait_s=30)
+    computing.close()
 
 
 @pytest.mark.parametrize(

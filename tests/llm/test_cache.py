@@ -337,6 +337,14 @@ def test_damaged_facts_about_a_model_are_counted_anew(cache, stock):
     assert cache.stats("m").cost_usd == 7
 
 
+async def test_a_claim_whose_reply_cannot_be_read_is_given_up(cache, stock):
+    key = entry(1).request.key
+    stock[key] = entry(1).to_json().replace('"version":1', '"version":99')
+    for _ in range(2):
+        with pytest.raises(UsageError, match="version"):
+            await cache.claim(key)
+
+
 async def test_damaged_attempts_are_set_aside_and_good_ones_are_not(cache, stock):
     key = entry(1).request.key
     await cache.write(lambda: cache.keep_unanswered(key, entry(1).attempts))

@@ -17,7 +17,7 @@ from analysis.report.writer import finished_figures
 from analysis.table_format import TableFormat
 from analysis.tables import TABLES, finished_tables, make_tables
 from analysis.tables.formats import render
-from analysis.tables.model import from_text, to_text
+from analysis.tables.model import from_text, options_text, to_text
 from merge_runner.errors import UsageError
 from merge_runner.results.store import results_digest
 from tests.analysis.studies import write_study, yielding
@@ -140,6 +140,13 @@ def test_tables_of_results_that_changed_meanwhile_are_not_kept(db):
     assert found == {}
     keep_finished(db, now, "x", {"gap": "new"})
     assert finished(db, "x", ["gap"]) == (now, {"gap": "new"})
+
+
+def test_tables_of_a_study_that_was_read_before_a_change_are_not_kept(db):
+    study = Study(db)
+    change(db, CHANGES["an outcome"])
+    finished_tables(db, None, ["attempts"], study)
+    assert finished(db, options_text(db, None), ["attempts"])[1] == {}
 
 
 def test_beside_another_program_tables_are_made_and_not_kept(db, made, caplog):

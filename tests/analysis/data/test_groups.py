@@ -209,3 +209,7 @@ def test_a_stored_spec_that_cannot_be_read_is_named_with_a_trial_in_one_line(db,
     (line,) = str(refused.value).splitlines()
     assert line.startswith("the spec other-baseline, of other/baseline/L_0_-8/rep01, cannot be ")
     assert says in line
+
+
+def test_a_spec_of_no_trial_keeps_nothing_from_being_read(db):
+    assert changed(db, """INSERT INTO specs VALUES ('orphan', '{"scenario": {"odd": 1}}')""").models
