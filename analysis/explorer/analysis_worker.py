@@ -166,7 +166,7 @@ def human_panels(study: Study) -> dict[str, Any]:
             {
                 "id": group.id,
                 "driver": group.label,
-                "scenario": specs.get(group.spec_hash, {}).get("scenario"),
+                "scenario": specs.get(group.spec_hash or "", {}).get("scenario"),
                 "conditions": {name: _in_condition(group, name) for name in study.conditions},
             }
             for group in study.baselines
