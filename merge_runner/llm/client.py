@@ -284,7 +284,7 @@ class LlmClient:
                 paid = await stack.enter_async_context(
                     self._money.attempt(call.order, call.request.key, call.asked)
                 )
-            with call.waiting("for its turn"):
+            with call.waiting("for a turn under the rate limits"):
                 settle = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
             yield paid, settle
 

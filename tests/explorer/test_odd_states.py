@@ -123,6 +123,8 @@ def test_a_fault_in_a_computation_does_not_stay(study):
     answers = iter([ValueError("a fault"), ({"counted": 1}, b"")])
 
     class Faulty:
+        alive = True
+
         def ask(self, request, **limits):
             answer = next(answers)
             if isinstance(answer, Exception):

@@ -30,7 +30,6 @@ async def test_conditions_from_outside_go_through_every_command(merge_runner, tm
         command[0]: await merge_runner(*command)
         for command in (
             ("tables", "conflict-resolution", "who-first"),
-            ("figures", "--out", "figures"),
             ("report", "--out", "report.html"),
             ("view", "--export", "pages"),
             ("audit",),

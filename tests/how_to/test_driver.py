@@ -68,14 +68,12 @@ def test_a_driver_decides_at_its_own_rate_and_is_drawn_from_its_seed(study, play
 def test_it_is_in_every_command_that_reads(study, played):
     audit = study.run("audit", "--json", **played)
     assert (audit.code, "not derived" in audit.out) == (0, False), audit.out
-    done = study.run("view", "--export", "pages", **played)
+    done = study.run("view", "--trials", "*", "--single", "trials.html", **played)
     assert done.code == 0, done.err
     tables = study.run("tables", "ablation-quantitative", "--format", "csv", **played)
     for name in PAIRS:
         assert name in tables.out
-    pages = [page.read_text() for page in (study.folder / "pages").rglob("*") if page.is_file()
-             and page.suffix in {".html", ".js", ".json"}]  # fmt: skip
-    assert any("impulsive decision" in page or "hesitant+impulsive" in page for page in pages)
+    assert "hesitant+impulsive" in (study.folder / "trials.html").read_text()
 
 
 def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
@@ -87,7 +85,7 @@ def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
         "(install the package that registers it)" in note
         for note in notes
     ), notes
-    done = study.run("view", "--export", "bare")
+    done = study.run("view", "--trials", "*", "--single", "bare.html")
     assert done.code == 0, done.err
     asked = study.run("sweep", "fine.toml", "--model", "impulsive")
     assert asked.code == 2

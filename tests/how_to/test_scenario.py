@@ -49,8 +49,6 @@ async def test_a_scenario_from_outside_goes_through_every_command(merge_runner, 
 
     # From here on the package is not there.
     for command in (
-        ("tables",),
-        ("figures", "--out", "figures"),
         ("report", "--out", "report.html"),
         ("view", "--export", "pages"),
         ("audit",),
