@@ -103,12 +103,6 @@ class _Seated:
 async def _decide(world: World, seats: Mapping[Side, _Seated]) -> dict[Side, Decision | CallFailed]:
     """Ask at once all who are due; where one call fails, the other's answer is still awaited."""
 
-    async def answer(seated: _Seated, observation: Observation) -> Decision | CallFailed:
-        try:
-            return await seated.driver.decide(observation, seated.number(world.step))
-        except CallFailed as failure:
-            return failure
-
     asked = {
         side: seated
         for side, seated in seats.items()
@@ -116,6 +110,13 @@ async def _decide(world: World, seats: Mapping[Side, _Seated]) -> dict[Side, Dec
     }
     if not asked:
         return {}
+
+    async def answer(seated: _Seated, observation: Observation) -> Decision | CallFailed:
+        try:
+            return await seated.driver.decide(observation, seated.number(world.step))
+        except CallFailed as failure:
+            return failure
+
     answers = await asyncio.gather(
         *(answer(seated, world.observe(side)) for side, seated in asked.items())
     )

@@ -248,7 +248,9 @@ class LlmClient:
                 await asyncio.sleep(seconds)
 
         try:
-            answer: ChatReply = await retries(deadline, sleep=sleep)(self._attempt, call, deadline)
+            async for attempt in retries(deadline, sleep=sleep):
+                with attempt:
+                    return await self._attempt(call, deadline)
         except (OutOfTime, RequestFailed) as exc:
             why, made = f"{exc} ({call.last_failure})", len(call.own_attempts)
             if isinstance(exc, OutOfTime) and not self.first.passed:
@@ -258,7 +260,7 @@ class LlmClient:
                     "the same command"
                 ) from exc
             raise call.failed(f"{self.name}: {why}, {made} attempts") from exc
-        return answer
+        raise AssertionError("unreachable: the loop returns or raises")
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; returns its answer, which is kept, or raises what follows from it."""

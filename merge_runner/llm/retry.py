@@ -44,10 +44,11 @@ def backoff_s(attempts: int) -> float:
 def retries(
     deadline: Deadline, *, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
 ) -> AsyncRetrying:
-    """A loop that calls a coroutine function until it does not raise TryAgain.
+    """A loop of attempts, each a context, that goes on while they raise TryAgain.
 
-    Raises OutOfTime when the deadline would pass before the next attempt.
+    Raises OutOfTime when the deadline would pass before the next one.
     """
+    # Looped over, since to wrap a function for each call would take twice the processor time.
     return AsyncRetrying(
         retry=retry_if_exception_type(TryAgain),
         wait=_wait_s,

@@ -48,12 +48,11 @@ class Call:
     async def run(self, deadline_s=600.0):
         deadline = Deadline(deadline_s)
 
-        async def attempt():
-            turn = await self.take_turn()
-            with deadline.attempt() as seconds_left:
-                return await self.attempt(turn, seconds_left)
-
-        return await retries(deadline, sleep=self.sleep)(attempt)
+        async for context in retries(deadline, sleep=self.sleep):
+            with context:
+                turn = await self.take_turn()
+                with deadline.attempt() as seconds_left:
+                    return await self.attempt(turn, seconds_left)
 
 
 @pytest.fixture
