@@ -50,7 +50,7 @@ async def test_a_scenario_from_outside_goes_through_every_command(merge_runner, 
     # From here on the package is not there.
     for command in (
         ("report", "--out", "report.html"),
-        ("view", "--export", "pages"),
+        ("view", "--trials", "*", "--single", "trials.html"),
         ("audit",),
     ):
         run = await merge_runner(*command)
