@@ -102,7 +102,6 @@ class _Seated:
 
 async def _decide(world: World, seats: Mapping[Side, _Seated]) -> dict[Side, Decision | CallFailed]:
     """Ask at once all who are due; where one call fails, the other's answer is still awaited."""
-
     asked = {
         side: seated
         for side, seated in seats.items()

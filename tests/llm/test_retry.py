@@ -53,6 +53,7 @@ class Call:
                 turn = await self.take_turn()
                 with deadline.attempt() as seconds_left:
                     return await self.attempt(turn, seconds_left)
+        raise AssertionError("unreachable: the loop returns or raises")
 
 
 @pytest.fixture
