@@ -88,7 +88,7 @@ OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
 
 def main() -> None:
     """Run the command line and exit with the contract's code."""
-    # The objects of a trial live until it ends: frequent collections would find next to nothing.
+    # A trial's objects live until it ends, so frequent garbage collections would find almost none.
     gc.set_threshold(20_000, 10, 100)
     debug = "--debug" in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != "--debug"]
@@ -100,7 +100,7 @@ def main() -> None:
         say(f"error: {exc}")
         sys.exit(exc.exit_code)
     except RuntimeError as exc:
-        if debug or str(exc) != "Query interrupted":  # as DuckDB says of Ctrl-C
+        if debug or str(exc) != "Query interrupted":  # what DuckDB raises on Ctrl-C
             raise
         say("interrupted: run the same command again")
         sys.exit(130)
@@ -242,7 +242,7 @@ def sql(
     from merge_runner.results.store import answers
 
     writers = {Format.TEXT: write_table, Format.CSV: write_csv, Format.JSON: write_json}
-    # The reader of a pipe may take its time, and would keep every sweep from writing meanwhile.
+    # A slow reader of a pipe would otherwise keep every sweep from writing meanwhile.
     with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as spooled:
         with answers(db, query) as (names, rows):
             writers[output](names, rows, spooled)

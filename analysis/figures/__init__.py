@@ -1,1 +1,1 @@
-"""The pictures: their numbers, what they have in common, and how each is drawn."""
+"""The figures: the numbers in them, what they have in common, and how each is drawn."""

@@ -25,14 +25,14 @@ MISSING = "human recordings\nare not imported"
 
 
 def named(group: Group) -> str:
-    """A group as figures name it: ``o3/A2``, and a stand-in as what it is."""
+    """A group's name in figures: ``o3/A2``, with a stand-in marked as one."""
     if not group.setting:
         return group.label
     return f"{group.id} ({group.posing})" if group.scripted else group.id
 
 
 def wrapped(text: str, width_in: float) -> str:
-    """A name in lines that are no wider than this: broken at blanks and signs, or else anywhere."""
+    """A name in lines no wider than this, broken at blanks or punctuation, or else anywhere."""
     marked = re.sub(r"([+/])", f"\\1{BREAK} ", text)
     lines = textwrap.wrap(marked, max(6, int(width_in / CHARACTER_IN)))
     return "\n".join(re.sub(f"{BREAK} ?", "", line) for line in lines)
@@ -50,7 +50,7 @@ def velocity_text(velocity_mps: float) -> str:
 
 
 def remarks(study: Study, colour: str) -> list[Line2D]:
-    """What a legend says of humans who are shown by something else than their own trials."""
+    """Remarks for a legend where humans are shown by something other than their own trials."""
     if study.human not in study.groups:
         return []
     if not study.human.measured:

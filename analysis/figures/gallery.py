@@ -53,7 +53,7 @@ from merge_runner.errors import UsageError
 
 LEGEND_COLUMNS = 4
 PASSED, FAILED, UNKNOWN = SKY_BLUE, ORANGE, "#dddddd"
-# The same input gives the same file.
+# These settings are fixed, so that equal input gives equal files.
 SETTINGS: Any = {
     "font.size": 7,
     "axes.titlesize": 7,
@@ -61,7 +61,7 @@ SETTINGS: Any = {
     "axes.spines.right": False,
     "axes.linewidth": 0.6,
     "pdf.fonttype": 42,
-    "text.parse_math": False,  # a dollar in a name is a dollar
+    "text.parse_math": False,  # a dollar sign in a name does not start a formula
     "svg.hashsalt": "merge-runner",
     "savefig.dpi": 300,
 }
@@ -121,7 +121,7 @@ def ablation_matrix(study: Study) -> Figure:
 
 
 def distributions(study: Study) -> Figure:
-    """Each metric that is no rate, of every group: median, quartiles, and every trial."""
+    """Each metric other than rates, for every group: median, quartiles, and every trial."""
     groups, metrics = study.groups, _distributed()
     names = [wrapped(named(group), PAGE_IN / 4) for group in groups]
     row_in = max(0.28, LINE_IN * line_count(names) + 0.04)
@@ -141,7 +141,7 @@ def distributions(study: Study) -> Figure:
 
 
 def _distributed() -> list[Metric]:
-    """Those with values to spread; a rate has two."""
+    """The metrics whose values have a distribution to show; a rate's values are only 0 and 1."""
     return [metric for metric in shown_in("distributions") if not metric.rate]
 
 
@@ -165,7 +165,7 @@ def _distribution(axis: Axes, row: int, group: Group, metric: Metric, colour: st
 
 
 def _reference(axis: Axes, row: int, metric: Metric, colour: str) -> None:
-    """The published value of humans without traces, or that there is none."""
+    """The published value of humans without traces, or a remark that there is none."""
     found = human_reference(metric)
     if found is None:
         axis.annotate("no published value", (0.02, row), xycoords=("axes fraction", "data"))
@@ -239,7 +239,7 @@ def _figure(study: Study, name: str) -> Figure:
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
-        figure.set_layout_engine(None)  # or every form would be laid out anew
+        figure.set_layout_engine(None)  # or the figure would be laid out again for every form
     return figure
 
 

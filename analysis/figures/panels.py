@@ -28,7 +28,7 @@ class Point:
 
 
 def velocities_mps(study: Study) -> list[float]:
-    """The relative velocities that there are panels for."""
+    """The relative velocities that have panels."""
     return sorted({*HUMAN_VELOCITIES_MPS, *(velocity for _, velocity in study.conditions.values())})
 
 
@@ -58,7 +58,7 @@ def gaps(group: Group, velocity_mps: float) -> list[Point]:
 
 
 def deviations(group: Group, velocity_mps: float) -> list[Point]:
-    """Panel E: mean RMSE of the speed in m/s, two values a trial."""
+    """Panel E: mean RMSE of the speed in m/s, two values per trial."""
     if not group.measured:
         return []
     return [
@@ -71,7 +71,7 @@ def deviations(group: Group, velocity_mps: float) -> list[Point]:
 def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
     """The human regression of the gap as the paper prints it: headways and gaps in m.
 
-    It reaches as far as the humans' conditions do, whatever else was driven.
+    The line spans the headways of the humans' conditions, whatever other conditions were driven.
     """
     farthest_m = max(abs(one.projected_headway_m) for one in HUMAN_CONDITIONS.values())
     headway = np.linspace(-farthest_m, farthest_m, 81)

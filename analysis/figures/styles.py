@@ -1,7 +1,7 @@
 """How drivers are told apart in every picture: by a colour and a shape each; humans are black.
 
-The figures draw with matplotlib and the pages with SVG of their own, since their points are links
-with words for a screen reader, and an exported page draws nothing else; both take this from here.
+The figures are drawn with matplotlib. The pages have SVG of their own, since their points are links
+with words for a screen reader, and exported pages have no other pictures. Both use these styles.
 """
 
 from __future__ import annotations

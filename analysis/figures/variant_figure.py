@@ -1,4 +1,4 @@
-"""Figure 2 of arXiv 2604.09609 for every prompt variant: a row a group, a column a panel."""
+"""Figure 2 of arXiv 2604.09609 for every prompt variant: a row per group, a column per panel."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from merge_runner.prompts.blocks import title_of
 LABEL_IN, ROW_IN = 1.15, 0.62
 LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = LABEL_IN + 0.35, 0.08, 0.4, 0.62
 BETWEEN_ROWS_IN, BETWEEN_COLUMNS_IN = 0.16, 0.3
-# Those of the humans' relative velocities in their order, and what is left for others.
+# Styles for the humans' relative velocities, in their order, and those left for others.
 STYLES = (Style(BLUE, "down"), Style(GREEN, "circle"), Style(VERMILION, "triangle"))
 OTHER_COLOURS, OTHER_SHAPES = (PURPLE, SKY_BLUE, ORANGE), ("square", "diamond", "plus")
 Styles = dict[float, Style]
@@ -136,7 +136,8 @@ def _traces(axis: Axes, study: Study, group: Group, first: str, styles: Styles) 
     for found, style in zip(parts, styles.values(), strict=True):
         draw_traces(axis, found, style.colour, count)
     if count:
-        # Who goes first drives faster: below there is room, and above for who goes second.
+        # The vehicle that goes first drives faster, which leaves room below its traces. The one
+        # that goes second leaves room above.
         y, va = (0.04, "bottom") if first == "left" else (0.96, "top")
         axis.text(0.98, y, f"n = {count}", transform=axis.transAxes, ha="right", va=va, fontsize=6)
     else:
@@ -167,7 +168,7 @@ def _published(axis: Axes) -> None:
 
 
 def _scales(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None:
-    """One scale a quantity; a few very wide intervals must not press all others flat."""
+    """One scale per quantity; a few very wide intervals must not flatten all the others."""
     speeds = [limit for axis in axes[0, :2] for limit in axis.get_ylim()]
     for axis in axes[0, :2]:
         axis.set_ylim(min(speeds), max(speeds))
@@ -186,7 +187,7 @@ def _scales(axes: NDArray[np.object_], groups: list[Group], study: Study) -> Non
 
 
 def _limits(found: list[Estimate], lines: list[float]) -> tuple[float, float]:
-    """Limits that hold all values and lines, and of 20 bounds of intervals 19."""
+    """Limits that contain all values and lines, and 19 of 20 bounds of intervals."""
     values = [*lines, *(one.value for one in found if one.value is not None)]
     lows = [one.low for one in found if one.low is not None] or values
     highs = [one.high for one in found if one.high is not None] or values

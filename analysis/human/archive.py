@@ -1,4 +1,4 @@
-"""The files of a download: a folder, or a zip that is read in memory and never unpacked."""
+"""The files of a download: of a folder, or of a zip that is never unpacked to disk."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from merge_runner.text_safety import one_line
 
 MAX_FILE_BYTES = 64 * 2**20
 MAX_TOTAL_BYTES = 4 * 2**30
-# Recorded numbers shrink to a third; a text of one line repeated, to a hundredth.
+# A zip shrinks recorded numbers to about a third, but one line repeated over and over to a
+# hundredth.
 MAX_RATIO = 200
 ENCRYPTED = 0x1
 DAMAGED = (
@@ -34,7 +35,7 @@ DAMAGED = (
 
 
 class Unreadable(MergeRunnerError):
-    """One file holds no trial that can be imported; the message is the reason."""
+    """A file holds no trial that can be imported; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def open_files(path: Path) -> Iterator[list[File]]:
 
 
 def refuse_bombs(files: Iterable[File]) -> None:
-    """Raise UsageError where the sizes that a zip declares are none that recordings can have."""
+    """Raise UsageError where a zip declares sizes that recordings cannot have."""
     total = 0
     for file in files:
         total += file.size
@@ -108,7 +109,7 @@ def _files_below(folder: Path) -> Iterator[File]:
 
 def _read_file(path: Path) -> bytes:
     if path.exists() and not path.is_file():
-        raise Unreadable("it is not a regular file")  # a device or a pipe may never end
+        raise Unreadable("it is not a regular file")  # reading a device or a pipe might never end
     try:
         return path.read_bytes()
     except OSError as exc:
@@ -116,7 +117,7 @@ def _read_file(path: Path) -> bytes:
 
 
 def _refuse_paths_outside(path: Path, members: list[zipfile.ZipInfo]) -> None:
-    """Nothing is unpacked, but a zip with such names was made to harm."""
+    """Raise UsageError for paths out of the zip: harmless here, but such a zip is an attack."""
     for member in members:
         name = PureWindowsPath(member.orig_filename)
         if name.anchor or ".." in name.parts:
@@ -132,7 +133,7 @@ def _reader(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Callable[[], b
             raise Unreadable("it is encrypted: unpack the zip and import the folder")
         if stat.S_ISLNK(member.external_attr >> 16):
             raise Unreadable("it is a link, not a file")
-        # Only these two unpack no more bytes than asked for.
+        # Only these two methods can be unpacked in parts of a limited size.
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise Unreadable("its compression is not deflate: unpack the zip, import the folder")
         try:

@@ -1,4 +1,4 @@
-"""From the files of a download to trials in the database."""
+"""Turns the files of a download into trials in the database."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ NAME = re.compile(
     r"_(?P<phase>iter|training)_(?P<number>[0-9]{1,6})\.(?P<suffix>csv|mat|pkl)",
     re.IGNORECASE,
 )
-# The recorder wrote a CSV, a MAT and a PKL of each trial; unpickling one would run what is in it.
+# The recorder wrote a CSV, a MAT and a PKL of each trial; unpickling would run code in the file.
 NOT_READ = "the CSV that the experiment's program writes beside it is what can be imported"
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedTrial:
-    """One trial of a download: its CSV files, copies too, and the names of its other files."""
+    """One trial of a download: its CSV files, including copies, and its other files' names."""
 
     experiment: int
     iteration: int
@@ -36,7 +36,7 @@ class RecordedTrial:
 
 @dataclass(frozen=True, slots=True)
 class Download:
-    """What a download holds: its trials in order, and numbers of training and simulated runs."""
+    """A download's contents: its trials in order, and how many runs were training or simulated."""
 
     trials: list[RecordedTrial]
     training: int
@@ -47,9 +47,9 @@ class Download:
 class Report:
     """What became of the trials.
 
-    ``added`` and ``there`` are numbers of trials, ``differing`` ids of those that are stored with
-    other values. ``unreadable`` holds file and reason where a trial could not be imported,
-    ``replaced`` where another of its files was read instead.
+    ``added`` and ``there`` count the trials added and those already stored; ``differing`` are ids
+    of trials already stored with other values. ``unreadable`` holds file and reason where a trial
+    could not be imported, ``replaced`` where another of its files was read instead.
     """
 
     added: int = 0
@@ -89,7 +89,7 @@ def sort_files(files: Iterable[File]) -> Download:
 
 
 def import_trials(trials: Iterable[RecordedTrial], store: Store) -> Report:
-    """Store the trials batch by batch; a batch that is stored stays. Raises StoreError."""
+    """Store the trials batch by batch; an error does not undo earlier ones. Raises StoreError."""
     report = Report()
     remaining = iter(trials)
     while batch := list(islice(remaining, BATCH)):

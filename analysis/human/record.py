@@ -1,4 +1,4 @@
-"""A recorded trial as a trial of the database: its condition, its outcome, its states."""
+"""Converts a recorded trial for the database: its condition, its outcome, its states."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STATUSES: dict[str, Status] = {
 # A recording may begin one step late: up to 0.52 m and 0.05 m/s from the start of its condition.
 START_TOLERANCE_M = 0.6
 START_TOLERANCE_MPS = 0.1
-# The experiment ends at a place, which differs from the travelled distance by some millimetres.
+# The experiment ended at a position, which differs from the distance travelled by some millimetres.
 END_TOLERANCE_M = 1.0
 SPEC = canonical_json(
     {
@@ -136,7 +136,7 @@ def _states(trace: Trace, start: int) -> tuple[StateRow, ...]:
         for side in SIDES
     ]
     steps = range(-start, len(trace.positions_m["left"]) - start)
-    # Rounded: without the binary dust of a product like 3 * 0.05.
+    # Rounded, because a product like 3 * 0.05 is not exactly 0.15 in binary.
     times_s = [round(step * trace.step_s, 9) for step in steps]
     return tuple(
         StateRow(step, time_s, side, *values)

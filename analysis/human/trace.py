@@ -1,7 +1,7 @@
-"""One recorded trial as it stands in its CSV file.
+"""One recorded trial, as read from its CSV file.
 
-The experiment's recorder wrote series under dotted names, and scalars into the first row alone.
-Rows count from 0.
+The experiment's recorder wrote series under dotted names, and scalars only in the first row.
+Rows are counted from 0.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ NEEDED = ("dt", "end_state", *SERIES)
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Both vehicles, one value a sample, in SI units; at least 2 samples, all of them finite.
+    """Both vehicles, one value per sample, in SI units; at least 2 samples, all finite.
 
-    ``step_s`` is the time between samples, ``end_state`` the recorder's word for how it ended,
-    ``positions_m`` the distances travelled along the own branch.
+    ``step_s`` is the time between samples, ``end_state`` the recorder's word for how the trial
+    ended, ``positions_m`` the distances that each vehicle travelled along its own branch.
     """
 
     step_s: float

@@ -1,1 +1,1 @@
-"""The report: what the results show, in words, and the page that shows it."""
+"""The report: what the results show, in words, on one HTML page with tables and figures."""

@@ -1,4 +1,4 @@
-"""In plain words: what the prompt variants of each driver change, and what could not be shown."""
+"""In plain words: what each driver's prompt variants change, and what could not be shown."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from analysis.tables import finished_tables
 from analysis.tables.model import Row
 from analysis.tables.notes import listed
 
-# Coefficients of the regressions, as a sentence names them, and their units.
+# How a sentence names each coefficient of the regressions, and its unit.
 SLOPES = {
     "projected_headway": ("the effect of headway on who merges first", "logits per m"),
     "relative_velocity": ("the effect of relative velocity on who merges first", "logits per m/s"),
@@ -37,8 +37,8 @@ SOURCES = ("contrasts", "who-first-variants", "gap-variants")
 class Change:
     """What a variant changes in one measure or slope, named by ``what``.
 
-    ``difference``, ``ci`` and ``detectable`` are in its unit; ``possible``: whether a test of so
-    few trials can reach 5 % at all.
+    ``difference``, ``ci`` and ``detectable`` are in the unit of that measure or slope.
+    ``possible`` says whether a test of so few trials can give p < .05 at all.
     """
 
     setting: str
@@ -58,7 +58,7 @@ class Change:
 
 
 def _names() -> dict[str, tuple[str, str]]:
-    """What may differ, as a sentence names it, and the unit of a difference."""
+    """Each measure and slope that may differ: how a sentence names it, and its unit."""
     metrics = {
         metric.name: (metric.in_sentences, "points" if metric.rate else metric.unit)
         for metric in compared()
@@ -67,11 +67,12 @@ def _names() -> dict[str, tuple[str, str]]:
 
 
 def ablation_sentences(study: Study) -> list[str]:
-    """What is shown of the variants of each driver; nothing of stand-ins."""
+    """What is shown about the variants of each driver, except those that stand-ins answered."""
     found = dict(variants(study))
     shown = [group for group in found if not group.scripted]
     if not shown:
         return []
+    # The sentences quote the tables' values, so that text and tables cannot disagree.
     tables = finished_tables(study.db, study.chosen, SOURCES, study)
     rows = {row.id: row for table in tables for row in table.rows}
     return [
@@ -95,6 +96,8 @@ def _of_driver(
     changes = [change for group in groups for change in _changes(group, baseline, rows)]
     for group in groups:
         yield from _differs(label, group, baseline, changes)
+    # A test that could not have reached 5 % says nothing when it does not, unlike one
+    # that could have found a difference and did not.
     possible = [one for one in changes if one.possible and one.p_holm >= ALPHA]
     yield from _not_shown(label, possible)
     yield from _too_few(label, [one for one in changes if not one.possible])
@@ -105,11 +108,14 @@ def _changes(group: Group, baseline: Group, rows: dict[str, Row]) -> Iterator[Ch
     for metric in compared():
         row = rows.get(f"{group.id}/{BASELINE}/{metric.name}")
         if row is not None:
+            # Before Holm's correction, which only makes p larger: a lenient bound.
             possible = smallest_p(group, baseline, metric) < ALPHA
             yield _change(group, metric.name, row, "ci", possible=possible)
     for slope in SLOPES:
         row = rows[f"{group.id}/{slope}"]
+        # There is none where a fit failed.
         if "difference" in row.values:
+            # The smallest p of these tests is unknown, so p < .05 is assumed possible.
             yield _change(group, slope, row, "difference_ci", possible=True)
 
 
@@ -127,10 +133,10 @@ def _change(group: Group, what: str, row: Row, interval: str, *, possible: bool)
 
 
 def smallest_p(group: Group, baseline: Group, metric: Metric) -> float:
-    """The smallest p that a test of so many trials gives, whatever comes out.
+    """The smallest p that a test of so many trials can give, whatever their outcomes.
 
-    Fisher's of two rates of 0 and 1; that of the permutation test, where of all ways to shuffle
-    within the conditions one is the most extreme, or two that mirror each other.
+    For a rate, Fisher's p of rates 1 and 0. For a mean, the permutation test's p where only one of
+    all ways to shuffle within the conditions is the most extreme, or two that mirror each other.
     """
     if metric.rate:
         n, m = (counts(one, metric)[1] for one in (group, baseline))
@@ -142,6 +148,7 @@ def smallest_p(group: Group, baseline: Group, metric: Metric) -> float:
     shared = [
         (int(first[name]), int(second[name])) for name in first.index.intersection(second.index)
     ]
+    # Two-sided: where all sizes are equal, swapping the groups gives an equally large difference.
     extreme = 2 if all(n == m for n, m in shared) else 1
     return extreme / prod(comb(n + m, n) for n, m in shared)
 
@@ -203,7 +210,7 @@ def _which(changes: list[Change]) -> str:
 
 
 def _grouped(found: list[tuple[str, str]]) -> str:
-    """Measures and slopes with their variants; those of the same variants together."""
+    """Measures and slopes, each with its variants; those with the same variants share a list."""
     alike: dict[str, list[str]] = {}
     for what, (name, _) in _names().items():
         settings = ", ".join(setting for setting, other in found if other == what)

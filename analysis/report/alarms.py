@@ -1,4 +1,4 @@
-"""What puts the results of a study in doubt, in words."""
+"""What casts doubt on the results of a study, in words."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from analysis.data.provenance import Mismatch, Provenance, tally
 from analysis.data.study import Group, Study
 from merge_runner.drivers.registry import EMULATOR
 
+# The share of a group's decisions above which an alarm is raised: a convention.
 MANY_FALLBACKS = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """What a reader must know before any number."""
+    """A warning to read before any of the numbers."""
 
     title: str
     text: str
 
 
 def alarms(study: Study, origin: Provenance) -> list[Alarm]:
-    """What puts the results of a study in doubt, the worst first."""
-    # Title, what was found, and what a reader should know of it.
+    """What casts doubt on the results of a study, the worst first."""
+    # Title, findings, and what they mean; an alarm without findings is not shown.
     found = (
         (
             "A scripted stand-in answered",
@@ -88,13 +89,14 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
         ),
     )
     return [
+        # First, since no number is what it claims to be if another model drove.
         *(Alarm("Another model answered", mismatch(one)) for one in origin.mismatches),
         *(Alarm(title, f"{'; '.join(parts)}. {rest}") for title, parts, rest in found if parts),
     ]
 
 
 def mismatch(one: Mismatch) -> str:
-    """Which model answered in the place of which, how often, and in which sweeps."""
+    """Which model answered in place of which other, how often, and in which sweeps."""
     answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
     sweeps = f"sweep{'s' * (len(one.sweeps) != 1)} {', '.join(one.sweeps) or 'unknown'}"
     return (
@@ -104,7 +106,7 @@ def mismatch(one: Mismatch) -> str:
 
 
 def posing(study: Study) -> list[Group]:
-    """Stand-ins that answered in a model's name; the emulator has one of its own."""
+    """Groups where a stand-in answered under a model's name; the emulator's own name is honest."""
     return [group for group in study.models if group.scripted and EMULATOR not in group.models]
 
 
@@ -117,6 +119,7 @@ def _failures(group: Group) -> str:
 
 def _fallbacks(study: Study) -> Iterator[str]:
     for group in study.models:
+        # Without decisions both sides are 0, and there is no share to take.
         found = tally(study, group)
         if found.fallbacks > MANY_FALLBACKS * found.decisions:
             share = 100 * found.fallbacks / found.decisions
@@ -132,7 +135,7 @@ def _unknown(study: Study) -> Iterator[str]:
 
 
 def _mixed(study: Study) -> Iterator[str]:
-    """The names under which several settings were played, each with its marks."""
+    """Names under which several settings were played; each with the marks that tell them apart."""
     marked: dict[str, dict[str, None]] = {}
     for group in study.models:
         marked.setdefault(group.name, {})[group.name + group.mark] = None

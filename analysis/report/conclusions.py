@@ -1,6 +1,6 @@
 """In plain words: what the results of a study show, and what they cannot show.
 
-Each sentence is made of the numbers that it talks about. Scripted stand-ins are in none.
+Each sentence is built from the numbers that it reports. None includes scripted stand-ins.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ NAMES = {
     "I4": "the gap does not depend on the relative velocity",
     "I5": "accelerations are held and jump as the humans' do",
 }
-# So many of the human data sets of a study's size that have a mark make its lack strong evidence,
-# and at most so many weak evidence.
+# That a driver lacks an indicator is strong evidence against it where at least the first share of
+# human data sets of the study's size show this indicator, weak where fewer than the second do.
 STRONG, WEAK = 0.95, 0.8
 
 
 def shown(study: Study) -> list[str]:
-    """What the baseline of each driver shows, and then its prompt variants."""
+    """What each driver's baseline shows, then what the prompt variants change."""
     texts = [text for group in _concluded(study) for text in _shown(study, group)]
     return texts + ablation_sentences(study)
 
@@ -60,7 +60,7 @@ def not_shown(study: Study, origin: Provenance) -> list[str]:
 
 
 def nothing(study: Study) -> str:
-    """Why there is nothing to conclude, where ``shown`` is empty."""
+    """Why nothing can be concluded; for use where ``shown`` is empty."""
     if study.chosen is not None:
         return "Nothing: no driver that was played with the baseline prompt is chosen."
     if study.empty:
@@ -71,13 +71,15 @@ def nothing(study: Study) -> str:
 
 
 def _concluded(study: Study) -> list[Group]:
-    """The baselines that conclusions are about."""
+    """The baselines that conclusions are drawn about: no humans, no stand-ins."""
     return [group for group in study.baselines if group.setting and not group.scripted]
 
 
 def _shown(study: Study, group: Group) -> list[str]:
     if not len(group.ended):
         return [f"{group.driver}: no trial ended ({group.left_out})."]
+    # Comparisons with humans use only conditions that humans drove: another mix of conditions would
+    # pass for another behaviour.
     alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
     own = len(group.ended) - len(alike.ended)
     texts = _marks(study, group) if len(group.finished) else []
@@ -104,10 +106,11 @@ def _shown(study: Study, group: Group) -> list[str]:
 
 
 def _marks(study: Study, group: Group) -> list[str]:
-    """Which indicators hold, which do not, and what the lack of one says."""
+    """Which indicators hold, which do not, and how strong the evidence of a missing one is."""
     found = score(study, group)
     both = {name: (found.paper[name].passed, found.robust[name].passed) for name in INDICATORS}
     agreed = [NAMES[name] for name, verdicts in both.items() if verdicts == (True, True)]
+    # Passed is None where a rule cannot judge: that is no failure, and the other rule decides.
     failed = [name for name, verdicts in both.items() if False in verdicts and True not in verdicts]
     mixed = [
         f"{NAMES[name]} (paper's rule: {_word(found.paper[name])}, "
@@ -126,9 +129,10 @@ def _marks(study: Study, group: Group) -> list[str]:
 
 
 def _weight(group: Group, found: Score, name: str) -> str:
-    """What the lack of a mark says, from how often humans have it in studies of this size.
+    """How strongly a missing indicator speaks against a driver.
 
-    A driver that has it by neither rule also lacks the one that humans pass more often.
+    That follows from how often human data sets of this size show it. A driver that shows it by
+    neither rule has also failed the rule that humans pass more often, so that rule counts.
     """
     robust, paper = found.ceiling.robust.get(name), found.ceiling.paper.get(name)
     if robust is None or paper is None:
@@ -147,7 +151,7 @@ def _weight(group: Group, found: Score, name: str) -> str:
 
 
 def _size(group: Group) -> str:
-    """The size of the human data sets that a driver is weighed by."""
+    """The size of the human data sets that a driver is compared with, in words."""
     alike = sum(group.sizes)
     if alike == len(group.ended):
         return "this size"
@@ -163,6 +167,7 @@ def _collisions(study: Study, group: Group) -> str:
     found, human = estimate(group, BOXES), estimate(humans, BOXES)
     if found.value is None:
         return f"{group.driver}: of no trial is it decided whether boxes would have overlapped."
+    # By the humans' own collision rule for both: the paper's rule for drivers is another one.
     contrast = contrast_rates(counts(group, BOXES), counts(humans, BOXES))
     assert contrast.low is not None
     assert contrast.high is not None
@@ -182,7 +187,7 @@ def _collisions(study: Study, group: Group) -> str:
 
 
 def _told(study: Study, group: Group, metric: Metric) -> str:
-    """What a driver comes to by a metric, and the humans."""
+    """A driver's value of a metric beside the humans'."""
     found, subject = estimate(group, metric), metric.in_sentences
     if found.value is None:
         return f"{group.driver}: no trial has {subject}."
@@ -222,7 +227,7 @@ def _digits(metric: Metric, value: float) -> str:
 
 
 def _alike(human: Group, group: Group) -> Group:
-    """The humans in the conditions that a driver was played in."""
+    """The humans' trials in the conditions that the driver was played in."""
     return human.part(lambda trials: trials["condition"].isin(group.ended["condition"]))
 
 
@@ -240,6 +245,7 @@ def _limits(study: Study, group: Group) -> list[str]:
             f"I4 together by the paper's tests, {100 * found.ceiling.robust['I1-I4']:.0f} % by the "
             "robust ones; one that a test cannot judge does not pass."
         )
+    # The paper's rule passes I4 on a large p, which too few trials give as well as no effect does.
     if found.paper["I4"].passed and found.robust["I4"].passed is False:
         texts.append(
             f"{group.driver}: that the gap does not depend on relative velocity is not shown; the "
@@ -252,7 +258,7 @@ def _limits(study: Study, group: Group) -> list[str]:
 
 
 def _human_limits(study: Study) -> list[str]:
-    """What the humans' side rests on."""
+    """What the human side of each comparison rests on."""
     texts = []
     if study.imported is None:
         texts.append(
@@ -285,7 +291,7 @@ def _human_limits(study: Study) -> list[str]:
 
 
 def _asked(group: Group, origin: Provenance) -> list[str]:
-    """What the results of a baseline depend on: its task, its wording, what was sent with it."""
+    """What a baseline's results depend on: its task, its wording, the parameters sent with it."""
     if not group.setting or group.scripted:
         return []
     changed = origin.tasks.get(group.spec_hash or "")
@@ -293,6 +299,7 @@ def _asked(group: Group, origin: Provenance) -> list[str]:
     if (group.trials["source"] == "driver").all():
         return [*task, f"{group.driver} is a program: it reads no prompt, and samples nothing."]
     sent = origin.sent.get(group.spec_hash or "") or {"": {}}
+    # Usually both sides are sent the same, and the sides need no naming.
     alike = len({str(parameters) for parameters in sent.values()}) == 1
     listed = [
         _parameters(parameters) if alike else f"{side}: {_parameters(parameters)}"

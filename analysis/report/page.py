@@ -1,4 +1,4 @@
-"""The HTML of the report: conclusions, figures, tables, provenance, the trials behind it all."""
+"""The HTML of the report: conclusions, figures, tables, provenance, and the trials behind them."""
 
 from __future__ import annotations
 
@@ -22,29 +22,31 @@ from analysis.tables.model import Column, Row, Table
 from merge_runner.results.provenance import program
 
 TEMPLATES = Path(__file__).with_name("templates")
+# At most so many trials are listed for a cell: a page with all of them would be unwieldy.
 LISTED = 300
 LIBRARIES = ("statsmodels", "firthmodels", "scipy", "numpy", "pandas", "matplotlib")
 
 
 @dataclass
 class Links:
-    """The sources of all cells; equal ones are listed once, under one number."""
+    """The sources of all cells, numbered; cells with equal sources share a number."""
 
     study: Study
     found: dict[tuple[Source, ...], int] = field(default_factory=dict)
 
     def to(self, table: Table, row: Row, column: Column) -> int:
-        """The number of a cell's sources."""
+        """The number under which the sources of a cell are listed."""
         sources = sources_of(self.study, table, row, column)
         return self.found.setdefault(sources, len(self.found) + 1)
 
 
 def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
-    """The report as one HTML text; ``figures`` are SVG in Base64, by name."""
+    """The report as one HTML document; ``figures`` maps names to SVG in Base64."""
     links = Links(study)
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
+        # A misspelt name fails the report rather than leaving a blank in it.
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -76,7 +78,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
 
 
 def _records(frame: pd.DataFrame) -> list[dict[str, object]]:
-    """Rows for a template: what is missing is an empty text, whole numbers are whole."""
+    """Rows for a template: missing values become empty text, whole floats integers."""
     return [
         {str(name): _plain(value) for name, value in row.items()}
         for row in frame.to_dict(orient="records")
@@ -87,5 +89,6 @@ def _plain(value: object) -> object:
     if value is None or value is pd.NaT or (isinstance(value, float) and pd.isna(value)):
         return ""
     if isinstance(value, float):
+        # Pandas turns a column of integers into floats where any is missing.
         return int(value) if value.is_integer() else round(value, 6)
     return value

@@ -1,4 +1,4 @@
-"""In plain words: in what a driver differs from the humans, and what could not have been shown."""
+"""In plain words: how a driver differs from humans, and what could not have been shown."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from analysis.stats.intervals import POWER, Difference
 from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions
 from analysis.tables.notes import listed
 
+# The intercept's interaction, in words: with every term at 0, nobody is ahead or faster.
 LEVELS = {
     WHO_FIRST: ("who merges first where nobody is ahead or faster", "logits"),
     GAP: ("the gap where nobody is ahead or faster", "m"),
@@ -19,13 +20,15 @@ LEVELS = {
 
 
 def unlike(study: Study, group: Group) -> Iterator[str]:
-    """What one model of a driver and the humans shows of their difference."""
+    """What a joint model of a driver and the humans shows about their difference."""
     found = interactions(study.human, group)
     tested = [(one, one.found) for one in found if one.found is not None]
     for problem in dict.fromkeys(one.problem for one in found if one.problem):
         yield f"{group.driver}: a difference from the humans cannot be tested: {problem}."
     for remark in dict.fromkeys(one.remark for one, _ in tested if NARROW in one.remark):
         yield f"{group.driver} beside the humans: {remark}."
+    # Over both outcomes at once, since the sentence makes one claim about the driver; the table
+    # differences leaves its p uncorrected.
     holm, _ = corrected([difference.p for _, difference in tested]) if tested else ((), ())
     shown = [pair for pair, p in zip(tested, holm, strict=True) if p < ALPHA]
     if shown:

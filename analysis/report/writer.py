@@ -1,4 +1,4 @@
-"""One HTML file with everything: figures, tables, conclusions, provenance. It needs no network."""
+"""Writes the report: one HTML file with everything in it, which needs no network."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from merge_runner.errors import UsageError
 def write_report(
     db: Path, models: Sequence[str] | None, out: Path, files: Path | None
 ) -> Iterator[Path]:
-    """Write the report, and all tables and figures into ``files``; yields the paths.
+    """Write the report, and every table and figure into the folder ``files``; yields the paths.
 
-    ``models`` keeps these drivers alone. Raises UsageError.
+    ``models`` restricts the report to these drivers. Raises UsageError.
     """
     study = Study(db, models)
     tables = finished_tables(db, models, study=study)
@@ -39,7 +39,7 @@ def write_report(
 
 
 def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
-    """Write each table in every form; yields the paths."""
+    """Write each table in every format; yields the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     for table in tables:
         for form in TableFormat:
@@ -49,7 +49,7 @@ def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
 
 
 def finished_figures(study: Study, options: str) -> dict[str, str]:
-    """Every figure by name as SVG in Base64, as it is kept in the database or drawn now."""
+    """Every figure by name as SVG in Base64: read from the database where stored, else drawn."""
     _, found = finished(study.db, options, list(FIGURES))
     drawn = {
         name: base64.b64encode(rendered(study, name, "svg")).decode()

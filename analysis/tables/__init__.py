@@ -1,4 +1,4 @@
-"""The paper's tables, and those that say what these cannot."""
+"""The paper's tables, and further tables for questions that those leave open."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
     from analysis.data.study import Study
 
-# Name to module. They are loaded when a table is made: one that is kept must not wait for pandas.
+# Maps each table to its module. A module is imported only when its table is computed, so that a
+# table stored in the database can be shown without waiting for pandas.
 TABLES = {
     "who-first": "regressions",
     "gap": "regressions",
@@ -40,7 +41,7 @@ TABLES = {
 
 
 def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
-    """The named tables, or all; raises UsageError."""
+    """Compute the named tables, or all of them; raises UsageError for an unknown name."""
     from analysis.tables.against import placed
 
     return [placed(_maker(name)(study), study.groups) for name in _valid(names)]
@@ -49,28 +50,30 @@ def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
 def finished_tables(
     db: Path, models: Sequence[str] | None, names: Sequence[str] = (), study: Study | None = None
 ) -> list[Table]:
-    """The named tables of a database, or all, as they are kept there; what is not is made.
+    """The named tables of a database, or all: read from it where stored, else computed.
 
-    ``models`` keeps these drivers alone; ``study`` is the study of them, where there is one.
-    Raises UsageError.
+    ``models`` restricts the tables to these drivers; ``study`` is their study, if the caller
+    already has it. Raises UsageError for an unknown name.
     """
     wanted = _valid(names)
     options = options_text(db, models)
     _, kept = finished(db, options, wanted)
     found = {name: from_text(text) for name, text in kept.items()}
+    # A name may be given twice; the table is computed once.
     missing = [name for name in dict.fromkeys(wanted) if name not in found]
     if missing:
         from analysis.data.study import Study
 
         study = study or Study(db, models)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
+        # The state is the one before the study was read: trials stored since then outdate it.
         keep_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})
         found |= made
     return [found[name] for name in wanted]
 
 
 def table(study: Study, name: str) -> pd.DataFrame:
-    """A table as a data frame, at full precision, one row as in its CSV; raises UsageError."""
+    """A table as a data frame at full precision, with the rows of its CSV; raises UsageError."""
     import pandas as pd
 
     (made,) = make_tables(study, [name])

@@ -33,7 +33,8 @@ KEYS = (
     *GROUP_COLUMNS,
     Column("n", "n", "count", 0, "trials that ended", "status <> 'failed'"),
 )
-# Columns that rest on who merged first.
+# Columns that rest on who merged first: before a complete import the published outcomes of humans
+# fill these, while the others rest on the imported trials.
 OF_OUTCOMES = tuple(
     f"{name}_{rule}" for name in ("i1", "i2") for rule in ("paper", "robust", "differ")
 )
@@ -119,7 +120,7 @@ def _metric_columns(metric: Metric) -> tuple[Column, Column]:
 
 
 def _denominators(metrics: list[Metric]) -> str:
-    """Which trials the metrics are of: ``collisions over all ended trials; gap over finished``."""
+    """Which trials count for which metrics: ``collisions over all ended trials; gap over ...``."""
     ended, finished = (
         listed(list(dict.fromkeys(one.in_lists for one in metrics if one.trials == trials)))
         for trials in ("ended", "finished")
@@ -136,6 +137,7 @@ def _qualitative_row(study: Study, group: Group) -> Row:
         "score_paper": score_text(found.paper),
         "score_robust": score_text(found.robust),
     }
+    # A ceiling is for one data set of one size; indicators of different trials have no common size.
     remarks = [verdict_note(found, *INDICATORS), score_note(found)]
     if of_both := outcomes_note(group):
         remarks += [of_both, "no ceiling: the indicators rest on different trials"]
@@ -149,6 +151,7 @@ def _quantitative_row(group: Group) -> Row:
     metrics = shown_in("tables")
     values: dict[str, Value] = {"n": len(group.ended_outcomes)}
     missing, absent = [], []
+    # Metrics from the same source share one note.
     shipped: dict[str, list[Metric]] = {}
     for metric in metrics:
         found = estimate_or_reference(group, metric)
@@ -156,6 +159,7 @@ def _quantitative_row(group: Group) -> Row:
             absent.append(no_human_value(metric))
             continue
         values[metric.name] = found.value
+        # A published value may come without an interval.
         if (interval := found.bounds()) is not None:
             values[f"{metric.name}_ci"] = interval
         if isinstance(found, HumanReference):

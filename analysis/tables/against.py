@@ -1,4 +1,4 @@
-"""Our cells beside those that the paper prints, with the difference."""
+"""Our values beside those printed in the paper (arXiv 2604.09609), with the differences."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import UsageError
 
 PAPER = "paper"
-# The drivers that the paper has rows of.
+# The drivers that have rows in the paper.
 DRIVERS = ("human", "o3", "gemini-2.5-pro")
 METRICS_FILE = "paper_ablation_quantitative"
 INDICATORS_FILE = "paper_ablation_qualitative"
-# Table to its published file.
+# Maps each table to the file of its published values.
 FILES = {
     "who-first": "paper_who_first",
     "gap": "paper_gap",
     "ablation-qualitative": INDICATORS_FILE,
     "ablation-quantitative": METRICS_FILE,
 }
-# Our columns to those of the file, where they are not the metrics'.
+# Maps our columns to those of the file; for metrics the registry does this (_metric_columns).
 COLUMNS = {
     "who-first": {c: c for c in ("n", "b", "se", "z", "p")},
     "gap": {c: c for c in ("n", "b", "se", "t", "p")},
@@ -42,9 +42,9 @@ INDICATOR_ROWS = {**{f"I{i}": f"i{i}" for i in range(1, 6)}, "score": "score"}
 
 
 def placed(table: Table, groups: Iterable[Group]) -> Table:
-    """The table with rows that say which driver of the paper they stand beside.
+    """The table, each of whose rows now names the paper's driver to compare it with.
 
-    A driver stands beside that of its very name, if its provider answered and no stand-in did.
+    That is the driver of exactly the same name, provided that no stand-in answered for it.
     """
     if not in_paper(table):
         return table
@@ -53,9 +53,12 @@ def placed(table: Table, groups: Iterable[Group]) -> Table:
 
 
 def _placed(row: Row, group: Group) -> Row:
+    # In each of the paper's rows one model drives both vehicles. Another sample set is still the
+    # same driver: it only draws other samples.
     (asked, *others) = group.models
     sample_set = "" if group.name == asked else f"/set{group.trials['sample_set'].iloc[0]}"
     own = not others and group.name == asked + sample_set and not group.scripted
+    # The emulator under its own name misleads nobody.
     posing = group.scripted and group.models != (EMULATOR,)
     return replace(
         row,
@@ -66,7 +69,7 @@ def _placed(row: Row, group: Group) -> Row:
 
 
 def _printed(row: Row, group: Group) -> tuple[str, ...]:
-    """The columns that rest on published values: to compare them with these says nothing."""
+    """The columns that rest on published values, which a comparison with those cannot test."""
     of_outcomes = not group.measured or group.published_outcomes is not None
     return (*row.printed, *row.published) if of_outcomes else row.printed
 
@@ -74,9 +77,9 @@ def _printed(row: Row, group: Group) -> tuple[str, ...]:
 def against(table: Table, reference: str, driver: str | None = None) -> Table:
     """A table with published values and differences.
 
-    Each row stands beside the paper's row of that name; with ``driver`` those of all drivers stand
-    beside its rows, except for stand-ins that answered in its name. Raises UsageError for another
-    reference, and for a driver that the paper has not.
+    Each row is compared with the paper's row of the same name. With ``driver``, the rows of all
+    drivers are compared with that driver's, except for stand-ins that answered in its name. Raises
+    UsageError for any other reference, and for a driver that is not in the paper.
     """
     if reference != PAPER:
         raise UsageError(f"--against {reference}: valid is {PAPER}")
@@ -98,7 +101,7 @@ def against(table: Table, reference: str, driver: str | None = None) -> Table:
 
 
 def _placements(table: Table, driver: str | None) -> list[str]:
-    """Who stands beside whom, where that is not the row of the same name; and who does not."""
+    """Notes on rows that are compared with another driver's, and on those kept from comparison."""
     names = [name for name in DRIVERS if driver in {None, name}]
     kept_off = [
         (row.values["driver"], name)
@@ -151,6 +154,7 @@ def _indicators(table: Table, named: str | None) -> tuple[list[Column], list[Row
         values = dict(row.values)
         if item in INDICATOR_ROWS:
             printed = _row(published(INDICATORS_FILE), driver, setting, "")
+            # The paper prints verdicts by its own rule, so the robust ones have no counterpart.
             values |= _compared(row, PAPER, printed, INDICATOR_ROWS[item])
         elif theirs := _metric_columns(driver).get(item):
             printed = _row(published(METRICS_FILE), driver, setting, "")
@@ -160,12 +164,12 @@ def _indicators(table: Table, named: str | None) -> tuple[list[Column], list[Row
 
 
 def _theirs(table: str, driver: str) -> dict[str, str]:
-    """Our columns to those that the paper's row of a driver fills."""
+    """Maps our columns to the columns that the paper fills in for a driver."""
     return COLUMNS.get(table) or _metric_columns(driver)
 
 
 def _metric_columns(driver: str) -> dict[str, str]:
-    """The metrics to the columns of the file; the paper has another collision rule for humans."""
+    """Maps metrics to columns of the file: the paper judges human collisions by another rule."""
     columns = {
         one.name: one.paper_of_humans if driver == HUMAN else one.paper_of_drivers
         for one in shown_in("tables")
@@ -174,13 +178,16 @@ def _metric_columns(driver: str) -> dict[str, str]:
 
 
 def _key(row: Row, named: str | None) -> tuple[str, str, str]:
-    """The paper's driver, setting and item of a row; the mixed models have no counterpart."""
+    """The driver, setting and item under which to look a row up in the paper's files.
+
+    The rows of mixed models have no counterpart there.
+    """
     group = row.groups[0]
     item = row.id.removeprefix(group).lstrip("/")
     driver = row.beside
     if named is not None and driver != HUMAN:
         driver = "" if named in row.stand_in_for else named
-    # The humans had no prompt: whatever a driver's was, they stand beside it.
+    # The humans had no prompt, and hence no setting in the file.
     return driver, "" if driver == HUMAN else group.rpartition("/")[2], item
 
 
@@ -208,10 +215,11 @@ def _compared(row: Row, name: str, printed: dict[str, Any] | None, theirs: str) 
     if printed is None:
         return {}
     ours, value = row.values.get(name), printed[theirs]
-    if isinstance(value, str):  # a column of p-values holds texts like <0.001
+    if isinstance(value, str):  # p-values; some are printed as a bound, which has no difference
         if value.startswith("<"):
             return {f"{name}_in_paper": value}
         value = float(value)
+    # Scores and verdicts are shown beside ours without a difference.
     if theirs == "score":
         return {f"{name}_in_paper": f"{value} of {len(INDICATORS)}"}
     if theirs.upper() in INDICATORS:

@@ -1,4 +1,4 @@
-"""What became of the calls: retried, lost, answered without a plan, driven from an older one."""
+"""What became of the calls: retried, lost, unusable, or replaced by an older plan."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ FALLBACK = (
 
 
 def attempts(study: Study) -> Table:
-    """One row a driver and variant: trials, calls, attempts, and what went wrong with them."""
+    """A row per driver and variant: trials, calls, attempts, and what went wrong with them."""
     found = {group.id: tally(study, group) for group in study.models}
+    # Only the reasons that occur get a column; those of ANSWERS have theirs even at zero.
     reasons = dict.fromkeys(
         reason for one in found.values() for reason in sorted(one.failures) if reason not in ANSWERS
     )
@@ -76,7 +77,7 @@ def _count(name: str, meaning: str, counts: str) -> Column:
 
 
 def _rated(name: str, meaning: str, counts: str) -> tuple[Column, Column]:
-    """A number and its share."""
+    """A column of counts and a column of their shares."""
     return (
         _count(name, meaning, counts),
         Column(f"{name}_percent", "(%)", "percent", 2, f"share of {meaning}", counts),
@@ -84,7 +85,7 @@ def _rated(name: str, meaning: str, counts: str) -> tuple[Column, Column]:
 
 
 def _with(what: str) -> str:
-    """The predicate of trials with attempts of which this holds."""
+    """The SQL predicate for trials that have an attempt for which ``what`` holds."""
     return (
         "trials.trial_id IN (SELECT trial_id FROM attempts "  # noqa: S608 # ours
         f"WHERE attempts.spec_hash = trials.spec_hash AND {what})"
@@ -106,6 +107,8 @@ def _row(group: Group, found: Tally, reasons: tuple[str, ...]) -> Row:
         "calls": found.calls,
         "attempts": found.attempts,
         **_share("retried", found.retried, found.attempts),
+        # Each share has its own denominator: a call may take several attempts, and a lost call has
+        # no answer that could be invalid.
         **_share("lost", found.lost, found.calls),
         **_share("refused", found.failures["refusal"], found.answers),
         **_share("truncated", found.failures["truncated"], found.answers),
@@ -120,6 +123,7 @@ def _row(group: Group, found: Tally, reasons: tuple[str, ...]) -> Row:
 
 
 def _share(name: str, count: int, of: int) -> dict[str, Value]:
+    # No calls at all is not 0 %.
     return {name: count, f"{name}_percent": 100 * count / of if of else None}
 
 

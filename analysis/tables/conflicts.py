@@ -1,4 +1,4 @@
-"""How conflicts are resolved: when, and how close it gets."""
+"""How conflicts are resolved: when, and how close the vehicles come to a collision."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from analysis.tables.notes import measured_notes, sample_notes
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.text_safety import quoted
 
+# Quartiles, since the human times are published as these; named as the columns of that file.
 QUARTILES = {"crt_q1_s": 0.25, "crt_median_s": 0.5, "crt_q3_s": 0.75}
 
 
 def conflict_resolution(study: Study) -> Table:
-    """One row a baseline and condition: quartiles of the conflict resolution time."""
+    """A row per baseline and condition: quartiles of the conflict resolution time."""
     resolved = "conflict_resolution_s IS NOT NULL"
     meaning = "of the time until the vehicles are first off a collision course"
     return Table(
@@ -36,6 +37,7 @@ def conflict_resolution(study: Study) -> Table:
             _resolution(group, name)
             for name in study.conditions
             for group in study.baselines
+            # Humans have no setting, and no row in conditions that none of them drove.
             if group.setting or name in HUMAN_CONDITIONS
         ],
         (
@@ -47,7 +49,7 @@ def conflict_resolution(study: Study) -> Table:
 
 
 def criticality(study: Study) -> Table:
-    """One row a group: medians and quartiles of surrogate safety measures of finished trials."""
+    """A row per group: medians and quartiles of surrogate safety measures of finished trials."""
     columns = [*GROUP_COLUMNS]
     for metric in shown_in("criticality"):
         name, digits, counts = metric.name, metric.decimals, metric.counts
@@ -93,6 +95,7 @@ def _criticality(group: Group) -> Row:
         if found.empty:
             missing.append(metric.heading)
             continue
+        # The spread of the trials, not a confidence interval of the median.
         low, middle, high = (float(found.quantile(q)) for q in QUARTILES.values())
         cells |= {metric.name: middle, f"{metric.name}_quartiles": (low, high)}
     note = f"no finished trial with {', '.join(missing)}" if missing else ""

@@ -20,7 +20,7 @@ from analysis.stats.measures import (
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import listed, sample_notes
 
-# Of a row: those that the outcomes of humans are in.
+# The columns that rest on human outcomes, in rows whose metric does.
 COLUMNS = ("difference", "ci", "p", "p_holm", "p_bh", "n", "n_reference")
 
 
@@ -28,6 +28,8 @@ def contrasts(study: Study) -> Table:
     """Every variant against its driver's baseline, and every baseline against the humans."""
     rows: list[Row] = []
     for driver in dict.fromkeys(group.driver for group in study.models):
+        # A family is one question asked of several variants. Correcting over all metrics at once
+        # would make the result depend on how many are registered.
         for metric in compared():
             rows += _family(study, driver, metric)
     rows += _against_humans(study)
@@ -84,7 +86,7 @@ def _family(study: Study, driver: str, metric: Metric) -> list[Row]:
 
 
 def _against_humans(study: Study) -> Iterator[Row]:
-    """Every driver's baseline against the humans, as far as these are known."""
+    """Every driver's baseline against the humans, for metrics whose human value can be tested."""
     if study.human not in study.groups:
         return
     pairs = [(group, study.human) for group in study.models if group.setting == BASELINE]
@@ -94,7 +96,7 @@ def _against_humans(study: Study) -> Iterator[Row]:
 
 
 def _recordings_note(study: Study) -> list[str]:
-    """Which means cannot be compared with the humans before these are imported."""
+    """Which means cannot be compared with humans before the recordings are imported."""
     means = [one.in_lists for one in compared() if not (one.rate or known(study.human, one))]
     need = "needs" if len(means) == 1 else "need"
     command = "merge-runner human import"
@@ -102,7 +104,7 @@ def _recordings_note(study: Study) -> list[str]:
 
 
 def _corrected(pairs: list[tuple[Group, Group]], metric: Metric, reference: str) -> list[Row]:
-    """A family of contrasts; groups without the measure are left out of it."""
+    """One family of contrasts; pairs without the measure are left out, also of its correction."""
     found = [
         (group, other, contrast)
         for group, other in pairs
@@ -120,6 +122,7 @@ def _corrected(pairs: list[tuple[Group, Group]], metric: Metric, reference: str)
                 "setting": group.setting,
                 "reference": reference,
                 "measure": metric.heading,
+                # Rates are tested as fractions and shown in percentage points.
                 "difference": contrast.value * (100 if metric.rate else 1),
                 "ci": contrast.bounds(100 if metric.rate else 1),
                 "p": contrast.p,
@@ -153,17 +156,18 @@ def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
 
 
 def _rate(group: Group, metric: Metric) -> tuple[int, int]:
-    """Successes and n; of humans without traces those that the published rate comes to."""
+    """Successes and n; for humans without traces, as implied by the published rate."""
     if known(group, metric):
         return counts(group, metric)
     return _published_rate(metric) or (0, 0)
 
 
 def _published_rate(metric: Metric) -> tuple[int, int] | None:
-    """Successes and n of the humans, from a published rate of so many trials."""
+    """The humans' successes and n, if their published rate comes with its number of trials."""
     found = human_reference(metric)
     if not metric.rate or found is None or found.n is None:
         return None
+    # Fisher's test needs whole counts, and a published percentage is rounded.
     return round(found.n * found.value / 100), found.n
 
 
@@ -191,7 +195,7 @@ def _percent(value: float | None, metric: Metric) -> float | None:
 
 
 def shared_notes(study: Study) -> list[str]:
-    """Variants share a reply with the baseline where their prompts are equal."""
+    """Notes on replies that variants share with the baseline, where their prompts are equal."""
     named = {group.spec_hash: group.id for group in study.models}
     return [
         f"{named[row.spec_hash]}: {row.shared} of {row.calls} calls share their reply with "

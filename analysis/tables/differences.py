@@ -1,4 +1,7 @@
-"""Whether drivers differ from humans: the interactions with the source in one model of both."""
+"""Whether drivers differ from humans, by interactions with the source in a joint model.
+
+For the model and its errors see ``analysis.stats.joint``.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +17,14 @@ from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
 
 OUTCOMES = {WHO_FIRST: "left first (logit)", GAP: "gap (m)"}
 COUNTS = {WHO_FIRST: WITH_MERGER, GAP: WITH_GAP}
-# What the humans are known by where it is not by their traces, and the columns that rest on them.
+# The shipped files that describe the humans where there are too few traces of them, and the columns
+# that rest on these files.
 FILES = {WHO_FIRST: "human_outcomes", GAP: "paper_gap"}
 OF_HUMANS = ("n_human", "b_human", "difference", "ci", "p", "freedom", "detectable")
 
 
 def differences(study: Study) -> Table:
-    """Every driver's baseline against the humans, one row an outcome and term."""
+    """Every driver's baseline against the humans: a row per outcome and term."""
     drivers = [group for group in study.baselines if group is not study.human]
     compared = drivers if study.human in study.groups else []
     human = study.human
@@ -91,6 +95,7 @@ def differences(study: Study) -> Table:
 
 
 def _row(human: Group, group: Group, found: Interaction) -> Row:
+    # Fewer pairs cannot show how pairs vary: then the humans' side is the published values.
     of_traces = pairs_known(human, found.outcome) >= MIN_PAIRS
     said = found.problem or found.remark
     return Row(
@@ -99,6 +104,7 @@ def _row(human: Group, group: Group, found: Interaction) -> Row:
         {
             "driver": group.label,
             "outcome": OUTCOMES[found.outcome],
+            # The intercept's interaction with the source is the main effect of the source.
             "term": "Source" if found.term == "intercept" else TERM_NAMES[found.term],
             "n": found.n,
             "n_human": found.n_human,
@@ -121,6 +127,7 @@ def _tested(found: Difference | None) -> dict[str, Value]:
         "difference": found.value,
         "ci": found.bounds(),
         "p": found.p,
+        # Infinite degrees of freedom mean a normal test; JSON has no infinity.
         "freedom": None if isinf(found.freedom) else found.freedom,
         "detectable": found.detectable,
         "method": found.by,

@@ -1,4 +1,4 @@
-"""Whether failures bias the results: outcomes with and without the trials that had a fallback."""
+"""Outcomes with and without trials that had a fallback, to see whether failures bias them."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from analysis.tables.indicators import RULES
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import sample_notes
 
-# What an indicator's regression is fitted to.
+# The metric that each indicator's regression is fitted to.
 FITTED = {"I1": LEFT_FIRST, "I2": LEFT_FIRST, "I3": GAP, "I4": GAP}
-# The two sides: name, suffix of the columns, predicate of the trials.
+# The two sides of the comparison: name, suffix of the columns, predicate for the trials.
 ALL = ("all", "", "")
 WITHOUT = ("without", "_without", f"NOT {FALLBACK}")
 
 
 def fallbacks(study: Study) -> Table:
-    """One row a group and measure, and one a group and indicator: all trials, and those without."""
+    """A row per group and measure or indicator: over all trials, and without fallbacks."""
     rows = [row for group in study.models for row in _rows(study, group)]
     return Table(
         "fallbacks",
@@ -89,16 +89,17 @@ def _rows(study: Study, group: Group) -> list[Row]:
 
 
 def without_fallbacks(study: Study, group: Group) -> Group:
-    """The group with only those trials that had no fallback; itself where none had."""
+    """The group without its trials that had a fallback; the same object where none had."""
     own = of_group(study.calls.decisions, group, group.trials)
     had = set(own.loc[own["fallback"], "trial_id"])
+    # The same object, because fits are cached by group and ``_why`` compares by identity.
     if not had:
         return group
     return group.part(lambda trials: ~trials["trial_id"].isin(had))
 
 
 def _why(group: Group, clean: Group) -> str:
-    """What a reader should know of the comparison, where it is none."""
+    """Why there is nothing to compare, where that is so."""
     if group.ended.empty:
         return "no trial ended"
     if len(clean.ended) == len(group.ended):
@@ -117,7 +118,9 @@ def _metric_row(group: Group, clean: Group, metric: Metric, why: str) -> Row:
         **_estimated(without, "without", "_without"),
     }
     if found.value is not None and without.value is not None:
+        # No test: the two sides share trials, so they are not independent samples.
         cells["difference"] = without.value - found.value
+    # A side that is empty because of ``why`` needs no second explanation.
     missing = found.value is None or (without.value is None and not why)
     nothing = f"{metric.heading}: no trial with this measure" if missing else ""
     remarks = (why, nothing, undecided(group, metric))
@@ -131,6 +134,7 @@ def _estimated(found: Estimate, name: str, suffix: str) -> dict[str, Value]:
 def _verdict_row(group: Group, clean: Group, name: str, why: str) -> Row:
     found, without = _judged(fits(group), name), _judged(fits(clean), name)
     changed = any(disagree(*pair) for pair in zip(found, without, strict=True))
+    # Where nothing differs or nothing is left, ``why`` already explains the second side.
     sides = (("", found), *(() if why else ((" without", without),)))
     reasons = dict.fromkeys(
         f"{name}{side}: {verdict.why}" for side, both in sides for verdict in both if verdict.why

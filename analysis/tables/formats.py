@@ -1,9 +1,8 @@
-"""Tables as text, CSV, JSON, Markdown and LaTeX. Full precision in CSV and JSON, else rounded.
+"""Tables as text, CSV, JSON, Markdown and LaTeX: at full precision in CSV and JSON, else rounded.
 
-The text is not a table of rich, which aligns other than this and takes eight times as long: 1.8 s
-for 600 rows. The Markdown is not of pandas, which needs tabulate for it. The LaTeX is not of pandas
-either: it writes the same rows between the same rules, as long as they are escaped as here, and
-takes nine times as long, beside 1.5 s to import its templates.
+No library writes them. A text table by rich is aligned differently and takes eight times as long
+(1.8 s for 600 rows). Pandas needs tabulate for Markdown. Its LaTeX has the same rows and rules,
+once they are escaped as here, but takes nine times as long, and 1.5 s more to import its templates.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ def render(tables: Sequence[Table], form: TableFormat) -> str:
         TableFormat.LATEX: as_latex,
     }[form]
     return "\n\n".join(
-        # Several CSV tables in one stream need their names.
+        # Several CSV tables in one stream could not be told apart without their names.
         f"# {table.name}\n{write(table)}"
         if form is TableFormat.CSV and len(tables) > 1
         else write(table)
@@ -41,6 +40,7 @@ def render(tables: Sequence[Table], form: TableFormat) -> str:
 
 def as_text(table: Table) -> str:
     """A table for the terminal, never cut: lines are as long as they need to be."""
+    # Characters differ in width on a terminal, so len() would misalign the columns.
     from rich.cells import cell_len
 
     columns = []
@@ -61,7 +61,7 @@ def as_text(table: Table) -> str:
 
 
 def as_csv(table: Table) -> str:
-    """A table's values at full precision; an interval makes two columns."""
+    """A table's values at full precision; an interval takes two columns."""
     out = io.StringIO()
     writer = csv_writer(out)
     names = [name for column in table.columns for name in _names(column)]
@@ -87,7 +87,7 @@ def as_json(table: Table) -> dict[str, object]:
 
 
 def value_rows(table: Table) -> list[dict[str, Value]]:
-    """Each row's id, values and note; an interval makes two values."""
+    """Each row's id, values and note; an interval becomes two values."""
     return [
         {
             "row": row.id,
@@ -155,12 +155,12 @@ def shown_value(column: Column, value: Value) -> str:
 
 
 def shown_columns(table: Table) -> list[Column]:
-    """The columns that hold anything."""
+    """The columns with at least one value."""
     return [c for c in table.columns if any(r.values.get(c.name) is not None for r in table.rows)]
 
 
 def notes_of(table: Table) -> list[str]:
-    """The table's notes, after those of its rows; equal notes are said once, with their groups."""
+    """The notes of rows, then of the table; equal notes of rows appear once, with their groups."""
     groups: dict[str, dict[str, None]] = {}
     for row in table.rows:
         if row.note:
@@ -186,11 +186,12 @@ def _text(column: Column, value: Value) -> str:
 
 def _rounded(value: float, digits: int) -> str:
     text = f"{value:.{digits}f}"
-    # A rounded zero has no sign.
+    # A small negative value that rounds to zero would otherwise be shown as -0.00.
     return text.lstrip("-") if float(text) == 0 else text
 
 
 def _exact(cell: Value) -> object:
+    # repr is the shortest text that reads back as the same float; float() strips NumPy's type name.
     return repr(float(cell)) if isinstance(cell, float) else in_spreadsheet(cell)
 
 
@@ -243,11 +244,12 @@ def _escaped(text: str) -> str:
 
 
 def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> dict[str, object]:
-    """A table as templates need it: headings, cells with what ``link`` leads to, notes.
+    """A table as templates need it: headings, cells with what ``link`` returns, notes.
 
-    The texts that lead a row are its headers.
+    The text cells before a row's first other cell are its headers.
     """
     columns = shown_columns(table)
+    # A screen reader announces a row's headers with each of its cells.
     leading = next((i for i, c in enumerate(columns) if c.kind != "text"), len(columns))
     return {
         "name": table.name,

@@ -1,4 +1,4 @@
-"""What the gap comes to by each of its definitions."""
+"""The gap, and its regression, under each definition of the gap."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from analysis.stats.regressions import Regression, gap_ols
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import measured_notes
 
-# Column of the trials to what is measured.
+# Maps a column of the trials to the definition that it follows.
 DEFINITIONS = {
     GAP.value: "interpolated, first vehicle at the merge point (ours)",
     "gap_first_sample_m": "first sample, first vehicle at the merge point",
@@ -19,7 +19,7 @@ TERMS = {"headway": "abs_projected_headway", "velocity": "abs_relative_velocity"
 
 
 def gap_definitions(study: Study) -> Table:
-    """One row a group and definition: the mean gap, and what I3 and I4 rest on."""
+    """A row per group and definition: the mean gap, and the coefficients behind I3 and I4."""
     return Table(
         "gap-definitions",
         "The gap and its dependence on headway and velocity, by the definition of the gap",

@@ -17,7 +17,7 @@ from analysis.tables.model import Column, Row, Table, Value, row_of
 from analysis.tables.notes import ceiling_notes, intermittency_notes, no_ceiling, sample_notes
 from analysis.tables.profiles import gain_values
 
-# The indicators that rest on who merged first, and all columns of their rows.
+# The indicators that rest on who merged first, and the columns of their rows that do so too.
 OF_OUTCOMES = ("I1", "I2")
 EVERY = ("paper", "robust", "differ", "value", "interval", "n")
 RULES = (
@@ -27,7 +27,7 @@ RULES = (
 
 
 def indicators(study: Study) -> Table:
-    """Table V: I1 to I5 and the quantitative measures, one row a driver."""
+    """Table V: I1 to I5 and the quantitative measures, each with a row per driver."""
     rows = []
     for name in INDICATORS:
         rows += [_verdict_row(study, group, name) for group in study.baselines]
@@ -91,7 +91,7 @@ def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value
 
 
 def ceiling_values(found: Score, name: str) -> dict[str, Value]:
-    """The shares in percent of human data sets that pass an indicator, or ``I1-I4`` together."""
+    """Which percentages of human data sets pass an indicator, or ``I1-I4`` together, by rule."""
     by_rule = {"paper": found.ceiling.paper, "robust": found.ceiling.robust}
     return {
         f"ceiling_{rule}": 100 * shares[name] if name in shares else None
@@ -100,7 +100,7 @@ def ceiling_values(found: Score, name: str) -> dict[str, Value]:
 
 
 def verdict_note(found: Score, *names: str) -> str:
-    """Why a verdict is missing or rests on something else than a test."""
+    """Why a verdict is missing, or what it rests on if not on a test."""
     known: dict[str, dict[str, None]] = {}
     for name in names:
         for judged in found.rules.values():
@@ -125,7 +125,7 @@ def score_text(judged: dict[str, Verdict]) -> str | None:
 
 
 def score_note(found: Score) -> str:
-    """Which indicators are in neither number of a score, and of which."""
+    """Which indicators a score leaves out of both its numbers, by rule."""
     rules: dict[tuple[str, ...], list[str]] = {}
     for rule, judged in found.rules.items():
         if left_out := total(judged).open:
@@ -140,12 +140,14 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
     found = score(study, group)
     of_outcomes = name in OF_OUTCOMES
     trials = group.outcomes if of_outcomes else group.trials
-    # A ceiling is drawn with as many trials as there are outcomes.
+    # A ceiling is drawn for as many trials as there are outcomes. It does not fit indicators of the
+    # gap or the speeds where only some of these trials have traces.
     drawn = of_outcomes or not outcomes_note(group)
     remarks = (
         verdict_note(found, name),
         _inaction(study, group, name),
         outcomes_note(group),
+        # I5 compares with human traces directly and has no ceiling.
         no_ceiling(group) if name in TESTED else "",
     )
     return row_of(
@@ -164,7 +166,7 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
 
 
 def _inaction(study: Study, group: Group, name: str) -> str:
-    """Which trials do not count for I5."""
+    """How many trials do not count for I5."""
     still = int(gains(study, group)["steady"].sum()) if name == "I5" and group.measured else 0
     return f"I5 without {still} of {len(group.finished)} trials: no control action" * bool(still)
 
@@ -178,6 +180,7 @@ def _total_row(study: Study, group: Group) -> Row:
             "indicator": "Score",
             "paper": score_text(found.paper),
             "robust": score_text(found.robust),
+            # No single ceiling fits a score whose indicators rest on different trials.
             **({} if of_both else ceiling_values(found, "I1-I4")),
             "n": len(group.finished),
         },

@@ -1,4 +1,7 @@
-"""A table as data: typed columns, rows with ids, notes. Formats and ``explain`` read this alone."""
+"""A table as data: typed columns, rows with ids, and notes.
+
+The output formats and ``explain`` read nothing else.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,10 @@ Value = str | int | float | bool | tuple[float, float] | None
 class Column:
     """One column.
 
-    ``meaning`` says in words what stands in it, and ``counts`` is the SQL predicate of the
-    trials that its values rest on. A value may be missing without a note where ``optional``.
-    ``within`` narrows the trials of its rows, also of those that name their own. ``of`` says whose
-    trials its values rest on: the row's own, those of its ``reference``, or both.
+    ``meaning`` describes its values in words, and ``counts`` is the SQL predicate for the trials
+    that they rest on. If ``optional``, a value may be missing without a note. ``within`` narrows
+    these trials further, even in rows that have a predicate of their own. ``of`` says whose trials
+    the values rest on: those of the row, those of its ``reference``, or both.
     """
 
     name: str
@@ -41,12 +44,13 @@ class Column:
 class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
-    ``counts`` is the SQL predicate of its trials, where it is not that of the columns; ``printed``
-    names the columns whose values are the published ones, or rest on them, ``published`` those that
-    the published human outcomes are in, where trials of humans are in others. ``beside`` is the
-    driver of the paper whose row it stands beside, if any, and ``stand_in_for`` the models in whose
-    names a scripted stand-in answered. ``reference`` is the group that it is compared with, in the
-    columns that compare, and ``cited`` the shipped file that its ``published`` columns are made of.
+    ``counts`` is the SQL predicate for its trials, where that of the columns does not apply.
+    ``printed`` names the columns whose values are published ones or rest on them. ``published``
+    names the columns that rest on the published human outcomes where the others rest on human
+    trials. ``beside`` is the paper's driver whose row it is compared with, if any, and
+    ``stand_in_for`` the models in whose names a scripted stand-in answered. ``reference`` is the
+    group that the comparing columns compare it with, and ``cited`` the shipped file that its
+    ``published`` columns are computed from.
     """
 
     id: str
@@ -74,7 +78,7 @@ def row_of(
     printed: tuple[str, ...] = (),
     published: tuple[str, ...] = (),
 ) -> Row:
-    """A row of a group, named ``o3/A2/item``, with its GROUP_COLUMNS; the remarks are its note."""
+    """A group's row with its GROUP_COLUMNS, named ``o3/A2/item``; its note joins the remarks."""
     return Row(
         f"{group.id}/{item}" if item else group.id,
         (group.id,),
@@ -88,7 +92,7 @@ def row_of(
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table; a missing value always comes with a note, and NaN never occurs."""
+    """A table: a missing value in a required column always has a note, and NaN never occurs."""
 
     name: str
     title: str
@@ -97,6 +101,7 @@ class Table:
     notes: Sequence[str] = field(default_factory=tuple)
     number: str = ""
 
+    # NaN is not valid JSON, and a reader could not tell its cause: a missing value is None.
     def __post_init__(self) -> None:
         for row in self.rows:
             for column in self.columns:
@@ -113,14 +118,15 @@ class Table:
 
 
 def to_text(table: Table) -> str:
-    """A table as JSON, from which ``from_text`` makes an equal one."""
+    """A table as JSON text, which ``from_text`` turns back into an equal table."""
     return json.dumps(asdict(table), ensure_ascii=False)
 
 
 def from_text(text: str) -> Table:
-    """The table that was made a text."""
+    """The table that ``to_text`` wrote."""
     content = json.loads(text)
     columns = tuple(Column(**column) for column in content["columns"])
+    # JSON has no tuples: without these conversions the table would not equal the original.
     intervals = {column.name for column in columns if column.kind == "interval"}
     for row in content["rows"]:
         for name in intervals & row["values"].keys():
@@ -133,5 +139,5 @@ def from_text(text: str) -> Table:
 
 
 def options_text(db: Path, models: Sequence[str] | None) -> str:
-    """What else a table depends on than the results: notes name the database."""
+    """What a table depends on besides the results; the path, since its notes name the database."""
     return json.dumps([str(db), models])

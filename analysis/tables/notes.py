@@ -19,9 +19,9 @@ def listed(items: Sequence[str]) -> str:
 
 
 def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) -> list[str]:
-    """One note a group on its trials and those left out, and what else to know of the drivers.
+    """A note for each group on its trials and those left out, and caveats about the drivers.
 
-    ``pooled`` says that the table takes imported human trials as independent.
+    ``pooled`` means that the table treats imported human trials as independent.
     """
     shown = list(groups)
     notes = [
@@ -37,13 +37,13 @@ def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) 
 
 
 def measured_notes(study: Study) -> list[str]:
-    """The notes of a table of all groups whose speeds are known."""
+    """The notes of a table that shows every group whose speeds are known."""
     nothing = [] if study.measured else ["there is no measured trial to show"]
     return [*nothing, *sample_notes(study, study.measured)]
 
 
 def _own_notes(study: Study, groups: list[Group]) -> list[str]:
-    """Which of these trials are of conditions that no human drove."""
+    """Notes on the trials in conditions that no human drove."""
     notes = []
     for group in groups:
         mine = group.trials.loc[~group.trials["condition"].isin(HUMAN_CONDITIONS), "condition"]
@@ -58,7 +58,7 @@ def _own_notes(study: Study, groups: list[Group]) -> list[str]:
 
 
 def repeated_note(group: Group) -> str:
-    """That a driver without chance repeats its trials."""
+    """Says that a deterministic driver repeats its trials."""
     every = len(group.trials) + group.repeated
     return (
         f"{group.repeated} of {every} trials repeat an earlier one to the last state, as of a "
@@ -66,6 +66,7 @@ def repeated_note(group: Group) -> str:
     )
 
 
+# Nearly every table has these notes: they are made once for a study.
 @cache
 def _human_notes(study: Study, pooled: bool) -> tuple[str, ...]:
     if study.imported is None:
@@ -74,6 +75,7 @@ def _human_notes(study: Study, pooled: bool) -> tuple[str, ...]:
             f"human import PATH` reads the recordings (doi {HUMAN_DOI})",
         )
     found = tuple(f"human: {finding}" for finding in study.imported.findings())
+    # A table that models the pairs (see stats.joint) has no such bias to warn of.
     if not pooled:
         return found
     return (
@@ -107,7 +109,7 @@ def ceiling_notes(study: Study) -> list[str]:
 
 
 def intermittency_notes(study: Study) -> list[str]:
-    """How I5 is measured, and what is judged by it."""
+    """How I5 is measured, and who is judged by it."""
     rule = (
         "a driver passes where the 95 % interval of its difference from the humans in the same "
         f"conditions lies within {MARGIN_SD} human SD, fails where it lies beyond, and cannot be "

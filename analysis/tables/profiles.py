@@ -1,4 +1,4 @@
-"""How velocity profiles look: the numbers behind indicator I5, and the size of plan revisions."""
+"""The shape of velocity profiles (the numbers behind indicator I5), and how plans are revised."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from analysis.tables.notes import intermittency_notes, sample_notes
 
 
 def velocity_profiles(study: Study) -> Table:
-    """One row a group: how far accelerations are held, beside the humans', and the plans."""
+    """A row per group: how far accelerations are held, compared with humans, and plan revisions."""
     return Table(
         "velocity-profiles",
         "Piecewise-linear velocity profiles (I5) and plan revisions",
@@ -61,17 +61,21 @@ def _row(study: Study, group: Group) -> Row:
     if not group.measured:
         return row_of(group, values, "no human traces are imported")
     trials = gains(study, group)
+    # A trial in which no vehicle acted has no gain.
     judged = trials["gain"].dropna()
     values |= {"no_action": int(trials["steady"].sum())} | gain_values(study, group)
     if len(judged):
         values["held_percent"] = float(100 * (judged > 0).mean())
+    # A difference in human SD needs a human spread in every condition.
     if study.calibrated and group is not study.human:
         found = difference(study, group)
         values |= {"difference_sd": found.value, "difference_sd_ci": found.bounds()}
+    # Plans are revised in trials that collide, too: ``ended`` here, ``finished`` above.
     plans = of_group(study.plans, group, group.ended)[
         ["plans", "coarse_plans", "revised_plans", "total_revision", "large_revisions"]
     ].sum()
     if plans["plans"]:
+        # Sums are divided at the end: every plan weighs the same, not every trial.
         values["coarse_percent"] = float(100 * plans["coarse_plans"] / plans["plans"])
     if plans["revised_plans"]:
         values["revision"] = float(plans["total_revision"] / plans["revised_plans"])
@@ -82,7 +86,7 @@ def _row(study: Study, group: Group) -> Row:
 def gain_values(
     study: Study, group: Group, value: str = "gain", interval: str = "gain_ci"
 ) -> dict[str, Value]:
-    """The mean gain of a group whose speeds are known, under the names of two columns."""
+    """The mean gain and its interval under these column names; empty if speeds are unknown."""
     if not group.measured:
         return {}
     found = mean_gain(study, group)

@@ -30,7 +30,7 @@ TESTED_ELSEWHERE = (
     "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
     "table differences tests it"
 )
-# Of Table III and its variants: the columns that rest on who merged first.
+# The columns of Table III, and of its variants' table, that rest on who merged first.
 OF_OUTCOMES = ("n", "b", "se", "z", "ci", "p", "firth_b", "firth_se", "firth_ci", "firth_p")
 RANDOM_INTERCEPT = "random intercept per pair"
 
@@ -100,7 +100,7 @@ def gap(study: Study) -> Table:
 
 
 def key_columns(counts: str, *more: Column) -> tuple[Column, ...]:
-    """What leads each row of a regression, with ``more`` columns behind the driver."""
+    """The leading columns of a regression table, with ``more`` columns after the driver."""
     return (
         Column("term", "term"),
         Column("driver", "driver"),
@@ -119,7 +119,9 @@ def _wald_columns(statistic: str, counts: str) -> tuple[Column, ...]:
 
 
 def who_first_row(group: Group, term: str) -> Row:
-    """A term of who merged first: by maximum likelihood, and by Firth's fit."""
+    """The row of a term of who merged first: by maximum likelihood, and by Firth's fit."""
+    # Wald's p fails where conditions nearly separate the outcomes, as those of humans do (Hauck and
+    # Donner 1977); Firth's penalty (1993) keeps estimates finite there.
     fit = fits(group)
     return row_of(
         group,
@@ -137,7 +139,10 @@ def who_first_row(group: Group, term: str) -> Row:
 
 
 def gap_row(group: Group, term: str) -> Row:
-    """A term of the gap: by least squares, and with HC3 errors; as printed before an import."""
+    """The row of a term of the gap: by least squares, and with HC3 errors.
+
+    Before an import, the humans' row holds what the paper prints.
+    """
     if not group.measured:
         return _published_gap(group, term)
     fit = fits(group)
@@ -147,6 +152,8 @@ def gap_row(group: Group, term: str) -> Row:
         **_values(fit.ols, term),
         **_values(fit.hc3, term, "hc3_"),
     }
+    # I4 claims that this effect is absent. A large p is no evidence of that, so equivalence is
+    # tested (Schuirmann 1987); HC3 errors (MacKinnon and White 1985) hold for unequal variances.
     if term == "abs_relative_velocity" and term in fit.hc3.terms:
         slope = fit.hc3.terms[term]
         values["equivalence_p"] = float(equivalence_p(slope.b, slope.se, fit.hc3.freedom))
@@ -154,7 +161,7 @@ def gap_row(group: Group, term: str) -> Row:
 
 
 def _values(fit: Regression, term: str, prefix: str = "") -> dict[str, Value]:
-    """All that is known of a coefficient; tables show its statistic as z or as t."""
+    """A coefficient's values; its statistic goes under both z and t, and a table shows one."""
     found = fit.terms.get(term)
     if found is None:
         return {}
@@ -169,14 +176,15 @@ def _values(fit: Regression, term: str, prefix: str = "") -> dict[str, Value]:
 
 
 def problems(*found: Regression) -> str:
-    """What keeps any of the fits from having terms, empty where nothing does."""
+    """Why fits have no coefficients; empty where all have them."""
     return "; ".join(dict.fromkeys(fit.problem for fit in found if fit.problem))
 
 
 def _mixed_rows(
     group: Group, term: str, mixed: Callable[[Group], dict[str, tuple[str, Regression]]]
 ) -> list[Row]:
-    """The humans again, with a random intercept per pair; after an import alone."""
+    """The humans again, with a random intercept per pair; none before an import."""
+    # Only humans drove in pairs: repeated trials of a pair are alike, which the pooled fit ignores.
     if group.setting or not group.measured:
         return []
     return [
@@ -197,13 +205,13 @@ def _mixed_rows(
 
 @cache
 def _who_first_mixed(group: Group) -> dict[str, tuple[str, Regression]]:
-    """The mixed model by the name of its rows, with its label."""
+    """The mixed model: its label and fit by the name of its rows; once for all terms."""
     return {"mixed": (RANDOM_INTERCEPT, who_first_mixed(group.trials))}
 
 
 @cache
 def _gap_mixed(group: Group) -> dict[str, tuple[str, Regression]]:
-    """The same of our gap, and of that which the published mixed model is of."""
+    """The same for our gap, and for the definition that the published mixed model uses."""
     return {
         "mixed": (RANDOM_INTERCEPT, gap_mixed(group.trials)),
         "mixed-mean100": (
@@ -214,12 +222,12 @@ def _gap_mixed(group: Group) -> dict[str, tuple[str, Regression]]:
 
 
 def _published_p(text: str) -> Value:
-    """A printed p-value; ``<0.001`` stays a text."""
+    """A printed p-value; a bound such as ``<0.001`` stays text."""
     return text if text.startswith("<") else float(text)
 
 
 def _mixed_notes(study: Study, table: str) -> tuple[str, ...]:
-    """The published mixed model, to compare the human rows with."""
+    """A note with the published mixed model, for comparison with the human rows."""
     if study.human not in study.groups:
         return ()
     terms = published("human_mixed_models").query("table == @table")
@@ -236,7 +244,7 @@ def _mixed_notes(study: Study, table: str) -> tuple[str, ...]:
 
 
 def _published_gap(group: Group, term: str) -> Row:
-    """The humans' row of Table IV as the paper prints it; the interval is that of b and its SE."""
+    """The humans' row of Table IV as the paper prints it; its interval follows from b and SE."""
     printed = published("paper_gap").query("driver == 'human' and term == @term").iloc[0]
     n, b, se = int(printed["n"]), float(printed["b"]), float(printed["se"])
     return row_of(

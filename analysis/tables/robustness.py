@@ -1,4 +1,4 @@
-"""Outcomes under the readings of the paper's collision rule, and under the humans' own."""
+"""Outcomes under several readings of the paper's collision rule, and under that for humans."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from analysis.stats.intervals import proportion
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import measured_notes
 
-# The size of a spec's vehicles in words.
+# The size of the vehicles under each spec, in words.
 SIZES = "SELECT spec_hash, format('{:g} m x {:g} m', length_m, width_m) AS size FROM geometry"
 
 
 def robustness(study: Study) -> Table:
-    """One row a group and rule: collisions, who was first, and what cannot be known."""
+    """A row per group and rule: collisions, who was first, and what remains undecided."""
     rows: list[Row] = []
     if study.measured:
         found = outcomes(study.db, pd.concat([group.trials for group in study.measured]))
@@ -54,7 +54,7 @@ def robustness(study: Study) -> Table:
 
 
 def _size_notes(study: Study) -> Iterator[str]:
-    """The vehicles that are judged, with the groups that drove them."""
+    """The vehicles' sizes, with the groups that drove them where sizes differ."""
     found = load_each({"sizes": SIZES}, study.db)["sizes"].set_index("spec_hash")["size"]
     driven: dict[str, list[str]] = {}
     for group in study.measured:
@@ -66,6 +66,7 @@ def _size_notes(study: Study) -> Iterator[str]:
 
 
 def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
+    # All trials that ended, as one that finished under its own rule may collide under another.
     own = of_group(found, group, group.ended)
     rows = []
     for rule in READINGS:
@@ -82,6 +83,7 @@ def _rows(group: Group, found: pd.DataFrame) -> list[Row]:
                 ((chosen["status"] == "finished") & (chosen["merged_first"] == "left")).sum()
             ),
         }
+        # Undecided trials stay in n: the share is a lower bound.
         note = "no trial ended"
         if share.value is not None:
             values |= {

@@ -1,4 +1,4 @@
-"""Tables III and IV for every prompt variant, and how each differs from its baseline."""
+"""Tables III and IV for every prompt variant, with its differences from the baseline."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FAMILY_NOTE = (
 
 
 def who_first_variants(study: Study) -> Table:
-    """Table III with a row a group and term, and the differences from the baseline."""
+    """Table III with a row per group and term, and the differences from the baseline."""
     return Table(
         "who-first-variants",
         "Logistic regression of which driver merged first (1: left), for every prompt variant",
@@ -56,7 +56,7 @@ def who_first_variants(study: Study) -> Table:
 
 
 def gap_variants(study: Study) -> Table:
-    """Table IV with a row a group and term, and the differences from the baseline."""
+    """Table IV with a row per group and term, and the differences from the baseline."""
     return Table(
         "gap-variants",
         "Linear regression of the gap at the merge point (m), for every prompt variant",
@@ -79,7 +79,11 @@ def gap_variants(study: Study) -> Table:
 def _fit_columns(
     name: str, estimate: str, other: str, p: str, test: str, counts: str
 ) -> tuple[Column, ...]:
-    """Coefficient, error, interval and p of one fit; ``estimate`` and ``other`` lead headings."""
+    """Columns of one fit's coefficient, error, interval and p.
+
+    ``estimate`` is the prefix of the coefficient's heading, ``other`` that of the next two.
+    """
+    # The first fit is the table's subject: where it is missing, a note must say why.
     optional = bool(name)
     return (
         Column(f"{name}b", f"{estimate}b", "number", 2, "coefficient", counts, optional),
@@ -104,7 +108,8 @@ def _difference_columns(counts: str) -> tuple[Column, ...]:
 
 
 def _who_first_row(group: Group, term: str) -> Row:
-    """That of Table III, with the profile interval of Firth's coefficient."""
+    """The row of Table III, with the profile interval of Firth's coefficient."""
+    # A penalised likelihood can be skewed, where b +- z SE misleads (Heinze and Schemper 2002).
     row, profiles = who_first_row(group, term), firth_intervals(group)
     return replace(row, values={**row.values, "firth_ci": profiles.get(term)})
 
@@ -116,7 +121,7 @@ def _rows(
     differences: Differences,
     compared: Callable[[Fits], Regression],
 ) -> list[Row]:
-    """Term by term a row a group; ``compared`` is the fit without which there is no difference."""
+    """A row per group for each term; ``compared`` is the fit that a difference requires."""
     found, baselines = corrected_differences(study, differences), dict(variants(study))
     rows = []
     for term in terms:
@@ -152,7 +157,8 @@ def _with_difference(row: Row, baseline: Group | None, one: Corrected) -> Row:
 
 
 def _why_none(group: Group, baseline: Group | None, compared: Callable[[Fits], Regression]) -> str:
-    """Why a variant has no difference from its baseline, as far as its own note does not say it."""
+    """Why a variant has no difference from its baseline, unless its own note already says so."""
+    # The note of its own regression names this problem.
     if compared(fits(group)).problem:
         return ""
     if baseline is None:

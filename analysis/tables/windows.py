@@ -1,4 +1,4 @@
-"""Speed deviation and joint rate over four readings of "the interaction window"."""
+"""Speed deviation and joint rate under four readings of the paper's "interaction window"."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WINDOWS = {
 
 
 def speed_windows(study: Study) -> Table:
-    """One row a group and window; the right window gives the published human values."""
+    """A row per group and window; the paper's window is the one that yields its human values."""
     return Table(
         "speed-windows",
         "Speed deviation and joint rate by the window in which they are taken",
@@ -50,7 +50,8 @@ def _printed(metric: Metric) -> str:
 def _row(study: Study, group: Group, window: str) -> Row:
     found = study.deviations[study.deviations["time_window"] == window]
     own = of_group(found, group, group.finished)
-    # The view of the windows has the same columns as that of the metrics.
+    # The view of the windows names its columns as the metrics' view does, so that the same names
+    # select them here.
     rmse = mean(own[RMSE.value].to_numpy(float))
     joint = proportion(int(own[JOINT.value].sum()), len(own)).value
     return row_of(

@@ -31,7 +31,7 @@ PLACES: dict[str, tuple[str, ...]] = {
     "decisions": ("decision", "side"),
     "calls": ("decision", "side", "attempt"),
 }
-# Texts of any length are compared by their hash, so that none of them is read.
+# Texts of any length are compared by their hashes, so that no long text need be read.
 LONG: dict[str, tuple[str, ...]] = {
     "decisions": ("rationale", "prompt"),
     "calls": ("request", "reply"),
@@ -40,9 +40,9 @@ LONG: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A column with other values in ``rows`` stored rows of a trial, and the first of them.
+    """A column that differs in ``rows`` stored rows of a trial, and the first of these rows.
 
-    Without a column, rows are missing or superfluous.
+    If ``column`` is None, rows are missing or superfluous.
     """
 
     table: str
@@ -60,7 +60,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """Rows of one table by trial, with the names of their columns; ``hashed`` are texts' hashes."""
+    """Rows of one table by trial, with its columns; those in ``hashed`` hold hashes of texts."""
 
     table: str
     names: tuple[str, ...]
@@ -79,7 +79,7 @@ class Stored:
         ignored: Collection[str] = (),
         tolerance: float = 0.0,
     ) -> Iterator[Difference]:
-        """In what a trial's stored rows differ from the wanted ones."""
+        """The differences of a trial's stored rows from the wanted ones."""
         stored, made = self.rows.get(key, []), [self._as_stored(row) for row in wanted]
         at = [self.names.index(name) for name in PLACES[self.table]]
         old = {tuple(row[i] for i in at): row for row in stored}
@@ -121,9 +121,9 @@ def stored_rows(
     span: Span | None = None,
     columns: str | None = None,
 ) -> Stored:
-    """The rows of these trials: these columns, or all of them with hashes in place of long texts.
+    """The rows of these trials: the given columns, or all, with hashes in place of long texts.
 
-    The columns must have those that identify a row.
+    The columns must include those that identify a row.
     """
     hashed = LONG.get(table, ()) if columns is None else ()
     hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in hashed)
@@ -146,8 +146,8 @@ def rows_of_trials(
 ) -> duckdb.DuckDBPyConnection:
     """A query for the rows of these trials, to be fetched.
 
-    A trial's rows lie together: their place is looked up first, or given, so that only they are
-    read.
+    A trial's rows lie together in the table. Their place is looked up first, unless it is given, so
+    that no other rows are read.
     """
     names = [[key[0] for key in keys], [key[1] for key in keys]]
     first, last = (
@@ -169,9 +169,9 @@ def in_batches(
     tables: Collection[str],
     read: Callable[[list[TrialKey], Spans], Read],
 ) -> Iterator[Read]:
-    """What ``read`` makes of some trials at a time, given where the rows of each table lie.
+    """What ``read`` returns for batches of trials, given where the rows of each table lie.
 
-    Where they do not fit into the database's memory, fewer are read at a time.
+    Where a batch does not fit into the database's memory, smaller ones are read.
     """
     where = {table: _spans(connection, table) for table in tables}
     nowhere = (0, -1)
@@ -208,7 +208,7 @@ def _spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, 
 
 
 def same_value(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table
-    """Whether two values of a table are equal, numbers within the tolerance, also in lists."""
+    """Whether two values of a table are equal; numbers, even within lists, within the tolerance."""
     if one == other:
         return True
     if isinstance(one, list) and isinstance(other, list):

@@ -31,14 +31,14 @@ PATIENCE_S = 60.0
 LOGS = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
 """How the names of a database's own files go on."""
 ROWS_AT_ONCE, COPIED_AT_ONCE = 100, 2_048
-# The size of a file for each of its calls where replies are short, compressed and with its share of
-# the states; and up to how much more its row groups are merged, and its texts are read without more
-# memory.
+# How many bytes of the file a call takes where replies are short, compressed and with its share of
+# the states. By how much the file may exceed that for its row groups still to be merged, and for
+# its texts to be read without more memory.
 BYTES_OF_A_CALL, MERGED_BYTES, SHORT_BYTES = 3_000, 2**26, 2**23
 LOG = logging.getLogger(__name__)
 Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
-    "memory_limit": "200MB",  # of the machine's by default; it is a cache of the file most of all
+    "memory_limit": "200MB",  # the default is a share of the machine's; most of it caches the file
     "max_vacuum_tasks": 0,  # see merge_small_groups
     "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
 }
@@ -51,12 +51,12 @@ REBUILD = (
 
 
 def schema_sql() -> str:
-    """What makes a database: its tables, and views on them with the measures."""
+    """The SQL that makes a database: its tables, and views of them with the measures."""
     return f"{SCHEMA.read_text(encoding='utf-8')}\n{measures_sql()}"
 
 
 def update_measures(connection: duckdb.DuckDBPyConnection) -> None:
-    """Define the measures anew where another version of the program did."""
+    """Define the measures anew if another version of the program defined them."""
     if not _has_these_measures(connection):
         connection.execute(measures_sql())
 
@@ -69,7 +69,7 @@ def _has_these_measures(connection: duckdb.DuckDBPyConnection) -> bool:
     return found == [(measures_version(),)]
 
 
-@cache  # once for a file, which a page may read a hundred times
+@cache  # warns once per file, which a page may read a hundred times
 def _warn_of_other_measures(path: Path) -> None:
     LOG.warning(
         "another version of the program defined the measures (trial_metrics and its views) of %s, "
@@ -86,7 +86,7 @@ def spill_folder() -> Path:
 
 
 def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
-    """A database of its own, in memory."""
+    """A new database in memory."""
     connection = duckdb.connect(config=settings)
     # DuckDB takes `python -c` for an interactive prompt: a slow query would draw into our output.
     connection.execute("SET enable_progress_bar = false")
@@ -96,11 +96,11 @@ def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
 class Instance:
     """A DuckDB instance; attaching a file to it takes the file's lock, detaching frees it.
 
-    Making one takes longer than most of what is done with it, so there is one for everything.
-    After an error it may be unusable, and a new one is made.
+    Making an instance takes longer than most queries, so one is used for everything. After an error
+    it may be unusable, and a new one is made.
 
-    A connection for reading reaches the file that it reads and those in the folder ``also``, and
-    nothing else; where the instance does not ``confine`` it, whoever opens it must.
+    A connection for reading reaches only the file that it reads and those in the folder ``also``.
+    If the instance does not ``confine`` it, whoever opens the connection must.
     """
 
     def __init__(
@@ -114,15 +114,16 @@ class Instance:
         self._numbers = itertools.count()
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
-        """A connection of its own."""
+        """A separate connection to the instance."""
         if self._connection is None:
             self._connection = in_memory(self._settings)
         return self._connection.cursor()
 
     def confined(self, path: Path) -> duckdb.DuckDBPyConnection:
-        """A connection that can reach no file but one database, whoever made that.
+        """A connection that can reach no file but one database, which may be anybody's.
 
-        A view or a macro in it may try to read any file, even under the name of a DuckDB function.
+        A view or a macro in that database may try to read any file, even under the name of a DuckDB
+        function.
         """
         if not self._confine:
             return self.cursor()
@@ -212,9 +213,9 @@ def _attached(
 
 
 def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
-    """Let the next write merge the row groups of many small ones, unless the rows hold long texts.
+    """Let the next write merge small row groups, unless the rows hold long texts.
 
-    Merging takes as much memory as the texts of 122,880 rows, and writes them again each time.
+    Merging takes as much memory as the texts of 122,880 rows, and rewrites these each time.
     """
     tasks = 100 if _bytes_of_texts(connection) <= MERGED_BYTES else 0
     connection.execute(f"SET max_vacuum_tasks = {tasks}")
@@ -222,7 +223,7 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
 
 @contextmanager
 def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
-    """More memory while long texts are read: each thread unpacks those of 2,048 rows at once."""
+    """Allow more memory while long texts are read: a thread unpacks those of 2,048 rows at once."""
     if _bytes_of_texts(connection) <= SHORT_BYTES:
         yield
         return
@@ -349,7 +350,7 @@ def unreadable_is_usage() -> Iterator[None]:
 
 def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
     """The version of an existing database; raises UsageError for a newer or a foreign one."""
-    # A table, and functions of DuckDB's: a view or a macro of such a name could read any file.
+    # Only a table, and DuckDB's own functions: a view or macro of that name could read any file.
     tables = dict(
         connection.execute(
             "SELECT table_name, column_count FROM system.main.duckdb_tables() "

@@ -22,7 +22,7 @@ STALE_S = 10.0
 CHECKING_STALE_S = 600.0
 MOST_BYTES = 1_000_000
 LOG = logging.getLogger(__name__)
-# Identifies the machine among those that share a folder: process ids mean nothing elsewhere.
+# Identifies the machine among those that share a folder: process ids mean nothing on another one.
 MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
@@ -55,7 +55,7 @@ class Standing:
     """Where a sweep stands. ``committed_usd`` counts against ``cap_usd``, over all runs.
 
     ``waiting`` says what its calls wait for, ``warnings`` what its user should know. ``left_s`` is
-    an estimate, None while there is none.
+    the estimated time left, None while there is no estimate.
     """
 
     sweep_id: str
@@ -109,7 +109,7 @@ class ProgressFile:
         path = _path(self.db, self.sweep_id)
         made = path.with_suffix(".tmp")
         with self._lock:
-            # A thread may bring an outdated state.
+            # A slower thread may arrive with an outdated state.
             if self._gone or (self._newest and standing.updated_at < self._newest):
                 return
             self._newest = standing.updated_at
@@ -160,7 +160,7 @@ def _path(db: Path, sweep_id: str) -> Path:
 
 def _read(path: Path) -> Standing | None:
     if not path.is_file():
-        return None  # a pipe may never end
+        return None  # reading a pipe might never end
     try:
         with path.open("rb") as file:
             return _STANDING.validate_json(file.read(MOST_BYTES))

@@ -16,7 +16,7 @@ Writer = Callable[[list[str], Rows, TextIO], None]
 
 
 def write_csv(names: list[str], rows: Rows, out: TextIO) -> None:
-    """Write CSV in which a spreadsheet finds nothing to run."""
+    """Write CSV in which a spreadsheet finds no formula to run."""
     csv_writer(out).writerows(map(in_spreadsheet, row) for row in chain((names,), rows))
 
 

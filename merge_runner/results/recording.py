@@ -3,8 +3,8 @@
 One row per call: the parts of its key, the exact request body, and all attempts as JSON. The
 file's key-value metadata hold where it comes from. Any Parquet tool can query it.
 
-A recording may come from anybody: none of it is executed, it is read in bounded memory, and none
-of it is kept unless all of it is what an export writes.
+A recording may come from anybody: nothing in it is executed, it is read in bounded memory, and
+nothing of it is added to the cache unless the whole file is one that an export could have written.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from merge_runner.results.database import Settings, append, in_memory
 from merge_runner.text_safety import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 2"
-# The hash of such a file does not cover what it says of its origin.
+# In this format, the file's hash does not cover what it says about its origin.
 FIRST_FORMAT = "merge-runner recording 1"
 UNCOVERED = (
     "it was exported by an earlier version: its hash does not cover what it says of where it comes "
@@ -69,17 +69,17 @@ PART_BYTES, GROUP_BYTES = 2**25, 2**27
 READING: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
-    "memory_limit": "1GB",  # what is unpacked counts too
+    "memory_limit": "1GB",  # unpacked bytes count, too
     "threads": 1,
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a recording holds: its calls, how many of them a scripted stand-in answered, and so on.
+    """A recording's contents: its calls, how many of them a scripted stand-in answered, and so on.
 
-    ``cost_usd`` is what its replies cost when they were made. ``covered`` says that the hash of the
-    file covers the provenance, too: that of the first format does not.
+    ``cost_usd`` is what its replies cost when they were made. ``covered`` says whether the file's
+    hash covers the provenance, too, which in the first format it does not.
     """
 
     calls: int
@@ -95,16 +95,16 @@ class Summary:
 
     @property
     def notes(self) -> list[str]:
-        """What a reader should know even if it is whole."""
+        """What a reader should know about the recording even if it is intact."""
         return [] if self.covered else [UNCOVERED]
 
 
 def export_recording(
     file: Path, cache: ResponseCache, keys: list[str], provenance: dict[str, str]
 ) -> int:
-    """Write the entries of these keys; returns their number. Raises RecordingError.
+    """Write the entries under these keys; returns their number. Raises RecordingError.
 
-    Damaged ones are left out; once the others are written, the error names them.
+    Damaged entries are left out; once the others are written, the error names them.
     """
     ordered, damaged = _in_order(cache, keys)
     if file.is_dir():
@@ -126,7 +126,7 @@ def _write_parts(
     folder: Path, file: Path, entries: Iterable[CachedCall | None], provenance: dict[str, str]
 ) -> None:
     """Write the entries part by part into the folder, and all of them as the file."""
-    partial = file.with_name(file.name + ".partial")  # no reader sees half a file
+    partial = file.with_name(file.name + ".partial")  # so that no reader sees half a file
     content, calls, size = hashlib.sha256(), 0, 0
     with in_memory(READING) as connection:
         columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
@@ -164,8 +164,8 @@ def _write_parts(
 def _in_order(cache: ResponseCache, keys: list[str]) -> tuple[list[str], dict[str, str]]:
     """The keys in the order of condition, repetition, side, decision, sample set and key.
 
-    Also returns the damaged ones, with what is wrong with each. Raises RecordingError where one
-    is not in the cache.
+    Also returns the keys of damaged entries, with what is wrong with each. Raises RecordingError
+    if a key is not in the cache.
     """
     places, missing, damaged = [], [], {}
     for key in keys:
@@ -187,7 +187,7 @@ def _in_order(cache: ResponseCache, keys: list[str]) -> tuple[list[str], dict[st
 
 
 def _of_bounded_size(rows: Iterable[tuple[Any, ...]]) -> Iterator[list[tuple[Any, ...]]]:
-    """The rows in lists of bounded size, of one row at least."""
+    """The rows in lists of bounded size, each of at least one row."""
     batch: list[tuple[Any, ...]] = []
     size = 0
     for row in rows:
@@ -267,7 +267,7 @@ class Spilled(Mapping[str, CachedCall]):
 def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
     """Verify the whole file, then add what the cache lacks; returns (added, already there).
 
-    Reading it twice keeps nothing of a file that proves damaged at its end.
+    The file is read twice, so that nothing of a file whose damage shows only at its end is added.
     """
     for _ in read_recording(file):
         pass
@@ -313,7 +313,7 @@ def _written(file: Path) -> Iterator[None]:
 
 
 def _fingerprint(key: str, attempts: str) -> bytes:
-    """The part of a row that the hash of a recording covers directly: its key covers the rest."""
+    """The part of a row that the recording's hash covers directly; the key covers the rest."""
     return f"{key} {attempts}\n".encode()
 
 
@@ -453,7 +453,7 @@ def _number(connection: duckdb.DuckDBPyConnection, sql: str) -> int:
 
 
 def read_provenance(file: Path) -> dict[str, str]:
-    """What a recording says of where it comes from, not verified; raises RecordingError."""
+    """What a recording says about its origin, not verified; raises RecordingError."""
     with _opened(file) as connection:
         return _metadata(file, connection)
 

@@ -1,7 +1,7 @@
 """Signatures of recordings, by the user's own tool: ssh-keygen, or minisign for a minisign key.
 
-A hash reveals damage. Whoever changes a file on purpose can compute its hash anew, but not its
-signature. Only these tools read keys; they ask for a passphrase themselves.
+A hash reveals accidental damage. Anyone who changes a file on purpose can compute its hash anew,
+but not its signature. Only these tools read keys; they ask for a passphrase themselves.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def sign(file: Path, key: Path) -> Path:
 
 
 def verified(file: Path, signers: Path) -> str:
-    """Who signed a file, in a line; raises RecordingError unless it is one of ``signers``.
+    """Who signed a file, as a line of text; raises RecordingError unless one of ``signers`` did.
 
-    These are the allowed signers of ssh-keygen, or the public key of minisign.
+    That is a file of allowed signers for ssh-keygen, or a public key of minisign.
     """
     tool = tool_for(signers)
     signature, allowed = _signature(file, tool), signers.resolve()
@@ -66,7 +66,7 @@ def _signature(file: Path, tool: str) -> Path:
 def _run(
     tool: str, options: Sequence[object], file: Path | None = None, *, asks: bool = False
 ) -> bytes:
-    """Run a tool on a file; one that ``asks`` for a passphrase does so at the terminal.
+    """Run a tool on a file; if it ``asks`` for a passphrase, it does so at the terminal.
 
     Raises RecordingError.
     """

@@ -43,7 +43,7 @@ from merge_runner.served_model import other_models, sql_of
 from merge_runner.signals import at_signals
 from merge_runner.text_safety import first_line
 
-# What differs from run to run: whether it made an attempt itself, and when.
+# Columns that differ from run to run: whether the run made an attempt itself, and when.
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
 
 
@@ -87,7 +87,7 @@ class Store:
     def begin_sweep(
         self, sweep: SweepRow, specs: dict[str, str], stored: Iterable[TrialKey]
     ) -> None:
-        """Add a sweep, what its spec hashes stand for, and its trials that are stored already."""
+        """Add a sweep, what its spec hashes stand for, and those of its trials already stored."""
         with self._writing() as connection:
             connection.execute(
                 "INSERT INTO sweeps VALUES (?, ?, ?, NULL, NULL, ?, ?, ?, ?)",
@@ -115,8 +115,8 @@ class Store:
     def ended_trials(self, keys: Collection[TrialKey]) -> set[TrialKey]:
         """Which of these trials are stored and did not fail.
 
-        Raises UsageError where a condition of theirs was another one: its numbers are no part of
-        the spec's hash.
+        Raises UsageError where one of their conditions had other numbers when they were stored:
+        the spec's hash does not cover these.
         """
         with self._writing() as connection:
             _refuse_other_conditions(connection, list(keys))
@@ -125,11 +125,11 @@ class Store:
     def write(
         self, sweep_id: str, records: Sequence[TrialRecord], *, patience_s: float
     ) -> dict[str, list[str]]:
-        """Store whole trials of a sweep; one that has ended already is compared and linked.
+        """Store whole trials and link them to a sweep; one already stored is compared instead.
 
         Returns the ids of those that are stored with other values, and in which columns.
         """
-        # Made before the lock is taken, though a trial that is stored already needs none.
+        # Made before the lock is taken, although a trial that is stored already needs none.
         played = [(record, rows_of(record)) for record in records]
         with self._writing(patience_s) as connection:
             merge_small_groups(connection)
@@ -141,7 +141,7 @@ class Store:
     def add_recorded(
         self, records: Sequence[TrialRecord], specs: dict[str, str]
     ) -> tuple[int, int, list[str]]:
-        """Store recorded trials, of no sweep; one that is stored already stays as it is.
+        """Store recorded trials, which belong to no sweep; one already stored stays as it is.
 
         Returns how many were added, how many were stored already, and the ids of those that are
         stored with other values.
@@ -210,7 +210,7 @@ def answering(
             )
         yield connection.execute(statements[0])
     except duckdb.IOException:
-        raise  # no query reaches a file but the database, so that one is damaged
+        raise  # a query reaches no file but the database, so it is the database that is damaged
     except duckdb.OutOfMemoryException as exc:
         raise UsageError(
             f"the query needs more than the {TEXTS['memory_limit']} of memory that it may use: ask "
@@ -234,8 +234,8 @@ def _reads(statement: duckdb.Statement) -> bool:
 def results_digest(path: Path) -> tuple[str, int]:
     """A hash of all results, and the number of trials in it.
 
-    It covers what happened (trials, states, decisions), in an order of its own, and not when,
-    where or at what price: no clock times, latencies, costs, cache keys or spec hashes.
+    The hash covers what happened (trials, states, decisions), whatever the order of storage, but
+    not when, where or at what price: no clock times, latencies, costs, cache keys or spec hashes.
     """
     digests: dict[TrialKey, Any] = {}
     with read_database(path) as connection, room_for_texts(connection):
@@ -266,7 +266,7 @@ def _by_trial(
 ) -> Iterator[tuple[TrialKey, list[list[Any]]]]:
     """The rows of each trial as soon as all of them are read.
 
-    They lie together in the table, which is too large to be sorted.
+    A trial's rows lie together in the table, which is too large to be sorted.
     """
     counts = {
         (trial_id, spec_hash): count
@@ -311,8 +311,8 @@ class SweepFacts:
     ``outcomes`` holds (variant, condition, status, merged_first, had a fallback, trials),
     ``ledger`` (driver, variant, fate, outcome, attempts) as the view ``attempts`` names them,
     ``failed`` (trial_id, error), ``others`` (model requested, model served, answers) where another
-    model answered, ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
-    scripted stand-in did.
+    model answered, and ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
+    scripted stand-in answered.
     """
 
     outcomes: list[tuple[str, str, str, str | None, bool, int]]
@@ -410,10 +410,10 @@ def _ended(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> dict[
 def _add_trials(
     connection: duckdb.DuckDBPyConnection, played: list[tuple[TrialRecord, dict[str, list[Row]]]]
 ) -> tuple[int, list[tuple[str, list[str]]]]:
-    """Store whole trials, in the place of failed ones; compare those that ended before.
+    """Store whole trials, replacing failed ones; compare those that had ended before.
 
-    Returns how many were stored, and the id of each that is stored with other values, with the
-    columns.
+    Returns how many were stored, and the ids of those that had been stored with other values, each
+    with the columns that differ.
     """
     stored = _ended(connection, [_key(record) for record, _ in played])
     _delete(connection, [key for key, ended in stored.items() if not ended])
@@ -433,7 +433,7 @@ def _add_trials(
 def _differing(
     connection: duckdb.DuckDBPyConnection, played: list[tuple[TrialKey, dict[str, list[Row]]]]
 ) -> Iterator[tuple[str, list[str]]]:
-    """The ids of trials that are stored with other values than were played, and the columns."""
+    """Trials whose stored values differ from those just played: their ids, with the columns."""
     keys = [key for key, _ in played]
     tables = [stored_rows(connection, table, keys) for table in PLACES] if played else []
     for key, rows in played:

@@ -1,4 +1,4 @@
-"""Makes the clients of a sweep's language models, with their connections or sealed."""
+"""Makes the clients of a sweep's language models: connected, or answering from recordings."""
 
 from __future__ import annotations
 
@@ -36,10 +36,11 @@ SPARE_FILES = 64
 
 @dataclass(frozen=True, slots=True)
 class EndpointPlan:
-    """How the endpoints of a sweep are asked; ``urls`` are variables that hold their base URLs.
+    """How the endpoints of a sweep are asked; ``urls`` maps variables to base URLs.
 
-    ``known`` are the models whose endpoint has ever answered in its format, ``passed`` those where
-    it has done so in this run. ``strict`` stops at an answer of another model.
+    ``known`` names the models whose endpoint has ever given an answer in its format, ``passed``
+    those where it has done so in this run. With ``strict``, an answer from another model than the
+    one requested stops the run.
     """
 
     urls: Mapping[str, str]
@@ -50,7 +51,7 @@ class EndpointPlan:
 
 @dataclass(frozen=True, slots=True)
 class LocalServices:
-    """What the clients of a run share: the queue of each model, and the money."""
+    """What the clients of a run share: the rate limiter of each model, and the budget."""
 
     limiters: Mapping[str, Limiter]
     budget: Budget
@@ -75,9 +76,9 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
 def open_services(
     plan: Plan, options: Options, cache: ResponseCache, ledger: Ledger, stack: AsyncExitStack
 ) -> LocalServices:
-    """The services of a run; its claims are given up with ``stack``.
+    """The services of a run; closing ``stack`` gives up its claims.
 
-    Raises UsageError where a cap could not hold.
+    Raises UsageError where a spending cap could not be enforced.
     """
     for name, entry in plan.entries.items():
         if options.max_cost_usd is not None and not is_known(entry):
@@ -87,7 +88,7 @@ def open_services(
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
-    cache.claims.open()  # now, not in the midst of the run, where the folder has no locks
+    cache.claims.open()  # a folder without locks must fail now, not in the middle of the run
     stack.callback(cache.claims.close)
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
@@ -105,7 +106,7 @@ def open_services(
 def _shared_limits(
     name: str, entry: ModelEntry, rpm: int | None, tpm: int | None, stack: AsyncExitStack
 ) -> SharedLimits | None:
-    """What all sweeps of this user with one key keep together; our own emulator has no key."""
+    """The limits that all of this user's sweeps with the same key share; our emulator has none."""
     own_emulator = entry.provider == "emulator" and running_emulator_url() is None
     if own_emulator or (rpm is None and tpm is None):
         return None
@@ -121,7 +122,7 @@ async def start_endpoints(
 ) -> dict[str, str]:
     """The variables of base URLs that lead to the entries' endpoints.
 
-    Starts the emulator where it is asked, to be stopped with ``stack``.
+    Starts the emulator where an entry needs it; closing ``stack`` stops it.
     """
     urls = base_urls(entries)
     emulated = any(entry.provider == "emulator" for entry in entries.values())
@@ -168,7 +169,7 @@ def live_clients(
 
 
 def _allow_open_files(wanted: int) -> None:
-    """Raise this process's limit of open files to what the connections need."""
+    """Raise this process's limit on open files to what the connections need."""
     # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft >= wanted or soft == resource.RLIM_INFINITY:

@@ -21,9 +21,9 @@ PROMPT_MARGIN = 1.25
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Who drives, trials, calls, tokens, USD (None: a price is unknown) and minutes of a live run.
+    """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
 
-    ``measured`` lists the drivers whose tokens and latency are those of their earlier answers.
+    ``measured`` lists the drivers whose tokens and latency are taken from their earlier answers.
     """
 
     driver: str
@@ -39,7 +39,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class _PerCall:
-    """What one call of a model takes, as measured or as the registry has it."""
+    """What one call of a model takes, as measured or as listed in the registry."""
 
     usage: Usage
     latency_s: float
@@ -56,9 +56,9 @@ def estimate(
 ) -> Estimate:
     """The estimate for what a live run of a plan has yet to do.
 
-    ``trials`` have ended nowhere; ``calls`` are about how many each model has yet to answer;
-    ``facts`` is what the cache knows of each model's earlier answers to requests like these, at
-    its endpoint.
+    ``trials`` counts those neither stored nor recorded; ``calls`` is roughly how many each model
+    has yet to answer; ``facts`` is what the cache knows about each model's earlier answers to
+    similar requests at its endpoint.
     """
     all_calls = input_tokens = output_tokens = 0
     cost: float | None = 0.0
@@ -94,7 +94,7 @@ def estimate(
 
 
 def worst_trial_usd(plan: Plan) -> float:
-    """What a whole trial may cost: to the timeout, every byte a token, every answer at its cap."""
+    """The most a trial can cost: up to the timeout, a token per byte, every answer at its cap."""
     prompt_bytes = len(_typical_prompt(plan).encode()) * PROMPT_MARGIN
     return sum(
         math.ceil(plan.scenario.timeout_steps / model_pace(plan.scenario).interval_steps)
@@ -136,7 +136,7 @@ def _limited_s(options: Options, entry: ModelEntry, calls: int, each: _PerCall) 
 
 
 def _typical_prompt(plan: Plan) -> str:
-    """The longest variant's prompt in the midst of an approach."""
+    """The longest variant's prompt in the middle of an approach."""
     world = new_world(plan.scenario, plan.conditions[0])
     rest = (0.25,) * (plan.scenario.plan_actions - plan.scenario.executed_actions)
     prompts = (

@@ -17,11 +17,11 @@ BATCH = 64
 """Trials in one transaction: few enough that a reader gets its turn soon."""
 MOST_PENDING = 4 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
-# How much may wait while nothing can be stored, as while another program holds the file.
+# How many bytes may wait in memory while storing fails, as when another program holds the file.
 MOST_STUCK_BYTES = 2**29
 LOCK_PATIENCE_S = 2.0
-# How long the end waits for a lock, which somebody will release, and for anything else, such as
-# a full disk to have room again.
+# How long the end of a sweep retries: longer for a lock, which somebody will release, than for
+# anything else, such as a full disk.
 LAST_LOCK_PATIENCE_S, LAST_PATIENCE_S = 60.0, 3.0
 
 
@@ -36,8 +36,8 @@ class Flusher:
     """Collects ended trials and stores them about once a second.
 
     Trials that cannot be stored wait in memory, up to a limit, while others are played; where
-    storing is merely slow, new trials wait for it. ``differing`` names the trials that are stored
-    already with other values, and the columns.
+    storing is merely slow, new trials wait for it. ``differing`` maps trials that were already
+    stored with other values to the columns that differ.
     """
 
     def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
@@ -61,7 +61,7 @@ class Flusher:
             self._awake.set()
 
     async def room(self) -> None:
-        """Wait while much is still to be stored, and it can be."""
+        """Wait while too much is still to be stored, unless storing has ended."""
         while self._is_full() and not self._task.done():
             self._tried.clear()
             await self._tried.wait()
@@ -112,7 +112,7 @@ class Flusher:
             )
         except StoreError as exc:
             self._problem = exc
-            # In front, so that trials are stored in the order in which they ended.
+            # Back in front, so that trials are stored in the order in which they ended.
             self._pending = batch + self._pending
             if str(exc) != self._said:  # it is tried again every second
                 self._said = str(exc)

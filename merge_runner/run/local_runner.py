@@ -21,18 +21,18 @@ from merge_runner.run.plan import Plan
 from merge_runner.run.scheduler import Gate, run_bounded
 from merge_runner.trial import play_trial
 
-# Called with each trial that ends; a suspended one has no money to go on.
+# Called with each trial that ends, or is suspended for lack of money.
 Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]
-# Awaited before a trial begins, until there is memory to keep it in until it is stored.
+# Awaited before a trial begins: returns once there is memory to hold the trial until it is stored.
 Room = Callable[[], Awaitable[None]]
 
 
 async def no_wait() -> None:
-    """Room without end."""
+    """A Room without limits."""
 
 
 class TrialRunner(Protocol):
-    """Whoever plays the trials of a sweep: this process, or workers in a cluster."""
+    """What plays the trials of a sweep: this process, or workers in a cluster."""
 
     @property
     def meters(self) -> Mapping[str, Meter]:
@@ -69,11 +69,11 @@ class TrialRunner(Protocol):
         ...
 
     async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
-        """Play trials in order; what ``ended`` raises, and any error but a trial's own, ends it."""
+        """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
         ...
 
     async def drain(self) -> None:
-        """Let calls in flight end and be saved, and give up those that wait for a turn."""
+        """Let calls in flight end and be saved, and drop those that still wait for a turn."""
         ...
 
 
@@ -90,7 +90,7 @@ class LocalRunner:
 
     @cached_property
     def drivers(self) -> Mapping[str, MakeDriver]:
-        """Who makes the drivers of a name: a program, or a model that one of the clients asks."""
+        """Makers of drivers by name: of a program, or of a model that one of the clients asks."""
         models = {name: LanguageModel(partial(self._ask, name)) for name in self.clients}
         return {**PROGRAMS, **models}
 
@@ -101,7 +101,7 @@ class LocalRunner:
 
     @property
     def meters(self) -> Mapping[str, Meter]:
-        """Those of the clients."""
+        """The meters of the clients."""
         return {name: client.meter for name, client in self.clients.items()}
 
     @property

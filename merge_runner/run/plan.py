@@ -38,9 +38,9 @@ PROMPTS_PER_DRIVER = 10.5
 class Options:
     """How a sweep runs; nothing here changes a result.
 
-    ``rpm`` and ``tpm`` replace those of the registry. ``dask`` names the cluster that plays; None:
-    this process does. ``faults_identity`` distinguishes the answers of an emulator that is asked
-    for bad answers from those of the usual one.
+    ``rpm`` and ``tpm`` override the registry's. ``dask`` names the cluster that plays the trials;
+    if None, this process plays them. ``faults_identity`` keeps the answers of an emulator that was
+    told to misbehave apart from those of the usual one.
     """
 
     db: Path
@@ -62,7 +62,7 @@ class Options:
         return 2 * self.in_flight
 
     def rates(self, entry: ModelEntry) -> tuple[int | None, int | None]:
-        """The requests and tokens a minute that a model may get; None: as many as there are."""
+        """The requests and tokens a minute that a model may get; None: no limit."""
         return self.rpm or entry.rpm, self.tpm or entry.tpm
 
 
@@ -87,7 +87,7 @@ class Plan:
 
     @property
     def ledger(self) -> str:
-        """Under what name the sweep's spending is kept, over all its runs."""
+        """The name of the ledger that holds the sweep's spending over all its runs."""
         return f"{self.name}/{self.model}/set{self.sample_set}"
 
     @property
@@ -132,10 +132,10 @@ class Plan:
         }
 
     def trial_specs(self) -> list[TrialSpec]:
-        """All trials, repetition by repetition, so that what is finished is balanced.
+        """All trials, repetition by repetition, so that an unfinished sweep is balanced, too.
 
         Within a repetition the order is random, by the order seed, so that no condition or variant
-        is always asked first: a service that drifts over hours does so for all alike.
+        always comes first: a service that drifts over hours affects all of them alike.
         """
         hashes = {variant: spec_hash(text) for variant, text in self.specs().items()}
         cells = [
@@ -194,7 +194,7 @@ class Plan:
 
 
 def _lot(*what: object) -> str:
-    """A random place in a row that is the same on every machine."""
+    """A sort key that orders trials randomly, but the same way on every machine."""
     return hashlib.sha256("/".join(map(str, what)).encode()).hexdigest()
 
 
@@ -249,7 +249,7 @@ def _conditions(file: SweepFile, chosen: Sequence[str] | None) -> tuple[str, ...
     if not conditions:
         raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
     for name in conditions:
-        new_world(file.scenario, name)  # raises where it cannot be played
+        new_world(file.scenario, name)  # raises where the condition cannot be played
     return conditions
 
 

@@ -45,9 +45,9 @@ class Progress:
     """Where a sweep stands; ``runner`` plays its trials.
 
     ``planned`` and ``stored`` count trials by prompt variant and condition: all of them, and those
-    that were stored before this run. ``by_cell`` counts how those of this run ended, in one of the
-    ways of a Status or ``suspended``, which wait for money. ``worst_stall_s`` is by how much the
-    event loop was late at worst.
+    that were stored before this run. ``by_cell`` counts how the trials of this run ended: with a
+    Status, or ``suspended`` until there is more money. ``worst_stall_s`` is the longest delay of
+    the event loop.
     """
 
     plan: Plan
@@ -64,7 +64,7 @@ class Progress:
 
     @property
     def title(self) -> str:
-        """What is played, and by whom."""
+        """A title that says what is played, and by which drivers."""
         stand_in = " (scripted stand-in)" if self.plan.scripted else ""
         return f"{self.plan.name}: {self.plan.driver}{stand_in}"
 
@@ -107,7 +107,7 @@ class Progress:
         ]
 
     def standing(self, sweep_id: str) -> Standing:
-        """The same for other processes, cell by cell."""
+        """Where the sweep stands, cell by cell, for other processes."""
         return Standing(
             sweep_id=sweep_id,
             name=self.plan.name,
@@ -155,7 +155,7 @@ class Progress:
         return "" if workers is None else f" on {workers or 'no'} worker{'s' * (workers != 1)}"
 
     def _spent(self) -> str:
-        """What counts against the cap: all runs of the sweep, and what is set aside."""
+        """What counts against the cap: spending of all runs of the sweep, and money set aside."""
         if self.cap_usd is None:
             return ""
         return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
@@ -184,9 +184,9 @@ class Progress:
         ]
 
     def _left_s(self) -> float | None:
-        """The time left in s, None while nothing tells it.
+        """The estimated time left in s; None while there is nothing to estimate it from.
 
-        Trials that run in step all end late, so that early in a run the calls tell more of it.
+        Trials that run in step all end late, so early in a run the calls are a better basis.
         """
         ended, total = self.ended, self.total
         if ended == total:
@@ -199,7 +199,7 @@ class Progress:
         return elapsed / part - elapsed if part else None
 
     def _waiting(self) -> list[str]:
-        """How many calls wait for what, and until when at the latest, where that is known."""
+        """How many calls wait, for what, and the latest time until when, if known."""
         alike: dict[str, list[Wait]] = {}
         for wait in self.runner.waits:
             alike.setdefault(wait.what, []).append(wait)
@@ -214,7 +214,7 @@ class Progress:
 
 @asynccontextmanager
 async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
-    """Keep the file of a sweep up to date while the body runs, and remove it at its end."""
+    """Keep a sweep's progress file up to date while the body runs; remove the file at the end."""
     clear_dead(file.db)
     file.write(progress.standing(file.sweep_id))
     publishing = asyncio.create_task(_publish(progress, file))
@@ -286,7 +286,7 @@ def _table(progress: Progress) -> Table:
 
     table = Table(title=progress.title, title_justify="left", show_header=False, box=None)
     for name, text in progress.fields():
-        table.add_row(name, Text(printable(text)))  # a server's words are no markup
+        table.add_row(name, Text(printable(text)))  # text from a server must not be read as markup
     return table
 
 

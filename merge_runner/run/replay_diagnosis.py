@@ -24,11 +24,11 @@ class Miss:
 
 
 def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
-    """What differs from the nearest request: one text for all misses that differ alike.
+    """How each miss differs from the nearest request: one text for all that differ in the same way.
 
-    It names the first trial, side and decision, and how many more there are. Nearest is a request
-    of the same slot, else of the same place in another repetition, else any; among those of one
-    slot the one with the fewest differences.
+    The text names the first trial, side and decision, and how many more there are. The nearest
+    request is one of the same slot, else one of the same place in another repetition, else any;
+    among several of one slot, the one with the fewest differences.
     """
     wanted = {miss.request.slot for miss in misses}
     same_slot: dict[Slot, list[ChatRequest]] = {}
@@ -46,7 +46,7 @@ def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
 
 
 def _as_line(group: list[tuple[Miss, str]]) -> str:
-    """The first of misses that differ alike, and how many there are."""
+    """The first of the misses that differ in the same way, and their number, as a line of text."""
     (first, text), *others = group
     slot = first.request.slot
     line = f"{first.trial_id}, {slot.side}, decision {slot.decision}: {text}"
@@ -106,7 +106,7 @@ def _leaves(name: str, value: object) -> Iterator[tuple[str, object]]:
 
 
 def _first_difference(old: object, new: object) -> tuple[str, str]:
-    """Both values, or of two texts the first line that differs."""
+    """Both values; for two texts, the first line that differs."""
     if isinstance(old, str) and isinstance(new, str):
         before, after = old.split("\n"), new.split("\n")
         for line, other in zip(before, after, strict=False):

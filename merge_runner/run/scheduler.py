@@ -14,7 +14,7 @@ A_FEW = 16
 class Gate:
     """Lets a few through in each round of the event loop, so that each round stays short.
 
-    Thousands of calls that are all ready at once would keep it from everything else.
+    Thousands of calls that are all ready at once would keep the loop from everything else.
     """
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class Gate:
         self._waiting: deque[asyncio.Future[None]] = deque()
 
     async def enter(self) -> None:
-        """Pass, or wait for a later round; who came first passes first."""
+        """Pass, or wait for a later round; first come, first served."""
         loop = asyncio.get_running_loop()
         if self._free == A_FEW:
             loop.call_soon(self._next_round)

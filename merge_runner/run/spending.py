@@ -66,7 +66,7 @@ def account(folder: Path, sweep: str) -> Account:
 
 
 def release(folder: Path, sweep: str) -> Account:
-    """Count no longer what is set aside for a sweep. Raises UsageError while anybody asks."""
+    """Stop counting what is set aside for a sweep. Raises UsageError while a run is asking."""
     account(folder, sweep)
     with _opened(folder) as cache:
         if not cache.claims.take_all():

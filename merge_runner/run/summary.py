@@ -23,7 +23,7 @@ PRICED_ALIKE = "replies of stand-ins are priced as the model's; nobody charges f
 
 
 def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> dict[str, Any]:
-    """The summary as JSON values; ``expected`` is what was estimated of it before, if it was."""
+    """The summary as JSON values; ``expected`` is the estimate made before the run, if any."""
     plan, facts, meter, spending = outcome.plan, outcome.facts, outcome.meter, outcome.spending
     return {
         "sweep_id": outcome.sweep_id,
@@ -156,7 +156,7 @@ def _costs(outcome: Outcome, options: Options, expected: Estimate | None) -> Ite
 
 
 def _mismatches(facts: SweepFacts | None) -> dict[str, int]:
-    """Requested and served model, where another one answered, with how often."""
+    """Requested and served model where these differ, and how often they did."""
     others = facts.others if facts else ()
     return {f"{requested} -> {served}": answers for requested, served, answers in others}
 
@@ -177,7 +177,7 @@ def _table(plan: Plan, facts: SweepFacts) -> Iterator[str]:
 
 
 def _stand_in(driver: str, model: str, provider: str, scripted: int, answers: int) -> str:
-    """That a stand-in answered in a model's name, or was asked for as what it is."""
+    """Says that a stand-in answered in a model's name, or that it was asked for by its own."""
     if provider == "emulator":
         return f"The model `{model}` is a scripted stand-in, no language model."
     part = "" if scripted == answers else f" in {scripted} of {answers} answers"
@@ -185,7 +185,7 @@ def _stand_in(driver: str, model: str, provider: str, scripted: int, answers: in
 
 
 def _counts(facts: SweepFacts, *by: int) -> defaultdict[tuple[object, ...], Counter[str]]:
-    """Trials by COLUMNS, in each group of rows that are alike in these places."""
+    """Counts of trials by COLUMNS, for each group of rows that are equal in these places."""
     groups: defaultdict[tuple[object, ...], Counter[str]] = defaultdict(Counter)
     for row in facts.outcomes:
         _, _, status, merged_first, _, trials = row
@@ -205,5 +205,6 @@ def _statuses(facts: SweepFacts) -> dict[str, int]:
 
 
 def _row(name: str, values: Iterable[object]) -> str:
-    # Widths that no count changes, so that two runs can be laid beside each other; rich fits them.
+    # The widths do not depend on the counts, so that two runs can be compared side by side; rich
+    # would fit them to the content.
     return f"{name:<10}" + "".join(f"{value:>12}" for value in values)

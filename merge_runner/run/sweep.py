@@ -58,12 +58,12 @@ FROM_RECORDINGS = 16
 class Outcome:
     """What a run of a plan did.
 
-    ``stored_before`` trials were not played because they are stored; ``suspended`` ones wait for
-    money, with their replies kept. ``meter`` counts the calls of this run, ``spending`` is that of
-    the sweep over all its runs, and ``cache_cost_usd`` what all replies in the cache cost when they
-    were made. ``facts`` are those of the database over all trials of the sweep, and ``audit`` what
-    was checked there, None where they are not stored. ``playing_s`` is how long the trials took,
-    ``worst_stall_s`` by how much the event loop was late at worst.
+    ``stored_before`` trials were not played because they were stored already; ``suspended`` ones
+    wait for money, and their replies are in the cache. ``meter`` counts the calls of this run,
+    ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` what all replies in
+    the cache cost when they were made. ``facts`` summarises what the database holds of the sweep,
+    and ``audit`` the checks made there; both are None where nothing is stored. ``playing_s`` is how
+    long the trials took, ``worst_stall_s`` the longest delay of the event loop.
     """
 
     plan: Plan
@@ -106,7 +106,7 @@ class Sweep:
         self._todo = [spec for key, spec in specs.items() if key not in ended]
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
-        # By a model and how many calls it had answered: an answer begins a new count.
+        # Keyed by model and its number of answered calls, so that an answer starts a new count.
         self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
         self._suspended: TrialSuspended | None = None
         self._progress = Progress(
@@ -196,13 +196,13 @@ class Sweep:
         return estimate(plan, self._options, trials=trials, calls=calls, facts=facts)
 
     def _measured(self, name: str, entry: ModelEntry) -> CallTotals:
-        """What is known of answers to requests like those of this sweep."""
+        """What is known about answers to requests like those of this sweep."""
         sent = FORMATS[entry.format].request(entry, "")
         asked = manner(sent.path, canonical_json(sent.body))
         return self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
 
     def close(self) -> None:
-        """Close what was opened, where the sweep is not run."""
+        """Close what was opened, if the sweep is not run after all."""
         self._cache.close()
 
     def _explain_misses(self, outcome: Outcome) -> None:
@@ -238,7 +238,7 @@ class Sweep:
         return sweep_id
 
     async def _runner(self, stack: AsyncExitStack) -> TrialRunner:
-        """Who plays: this process, or the workers of a cluster."""
+        """What plays the trials: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if options.replay or not self._todo or not plan.entries:
             clients = sealed_clients(plan, self._cache)
@@ -266,7 +266,7 @@ class Sweep:
         from merge_runner.run.cluster.connect import connected
 
         client = await stack.enter_async_context(connected(options.dask))
-        from merge_runner.run.cluster.coordinator import Coordinator  # needs what was asked for
+        from merge_runner.run.cluster.coordinator import Coordinator  # imports Dask
 
         return await stack.enter_async_context(
             Coordinator(client, plan, endpoint_plan, self._cache, services, options.in_flight)
@@ -334,7 +334,7 @@ class Sweep:
                 finished=outcome.exit_code == 0,
                 derive=False,  # these trials have just been driven
             )
-            # Another model's answers are told apart from this, and only --strict-model stops there.
+            # Answers from another model are reported elsewhere; only --strict-model stops for them.
             findings = [f for f in outcome.audit.findings if f.kind != "served"]
             if findings:
                 outcome.fail(1, f"the audit found {len(findings)} faults: `merge-runner audit`")
@@ -345,7 +345,7 @@ class Sweep:
             outcome.fail(exc.exit_code, str(exc))
 
     def _watch_for_outage(self, record: TrialRecord, runner: TrialRunner) -> None:
-        """Stop when trials fail for want of one model, which answers no call in between."""
+        """Stop when trials keep failing for one model that answers no call in between."""
         if self._options.replay:
             return
         for name in {self._plan.sides[failed.side] for failed in record.failed_calls}:
@@ -378,12 +378,12 @@ class Sweep:
 
 
 def _differing(trials: Mapping[str, Sequence[str]]) -> str:
-    """The first trials that are stored otherwise, each with the columns."""
+    """The first trials that are stored with other values, each with the columns that differ."""
     shown = list(trials.items())[:SHOWN]
     return "; ".join(f"{trial_id} ({', '.join(columns)})" for trial_id, columns in shown)
 
 
 async def _drained(runner: TrialRunner, work: asyncio.Task[None]) -> None:
-    """When the work has ended, in whatever way, save the calls that are in flight."""
+    """Once the work has ended, however it did, save the calls that are in flight."""
     await asyncio.wait([work])
     await runner.drain()

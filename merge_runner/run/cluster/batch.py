@@ -1,4 +1,4 @@
-"""What the coordinator gives a worker to play, if both are the same program."""
+"""What the coordinator gives a worker to play, provided that both run the same program."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Batch:
 
 @cache
 def fingerprint() -> str:
-    """The version and a hash of all source, plug-ins too: who differs might play other trials."""
+    """The version and a hash of all source and plug-ins; a worker with another one is refused."""
     code = hashlib.sha256()
     for source in (Path(merge_runner.__file__).parent, *plugin_sources()):
         for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:

@@ -70,7 +70,7 @@ async def _local_cluster(workers: int) -> AsyncIterator[object]:
     from distributed import LocalCluster
 
     _choose_how_workers_start()
-    # None leaves the method that was chosen: if Dask is told "forkserver", it has it import pandas.
+    # None leaves the method chosen above: given "forkserver", it has it import pandas.
     with dask.config.set({"distributed.worker.multiprocessing-method": None}):
         cluster = LocalCluster(
             n_workers=workers,
@@ -78,7 +78,7 @@ async def _local_cluster(workers: int) -> AsyncIterator[object]:
             processes=True,
             dashboard_address=None,
             silence_logs=logging.CRITICAL,
-            preload=[WORKER],  # also for one that takes a lost one's place
+            preload=[WORKER],  # also in workers that replace lost ones
             asynchronous=True,
         )
         with _for_children():
@@ -88,7 +88,7 @@ async def _local_cluster(workers: int) -> AsyncIterator[object]:
 
 
 def _choose_how_workers_start() -> None:
-    """Forked from a process that has imported what they need; on Linux, where that is safe."""
+    """On Linux, where it is safe, fork them from a process that has their imports; else spawn."""
     method = "forkserver" if sys.platform == "linux" else "spawn"
     multiprocessing.set_start_method(method, force=True)
     if method == "forkserver":
@@ -97,8 +97,8 @@ def _choose_how_workers_start() -> None:
 
 @contextmanager
 def _for_children() -> Iterator[None]:
-    """Processes that are started within ignore Ctrl-C and import nothing from this folder."""
-    resource_tracker.ensure_running()  # else it starts within, and lets Ctrl-C through again
+    """Processes started in this block ignore Ctrl-C and import nothing from the current folder."""
+    resource_tracker.ensure_running()  # starting it in the block would unblock Ctrl-C again
     name = "PYTHONSAFEPATH"
     kept = os.environ.get(name)
     os.environ[name] = "1"
@@ -113,14 +113,14 @@ def _for_children() -> Iterator[None]:
 
 
 def _silence() -> None:
-    """Dask logs with tracebacks what we tell in a line: lost workers, a lost scheduler."""
+    """Silence Dask, which logs tracebacks for what we report in a line, such as lost workers."""
     for name in logging.root.manager.loggerDict:
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _local_workers(where: str) -> int:
-    """How many workers are to be started on this machine; 0 where a scheduler is named."""
+    """How many workers to start on this machine; 0 where a scheduler is named."""
     kind, _, number = where.partition(":")
     if kind != "local":
         return 0

@@ -1,8 +1,8 @@
-"""Hands batches of trials to the workers of a cluster, and alone keeps what they bring.
+"""Hands batches of trials to the workers of a cluster, and alone stores what they send back.
 
-Dask decides where a batch is played, and begins it again elsewhere when its worker dies. Which
-trials it holds is decided when it begins: the next ones in the order of the sweep. Those of a lost
-worker go back to the front.
+Dask decides where a batch is played, and starts it again elsewhere when its worker dies. Which
+trials a batch holds is decided when it starts: the next ones in the order of the sweep. Those of a
+lost worker go back to the front.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class Coordinator:
             self.fail(exc)
 
     async def admit(self, session: Session, token: str, theirs: str, host: str) -> Batch | None:
-        """The batch of a worker that joins; None: there is nothing to do."""
+        """The batch for a worker that joins; None if there is nothing to do."""
         if not secrets.compare_digest(token, self._token):
             session.link.abort()
             return None
@@ -205,8 +205,8 @@ class Coordinator:
         slots = max(1, min(self._slots, self._in_flight))
         share = min(self._free, max(1, self._in_flight // slots))
         idle = max(1, slots - sum(bool(other.trials) for other in self._sessions))
-        # Large batches at first, so that little is said, and smaller ones toward the end, so that
-        # no worker still has many when the others have none; never fewer than it plays at once.
+        # Large batches at first, to save messages, and smaller ones toward the end, so that no
+        # worker still has many when the others have none; never fewer than it plays at once.
         size = min(
             math.ceil(len(self._waiting) / idle),
             max(share, math.ceil(len(self._waiting) / (BATCHES_PER_WORKER * slots))),
@@ -227,7 +227,7 @@ class Coordinator:
         return frozenset(name for name in self._plan.entries if self.answers(name))
 
     async def _serve(self, comm: Comm) -> None:
-        """Serve a worker's batch from its first word until it is gone."""
+        """Serve a worker's batch from its first message until the worker is gone."""
         session = Session(self, comm)
         serving = self._sessions[session] = asyncio.create_task(session.serve())
         await asyncio.wait([serving])
@@ -239,8 +239,8 @@ class Coordinator:
             self.fail(error)  # a fault of ours: the run raises it
         if self._stopping:
             return
-        # What it had not ended goes to the front, in order. Whoever plays it next finds its replies
-        # in the cache.
+        # Trials it had not ended go to the front, in order. Whichever worker plays them next finds
+        # their replies in the cache.
         rest = sorted(session.trials.values(), key=lambda spec: spec.order)
         self._waiting.extendleft(reversed(rest))
         if rest and not session.ended:

@@ -1,15 +1,15 @@
 """Questions and messages between a worker and the coordinator, over one of Dask's connections.
 
-What is said within two milliseconds travels together, so that one packet carries many calls. The
-content is pickled as everything is that Dask carries: whoever reaches a Dask scheduler can run
-code there anyway, so protect the cluster, by TLS where the network is shared.
+Messages sent within two milliseconds travel together, so that one packet carries many calls. They
+are pickled like everything that Dask carries: anyone who reaches a Dask scheduler can run code
+there anyway, so protect the cluster, by TLS where the network is shared.
 
 None of Dask's public primitives does this. An Actor lives on a worker, and the books of the whole
-sweep would die with that one; asked 500 things at once it answered 80 to 180 a second, and a link
-2,600 to 3,900 (on 2 busy cores; a single question took 1 to 20 ms there, and 12 ms here, where a
-model takes a second). A Semaphore serves whoever asked first, while turns and money go to the
-oldest trial, and it freed what a killed worker held after 34 s, while the end of a connection is
-seen at once. Queues, events and topics carry no answers, errors or cancellations.
+sweep would die with that worker. Asked 500 questions at once, an Actor answered 80 to 180 a second,
+and a link 2,600 to 3,900 (on 2 busy cores; a single question took an Actor 1 to 20 ms and a link
+12 ms, while a model takes a second). A Semaphore serves whoever asked first, whereas turns and
+money go to the oldest trial; and it took 34 s to free what a killed worker held, whereas a closed
+connection is noticed at once. Queues, events and topics carry no answers, errors or cancellations.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class LinkLost(SweepStopped):
 
 
 class Link:
-    """One end. ``handlers`` answer what the other end asks or tells, by name.
+    """One end of a link. ``handlers`` answer what the other end asks or tells, by name.
 
-    When the other side is gone, those named in ``survives_disconnect`` are still finished; the
-    others wait for something on its behalf, and are cancelled.
+    When the other side is gone, handlers named in ``survives_disconnect`` still finish; the others
+    only wait for something on its behalf, and are cancelled.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Link:
         self._broken: BaseException | None = None
 
     def tell(self, what: str, *content: object) -> None:
-        """Say something that needs no answer; it is lost where the other side is gone."""
+        """Send a message that needs no answer; it is lost if the other side is gone."""
         self._send(0, what, content)
 
     async def ask(self, what: str, *content: object) -> Any:  # noqa: ANN401 # what the handler returns
@@ -74,7 +74,7 @@ class Link:
         try:
             return await self._asked[number]
         except asyncio.CancelledError:
-            # Else the other side would go on waiting, for a turn for one, on behalf of nobody.
+            # Else the other side would go on waiting, for instance for a turn, on behalf of nobody.
             self._send(number, CANCEL, ())
             raise
         finally:

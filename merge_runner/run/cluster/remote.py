@@ -22,7 +22,7 @@ class RemoteCache:
     link: Link
 
     def get(self, key: str) -> None:
-        """Nothing: what is recorded of a call is told when it is claimed."""
+        """Always None: a worker learns what is recorded of a call when it claims that call."""
 
     async def claim(self, key: str) -> KnownCall | None:
         """Claim a call and learn what is recorded of it; None while another one holds it."""
@@ -34,12 +34,15 @@ class RemoteCache:
         self.link.tell("release", key)
 
     async def put(self, entry: CachedCall, paid: int | None = None) -> CachedCall:
-        """Keep an entry, and the cost of the paid attempt that the coordinator holds so."""
+        """Store an entry with the cost of the paid attempt that the coordinator holds as ``paid``.
+
+        Returns the entry that is stored now: this one, or another that was there before.
+        """
         other: CachedCall | None = await self.link.ask("keep", entry, paid)
         return other or entry
 
     async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
-        """Keep the attempts at a call without an answer."""
+        """Store the attempts at a call that was not answered."""
         await self.link.ask("unanswered", key, attempts)
 
 
@@ -56,7 +59,7 @@ class RemoteRateLimit:
         return partial(self.link.tell, "used", number)
 
     def pause(self, seconds: float) -> None:
-        """All calls of all workers wait."""
+        """Make all calls of all workers wait."""
         self.link.tell("pause", self.name, seconds)
 
 

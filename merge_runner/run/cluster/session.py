@@ -22,8 +22,8 @@ from merge_runner.run.cluster.link import Link, rebuilt
 if TYPE_CHECKING:
     from merge_runner.run.cluster.coordinator import Coordinator
 
-# What a dead worker had sent is still kept, and what it had paid for is booked; whatever it waited
-# for is given up.
+# Replies that a dead worker had sent are still stored, and what it paid for is booked; whatever it
+# waited for is given up.
 SURVIVES_DISCONNECT = frozenset({"keep", "unanswered", "settle", "begin", "end"})
 
 
@@ -91,7 +91,7 @@ class Session:
         return await self._run.admit(self, token, fingerprint, host)
 
     def _trial(self, order: int, told: TrialRecord | str) -> None:
-        """A trial has ended: its record, or the reason for which it is suspended."""
+        """A trial has ended: takes its record, or the reason why it is suspended."""
         spec = self.trials.pop(order)
         self._run.ended(spec, TrialSuspended(told) if isinstance(told, str) else told)
 
@@ -124,12 +124,12 @@ class Session:
         self._cache.release(key)
 
     async def _keep(self, entry: CachedCall, paid: int | None) -> CachedCall | None:
-        """Keep a reply, and the cost of the attempt; returns another one that was there before."""
+        """Store a reply and the attempt's cost; returns another reply if one was there before."""
         keep = self._cache.put if paid is None else self._attempts[paid].keep
         try:
             kept = await keep(entry)
         except CacheFailed as exc:
-            self._run.fail(exc)  # here, not as told by a worker: it is no cache of the worker's
+            self._run.fail(exc)  # reported here, not by the worker, since the cache is ours
             raise
         self._run.answered[entry.request.model] += 1
         return None if kept == entry else kept
@@ -150,6 +150,6 @@ class Session:
         return paid.aside_usd
 
     def _close(self, number: int) -> None:
-        """An attempt has ended; nothing is held where its worker gave up waiting for money."""
+        """An attempt has ended; if its worker gave up waiting for money, nothing is held for it."""
         if paid := self._attempts.pop(number, None):
             paid.close()

@@ -35,7 +35,7 @@ def play_batch(address: str, token: str) -> None:
 
 
 class _Worker:
-    """One batch at a worker, from its first word to its last."""
+    """One batch at a worker, from its first message to its last."""
 
     def __init__(self) -> None:
         self._work: asyncio.Task[None] | None = None
@@ -82,7 +82,7 @@ class _Worker:
             )
             runner = LocalRunner(batch.plan, clients, batch.in_flight)
             self._work = asyncio.create_task(runner.play(batch.specs, partial(_tell, link)))
-            if self._stopping:  # told so before there was anything to cancel
+            if self._stopping:  # told to stop before there was anything to cancel
                 self._work.cancel()
             reporting = asyncio.create_task(_report(runner, link))
             try:
@@ -100,7 +100,7 @@ class _Worker:
 
 
 def _stop_profiler(dask: Worker) -> None:
-    """Stop Dask from looking at all threads a hundred times a second."""
+    """Stop Dask's profiler, which samples all threads a hundred times a second."""
     # Python 3.11 can deadlock there when it collects a threading.local.
     if (profiler := dask.periodic_callbacks.get("profile")) is not None:
         dask.loop.add_callback(profiler.stop)
