@@ -131,46 +131,51 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
     for row in found["plans"].itertuples():
         plans.setdefault((row.trial_id, row.spec_hash), {})[row.side] = row
     speeds = {(row.trial_id, row.spec_hash): row.mean_mps for row in found["speeds"].itertuples()}
-    rows = []
+
+    def judged_by(trial: Any, reading: str) -> Outcome:  # noqa: ANN401 # a row of pandas
+        key = (trial.trial_id, trial.spec_hash)
+        task, boxes = tasks[trial.spec_hash, reading], reading == BOXES
+        if boxes and trial.source == "human":
+            return trial.status, trial.merged_first  # it is the rule of the experiment
+        # A trial that ended before both drivers had decided holds nothing to judge by.
+        if trial.source != "human" and key not in decided:
+            return UNDECIDED, None
+        if seen(task, near.get(key, ()), between=boxes):
+            return "collided", None
+        if trial.status != "collided":  # no other end than a collision depends on the rule
+            return trial.status, trial.merged_first
+        if key not in speeds:  # humans have no plans that could be driven further
+            return UNDECIDED, None
+        start = Condition(trial.projected_headway_m, trial.relative_velocity_mps, speeds[key])
+        return _driven_further(task, start, specs[trial.spec_hash], plans[key], between=boxes)
+
     columns = ["trial_id", "spec_hash", "source", "status", "merged_first"]
     columns += ["projected_headway_m", "relative_velocity_mps"]
-    for trial in ended[columns].itertuples(index=False):
-        key = (trial.trial_id, trial.spec_hash)
-        # A trial that ended before both drivers had decided holds nothing to judge by.
-        known = trial.source == "human" or key in decided
-        for reading in readings:
-            task = tasks[trial.spec_hash, reading]
-            outcome: Outcome
-            if reading == BOXES and trial.source == "human":
-                outcome = trial.status, trial.merged_first  # it is the rule of the experiment
-            elif not known:
-                outcome = UNDECIDED, None
-            elif seen(task, near.get(key, ()), between=reading == BOXES):
-                outcome = "collided", None
-            elif trial.status != "collided":
-                # No other end than a collision depends on the rule.
-                outcome = trial.status, trial.merged_first
-            elif key not in speeds:  # humans have no plans that could be driven further
-                outcome = UNDECIDED, None
-            else:
-                sides = [plans[key][side] for side in SIDES]
-                lasting = [
-                    pace_of(task.config, specs[trial.spec_hash].get(side, {})).action_steps
-                    for side in SIDES
-                ]
-                outcome = redrive(
-                    task,
-                    Condition(trial.projected_headway_m, trial.relative_velocity_mps, speeds[key]),
-                    [
-                        [_in_steps(actions, n) for actions in side.applied]
-                        for side, n in zip(sides, lasting, strict=True)
-                    ],
-                    [_in_steps(side.last_plan, n) for side, n in zip(sides, lasting, strict=True)],
-                    begins=[round(side.since_s / task.config.step_s) for side in sides],
-                    between=reading == BOXES,
-                )
-            rows.append((*key, reading, *outcome))
+    rows = [
+        (trial.trial_id, trial.spec_hash, reading, *judged_by(trial, reading))
+        for trial in ended[columns].itertuples(index=False)
+        for reading in readings
+    ]
     return pd.DataFrame(rows, columns=["trial_id", "spec_hash", "rule", "status", "merged_first"])
+
+
+def _driven_further(
+    task: Task, start: Condition, spec: dict[str, Any], plans: dict[str, Any], *, between: bool
+) -> Outcome:
+    """How a trial that collided goes on by its plans, under a task with another rule."""
+    sides = [plans[side] for side in SIDES]
+    lasting = [pace_of(task.config, spec.get(side, {})).action_steps for side in SIDES]
+    return redrive(
+        task,
+        start,
+        [
+            [_in_steps(actions, n) for actions in side.applied]
+            for side, n in zip(sides, lasting, strict=True)
+        ],
+        [_in_steps(side.last_plan, n) for side, n in zip(sides, lasting, strict=True)],
+        begins=[round(side.since_s / task.config.step_s) for side in sides],
+        between=between,
+    )
 
 
 def _near(tasks: Mapping[tuple[str, str], Task]) -> str:

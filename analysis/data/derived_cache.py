@@ -100,18 +100,23 @@ def has(connection: duckdb.DuckDBPyConnection, table: str) -> bool:
     return found.fetchone() is not None
 
 
-def finished(db: Path, options: str, names: Sequence[str]) -> tuple[str, dict[str, str]]:
-    """The present state of the results, and those that are kept of it, by name."""
+def present_state(db: Path) -> str:
+    """The state of the results in a database; see ``state``."""
     with read_database(db) as connection:
-        now = state(connection)
+        return state(connection)
+
+
+def finished(db: Path, made_of: str, options: str, names: Sequence[str]) -> dict[str, str]:
+    """The tables or figures that are kept of this state, by name."""
+    with read_database(db) as connection:
         if not has(connection, "finished"):
-            return now, {}
+            return {}
         rows = connection.execute(
             "SELECT name, content FROM finished WHERE state = ? AND options = ? "
             "AND list_contains(?, name)",
-            [now, options, list(names)],
+            [made_of, options, list(names)],
         ).fetchall()
-    return now, dict(rows)
+    return dict(rows)
 
 
 def keep_finished(db: Path, made_of: str, options: str, contents: dict[str, str]) -> None:

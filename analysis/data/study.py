@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from analysis.data.collision_rules import judged
-from analysis.data.derived_cache import finished
+from analysis.data.derived_cache import present_state
 from analysis.data.imported_humans import Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
@@ -145,7 +145,7 @@ class Study:
         """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
         self.db = Path(db)
         self.chosen = models
-        self.state, _ = finished(self.db, "", ())
+        self.state = present_state(self.db)
         specs = load_specs(self.db)
         trials = trials_with_metrics(self.db).merge(
             self._read(TRACES), on=["trial_id", "spec_hash"], how="left"

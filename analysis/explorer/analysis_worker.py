@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.data.derived_cache import finished, keep_finished
+from analysis.data.derived_cache import finished, keep_finished, present_state
 from analysis.explorer.child import serve
 from analysis.metrics import GAP, Metric, shown_in
 from analysis.tables import make_tables
@@ -73,7 +73,7 @@ class Numbers:
     def _finished(self, names: Sequence[str]) -> dict[str, Table]:
         """Tables by name; those that are kept in the database are not made again."""
         options = options_text(self.db, None)
-        _, kept = finished(self.db, options, names)
+        kept = finished(self.db, present_state(self.db), options, names)
         found = {name: from_text(text) for name, text in kept.items()}
         if missing := [name for name in names if name not in found]:
             study = self.study

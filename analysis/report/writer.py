@@ -50,7 +50,7 @@ def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
 
 def finished_figures(study: Study, options: str) -> dict[str, str]:
     """Every figure by name as SVG in Base64: read from the database where stored, else drawn."""
-    _, found = finished(study.db, options, list(FIGURES))
+    found = finished(study.db, study.state, options, list(FIGURES))
     drawn = {
         name: base64.b64encode(rendered(study, name, "svg")).decode()
         for name in FIGURES

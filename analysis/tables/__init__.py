@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analysis.data.derived_cache import finished, keep_finished
+from analysis.data.derived_cache import finished, keep_finished, present_state
 from analysis.tables.formats import value_rows
 from analysis.tables.model import Table, from_text, options_text, to_text
 from merge_runner.errors import UsageError
@@ -57,7 +57,8 @@ def finished_tables(
     """
     wanted = _valid(names)
     options = options_text(db, models)
-    _, kept = finished(db, options, wanted)
+    state = study.state if study else present_state(db)
+    kept = finished(db, state, options, wanted)
     found = {name: from_text(text) for name, text in kept.items()}
     # A name may be given twice; the table is computed once.
     missing = [name for name in dict.fromkeys(wanted) if name not in found]

@@ -11,7 +11,7 @@ import duckdb
 import pytest
 
 from analysis.data import derived_cache as kept
-from analysis.data.derived_cache import finished, keep_finished
+from analysis.data.derived_cache import finished, keep_finished, present_state
 from analysis.data.study import Study
 from analysis.report.writer import finished_figures
 from analysis.table_format import TableFormat
@@ -93,11 +93,11 @@ def test_tables_are_made_once_and_then_read(db, made):
 @pytest.mark.parametrize("what", CHANGES)
 def test_after_any_change_of_the_results_tables_are_made_anew(db, made, what):
     finished_tables(db, None, ["attempts"])
-    state, _ = finished(db, "", ())
+    state = present_state(db)
     change(db, UNSEEN)
-    assert finished(db, "", ())[0] == state
+    assert present_state(db) == state
     change(db, CHANGES[what])
-    assert finished(db, "", ())[0] != state
+    assert present_state(db) != state
     finished_tables(db, None, ["attempts"])
     assert made == ["attempts", "attempts"]
 
@@ -126,27 +126,35 @@ def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, 
 def test_what_is_kept_is_no_result(db):
     before = results_digest(db)
     finished_tables(db, None, ["velocity-profiles"])
-    state, _ = finished(db, "", ())
+    state = present_state(db)
     finished_tables(db, None, ["gap"])
     assert results_digest(db) == before
-    assert finished(db, "", ())[0] == state
+    assert present_state(db) == state
 
 
 def test_tables_of_results_that_changed_meanwhile_are_not_kept(db):
-    state, _ = finished(db, "x", ["gap"])
+    state = present_state(db)
     change(db, CHANGES["an outcome"])
     keep_finished(db, state, "x", {"gap": "old"})
-    now, found = finished(db, "x", ["gap"])
-    assert found == {}
+    now = present_state(db)
+    assert finished(db, now, "x", ["gap"]) == finished(db, state, "x", ["gap"]) == {}
     keep_finished(db, now, "x", {"gap": "new"})
-    assert finished(db, "x", ["gap"]) == (now, {"gap": "new"})
+    assert finished(db, now, "x", ["gap"]) == {"gap": "new"}
 
 
 def test_tables_of_a_study_that_was_read_before_a_change_are_not_kept(db):
     study = Study(db)
     change(db, CHANGES["an outcome"])
     finished_tables(db, None, ["attempts"], study)
-    assert finished(db, options_text(db, None), ["attempts"])[1] == {}
+    assert finished(db, present_state(db), options_text(db, None), ["attempts"]) == {}
+
+
+def test_a_study_that_was_read_before_a_change_takes_no_table_of_the_later_state(db, made):
+    study = Study(db)
+    change(db, CHANGES["an outcome"])
+    finished_tables(db, None, ["attempts"])
+    finished_tables(db, None, ["attempts"], study)
+    assert made == ["attempts", "attempts"]
 
 
 def test_beside_another_program_tables_are_made_and_not_kept(db, made, caplog):
