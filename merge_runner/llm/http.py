@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import secrets
 import ssl
 from typing import Any
+from uuid import uuid4
 
 import aiohttp
 import httpx
@@ -88,8 +88,10 @@ class HttpTransport:
             if len(secret := value.removeprefix("Bearer ")) >= SHORTEST_SECRET
         )
         self._trust = Trust()
-        self._own = secrets.token_hex(8) + "-"
-        self._ids = map(str, itertools.count(1))
+        # Each id is a UUID, as some servers demand (llama-cpp-python): a random part, this
+        # transport's own, and the number of the request.
+        self._own = str(uuid4())[:24]
+        self._ids = map("{:012x}".format, itertools.count(1))
         self._client = _client(endpoint.base_url, connections, self._trust)
         self._headers = {
             **self._client.headers,
