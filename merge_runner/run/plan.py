@@ -40,7 +40,7 @@ class Options:
 
     ``rpm`` and ``tpm`` override the registry's. ``dask`` names the cluster that plays the trials;
     if None, this process plays them. ``faults_identity`` keeps the answers of an emulator that was
-    told to misbehave apart from those of the usual one.
+    told to misbehave apart from those of the usual one. A ``dry_run`` sends nothing.
     """
 
     db: Path
@@ -55,6 +55,7 @@ class Options:
     faults_identity: str = ""
     strict_model: bool = False
     dask: str | None = None
+    dry_run: bool = False
 
     @property
     def connections(self) -> int:
