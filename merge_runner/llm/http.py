@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import secrets
 import ssl
+import uuid
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,6 +29,7 @@ NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
+UUID_COUNTS_FROM = 24
 
 
 class NoCookies(httpx.Cookies):
@@ -89,8 +90,9 @@ class HttpTransport:
             if len(secret := value.removeprefix("Bearer ")) >= SHORTEST_SECRET
         )
         self._trust = Trust()
-        self._own = secrets.token_hex(8) + "-"
-        self._ids = map(str, itertools.count(1))
+        # As a UUID, since some servers refuse any other id; its last group counts.
+        self._own = str(uuid.uuid4())[:UUID_COUNTS_FROM]
+        self._ids = map("{:012x}".format, itertools.count(1))
         self._client = _client(endpoint.base_url, connections, self._trust)
         self._headers = {
             **self._client.headers,

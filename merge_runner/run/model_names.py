@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 from merge_runner.config import (
     PROVIDERS,
@@ -19,76 +19,25 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.first_call import REGISTRY, if_nobody
 from merge_runner.llm.transport import TransportFailure
 
-Entries = Mapping[str, ModelEntry]
-# What Ollama adds to a name that has none.
+# What Ollama adds to a name that has no tag.
 USUAL_TAG = ":latest"
 
 
-def with_asked_names(entries: Entries, say: Callable[[str], None]) -> dict[str, ModelEntry]:
-    """The entries with the names that their servers tell where nobody else does.
-
-    Raises UsageError, and ProviderDown where nobody listens.
-    """
-    return {
-        name: entry.model_copy(update={"id": model_id(entry) or _only_model(name, entry, say)})
-        for name, entry in entries.items()
-    }
-
-
-def with_recorded_names(
-    entries: Entries, cache: ResponseCache, *, strict: bool
+def with_names(
+    entries: Mapping[str, ModelEntry], find: Callable[[str, ModelEntry], str]
 ) -> dict[str, ModelEntry]:
-    """The entries with the names under which their replies are recorded where nobody tells one.
-
-    Several are a UsageError where it is ``strict``, and else as good as none: the name stays open.
-    """
+    """The entries by name, those without an ``id`` with the one that is found."""
     return {
-        name: entry.model_copy(
-            update={"id": model_id(entry) or _recorded_model(name, entry, cache, strict)}
-        )
+        name: entry.model_copy(update={"id": model_id(entry) or find(name, entry)})
         for name, entry in entries.items()
     }
 
 
-def check_listed(entries: Entries) -> None:
-    """Raise UsageError where a server lists its models and the one to be asked is not among them.
+def recorded_name(name: str, entry: ModelEntry, *, cache: ResponseCache, strict: bool) -> str:
+    """The model that the recorded replies are of; UNNAMED where there are none.
 
-    Whoever lists nothing, or does not answer, is found out by the first call.
+    Several models are a UsageError if ``strict``, and else as good as none.
     """
-    for name, entry in entries.items():
-        if PROVIDERS.require(entry.provider).model_env is None:
-            continue
-        endpoint = resolve_endpoint(name, entry)
-        try:
-            listed = _ask(endpoint)
-        except TransportFailure:
-            continue
-        if entry.id not in listed and entry.id + USUAL_TAG not in listed:
-            raise UsageError(
-                f"{driver_name(name, endpoint.identity)} serves no model {entry.id!r}, but "
-                f"{', '.join(listed) or 'none at all'}: {_choose(name, entry)}"
-            )
-
-
-def _only_model(name: str, entry: ModelEntry, say: Callable[[str], None]) -> str:
-    endpoint = resolve_endpoint(name, entry)
-    driver = driver_name(name, endpoint.identity)
-    try:
-        listed = _ask(endpoint, patient=True)
-    except TransportFailure as exc:
-        if exc.outcome == "no_connection":
-            raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
-        raise UsageError(
-            f"{driver} does not tell what it serves ({exc}): {_choose(name, entry)}"
-        ) from exc
-    if len(listed) != 1:
-        several = f"serves {', '.join(listed)}" if listed else "serves no model"
-        raise UsageError(f"{driver} {several}: {_choose(name, entry)}")
-    say(f"{driver} serves {listed[0]}, which is asked")
-    return listed[0]
-
-
-def _recorded_model(name: str, entry: ModelEntry, cache: ResponseCache, strict: bool) -> str:
     recorded = cache.recorded_models(entry.provider)
     if len(recorded) > 1 and strict:
         raise UsageError(
@@ -98,7 +47,46 @@ def _recorded_model(name: str, entry: ModelEntry, cache: ResponseCache, strict: 
     return recorded[0] if len(recorded) == 1 else UNNAMED
 
 
-def _ask(endpoint: Endpoint, *, patient: bool = False) -> Sequence[str]:
+def served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
+    """The one model that a server lists; raises ProviderDown where nobody listens, UsageError."""
+    endpoint = resolve_endpoint(name, entry)
+    driver = driver_name(name, endpoint.identity)
+    try:
+        listed = _listed(endpoint, patient=True)
+    except TransportFailure as exc:
+        if exc.outcome == "no_connection":
+            raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
+        raise UsageError(
+            f"{driver} does not say which models it serves ({exc}): {_choose(name, entry)}"
+        ) from exc
+    if len(listed) != 1:
+        names = ", ".join(listed) or "no model"
+        raise UsageError(f"{driver} serves {names}: {_choose(name, entry)}")
+    say(f"{driver} serves {listed[0]}, which is asked")
+    return listed[0]
+
+
+def check_served(entries: Mapping[str, ModelEntry]) -> None:
+    """Raise UsageError where a server lists its models and not the one that is to be asked.
+
+    A server that lists nothing, or does not answer, is judged by the first call.
+    """
+    for name, entry in entries.items():
+        if PROVIDERS.require(entry.provider).model_env is None:
+            continue
+        endpoint = resolve_endpoint(name, entry)
+        try:
+            listed = _listed(endpoint)
+        except TransportFailure:
+            continue
+        if entry.id not in listed and entry.id + USUAL_TAG not in listed:
+            raise UsageError(
+                f"{driver_name(name, endpoint.identity)} serves {', '.join(listed) or 'no model'}, "
+                f"and not {entry.id!r}: {_choose(name, entry)}"
+            )
+
+
+def _listed(endpoint: Endpoint, *, patient: bool = False) -> list[str]:
     from merge_runner.llm.model_list import listed_models  # imports httpx, which no replay needs
 
     check_network(endpoint.base_url)
@@ -106,8 +94,5 @@ def _ask(endpoint: Endpoint, *, patient: bool = False) -> Sequence[str]:
 
 
 def _choose(name: str, entry: ModelEntry) -> str:
-    """How to say which model is meant."""
     variable = PROVIDERS.require(entry.provider).model_env
-    if entry.id in (UNNAMED, model_id(entry.model_copy(update={"id": UNNAMED}))):
-        return f"set {variable} to one of them"
-    return f"correct `id` of [{name}] in {REGISTRY}"
+    return f"name one with {variable}, or with `id` of [{name}] in {REGISTRY}, which goes first"

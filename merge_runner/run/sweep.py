@@ -42,7 +42,7 @@ from merge_runner.run.clients import (
 from merge_runner.run.estimate import Estimate, estimate
 from merge_runner.run.flusher import Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
-from merge_runner.run.model_names import check_listed, with_asked_names, with_recorded_names
+from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
 from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
@@ -111,7 +111,7 @@ class Sweep:
         self._stored = [key for key in specs if key in ended]
         self._todo = [spec for key, spec in specs.items() if key not in ended]
         if self._todo and not (self._is_silent or options.dask):  # workers may see other servers
-            check_listed(plan.entries)
+            check_served(plan.entries)
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
         # Keyed by model and its number of answered calls, so that an answer starts a new count.
@@ -375,8 +375,9 @@ class Sweep:
     def _named(self, entries: Mapping[str, ModelEntry]) -> dict[str, ModelEntry]:
         """The entries, each with its model's name: as told, as recorded, or as its server says."""
         if self._is_silent:
-            return with_recorded_names(entries, self._cache, strict=self._options.replay)
-        return with_asked_names(entries, self._say)
+            recorded = partial(recorded_name, cache=self._cache, strict=self._options.replay)
+            return with_names(entries, recorded)
+        return with_names(entries, partial(served_name, say=self._say))
 
     def _endpoint(self, plan: Plan, name: str) -> str:
         """The endpoint's identity: in a replay, the one under which the model is recorded."""
