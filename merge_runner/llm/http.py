@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import ssl
-import uuid
 from collections.abc import Mapping
 from typing import Any
+from uuid import uuid4
 
 import aiohttp
 import httpx
@@ -29,7 +29,6 @@ NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
-UUID_COUNTS_FROM = 24
 
 
 class NoCookies(httpx.Cookies):
@@ -90,8 +89,9 @@ class HttpTransport:
             if len(secret := value.removeprefix("Bearer ")) >= SHORTEST_SECRET
         )
         self._trust = Trust()
-        # As a UUID, since some servers refuse any other id; its last group counts.
-        self._own = str(uuid.uuid4())[:UUID_COUNTS_FROM]
+        # Each id is a UUID, as some servers demand (llama-cpp-python): a random part, this
+        # transport's own, and the number of the request.
+        self._own = str(uuid4())[:24]
         self._ids = map("{:012x}".format, itertools.count(1))
         self._client = _client(endpoint.base_url, connections, self._trust)
         self._headers = {
