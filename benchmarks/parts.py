@@ -58,7 +58,7 @@ async def limiter() -> dict[str, float]:
 
 def records(count: int) -> list[TrialRecord]:
     """Trials of a model that always yields, with prompts and replies of the usual length."""
-    plan = make_plan(sweep="baseline", model="emulator")
+    plan = make_plan("baseline", "emulator")
     entry = load_models()["emulator"]
     text = f"Y\n{'I keep my distance. ' * 80}\n```python\n{[-0.4] * 20}\n```"
     payload = {"id": "ID", "choices": [{"message": {"content": text}, "finish_reason": "stop"}]}

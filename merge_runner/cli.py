@@ -9,6 +9,8 @@ import math
 import shutil
 import sys
 import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
@@ -52,7 +54,22 @@ class Format(StrEnum):
 DbOption = Annotated[Path, typer.Option("--db", help="The results database.")]
 CacheOption = Annotated[Path, typer.Option("--cache", help="The folder of recorded replies.")]
 ModelOption = Annotated[
-    str, typer.Option("--model", help="A model of the registry, a program, or LEFT+RIGHT.")
+    list[str] | None,
+    typer.Option(
+        "--model",
+        metavar="NAME",
+        help="A model of the registry, a program, or LEFT+RIGHT; may be given more than once. "
+        "Else those of the study's file, or the emulator.",
+    ),
+]
+OnlyOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--only",
+        metavar="FACTOR=LEVEL",
+        help="A part of the study: a level of a factor, or of model or prompt; may be given more "
+        "than once.",
+    ),
 ]
 RepsOption = Annotated[
     int | None, typer.Option("--reps", help="Repetitions per condition, for every variant.")
@@ -123,7 +140,8 @@ def common(
 @app.command()
 def sweep(
     name: NameArgument,
-    model: ModelOption = "emulator",
+    model: ModelOption = None,
+    only: OnlyOption = None,
     reps: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
@@ -187,13 +205,16 @@ def sweep(
     )
     plan = make_plan(
         name,
-        model,
+        model or (),
         reps,
         listed(conditions),
         listed(variants),
         sample_set=sample_set,
         order_seed=order_seed,
+        only=_levels(only or ()),
     )
+    if max_cost is None:
+        options = replace(options, max_cost_usd=plan.study.file.budget.total_usd)
     if dry_run:
         _print_estimate(_dry_run(plan, options), as_json=as_json)
     else:
@@ -203,7 +224,8 @@ def sweep(
 @app.command()
 def replay(
     name: NameArgument,
-    model: ModelOption = "emulator",
+    model: ModelOption = None,
+    only: OnlyOption = None,
     reps: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
@@ -218,6 +240,7 @@ def replay(
     sweep(
         name=name,
         model=model,
+        only=only,
         reps=reps,
         conditions=conditions,
         variants=variants,
@@ -596,6 +619,17 @@ def _emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list
     if faults is not None:
         return ["--faults", str(faults.resolve())]
     return ["--fault-rate", str(fault_rate), "--seed", str(seed)]
+
+
+def _levels(only: Sequence[str]) -> dict[str, list[str]]:
+    """The levels of each factor that --only names; raises UsageError."""
+    levels: dict[str, list[str]] = {}
+    for each in only:
+        factor, equals, level = each.partition("=")
+        if not equals:
+            raise UsageError(f"--only {each}: write FACTOR=LEVEL, as in --only temperature=0.2")
+        levels.setdefault(factor.strip(), []).append(level.strip())
+    return levels
 
 
 def listed(text: str | None) -> list[str] | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 from urllib.parse import urlsplit
 
 from pydantic import (
@@ -60,9 +60,13 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class Frozen(BaseModel):
-    """A configuration object: frozen, and an unknown key is an error."""
+    """A configuration object: frozen, and an unknown key is an error.
+
+    ``nested`` says by key which objects it holds, also in lists and tables of them.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    nested: ClassVar[Mapping[str, type[BaseModel]]] = {}
 
 
 def whole_steps(name: str, seconds: float, step_s: float) -> int:
@@ -175,11 +179,14 @@ class ModelEntry(Frozen):
     what is sent (UNNAMED: what a server of one's own serves); a served model that is neither it
     nor one of ``aliases`` is reported as a mismatch. ``parameters`` go into the request as they
     are; what is not listed is not sent, so that the provider's default applies;
-    ``applied_defaults`` puts on record which. ``price`` is ``free``, ``genai-prices`` (the table of
-    that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a minute.
+    ``applied_defaults`` puts on record which, and ``rejects`` names parameters that the model
+    refuses or does not heed. ``price`` is ``free``, ``genai-prices`` (the table of that package) or
+    explicit figures. ``rpm`` and ``tpm`` are requests and tokens a minute.
     ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of ``--dry-run`` alone. A
     reply longer than ``max_reply_mb`` (unpacked) is refused.
     """
+
+    nested: ClassVar[Mapping[str, type[BaseModel]]] = {"price": Price}
 
     provider: str
     format: str
@@ -187,6 +194,7 @@ class ModelEntry(Frozen):
     aliases: tuple[str, ...] = ()
     parameters: dict[str, Json] = {}
     applied_defaults: dict[str, Json] = {}
+    rejects: tuple[str, ...] = ()
     max_output_tokens: Count
     cap_field: Literal["max_completion_tokens", "max_tokens"] = "max_completion_tokens"
     rpm: Count | None = None
@@ -205,21 +213,13 @@ class ModelEntry(Frozen):
     note: str = ""
 
 
-class SweepFile(Frozen):
-    """One sweep: its prompt variants with their repetitions per condition, and the scenario."""
-
-    description: str = ""
-    repetitions: dict[str, Annotated[Count, Field(le=MOST_REPETITIONS)]]
-    conditions: tuple[str, ...] | None = None
-    scenario: ScenarioConfig = ScenarioConfig()
-
-
 @dataclass(frozen=True, slots=True)
 class Provider:
     """Where a provider is reached, which variables configure it, and how it takes a key.
 
     ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are the members that
     every error of the provider has, by its documentation: one without them may be a gateway's.
+    ``parameters`` are those that its servers take beside those of the wire format.
     ``model_env`` is the variable that names the model of an entry without a name; a provider with
     one also lists its models at ``/models``. ``if_nobody`` says what to do where nobody answers.
     """
@@ -230,6 +230,7 @@ class Provider:
     auth: str = "bearer"
     key_needed: bool = True
     error_members: frozenset[str] = frozenset()
+    parameters: frozenset[str] = frozenset()
     model_env: str | None = None
     if_nobody: str = "check the network"
 
@@ -271,6 +272,7 @@ PROVIDERS.register(
         "https://openrouter.ai/api/v1",
         key_envs=("OPENROUTER_API_KEY",),
         error_members=frozenset({"message", "code"}),
+        parameters=frozenset({"top_k", "min_p", "top_a", "repetition_penalty", "reasoning"}),
     ),
 )
 PROVIDERS.register(
@@ -280,6 +282,11 @@ PROVIDERS.register(
         "LOCAL_BASE_URL",
         ("LOCAL_API_KEY",),
         key_needed=False,
+        # Of vLLM, llama.cpp and Ollama; a server leaves out those that it does not know.
+        parameters=frozenset(
+            {"top_k", "min_p", "typical_p", "repeat_penalty", "repetition_penalty", "grammar"}
+            | {"structured_outputs", "chat_template_kwargs", "mirostat_mode", "options"}
+        ),
         model_env="LOCAL_MODEL",
         if_nobody="start a server (docs/how-to/local-models.md)",
     ),
@@ -487,18 +494,6 @@ def with_base_urls(urls: Mapping[str, str]) -> dict[str, str]:
     return {**os.environ, **urls}
 
 
-def load_sweep(name: str) -> tuple[str, SweepFile]:
-    """The name and content of ``experiments/NAME.toml``, or of a path; raises UsageError."""
-    path = Path(name)
-    if path.suffix != ".toml":
-        folder = find_experiments()
-        path = folder / f"{name}.toml"
-        known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "models")
-        if name not in known:
-            raise UsageError(f"there is no sweep {name!r}; valid: {', '.join(known)}, or a path")
-    return path.stem, validated(SweepFile, read_toml(path), str(path))
-
-
 def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file as a dict; raises UsageError."""
     try:
@@ -536,15 +531,14 @@ def _auth_headers(scheme: str, key: str | None) -> dict[str, str]:
     return {"authorization": f"Bearer {key}"} if scheme == "bearer" else {scheme: key}
 
 
-NESTED: dict[str, type[BaseModel]] = {"scenario": ScenarioConfig, "price": Price}
-
-
 def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
     lines = []
     for error in exc.errors():
         place = ".".join(str(part) for part in error["loc"])
         if error["type"] == "extra_forbidden":
-            owner = NESTED.get(str(error["loc"][0]), model) if len(error["loc"]) > 1 else model
+            owner = model
+            for part in error["loc"][:-1]:
+                owner = getattr(owner, "nested", {}).get(part, owner)
             lines.append(f"unknown key {place!r}; valid: {', '.join(owner.model_fields)}")
         else:
             text = error["msg"].removeprefix("Value error, ")

@@ -10,7 +10,7 @@ Side = Literal["left", "right"]
 Road = Literal["merge", "straight"]
 Tactical = Literal["M", "Y"]
 Status = Literal["finished", "collided", "timeout", "failed"]
-# A prompt variant and a condition.
+# An arm of a study, which is a prompt variant where nothing else varies, and a condition.
 Cell = tuple[str, str]
 
 # The outcomes of an attempt that are answers.
@@ -179,6 +179,7 @@ class TrialSpec:
 
     ``order`` is its place in the sweep: lower goes first. ``scripted`` says that the emulator
     takes part, a stand-in and no language model. Humans have a ``pair`` and no ``variant``.
+    ``factors`` are the levels of the study's factors, ``arm`` names their crossing.
     """
 
     trial_id: str
@@ -193,11 +194,13 @@ class TrialSpec:
     order: int
     scripted: bool = False
     pair: str | None = None
+    factors: tuple[tuple[str, str], ...] = ()
+    arm: str = ""
 
     @property
     def cell(self) -> Cell:
-        """Its prompt variant and condition."""
-        return self.variant or "", self.condition
+        """Its arm of the study and its condition."""
+        return self.arm or self.variant or "", self.condition
 
 
 @dataclass(frozen=True, slots=True)

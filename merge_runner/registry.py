@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from merge_runner.errors import UsageError
 
@@ -24,6 +25,28 @@ GROUP = "merge_runner"
 # What can stand in a trial's id, on the command line and in an address.
 NAME = re.compile(r"[A-Za-z0-9_.-]+")
 T = TypeVar("T")
+_registries: list[Registry[Any]] = []
+# Who registers now: the program and what is installed, or a part of a study.
+_owner = [""]
+_changes = [0]
+
+
+@contextmanager
+def registering(owner: str) -> Iterator[None]:
+    """What is registered meanwhile takes the place of all that the same owner had registered."""
+    for registry in _registries:
+        registry.drop(owner)
+    _changes[0] += 1
+    _owner.append(owner)
+    try:
+        yield
+    finally:
+        _owner.pop()
+
+
+def changes() -> int:
+    """How often something was registered anew; what is derived from a registry holds until then."""
+    return _changes[0]
 
 
 def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
@@ -41,6 +64,8 @@ class Registry(Mapping[str, T]):
         """``kind`` is what one of them is called in messages."""
         self.kind = kind
         self._things: dict[str, T] = {}
+        self._owners: dict[str, str] = {}
+        _registries.append(self)
 
     def register(self, name: str, thing: T) -> T:
         """Add a thing, and return it; raises UsageError where the name is taken or odd."""
@@ -49,7 +74,13 @@ class Registry(Mapping[str, T]):
         if name in self._things:
             raise UsageError(f"there is a {self.kind} {name!r} already")
         self._things[name] = thing
+        self._owners[name] = _owner[-1]
         return thing
+
+    def drop(self, owner: str) -> None:
+        """Take out what an owner has registered."""
+        for name in [name for name, theirs in self._owners.items() if theirs == owner]:
+            del self._things[name], self._owners[name]
 
     def require(self, name: str, hint: str = "") -> T:
         """See ``require``."""

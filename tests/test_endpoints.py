@@ -9,7 +9,6 @@ from merge_runner.config import (
     Price,
     endpoint_identity,
     key_status,
-    load_sweep,
     normalised_url,
     resolve_endpoint,
     running_emulator_url,
@@ -17,6 +16,7 @@ from merge_runner.config import (
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
+from merge_runner.study.file import read_study
 
 REGISTRY = PROJECT / "experiments/models.toml"
 KEYS = {f"{name}_API_KEY": "k" for name in ("OPENAI", "GEMINI", "ANTHROPIC", "OPENROUTER")}
@@ -286,7 +286,7 @@ def test_an_unknown_key_of_a_sweep_is_one_line_that_names_the_valid_ones(
     file = tmp_path / "mine.toml"
     file.write_text(f"repetitions = {{ baseline = 2 }}\n{more}\n")
     with pytest.raises(UsageError) as caught:
-        load_sweep(str(file))
+        read_study(str(file))
     text = str(caught.value)
     assert "\n" not in text
     assert all(name in text for name in [unknown, *valid])

@@ -5,10 +5,11 @@ import hashlib
 import pytest
 from pydantic import ValidationError
 
-from merge_runner.config import ScenarioConfig, load_sweep
+from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.scenarios.registry import task_of
+from merge_runner.study.file import read_study
 
 
 def test_the_default_plan_has_20_actions_of_which_5_are_executed():
@@ -99,7 +100,7 @@ def test_an_unknown_key_in_a_sweep_file_is_named_with_the_valid_ones(tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text("[repetitions]\nbaseline = 1\n[scenario]\nhorizon = 4\n")
     with pytest.raises(UsageError) as caught:
-        load_sweep(str(file))
+        read_study(str(file))
     assert "'scenario.horizon'" in str(caught.value)
     assert all(field in str(caught.value) for field in ScenarioConfig.model_fields)
 

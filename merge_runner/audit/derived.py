@@ -18,7 +18,7 @@ from typing import Any
 import duckdb
 
 from merge_runner.audit.answers import COLUMNS, Answer, answers_another, read_answer
-from merge_runner.audit.expected import Spec, SweepConfig
+from merge_runner.audit.expected import ArmFacts, Spec, SweepConfig
 from merge_runner.audit.findings import Audit, Finding
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver, MakeDriver, Seat, take_seat
@@ -97,6 +97,7 @@ class _Trial:
     attempts: list[Answer]
     plans: dict[tuple[str, int], Decision]
     scripted: bool
+    factors: Mapping[str, str] = field(default_factory=dict)
     prompts: bool = True
     drivers: dict[Side, Driver] = field(default_factory=dict)
 
@@ -122,6 +123,7 @@ class _Trial:
             sample_set=row["sample_set"],
             order=0,
             scripted=self.scripted or any(a.wanted["scripted"] for a in self.attempts),
+            factors=tuple(self.factors.items()),
         )
 
     def slot(self, row: Mapping[str, Any]) -> dict[str, str | int]:
@@ -221,7 +223,6 @@ def _trials(
     left_out: Counter[str],
 ) -> Iterator[_Trial]:
     """The trials that can be derived; the others are counted, or reported by other checks."""
-    wires = _wires(config)
     for key in tables["trials"].rows:
         spec = specs.get(key[1])
         (row,) = tables["trials"].named(key)
@@ -234,6 +235,8 @@ def _trials(
         paces = {side: pace for side in SIDES if (pace := spec.pace(side)) is not None}
         if len(paces) < len(SIDES):
             continue
+        arm = config.arm_of.get(key[0], config.arms[0])
+        wires = _wires(config, arm)
         known = all(side in wires for side in SIDES if spec.asks(side))
         same_rules = spec.content.get("spec_version") == SPEC_VERSION
         same_world = (spec.track, spec.content.get("world_source")) == (
@@ -250,15 +253,21 @@ def _trials(
             spec.scenario,
             [read_answer(c, wires[c["side"]]) for c in calls if c["side"] in wires],
             {(d["side"], d["decision"]): _decided(d) for d in decisions},
-            scripted=any(model.provider == "emulator" for model in config.models.values()),
+            scripted=_is_scripted(config, arm),
+            factors=arm.factors,
         )
         left_out.update(_seat(trial, spec, paces))
         yield trial
 
 
-def _wires(config: SweepConfig) -> dict[str, WireFormat]:
-    """The formats of the models, by side."""
-    models = {side: config.models.get(name) for side, name in config.sides.items()}
+def _is_scripted(config: SweepConfig, arm: ArmFacts) -> bool:
+    models = map(config.models.get, arm.asked.values())
+    return any(model is not None and model.provider == "emulator" for model in models)
+
+
+def _wires(config: SweepConfig, arm: ArmFacts) -> dict[str, WireFormat]:
+    """The formats of an arm's models, by side."""
+    models = {side: config.models.get(name) for side, name in arm.asked.items()}
     return {
         side: FORMATS[model.format]
         for side, model in models.items()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
@@ -16,6 +17,8 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import between_body_and_slot
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.geometry import Track, track_of
+
+NOT_IN_AN_ID = r"[^A-Za-z0-9_.+-]"
 
 
 class _Facts(BaseModel):
@@ -35,8 +38,32 @@ class ModelFacts(_Facts):
     path: str | None = None
 
 
+class ArmFacts(_Facts):
+    """What a sweep says of an arm of its study; ``asked`` are keys of the sweep's models."""
+
+    model: str
+    variant: str
+    repetitions: int
+    scenario: dict[str, JsonValue]
+    sides: dict[str, str]
+    asked: dict[str, str]
+    factors: dict[str, str] = {}
+
+    @property
+    def levels(self) -> str:
+        """The part of its trials' ids that is for its factors, spelled as the plan spells it."""
+        return "".join(
+            f"/{name}={re.sub(NOT_IN_AN_ID, '_', level)}"
+            for name, level in self.factors.items()
+            if name not in ("prompt", "opponent")
+        )
+
+
 class SweepConfig(_Facts):
-    """The configuration of a sweep as its row holds it."""
+    """The configuration of a sweep as its row holds it.
+
+    Where only the prompt varies there are no ``stored_arms``, and each variant is one.
+    """
 
     model: str
     models: dict[str, ModelFacts]
@@ -46,34 +73,57 @@ class SweepConfig(_Facts):
     conditions: tuple[str, ...]
     sample_set: int
     prompt_blocks: dict[str, dict[str, str]]
+    stored_arms: tuple[ArmFacts, ...] = Field(default=(), alias="arms")
 
-    @property
-    def sides(self) -> dict[str, str]:
-        """Side to the name of its driver; without the plan's code, so that this is audited too."""
+    @cached_property
+    def arms(self) -> tuple[ArmFacts, ...]:
+        """All arms; without the plan's code, so that this is audited, too."""
         left, _, right = self.model.partition("+")
-        return {"left": left, "right": right or left}
+        sides = {"left": left, "right": right or left}
+        return self.stored_arms or tuple(
+            ArmFacts(
+                model=self.model,
+                variant=variant,
+                repetitions=repetitions,
+                scenario=self.scenario,
+                sides=sides,
+                asked=sides,
+            )
+            for variant, repetitions in self.repetitions.items()
+        )
+
+    def asks(self, arm: ArmFacts) -> bool:
+        """Whether a language model drives in an arm."""
+        return any(name in self.models for name in arm.asked.values())
+
+    @cached_property
+    def arm_of(self) -> dict[str, ArmFacts]:
+        """Trial id, spelled as the plan spells it, to the trial's arm."""
+        return {trial_id: arm for arm in self.arms for trial_id, _, _ in self._slots(arm)}
 
     @cached_property
     def trials(self) -> dict[str, dict[str, Any]]:
-        """Trial id, spelled as the plan spells it, to what the trial's row should say."""
-        suffix = f"/set{self.sample_set}" if self.sample_set else ""
-        of_all = {
-            "sample_set": self.sample_set,
-            "model_left": self.sides["left"],
-            "model_right": self.sides["right"],
-            "source": "llm" if self.models else "driver",
-        }
+        """Trial id to what the trial's row should say."""
         return {
-            f"{self.model}/{variant}/{condition}/rep{rep:02d}{suffix}": {
-                "variant": variant,
+            trial_id: {
+                "variant": arm.variant,
                 "condition": condition,
                 "rep": rep,
-                **of_all,
+                "sample_set": self.sample_set,
+                "model_left": arm.sides["left"],
+                "model_right": arm.sides["right"],
+                "source": "llm" if self.asks(arm) else "driver",
             }
-            for variant, repetitions in self.repetitions.items()
-            for condition in self.conditions
-            for rep in range(1, repetitions + 1)
+            for arm in self.arms
+            for trial_id, condition, rep in self._slots(arm)
         }
+
+    def _slots(self, arm: ArmFacts) -> Iterator[tuple[str, str, int]]:
+        suffix = f"/set{self.sample_set}" if self.sample_set else ""
+        for condition in self.conditions:
+            for rep in range(1, arm.repetitions + 1):
+                trial_id = f"{arm.model}/{arm.variant}/{condition}/rep{rep:02d}{suffix}"
+                yield trial_id + arm.levels, condition, rep
 
 
 @dataclass(frozen=True)
@@ -141,17 +191,18 @@ class Spec:
             return None
         return between_body_and_slot(endpoint, path, tuple(headers.items()))
 
-    def disagreements(self, config: SweepConfig, variant: str) -> Iterator[str]:
-        """In what the spec of a variant disagrees with the sweep's configuration."""
-        if self.content.get("scenario") != config.scenario:
+    def disagreements(self, config: SweepConfig, arm: ArmFacts) -> Iterator[str]:
+        """In what the spec of an arm disagrees with the sweep's configuration."""
+        if self.content.get("scenario") != arm.scenario:
             yield "scenario"
         if self.content.get("sample_set") != config.sample_set:
             yield "sample set"
         # Programs read no prompt, so that their specs hold none.
-        if config.models and self.content.get("prompt_blocks") != config.prompt_blocks.get(variant):
+        blocks = config.prompt_blocks.get(arm.variant)
+        if config.asks(arm) and self.content.get("prompt_blocks") != blocks:
             yield "prompt blocks"
         for side in SIDES:
-            name = config.sides[side]
+            name = arm.asked[side]
             for what in _differences(self.driver(side), name, config):
                 yield f"{side} {what}"
 

@@ -160,15 +160,17 @@ def _config(provenance: dict[str, str]) -> SweepConfig | None:
 
 
 def _numbering(drives: Drives, config: SweepConfig | None) -> Iterator[Finding]:
-    """Every driver is asked from its first decision to its last, once per variant.
+    """Every driver is asked from its first decision to its last, once per arm at most.
 
     Where a driver takes control at its own tunnel's exit, the later one begins later.
     """
-    late = config is not None and config.scenario.get("control_start") == "own_exit"
+    late = config is not None and any(
+        arm.scenario.get("control_start") == "own_exit" for arm in config.arms
+    )
     for drive, numbers in drives.items():
-        # Without a word on variants: as many as there are first requests.
-        variants = (
-            sum(drive.repetition <= wanted for wanted in config.repetitions.values())
+        # Without a word on arms: as many as there are first requests.
+        arms = (
+            sum(drive.repetition <= arm.repetitions for arm in config.arms)
             if config
             else numbers[min(numbers)]
         )
@@ -178,8 +180,8 @@ def _numbering(drives: Drives, config: SweepConfig | None) -> Iterator[Finding]:
                 # One finding for each hole: the numbers of a foreign file may be of any size.
                 text = f"nothing is recorded, though of later ones: the next is {number}"
                 yield Finding("numbering", text, None, drive.trial, drive.side, before + 1)
-            if numbers[number] > variants:
-                text = f"{numbers[number]} requests are recorded, for {variants} prompt variants"
+            if numbers[number] > arms:
+                text = f"{numbers[number]} requests are recorded, for {arms} prompt variants"
                 yield Finding("numbering", text, None, drive.trial, drive.side, number)
             before = number
 
@@ -193,7 +195,7 @@ def _missing(drives: Drives, config: SweepConfig | None, *, ended: bool) -> Iter
     """Of a sweep that has ended, every trial asks each of its models for a first decision."""
     if config is None or not ended:
         return
-    asked = [side for side in SIDES if config.sides[side] in config.models]
+    asked = [side for side in SIDES if any(a.asked[side] in config.models for a in config.arms)]
     recorded = {(drive.trial, drive.side) for drive in drives}
     cells = {(trial["condition"], trial["rep"]) for trial in config.trials.values()}
     for condition, repetition in sorted(cells):

@@ -41,10 +41,12 @@ HAVING len(places) > 1
     AND bool_or((trial_id, spec_hash) IN (SELECT (trial_id, spec_hash) FROM audited))
     AND NOT bool_or((trial_id, spec_hash) IN (SELECT (trial_id, spec_hash) FROM done))
 """
+# Drivers of a study may ask the same at the same slot: that is told, see IN_COMMON, and no fault.
+_DRIVEN = "(SELECT * FROM decisions JOIN trial_drivers USING (trial_id, spec_hash))"
 SHARED_CALLS = _SHARED.format(
-    what="spec_hash, call_key",
-    slots="decisions",
-    suspects="SELECT spec_hash, call_key FROM decisions GROUP BY ALL HAVING count(*) > 1",
+    what="spec_hash, driver, call_key",
+    slots=_DRIVEN,
+    suspects=f"SELECT spec_hash, driver, call_key FROM {_DRIVEN} GROUP BY ALL HAVING count(*) > 1",  # noqa: S608 # constants
 )
 SHARED_REPLIES = _SHARED.format(
     what="endpoint, model_requested, reply_id",

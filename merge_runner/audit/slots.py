@@ -105,8 +105,8 @@ def _spec_problems(
         yield f"the scenario of the spec {name} cannot be read: its trials are not checked"
     elif None in map(spec.pace, SIDES):
         yield f"the rates of the spec {name} cannot be read: its decisions are not checked"
-    wanted = config.trials.get(row["trial_id"])
-    differing = list(spec.disagreements(config, wanted["variant"])) if wanted else []
+    arm = config.arm_of.get(row["trial_id"])
+    differing = list(spec.disagreements(config, arm)) if arm else []
     if differing:
         yield f"the spec {name} is not what the sweep says in {', '.join(differing)}"
 
@@ -122,13 +122,11 @@ def _missing(
     missing = [name for name in config.trials if name not in seen]
     if not missing:
         return missing
-    same = {
-        variant: {
-            name for name, spec in specs.items() if not any(spec.disagreements(config, variant))
-        }
-        for variant in config.repetitions
-    }
-    hashes = sorted(set().union(*same.values()))
+    hashes = sorted(
+        name
+        for name, spec in specs.items()
+        if any(not any(spec.disagreements(config, arm)) for arm in config.arms)
+    )
     ended = {name for (name,) in connection.execute(ENDED, [missing, hashes]).fetchall()}
     if ended:
         audit.notes.append(f"{len(ended)} of its trials were played by another sweep")

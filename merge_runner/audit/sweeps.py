@@ -151,9 +151,8 @@ def _audit(
     config = _config(config_text, audit)
     if config is not None:
         check_slots(connection, config, specs, audit, finished=finished)
-    models = config.models if config else {}
     connection.execute("DELETE FROM sweep_models")
-    append(connection, "sweep_models", [(name, m.id, m.provider) for name, m in models.items()])
+    append(connection, "sweep_models", sorted(_models(config)) if config else [])
     audit.counts |= _counts(connection, COUNTS)
     audit.findings += run_checks(connection)
     audit.findings += check_traces(connection, specs)
@@ -168,6 +167,16 @@ def _audit(
         check_derived(connection, specs, config, audit)
     audit.findings = [replace(finding, sweep=sweep_id) for finding in audit.findings]
     return audit
+
+
+def _models(config: SweepConfig) -> set[tuple[str, str, str]]:
+    """The models by their names in the registry, each with its id and provider."""
+    return {
+        (arm.sides[side], model.id, model.provider)
+        for arm in config.arms
+        for side in SIDES
+        if (model := config.models.get(arm.asked[side])) is not None
+    }
 
 
 def _config(text: str, audit: Audit) -> SweepConfig | None:

@@ -114,7 +114,9 @@ def temper_for(seen: Seen, slot: Slot | None, prompt: str) -> Temper:
 
 
 def _chance_left_first(condition: str) -> float:
-    kinematics = CONDITIONS[condition]
+    kinematics = CONDITIONS.get(condition)
+    if kinematics is None:  # a study's own: this process may not know it
+        return 0.5
     # arXiv 2604.09609, Table III.
     odds = -0.30 + 1.11 * kinematics.projected_headway_m - 3.30 * kinematics.relative_velocity_mps
     return 1 / (1 + math.exp(-odds))

@@ -1,4 +1,4 @@
-"""The models of ``experiments/models.toml``."""
+"""The models of ``experiments/models.toml``, and those that a user adds to them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,25 @@ from merge_runner.llm.formats import FORMATS
 from merge_runner.registry import load_plugins
 from merge_runner.text_safety import one_line
 
+REGISTRY = "models.toml"
 
-def load_models(path: Path | None = None) -> dict[str, ModelEntry]:
-    """The entries by name, each with a known format and provider; raises UsageError."""
+
+def load_models(beside: Path | None = None) -> dict[str, ModelEntry]:
+    """The entries by name, each with a known format and provider; raises UsageError.
+
+    Those of a ``models.toml`` in the working directory, or ``beside`` a study, are added to the
+    registry, and take the place of those of the same name.
+    """
     load_plugins()  # before the file is read: an error in a plug-in is none of the file's
-    path = path or find_experiments() / "models.toml"
+    own = find_experiments() / REGISTRY
+    added = dict.fromkeys((folder or Path()) / REGISTRY for folder in (None, beside))
+    entries: dict[str, ModelEntry] = {}
+    for path in (own, *(each for each in added if each.is_file() and each != own)):
+        entries |= _entries(path)
+    return entries
+
+
+def _entries(path: Path) -> dict[str, ModelEntry]:
     entries = {}
     for name, table in read_toml(path).items():
         where = f"{path}: [{name}]"

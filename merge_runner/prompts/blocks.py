@@ -23,12 +23,18 @@ OUTPUT_FORMAT = "C5"
 class Fields(TypedDict):
     """What a template may name in braces, each as it is written in the prompt.
 
-    Numbers have two decimals, in m, s, m/s and m/s^2; lists are those of Python.
+    Numbers have two decimals, in m, s, m/s and m/s^2, or in the unit of their name; lists are
+    those of Python.
     """
 
     vehicle_length: str
     own_speed: str
     other_speed: str
+    own_speed_kmh: str
+    other_speed_kmh: str
+    own_speed_mph: str
+    other_speed_mph: str
+    relative_speed: str  # own minus other
     relative_distance: str  # how far the other car is ahead, negative if it is behind
     distance_to_merge: str  # before the merge point alone
     own_accelerations: str
@@ -89,12 +95,14 @@ class Block:
 class Variant:
     """The baseline without the blocks that it ``removes``, and with those that it ``adds``.
 
-    Tables and figures show its ``title``, or its name where that is empty.
+    Tables and figures show its ``title``, or its name where that is empty. One that a study makes
+    holds all its ``blocks`` in order.
     """
 
     removes: frozenset[str] = frozenset()
     adds: frozenset[str] = frozenset()
     title: str = ""
+    blocks: tuple[tuple[str, Block], ...] = ()
 
 
 def _named(template: str) -> list[str]:
@@ -193,6 +201,8 @@ def title_of(variant: str) -> str:
 def blocks_of(variant: str) -> dict[str, Block]:
     """The blocks of a variant by name, in the order of its prompt; raises UsageError."""
     chosen = VARIANTS.require(variant)
+    if chosen.blocks:
+        return dict(chosen.blocks)
     for name in sorted(chosen.removes | chosen.adds):
         BLOCKS.require(name, f"the variant {variant} names it")
     return {

@@ -9,6 +9,10 @@ from statistics import fmean
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import Fields, blocks_of
 from merge_runner.records import Observation, Road
+from merge_runner.registry import changes
+
+KMH_OF_MPS = 3.6
+MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
 
 
 def render_prompt(
@@ -24,11 +28,11 @@ def render_prompt(
     None before the first.
     """
     fields = _fields(observation, remaining_plan, scenario)
-    return _template(variant, observation.road).format_map(fields)
+    return _template(variant, observation.road, changes()).format_map(fields)
 
 
 @cache
-def _template(variant: str, road: Road) -> str:
+def _template(variant: str, road: Road, _: int) -> str:
     """The blocks of a variant that a road has, one below the other."""
     templates = (block.template(road) for block in blocks_of(variant).values())
     return "\n\n".join(template for template in templates if template is not None) + "\n"
@@ -39,10 +43,16 @@ def _fields(
 ) -> Fields:
     distance = observation.distance_to_merge_m
     every = scenario.action_steps
+    own, other = observation.own_speed_mps, observation.other_speed_mps
     return {
         "vehicle_length": f"{scenario.vehicle_length_m:g}",
-        "own_speed": decimal(observation.own_speed_mps),
-        "other_speed": decimal(observation.other_speed_mps),
+        "own_speed": decimal(own),
+        "other_speed": decimal(other),
+        "own_speed_kmh": decimal(own * KMH_OF_MPS),
+        "other_speed_kmh": decimal(other * KMH_OF_MPS),
+        "own_speed_mph": decimal(own * MPH_OF_MPS),
+        "other_speed_mph": decimal(other * MPH_OF_MPS),
+        "relative_speed": decimal(own - other),
         "relative_distance": decimal(observation.relative_distance_m),
         "distance_to_merge": "" if distance is None else decimal(distance),
         "own_accelerations": listing(_means(observation.own_accelerations_mps2, every)),

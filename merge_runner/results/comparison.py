@@ -27,6 +27,7 @@ _OF_THESE = (
 # What identifies a row within a trial.
 PLACES: dict[str, tuple[str, ...]] = {
     "trials": (),
+    "trial_factors": ("factor",),
     "states": ("step", "side"),
     "decisions": ("decision", "side"),
     "calls": ("decision", "side", "attempt"),

@@ -25,6 +25,7 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
     """All rows of a trial, by table."""
     return {
         "trials": [trial_row(record)],
+        "trial_factors": list(factor_rows(record)),
         "states": list(state_rows(record)),
         "decisions": list(decision_rows(record)),
         "calls": list(call_rows(record)),
@@ -54,6 +55,12 @@ def trial_row(record: TrialRecord) -> Row:
         record.error,
         record.scripted,
     )
+
+
+def factor_rows(record: TrialRecord) -> Iterator[Row]:
+    """Rows of ``trial_factors``."""
+    for factor, value in record.spec.factors:
+        yield record.spec.trial_id, record.spec.spec_hash, factor, value
 
 
 def state_rows(record: TrialRecord) -> Iterator[Row]:

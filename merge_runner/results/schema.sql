@@ -47,6 +47,14 @@ CREATE TABLE IF NOT EXISTS trials (
     PRIMARY KEY (trial_id, spec_hash)
 );
 
+-- The levels of a study's factors: a number and anything else but a text is written as in JSON.
+CREATE TABLE IF NOT EXISTS trial_factors (
+    trial_id VARCHAR NOT NULL,
+    spec_hash VARCHAR NOT NULL,
+    factor VARCHAR NOT NULL,
+    value VARCHAR NOT NULL
+);
+
 CREATE TABLE IF NOT EXISTS states (
     trial_id VARCHAR NOT NULL,
     spec_hash VARCHAR NOT NULL,
@@ -107,17 +115,23 @@ CREATE TABLE IF NOT EXISTS calls (
 CREATE MACRO IF NOT EXISTS driver_name(model, endpoint) AS
     model || coalesce(' at ' || nullif(regexp_extract(endpoint, '://([^/]+)', 1), ''), '');
 
--- Who drove: two different drivers are joined by a plus, another sample set has its number.
+-- Who drove: two different drivers are joined by a plus, another sample set has its number, and so
+-- has each level of a study's factors but the prompt and the opponent, which are named already.
 CREATE VIEW IF NOT EXISTS trial_drivers AS
 SELECT trial_id, spec_hash,
     if(left_driver = right_driver, left_driver, left_driver || '+' || right_driver)
-        || if(sample_set > 0, '/set' || sample_set, '') AS driver
+        || if(sample_set > 0, '/set' || sample_set, '')
+        || coalesce(' [' || levels || ']', '') AS driver
 FROM (
     SELECT trial_id, spec_hash, sample_set,
         driver_name(model_left, spec->>'$.left.endpoint') AS left_driver,
         driver_name(model_right, spec->>'$.right.endpoint') AS right_driver
     FROM trials LEFT JOIN specs USING (spec_hash)
-);
+) LEFT JOIN (
+    SELECT trial_id, spec_hash,
+        string_agg(factor || '=' || value, ', ' ORDER BY factor) AS levels
+    FROM trial_factors WHERE factor NOT IN ('prompt', 'opponent') GROUP BY ALL
+) USING (trial_id, spec_hash);
 
 -- The ledger of attempts: what became of each. retried: another one followed; driven: its plan was;
 -- fallback: it gave no valid plan (see failure), so that an older plan or 0 was driven; lost: its

@@ -92,13 +92,18 @@ def open_services(
     stack.callback(cache.claims.close)
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
+    # An account's limits are those of a model, with whatever parameters it is asked.
+    by_model: dict[str, Limiter] = {}
     limiters = {}
     for name, entry in plan.entries.items():
-        rpm, tpm = options.rates(entry)
-        shared = _shared_limits(name, entry, rpm, tpm, stack)
-        limiters[name] = Limiter(
-            rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]], shared=shared
-        )
+        model = plan.registered[name]
+        if model not in by_model:
+            rpm, tpm = options.rates(entry)
+            shared = _shared_limits(name, entry, rpm, tpm, stack)
+            by_model[model] = Limiter(
+                rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]], shared=shared
+            )
+        limiters[name] = by_model[model]
     budget = Budget(ledger, cap_usd=options.max_cost_usd, trial_usd=worst_trial_usd(plan))
     return LocalServices(limiters=limiters, budget=budget)
 
@@ -146,20 +151,23 @@ def live_clients(
     from merge_runner.llm.http import HttpTransport
 
     _allow_open_files(connections + SPARE_FILES)
+    transports: dict[str, HttpTransport] = {}
     clients = {}
     for name, entry in plan.entries.items():
-        endpoint = resolve_endpoint(name, entry, with_base_urls(endpoint_plan.urls))
-        check_network(endpoint.base_url)
-        transport = HttpTransport(
-            endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 1e6)
-        )
-        stack.push_async_callback(transport.close)
+        model = plan.registered[name]
+        if model not in transports:
+            endpoint = resolve_endpoint(name, entry, with_base_urls(endpoint_plan.urls))
+            check_network(endpoint.base_url)
+            transports[model] = HttpTransport(
+                endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 1e6)
+            )
+            stack.push_async_callback(transports[model].close)
         clients[name] = LlmClient(
             name=name,
             entry=entry,
             endpoint=plan.endpoints[name],
             cache=cache,
-            transport=transport,
+            transport=transports[model],
             limiter=limiters[name],
             budget=None if entry.price == "free" else budget,
             strict=endpoint_plan.strict,

@@ -105,7 +105,8 @@ def worst_trial_usd(plan: Plan) -> float:
             )
             or 0.0
         )
-        for entry in (plan.entries[n] for n in plan.sides.values() if n in plan.entries)
+        for arm in plan.arms[:1]
+        for entry in (arm.entries[n] for n in arm.asked.values() if n in arm.entries)
     )
 
 

@@ -19,6 +19,7 @@ from merge_runner.llm.meter import Meter
 from merge_runner.records import SIDES, Cell, ChatReply, Slot, TrialRecord, TrialSpec
 from merge_runner.run.plan import Plan
 from merge_runner.run.scheduler import Gate, run_bounded
+from merge_runner.study.crossing import Arm
 from merge_runner.trial import play_trial
 
 # Called with each trial that ends, or is suspended for lack of money.
@@ -89,6 +90,11 @@ class LocalRunner:
     workers: None = None
 
     @cached_property
+    def arms(self) -> Mapping[str, Arm]:
+        """The arms of the study by their labels."""
+        return self.plan.by_label()
+
+    @cached_property
     def drivers(self) -> Mapping[str, MakeDriver]:
         """Makers of drivers by name: of a program, or of a model that one of the clients asks."""
         models = {name: LanguageModel(partial(self._ask, name)) for name in self.clients}
@@ -134,13 +140,13 @@ class LocalRunner:
         self, spec: TrialSpec, room: Room
     ) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
         await room()  # before any call: what is answered must also be stored
-        scenario = self.plan.scenario
+        arm = self.arms[spec.arm]
         drivers = {
-            side: self.drivers[self.plan.sides[side]].make(scenario, spec, side) for side in SIDES
+            side: self.drivers[arm.asked[side]].make(arm.scenario, spec, side) for side in SIDES
         }
         self.playing[spec.cell] += 1
         try:
-            return spec, await play_trial(spec, scenario, drivers)
+            return spec, await play_trial(spec, arm.scenario, drivers)
         except TrialSuspended as exc:
             return spec, exc
         finally:

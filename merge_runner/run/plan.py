@@ -3,35 +3,35 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from merge_runner.config import (
     MOST_REPETITIONS,
     ModelEntry,
     ScenarioConfig,
-    SweepFile,
     both_sides,
     endpoint_identity,
-    load_sweep,
     pair_name,
 )
-from merge_runner.drivers.pace import pace_of
-from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.drivers.registry import EMULATOR, PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
-from merge_runner.records import Side, TrialSpec
-from merge_runner.registry import require
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.records import SIDES, Side, TrialSpec
+from merge_runner.scenarios.merge.conditions import CONDITIONS, MEAN_SPEED_MPS
 from merge_runner.scenarios.registry import SCENARIOS, new_world, task_of
+from merge_runner.study.crossing import OPPONENT, PROMPT, Arm, cross, level_text
+from merge_runner.study.file import EVERY_CONDITION, EVERY_PROMPT, Study, StudyFile, read_study
+from merge_runner.study.parts import adopt
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 PROMPTS_PER_DRIVER = 10.5
+_NOT_IN_AN_ID = re.compile(r"[^A-Za-z0-9_.+-]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,120 +69,205 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A sweep before it runs.
+    """A sweep before it runs: the arms of its study, each played in all conditions.
 
-    ``entries`` are the language models on either side, ``endpoints`` the identities of their
-    endpoints (see ``config.Endpoint``).
+    ``entries`` are the language models of all arms by what an arm's ``asked`` calls them, and
+    ``endpoints`` the identities of their endpoints (see ``config.Endpoint``).
     """
 
     name: str
-    model: str
-    sides: dict[Side, str]
+    study: Study
+    models: tuple[str, ...]
+    arms: tuple[Arm, ...]
     entries: dict[str, ModelEntry]
     endpoints: dict[str, str]
-    scenario: ScenarioConfig
-    repetitions: dict[str, int]
     conditions: tuple[str, ...]
     sample_set: int
     order_seed: int
 
     @property
+    def model(self) -> str:
+        """Who drives but for opponents, as ids of sweeps say, with a comma between models."""
+        pairs = (both_sides(model).values() for model in self.models)
+        return ",".join("+".join(dict.fromkeys(pair)) for pair in pairs)
+
+    @property
     def ledger(self) -> str:
-        """The name of the ledger that holds the sweep's spending over all its runs."""
+        """The name of the ledger that holds the sweep's spending over all its runs.
+
+        A study with a budget of its own has one ledger over all its models and samples.
+        """
+        if self.study.file.budget.total_usd is not None:
+            return self.name
         return f"{self.name}/{self.model}/set{self.sample_set}"
+
+    @property
+    def registered(self) -> dict[str, str]:
+        """The names in the registry of the models of ``entries``, whatever their parameters."""
+        return {arm.asked[side]: arm.sides[side] for arm in self.arms for side in SIDES}
+
+    @property
+    def scenario(self) -> ScenarioConfig:
+        """The first arm's."""
+        return self.arms[0].scenario
+
+    @property
+    def repetitions(self) -> dict[str, int]:
+        """Prompt variant to repetitions."""
+        return {arm.variant: arm.repetitions for arm in self.arms}
 
     @property
     def trials(self) -> int:
         """The number of trials."""
-        return sum(self.repetitions.values()) * len(self.conditions)
+        return sum(arm.repetitions for arm in self.arms) * len(self.conditions)
 
     @property
-    def llm_sides(self) -> int:
-        """How many of the two drivers are language models."""
-        return sum(name in self.entries for name in self.sides.values())
-
-    @property
-    def source(self) -> Literal["llm", "driver"]:
-        """Whether any language model takes part."""
-        return "llm" if self.entries else "driver"
+    def asking(self) -> float:
+        """How many of the two drivers of a trial are language models, on the average."""
+        sides = sum(
+            arm.repetitions * sum(name in arm.entries for name in arm.asked.values())
+            for arm in self.arms
+        )
+        return sides / sum(arm.repetitions for arm in self.arms)
 
     @property
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
-        return any(entry.provider == "emulator" for entry in self.entries.values())
+        return any(map(_is_scripted, self.arms))
 
     @property
     def driver(self) -> str:
         """The drivers with their endpoints; see ``pair_name``."""
-        return pair_name(self.sides.values(), self.endpoints)
+        return ", ".join(
+            dict.fromkeys(pair_name(arm.asked.values(), self.endpoints) for arm in self.arms)
+        )
+
+    def by_label(self) -> dict[str, Arm]:
+        """The arms by the labels that their trials carry."""
+        return {arm.label: arm for arm in self.arms}
+
+    def parts(self) -> Iterator[tuple[str, Plan]]:
+        """Each arm with its label, as a plan of its own."""
+        for arm in self.arms:
+            endpoints = {name: self.endpoints[name] for name in arm.entries}
+            yield arm.label, replace(self, arms=(arm,), entries=arm.entries, endpoints=endpoints)
+
+    def with_entries(self, entries: dict[str, ModelEntry]) -> Plan:
+        """The same with other entries for the same names, in its arms too."""
+        arms = (
+            replace(arm, entries={name: entries[name] for name in arm.entries}) for arm in self.arms
+        )
+        return replace(self, arms=tuple(arms), entries=entries)
 
     def specs(self) -> dict[str, str]:
-        """Variant to the canonical JSON that its spec hash covers."""
-        return {
-            variant: canonical_json(
-                {
-                    "spec_version": SPEC_VERSION,
-                    **task_of(self.scenario),
-                    "prompt_blocks": block_digests(variant) if self.entries else {},
-                    "left": self._driver(self.sides["left"]),
-                    "right": self._driver(self.sides["right"]),
-                    "sample_set": self.sample_set,
-                }
-            )
-            for variant in self.repetitions
-        }
+        """Spec hash to the canonical JSON that it covers."""
+        texts = (self.spec(arm, name) for arm in self.arms for name in self.conditions)
+        return {spec_hash(text): text for text in texts}
+
+    def spec(self, arm: Arm, condition: str) -> str:
+        """What determines a trial of an arm, but for its condition's headway and relative velocity.
+
+        These stand in its row, where a change of them is refused; another mean speed does not.
+        """
+        mean_speed_mps = CONDITIONS[condition].mean_speed_mps
+        return canonical_json(
+            {
+                "spec_version": SPEC_VERSION,
+                **task_of(arm.scenario),
+                "prompt_blocks": block_digests(arm.variant) if arm.entries else {},
+                "left": self._driver(arm, "left"),
+                "right": self._driver(arm, "right"),
+                "sample_set": self.sample_set,
+                **({} if mean_speed_mps == MEAN_SPEED_MPS else {"mean_speed_mps": mean_speed_mps}),
+            }
+        )
 
     def trial_specs(self) -> list[TrialSpec]:
         """All trials, repetition by repetition, so that an unfinished sweep is balanced, too.
 
-        Within a repetition the order is random, by the order seed, so that no condition or variant
+        Within a repetition the order is random, by the order seed, so that no condition or arm
         always comes first: a service that drifts over hours affects all of them alike.
         """
-        hashes = {variant: spec_hash(text) for variant, text in self.specs().items()}
+        hashes = {
+            (arm.label, name): spec_hash(self.spec(arm, name))
+            for arm in self.arms
+            for name in self.conditions
+        }
         cells = [
-            (repetition, variant, condition)
-            for repetition in range(1, max(self.repetitions.values()) + 1)
-            for variant, wanted in self.repetitions.items()
-            if repetition <= wanted
+            (repetition, arm, condition)
+            for repetition in range(1, max(arm.repetitions for arm in self.arms) + 1)
+            for arm in self.arms
+            if repetition <= arm.repetitions
             for condition in self.conditions
         ]
-        cells.sort(key=lambda cell: (cell[0], _lot(self.order_seed, *cell)))
-        suffix = f"/set{self.sample_set}" if self.sample_set else ""
+        cells.sort(
+            key=lambda cell: (cell[0], _lot(self.order_seed, cell[0], cell[1].label, cell[2]))
+        )
         return [
             TrialSpec(
-                trial_id=f"{self.model}/{variant}/{condition}/rep{repetition:02d}{suffix}",
-                spec_hash=hashes[variant],
-                source=self.source,
-                model_left=self.sides["left"],
-                model_right=self.sides["right"],
-                variant=variant,
+                trial_id=self._trial_id(arm, condition, repetition),
+                spec_hash=hashes[arm.label, condition],
+                source="llm" if arm.entries else "driver",
+                model_left=arm.sides["left"],
+                model_right=arm.sides["right"],
+                variant=arm.variant,
                 condition=condition,
                 repetition=repetition,
                 sample_set=self.sample_set,
                 order=order,
-                scripted=self.scripted,
+                scripted=_is_scripted(arm),
+                factors=tuple(arm.factors.items()),
+                arm=arm.label,
             )
-            for order, (repetition, variant, condition) in enumerate(cells)
+            for order, (repetition, arm, condition) in enumerate(cells)
         ]
 
     def config(self) -> dict[str, object]:
         """The sweep's configuration for its row in the database."""
         entries = {name: entry.model_dump(mode="json") for name, entry in self.entries.items()}
         prompt_blocks = {variant: block_digests(variant) for variant in self.repetitions}
-        return {
+        config: dict[str, object] = {
             "model": self.model,
             "models": entries,
             "endpoints": self.endpoints,
-            "scenario": self.scenario.model_dump(),
+            "scenario": self.study.file.scenario.model_dump(),
             "repetitions": self.repetitions,
             "conditions": list(self.conditions),
             "sample_set": self.sample_set,
             "order_seed": self.order_seed,
             "prompt_blocks": prompt_blocks,
         }
+        if self.study.file.factors or len(self.models) > 1:
+            config["arms"] = [
+                {
+                    "label": arm.label,
+                    "model": arm.model,
+                    "sides": arm.sides,
+                    "asked": arm.asked,
+                    "variant": arm.variant,
+                    "repetitions": arm.repetitions,
+                    "scenario": arm.scenario.model_dump(),
+                    "factors": arm.factors,
+                }
+                for arm in self.arms
+            ]
+        if self.study.is_own:
+            config["study"] = {"text": self.study.text, "plugins": self.study.plugins}
+        return config
 
-    def _driver(self, name: str) -> dict[str, object]:
-        entry = self.entries.get(name)
+    def _trial_id(self, arm: Arm, condition: str, repetition: int) -> str:
+        set_ = f"/set{self.sample_set}" if self.sample_set else ""
+        # The prompt and the opponent stand in it already.
+        levels = "".join(
+            f"/{name}={_NOT_IN_AN_ID.sub('_', level)}"
+            for name, level in arm.factors.items()
+            if name not in (PROMPT, OPPONENT)
+        )
+        return f"{arm.model}/{arm.variant}/{condition}/rep{repetition:02d}{set_}{levels}"
+
+    def _driver(self, arm: Arm, side: Side) -> dict[str, object]:
+        name = arm.asked[side]
+        entry = arm.entries.get(name)
         if entry is None:
             return PROGRAMS[name].in_spec(name)
         sent = FORMATS[entry.format].request(entry, "")
@@ -194,6 +279,10 @@ class Plan:
         }
 
 
+def _is_scripted(arm: Arm) -> bool:
+    return any(entry.provider == "emulator" for entry in arm.entries.values())
+
+
 def _lot(*what: object) -> str:
     """A sort key that orders trials randomly, but the same way on every machine."""
     return hashlib.sha256("/".join(map(str, what)).encode()).hexdigest()
@@ -201,75 +290,84 @@ def _lot(*what: object) -> str:
 
 def make_plan(
     sweep: str,
-    model: str,
+    models: str | Sequence[str] = (),
     repetitions: int | None = None,
     conditions: Sequence[str] | None = None,
     variants: Sequence[str] | None = None,
     *,
     sample_set: int = 0,
     order_seed: int = 0,
+    only: Mapping[str, Sequence[str]] | None = None,
 ) -> Plan:
-    """The plan of a sweep's file and what a user asks for; None keeps the file's value.
+    """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
-    Raises UsageError.
+    Registers what the study adds (``study.parts.adopt``). Raises UsageError.
     """
-    name, file = load_sweep(sweep)
-    models = load_models()
-    sides = both_sides(model)
-    for driver in sides.values():
-        require({**models, **PROGRAMS}, "model", driver, "two joined by + drive left and right")
-    for driver in {*sides.values()} - {*models}:
-        pace_of(file.scenario, PROGRAMS[driver].in_spec(driver))
+    study = read_study(sweep)
+    registry = load_models(study.path.parent)
+    adopt(study)
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
-    scenario = SCENARIOS.require(file.scenario.name)
-    if file.scenario.collision_rule not in scenario.collision_rules:
-        raise UsageError(
-            f"the scenario {file.scenario.name} has no collision_rule "
-            f"{file.scenario.collision_rule!r}; valid: {', '.join(scenario.collision_rules)}"
-        )
-    entries = {driver: models[driver] for driver in sides.values() if driver in models}
+    asked = (models,) if isinstance(models, str) else tuple(models)
+    drivers = tuple(dict.fromkeys(asked or study.file.models or (EMULATOR,)))
+    wanted = _repetitions(study, variants, repetitions)
+    arms = cross(study.file, drivers, wanted, registry, only or {})
+    entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
     return Plan(
-        name=name,
-        model="+".join(dict.fromkeys(sides.values())),
-        sides=sides,
+        name=study.name,
+        study=study,
+        models=drivers,
+        arms=tuple(arms),
         entries=entries,
-        endpoints={driver: endpoint_identity(entry) for driver, entry in entries.items()},
-        scenario=file.scenario,
-        repetitions=_repetitions(name, file, variants, repetitions),
-        conditions=_conditions(file, conditions),
+        endpoints={name: endpoint_identity(entry) for name, entry in entries.items()},
+        conditions=_conditions(study.file, conditions, arms),
         sample_set=sample_set,
         order_seed=order_seed,
     )
 
 
-def _conditions(file: SweepFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
+def _conditions(
+    file: StudyFile, chosen: Sequence[str] | None, arms: Sequence[Arm]
+) -> tuple[str, ...]:
     scenario = SCENARIOS[file.scenario.name]
-    wanted = next(c for c in (chosen, file.conditions, scenario.conditions) if c is not None)
-    conditions = tuple(dict.fromkeys(wanted))
+    listed = None if file.conditions is None else [each.name for each in file.conditions]
+    wanted = next(c for c in (chosen, listed, scenario.conditions) if c is not None)
+    conditions = tuple(
+        dict.fromkeys(
+            name
+            for each in wanted
+            for name in (scenario.conditions if each == EVERY_CONDITION else (each,))
+        )
+    )
     if not conditions:
         raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
     for name in conditions:
-        new_world(file.scenario, name)  # raises where the condition cannot be played
+        for arm in arms:
+            new_world(arm.scenario, name)  # raises where the condition cannot be played
     return conditions
 
 
 def _repetitions(
-    name: str, file: SweepFile, variants: Sequence[str] | None, chosen: int | None
+    study: Study, variants: Sequence[str] | None, chosen: int | None
 ) -> dict[str, int]:
-    for variant in (*file.repetitions, *(variants or ())):
-        blocks_of(variant)
+    """The wanted prompts with their repetitions per condition; raises UsageError."""
     if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
+    given = dict(study.file.repetitions)
+    for_all = given.pop(EVERY_PROMPT, None)
+    levels = [level_text(level) for level in study.file.factors.get(PROMPT, ())]
+    listed = levels or [*given] or ["baseline"] * (for_all is not None)
+    for variant in (*given, *listed, *(variants or ())):
+        blocks_of(variant)
     wanted: dict[str, int] = {}
-    for variant in file.repetitions if variants is None else variants:
-        repetitions = chosen or file.repetitions.get(variant)
+    for variant in listed if variants is None else variants:
+        repetitions = chosen or given.get(variant, for_all)
         if repetitions is None:
             raise UsageError(
-                f"the sweep {name} has no variant {variant}; it has {', '.join(file.repetitions)}. "
+                f"the sweep {study.name} has no variant {variant}; it has {', '.join(given)}. "
                 "With --reps N any variant can be run."
             )
         wanted[variant] = repetitions
     if not wanted:
-        raise UsageError(f"the sweep {name} has no variant; valid: {', '.join(VARIANTS)}")
+        raise UsageError(f"the sweep {study.name} has no variant; valid: {', '.join(VARIANTS)}")
     return wanted

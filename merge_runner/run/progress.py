@@ -192,7 +192,7 @@ class Progress:
         if ended == total:
             return None
         calls = self._calls_live + self._calls_cached
-        expected_calls = total * self.plan.llm_sides * PROMPTS_PER_DRIVER
+        expected_calls = total * self.plan.asking * PROMPTS_PER_DRIVER
         by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
         part = max(ended / total, by_calls)
         elapsed = time.monotonic() - self.started

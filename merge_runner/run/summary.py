@@ -18,7 +18,7 @@ from merge_runner.run.sweep import Outcome
 VARIANT, CONDITION, STATUS, FELL_BACK = 0, 1, 2, 4
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
 LEDGER = ("model", "variant", "fate", "outcome", "attempts")
-FAILURES_SHOWN = 10
+FAILURES_SHOWN = NOTES_SHOWN = 10
 PRICED_ALIKE = "replies of stand-ins are priced as the model's; nobody charges for them"
 
 
@@ -90,7 +90,10 @@ def as_lines(outcome: Outcome, options: Options, expected: Estimate | None) -> I
         if audit is not None:
             checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
             yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
-            yield from (f"note: {text}" for text in (*audit.notes, *map(str, audit.sharings)))
+            told = [*audit.notes, *map(str, audit.sharings)]
+            yield from (f"note: {text}" for text in told[:NOTES_SHOWN])
+            if len(told) > NOTES_SHOWN:
+                yield f"... and {len(told) - NOTES_SHOWN} more notes: `merge-runner audit`"
         for trial_id, error in facts.failed[:FAILURES_SHOWN]:
             yield f"failed: {trial_id}: {error}"
         if len(facts.failed) > FAILURES_SHOWN:

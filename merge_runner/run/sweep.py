@@ -22,7 +22,7 @@ from merge_runner.errors import (
     UsageError,
 )
 from merge_runner.llm.cache import CallTotals, ResponseCache
-from merge_runner.llm.content_hashes import canonical_json, manner, spec_hash
+from merge_runner.llm.content_hashes import canonical_json, manner
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger, Spending
 from merge_runner.llm.meter import Meter
@@ -100,9 +100,10 @@ class Sweep:
         self._say = say
         recorded = partial(Spilled, options.recording) if options.recording else None
         self._cache = ResponseCache(options.cache, overlay=recorded)
-        plan = replace(plan, entries=self._named(plan.entries))
+        plan = plan.with_entries(self._named(plan.entries))
         endpoints = {name: self._endpoint(plan, name) for name in plan.entries}
         self._plan = plan = replace(plan, endpoints=endpoints)
+        self._arms = plan.by_label()
         self._store = Store(options.db)
         specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
@@ -188,12 +189,12 @@ class Sweep:
         trials = 0
         calls = dict.fromkeys(plan.entries, 0.0)
 
-        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             nonlocal trials
             if isinstance(record, TrialSuspended) or record.status != "failed":
                 return
             trials += 1
-            for side, name in plan.sides.items():
+            for side, name in self._arms[spec.arm].asked.items():
                 if name in calls:
                     answered = sum(row.side == side for row in record.decisions)
                     calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
@@ -240,7 +241,7 @@ class Sweep:
                 git_dirty=dirty,
                 versions=canonical_json(versions()),
             ),
-            {spec_hash(text): text for text in self._plan.specs().values()},
+            self._plan.specs(),
             self._stored,
         )
         return sweep_id
@@ -356,7 +357,8 @@ class Sweep:
         """Stop when trials keep failing for one model that answers no call in between."""
         if self._options.replay:
             return
-        for name in {self._plan.sides[failed.side] for failed in record.failed_calls}:
+        asked = self._arms[record.spec.arm].asked
+        for name in {asked[failed.side] for failed in record.failed_calls}:
             since = name, runner.answers(name)
             self._failures_in_a_row[since] += 1
             failed = self._failures_in_a_row[since]

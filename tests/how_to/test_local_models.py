@@ -42,7 +42,7 @@ def registry(tmp_path):
     folder.mkdir()
     (folder / "models.toml").write_text("\n".join(BLOCKS))
     (folder / "baseline.toml").write_text('conditions = ["N_0_0"]\nrepetitions = { baseline = 1 }')
-    return folder / "models.toml"
+    return folder
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,11 @@ import sys
 import pytest
 
 from analysis.commands import main
-from merge_runner.config import PROVIDERS, ModelEntry, ScenarioConfig, SweepFile
+from merge_runner.config import PROVIDERS, ModelEntry, ScenarioConfig
 from merge_runner.emulator.faults import FAULTS, FaultPlan
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.study.file import StudyFile
 
 MODEL = {
     "provider": '"local"',
@@ -132,7 +133,7 @@ def test_a_registry_that_is_wrong(program, tmp_path, content, says):
         (b"", "repetitions: Field required"),
         (
             sweep("unknown = 1"),
-            f"unknown key 'unknown'; valid: {', '.join(SweepFile.model_fields)}",
+            f"unknown key 'unknown'; valid: {', '.join(StudyFile.model_fields)}",
         ),
         (sweep("scenario = 3"), "scenario: Input should be a valid dictionary"),
         (sweep("conditions = 'N_0_0'"), "conditions: Input should be a valid tuple"),

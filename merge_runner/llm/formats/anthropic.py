@@ -19,6 +19,7 @@ from merge_runner.llm.formats.base import (
     as_text,
     joined,
     outcome_of,
+    plain,
     total,
 )
 from merge_runner.llm.formats.delays import NONE_REMAINS, until_s
@@ -35,6 +36,10 @@ LIMITS = ("requests", "tokens", "input-tokens", "output-tokens")
 class AnthropicMessages(WireFormat):
     """``POST /v1/messages`` with the API version as a header."""
 
+    parameters = {  # noqa: RUF012 # never changed
+        **plain("temperature", "top_p", "top_k", "thinking"),
+        "reasoning_effort": ("output_config", "effort"),
+    }
     members = frozenset({"content", "stop_reason"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:

@@ -77,6 +77,9 @@ class WireFormat(ABC):
     delays.py).
     """
 
+    parameters: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """Parameters that a study may vary, by common names: where each stands in an entry's own."""
+
     members: ClassVar[frozenset[str]]
     """Members of a body: an answer has at least one of them, whatever it says."""
 
@@ -109,6 +112,11 @@ class WireFormat(ABC):
     def reset_s(self, headers: Mapping[str, str], now: datetime) -> float | None:
         """The time until exhausted limits are reset, by headers with lower-case names."""
         return None
+
+
+def plain(*names: str) -> dict[str, tuple[str, ...]]:
+    """Parameters that stand at the top, under their common names."""
+    return {name: (name,) for name in names}
 
 
 def is_answer(payload: dict[str, Any], members: frozenset[str]) -> bool:

@@ -19,6 +19,7 @@ from merge_runner.llm.formats.base import (
     first_of,
     joined,
     outcome_of,
+    plain,
     total,
 )
 from merge_runner.records import Usage
@@ -45,6 +46,13 @@ class GeminiGenerateContent(WireFormat):
     The parameters are members of ``generationConfig``.
     """
 
+    parameters = {  # noqa: RUF012 # never changed
+        **plain("temperature", "seed", "responseMimeType", "responseSchema"),
+        "top_p": ("topP",),
+        "top_k": ("topK",),
+        "thinking_budget": ("thinkingConfig", "thinkingBudget"),
+        "thinking_level": ("thinkingConfig", "thinkingLevel"),
+    }
     # A STOP without content is a known intermittent fault of Gemini 2.5 Pro.
     retries_empty = True
     members = frozenset({"candidates", "promptFeedback", "usageMetadata"})

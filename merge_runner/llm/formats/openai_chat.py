@@ -14,6 +14,7 @@ from merge_runner.llm.formats.base import (
     first_of,
     joined,
     outcome_of,
+    plain,
 )
 from merge_runner.llm.formats.openai import OpenAI, usage_of
 
@@ -21,6 +22,16 @@ from merge_runner.llm.formats.openai import OpenAI, usage_of
 class OpenAIChat(OpenAI):
     """``POST /chat/completions``; the path can be overridden, as Azure's classic form needs."""
 
+    parameters = plain(
+        "temperature",
+        "top_p",
+        "seed",
+        "presence_penalty",
+        "frequency_penalty",
+        "reasoning_effort",
+        "verbosity",
+        "response_format",
+    )
     members = frozenset({"choices"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:

@@ -13,6 +13,7 @@ from merge_runner.llm.formats.base import (
     as_text,
     joined,
     outcome_of,
+    plain,
 )
 from merge_runner.llm.formats.openai import OpenAI, usage_of
 
@@ -20,6 +21,11 @@ from merge_runner.llm.formats.openai import OpenAI, usage_of
 class OpenAIResponses(OpenAI):
     """``POST /responses``, not stored at the provider."""
 
+    parameters = {  # noqa: RUF012 # never changed
+        **plain("temperature", "top_p"),
+        "reasoning_effort": ("reasoning", "effort"),
+        "verbosity": ("text", "verbosity"),
+    }
     members = frozenset({"output", "status"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:

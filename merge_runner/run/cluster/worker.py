@@ -20,6 +20,7 @@ from merge_runner.run.cluster.batch import Batch, fingerprint
 from merge_runner.run.cluster.link import Link, LinkLost, taken_apart
 from merge_runner.run.cluster.remote import RemoteBudget, RemoteCache, RemoteRateLimit
 from merge_runner.run.local_runner import LocalRunner
+from merge_runner.study.parts import adopt
 
 REPORT_EVERY_S = 0.5
 
@@ -70,6 +71,7 @@ class _Worker:
 
     async def _play(self, batch: Batch, link: Link) -> None:
         entries = batch.plan.entries
+        adopt(batch.plan.study)
         async with AsyncExitStack() as stack:
             clients = live_clients(
                 batch.plan,

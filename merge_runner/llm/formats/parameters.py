@@ -1,0 +1,51 @@
+"""The parameters of requests by common names, and which of them a model takes."""
+
+from __future__ import annotations
+
+from pydantic import JsonValue
+
+from merge_runner.config import PROVIDERS, ModelEntry
+from merge_runner.errors import UsageError
+from merge_runner.llm.formats import FORMATS
+
+CAP = "max_output_tokens"
+
+
+def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValue) -> ModelEntry:
+    """The entry ``name`` with a parameter set; raises UsageError where the model rejects it.
+
+    What is the provider's default already is not sent.
+    """
+    if parameter == CAP:
+        if type(level) is not int or level < 1:
+            raise UsageError(f"{CAP} is a whole number from 1")
+        return entry.model_copy(update={CAP: level})
+    unset = parameter not in entry.parameters
+    if unset and parameter in entry.applied_defaults and entry.applied_defaults[parameter] == level:
+        return entry
+    places = FORMATS.require(entry.format).parameters
+    takes = {*places, *PROVIDERS.require(entry.provider).parameters, *entry.parameters, CAP}
+    takes -= {*entry.rejects}
+    if parameter not in takes:
+        defaults = ", ".join(
+            f"{n} = {v}" for n, v in entry.applied_defaults.items() if n in entry.rejects
+        )
+        raise UsageError(
+            f"{name} takes no parameter {parameter}"
+            + (f" but its default ({defaults})" if parameter in entry.applied_defaults else "")
+            + f"; valid: {', '.join(sorted(takes))}"
+        )
+    return entry.model_copy(
+        update={"parameters": _set(entry.parameters, places.get(parameter, (parameter,)), level)}
+    )
+
+
+def _set(
+    values: dict[str, JsonValue], place: tuple[str, ...], level: JsonValue
+) -> dict[str, JsonValue]:
+    """The values with one set at a place, a name within a name."""
+    first, *rest = place
+    if not rest:
+        return {**values, first: level}
+    inner = values.get(first)
+    return {**values, first: _set(inner if isinstance(inner, dict) else {}, tuple(rest), level)}

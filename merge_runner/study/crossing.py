@@ -1,0 +1,206 @@
+"""What the factors of a study cross to: its arms, each with its drivers, its world, its prompt."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+from pydantic import JsonValue
+
+from merge_runner.config import ModelEntry, ScenarioConfig, both_sides, validated
+from merge_runner.drivers.pace import pace_of
+from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.errors import UsageError
+from merge_runner.llm.formats.parameters import with_parameter
+from merge_runner.records import SIDES, Side
+from merge_runner.registry import require
+from merge_runner.scenarios.registry import SCENARIOS
+from merge_runner.study.file import StudyFile
+
+MODEL, PROMPT, OPPONENT, SELF, DEFAULT = "model", "prompt", "opponent", "self", "default"
+Levels = Mapping[str, JsonValue]
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One crossing of a study's levels, which is played in all its conditions.
+
+    ``model`` is what ids of trials say, ``sides`` who drives, by their names in the registry, and
+    ``asked`` the same, but by the names in ``entries`` of language models with these parameters.
+    ``factors`` are the levels as texts; ``label`` names what sets this arm apart from the others.
+    """
+
+    model: str
+    sides: dict[Side, str]
+    asked: dict[Side, str]
+    entries: dict[str, ModelEntry]
+    scenario: ScenarioConfig
+    variant: str
+    repetitions: int
+    factors: dict[str, str] = field(default_factory=dict)
+    label: str = ""
+
+
+def cross(
+    file: StudyFile,
+    models: Sequence[str],
+    repetitions: Mapping[str, int],
+    registry: Mapping[str, ModelEntry],
+    only: Mapping[str, Sequence[str]],
+) -> list[Arm]:
+    """The arms of a study, model by model; raises UsageError for a crossing that cannot be.
+
+    ``repetitions`` are those of each prompt, ``only`` the levels, as texts, that are wanted.
+    """
+    factors = {name: levels for name, levels in file.factors.items() if name != PROMPT}
+    if PROMPT in file.factors or len(repetitions) > 1:
+        factors[PROMPT] = tuple(repetitions)
+    axes = {MODEL: tuple(models), **factors}
+    _check_axes(file, axes, only)
+    varying = [name for name, levels in axes.items() if len(levels) > 1]
+    arms = []
+    for chosen in product(*axes.values()):
+        levels = dict(zip(axes, chosen, strict=True))
+        prompt = levels.get(PROMPT, next(iter(repetitions)))
+        if _is_left_out({PROMPT: prompt, **levels}, file.skip, only):
+            continue
+        try:
+            arms.append(_arm(file, levels, str(prompt), repetitions, registry, varying))
+        except UsageError as exc:
+            if not file.factors:
+                raise
+            where = ", ".join(f"{name} = {json.dumps(levels[name])}" for name in axes)
+            raise UsageError(f"{exc}; to leave such crossings out: skip = [{{ {where} }}]") from exc
+    if not arms:
+        raise UsageError("nothing is left to play: look at skip, and at --only")
+    return arms
+
+
+def level_text(level: JsonValue) -> str:
+    """How a level is written in results: a string as it is, anything else as JSON."""
+    return level if isinstance(level, str) else json.dumps(level, separators=(",", ":"))
+
+
+def _arm(
+    file: StudyFile,
+    levels: Levels,
+    prompt: str,
+    repetitions: Mapping[str, int],
+    registry: Mapping[str, ModelEntry],
+    varying: Sequence[str],
+) -> Arm:
+    scenario = _scenario(file.scenario, levels)
+    sides = _sides(str(levels[MODEL]), str(levels.get(OPPONENT, SELF)))
+    for name in sides.values():
+        require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
+    for name in {*sides.values()} - {*registry}:
+        pace_of(scenario, PROGRAMS[name].in_spec(name))
+    parameters = {
+        name: level
+        for name, level in levels.items()
+        if name not in (MODEL, PROMPT, OPPONENT) and name not in ScenarioConfig.model_fields
+    }
+    changed = set(both_sides(str(levels[MODEL])).values())
+    entries: dict[str, ModelEntry] = {}
+    asked = {}
+    for side, name in sides.items():
+        label, entry = _entry(name, registry, parameters if name in changed else {})
+        asked[side] = label
+        if entry is not None:
+            entries[label] = entry
+    return Arm(
+        model="+".join(dict.fromkeys(sides.values())),
+        sides=sides,
+        asked=asked,
+        entries=entries,
+        scenario=scenario,
+        variant=prompt,
+        repetitions=repetitions[prompt],
+        factors={name: level_text(levels[name]) for name in levels if name in file.factors},
+        label=" ".join(
+            level_text(levels[name])
+            if name in (MODEL, PROMPT)
+            else f"{name}={level_text(levels[name])}"
+            for name in varying
+        )
+        or prompt,
+    )
+
+
+def _sides(model: str, opponent: str) -> dict[Side, str]:
+    if opponent == SELF:
+        return both_sides(model)
+    if "+" in model:
+        raise UsageError(f"{model} is a pair already, and has no other opponent than {SELF}")
+    return dict(zip(SIDES, (model, opponent), strict=True))
+
+
+def _entry(
+    name: str, registry: Mapping[str, ModelEntry], parameters: Levels
+) -> tuple[str, ModelEntry | None]:
+    """A driver with these parameters, and the name of this combination."""
+    entry = registry.get(name)
+    changed = []
+    for parameter, level in parameters.items():
+        if level == DEFAULT:
+            continue
+        if entry is None:
+            raise UsageError(f"{name} is a program and takes no {parameter}, only {DEFAULT!r}")
+        with_it = with_parameter(name, entry, parameter, level)
+        if with_it != entry:
+            changed.append(f"{parameter}={level_text(level)}")
+        entry = with_it
+    return " ".join([name, *changed]), entry
+
+
+def _scenario(scenario: ScenarioConfig, levels: Levels) -> ScenarioConfig:
+    switches = {name: levels[name] for name in levels if name in ScenarioConfig.model_fields}
+    made = scenario
+    if switches:
+        given = scenario.model_dump(exclude_unset=True)
+        made = validated(ScenarioConfig, {**given, **switches}, "factors")
+    rules = SCENARIOS.require(made.name).collision_rules
+    if made.collision_rule not in rules:
+        raise UsageError(
+            f"the scenario {made.name} has no collision_rule {made.collision_rule!r}; valid: "
+            + ", ".join(rules)
+        )
+    return made
+
+
+def _check_axes(
+    file: StudyFile, axes: Mapping[str, Sequence[JsonValue]], only: Mapping[str, Sequence[str]]
+) -> None:
+    """Raise UsageError for levels that are not there, or there twice, and for names of none."""
+    if MODEL in file.factors:
+        raise UsageError("models are no factor: write models = [...] above the factors")
+    for name, levels in axes.items():
+        texts = [level_text(level) for level in levels]
+        if not texts or len({*texts}) < len(texts):
+            raise UsageError(f"the factor {name} needs levels, each of them once")
+    named = [
+        *((name, level) for row in file.skip for name, level in _pairs(row)),
+        *((name, text) for name, texts in only.items() for text in texts),
+    ]
+    for name, level in named:
+        if name != PROMPT or name in axes:
+            levels = require(axes, "factor", name)
+            require({level_text(each): each for each in levels}, f"level of {name}", level)
+
+
+def _pairs(row: Levels) -> Iterator[tuple[str, str]]:
+    for name, wanted in row.items():
+        for level in wanted if isinstance(wanted, list) else [wanted]:
+            yield name, level_text(level)
+
+
+def _is_left_out(levels: Levels, skip: Iterable[Levels], only: Mapping[str, Sequence[str]]) -> bool:
+    texts = {name: level_text(level) for name, level in levels.items()}
+
+    def fits(row: Levels) -> bool:
+        named = list(_pairs(row))
+        return all((name, texts[name]) in named for name in row)
+
+    return any(map(fits, skip)) or any(texts[name] not in wanted for name, wanted in only.items())

@@ -1,0 +1,200 @@
+"""A study's file: who drives, what varies, in which conditions, and what it may cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from pydantic import BaseModel, BeforeValidator, Field, model_validator
+
+from merge_runner.config import (
+    MOST_REPETITIONS,
+    Count,
+    Frozen,
+    Json,
+    NotNegative,
+    Positive,
+    ScenarioConfig,
+    find_experiments,
+    read_toml,
+    validated,
+)
+from merge_runner.errors import UsageError
+from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
+
+EVERY_PROMPT = "every prompt"
+"""Stands for a single number of repetitions in ``StudyFile.repetitions``."""
+EVERY_CONDITION = "all"
+"""In the list of conditions: the scenario's own ones."""
+
+
+def _texts(value: object) -> object:
+    return {"merge": value, "straight": value} if isinstance(value, str) else value
+
+
+def _named(value: object) -> object:
+    if not isinstance(value, list):
+        return value
+    return tuple({"name": each} if isinstance(each, str) else each for each in value)
+
+
+def _for_every_prompt(value: object) -> object:
+    return {EVERY_PROMPT: value} if isinstance(value, int) else value
+
+
+class RoadTexts(Frozen):
+    """The templates of a paragraph before and after the merge point; where one is left out, none.
+
+    What they may name in braces: ``prompts.blocks.Fields``.
+    """
+
+    merge: str | None = None
+    straight: str | None = None
+
+
+class AddedText(RoadTexts):
+    """A paragraph that a prompt adds ``before`` or ``after`` a block; else it stands last.
+
+    ``text`` stands for both roads.
+    """
+
+    text: str | None = None
+    before: str | None = None
+    after: str | None = None
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> AddedText:
+        if (self.text is None) == (self.merge is None and self.straight is None):
+            raise ValueError("give it a text, or merge and straight")
+        if self.before is not None and self.after is not None:
+            raise ValueError("before or after, not both")
+        return self
+
+
+class StudyPrompt(Frozen):
+    """A prompt that a study makes from another one: ``removes`` blocks of it first, and so on.
+
+    ``order`` names blocks of the prompt in the order in which they are to stand, all of them.
+    Tables show the ``title``.
+    """
+
+    nested: ClassVar[Mapping[str, type[BaseModel]]] = {"replace": RoadTexts, "add": AddedText}
+
+    based_on: str = "baseline"
+    remove: tuple[str, ...] = ()
+    replace: dict[str, Annotated[RoadTexts, BeforeValidator(_texts)]] = Field(default_factory=dict)
+    add: tuple[AddedText, ...] = ()
+    order: tuple[str, ...] = ()
+    title: str = ""
+
+
+class StudyCondition(Frozen):
+    """A condition: by its name alone one that is known, else one of the study's own."""
+
+    name: str
+    projected_headway_m: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    relative_velocity_mps: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    mean_speed_mps: Positive = MEAN_SPEED_MPS
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the study defines it."""
+        return "projected_headway_m" in self.model_fields_set
+
+    @model_validator(mode="after")
+    def _whole(self) -> StudyCondition:
+        numbers = self.projected_headway_m, self.relative_velocity_mps
+        if self.model_fields_set != {"name"} and None in numbers:
+            raise ValueError(
+                "a condition of your own needs projected_headway_m and relative_velocity_mps"
+            )
+        return self
+
+
+class BudgetTerms(Frozen):
+    """What a study may cost, in USD over all models, runs and days; ``split`` caps models."""
+
+    total_usd: NotNegative | None = None
+    split: dict[str, NotNegative] = Field(default_factory=dict)
+
+
+class Plugins(Frozen):
+    """Python files that register drivers, prompt blocks, metrics and so on, beside the study."""
+
+    files: tuple[str, ...] = ()
+
+
+class StudyFile(Frozen):
+    """One study. ``repetitions`` are per condition, for each prompt or for all of them.
+
+    ``factors`` are crossed with each other, with the ``models`` and with the conditions; ``skip``
+    leaves crossings out: each row names levels, or lists of them.
+    """
+
+    nested: ClassVar[Mapping[str, type[BaseModel]]] = {
+        "conditions": StudyCondition,
+        "scenario": ScenarioConfig,
+        "prompts": StudyPrompt,
+        "budget": BudgetTerms,
+        "plugins": Plugins,
+    }
+
+    description: str = ""
+    models: tuple[str, ...] = ()
+    repetitions: Annotated[
+        dict[str, Annotated[Count, Field(le=MOST_REPETITIONS)]], BeforeValidator(_for_every_prompt)
+    ]
+    conditions: Annotated[tuple[StudyCondition, ...], BeforeValidator(_named)] | None = None
+    scenario: ScenarioConfig = ScenarioConfig()
+    factors: dict[str, tuple[Json, ...]] = Field(default_factory=dict)
+    skip: tuple[dict[str, Json], ...] = ()
+    prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
+    budget: BudgetTerms = BudgetTerms()
+    plugins: Plugins = Plugins()
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """A study's file as it was read, with the source of its plug-ins by file name."""
+
+    name: str
+    file: StudyFile
+    text: str
+    path: Path
+    plugins: dict[str, str]
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it holds more than names of what there is."""
+        file = self.file
+        own_conditions = any(condition.is_own for condition in file.conditions or ())
+        return bool(file.factors or file.prompts or file.plugins.files or own_conditions)
+
+
+def read_study(name: str) -> Study:
+    """The study ``experiments/NAME.toml``, or that of a path; raises UsageError."""
+    path = Path(name)
+    if path.suffix != ".toml":
+        folder = find_experiments()
+        path = folder / f"{name}.toml"
+        known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "models")
+        if name not in known:
+            raise UsageError(f"there is no sweep {name!r}; valid: {', '.join(known)}, or a path")
+    file = validated(StudyFile, read_toml(path), str(path))
+    return Study(
+        name=path.stem,
+        file=file,
+        text=path.read_text(encoding="utf-8"),
+        path=path,
+        plugins={Path(each).name: _source(path, each) for each in file.plugins.files},
+    )
+
+
+def _source(study: Path, file: str) -> str:
+    path = study.parent / file
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as exc:
+        raise UsageError(f"{study}: the plug-in {file} cannot be read: {exc}") from exc

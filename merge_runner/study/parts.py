@@ -1,0 +1,150 @@
+"""What a study adds to the registries: its plug-ins, its prompts and its conditions."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from importlib.abc import InspectLoader
+from importlib.util import module_from_spec, spec_from_loader
+from types import CodeType
+
+from merge_runner.errors import UsageError
+from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of
+from merge_runner.registry import FAULTS, load_plugins, registering
+from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.study.file import AddedText, Study, StudyCondition, StudyPrompt
+
+LAST = "the end"
+
+
+def adopt(study: Study) -> None:
+    """Register what a study adds, in place of what the study before it added.
+
+    Raises UsageError.
+    """
+    load_plugins()  # first: a study may build on what is installed
+    load_plugin_files(study.plugins)
+    with registering("study"):
+        for condition in study.file.conditions or ():
+            if condition.is_own:
+                CONDITIONS.register(condition.name, _condition(condition))
+        for name, prompt in study.file.prompts.items():
+            VARIANTS.register(name, _variant(name, prompt))
+
+
+def load_plugin_files(sources: Mapping[str, str]) -> None:
+    """Run plug-ins, given by file name and source; one that runs already as it is stays."""
+    for file, source in sources.items():
+        name = f"study_{re.sub(r'[^A-Za-z0-9_]', '_', file.removesuffix('.py'))}"
+        loaded = sys.modules.get(name)
+        if loaded is None or loaded.__loader__ != _Source(file, source):
+            with registering(name):
+                _run(name, _Source(file, source))
+
+
+@dataclass(frozen=True)
+class _Source(InspectLoader):
+    """A module whose source is given, so that its hash and its text are known everywhere."""
+
+    file: str
+    source: str
+
+    def get_source(self, fullname: str) -> str:
+        return self.source
+
+    def is_package(self, fullname: str) -> bool:
+        return False
+
+    def get_code(self, fullname: str) -> CodeType:
+        return compile(self.source, self.file, "exec", dont_inherit=True)
+
+
+def _run(name: str, loader: _Source) -> None:
+    spec = spec_from_loader(name, loader)
+    assert spec is not None
+    module = sys.modules[name] = module_from_spec(spec)
+    try:
+        loader.exec_module(module)
+    except UsageError as exc:
+        del sys.modules[name]
+        raise UsageError(f"the plug-in {loader.file} fails: {exc}") from exc
+    except FAULTS as exc:
+        del sys.modules[name]
+        raise UsageError(f"the plug-in {loader.file} fails: {type(exc).__name__}: {exc}") from exc
+
+
+def _condition(condition: StudyCondition) -> Condition:
+    assert condition.projected_headway_m is not None  # the file's validation
+    assert condition.relative_velocity_mps is not None
+    return Condition(
+        condition.projected_headway_m, condition.relative_velocity_mps, condition.mean_speed_mps
+    )
+
+
+def _variant(name: str, prompt: StudyPrompt) -> Variant:
+    """The variant that a prompt of a study is; raises UsageError."""
+    blocks = dict(blocks_of(prompt.based_on))
+    before = dict(blocks)
+    for each in (*prompt.remove, *prompt.replace):
+        _known(name, each, blocks)
+    for each in prompt.remove:
+        del blocks[each]
+    for each, texts in prompt.replace.items():
+        old = blocks[each]
+        blocks[each] = Block(old.meaning, texts.merge, texts.straight, before=old.before)
+    for number, added in enumerate(prompt.add, 1):
+        blocks = dict(_inserted(name, blocks, f"{name}.{number}", added))
+    if prompt.order:
+        blocks = _ordered(name, blocks, prompt.order)
+    changed = {each for each, block in before.items() if blocks.get(each) != block}
+    return Variant(
+        removes=frozenset(changed),
+        adds=frozenset(each for each, block in blocks.items() if before.get(each) != block),
+        title=prompt.title,
+        blocks=tuple(blocks.items()),
+    )
+
+
+def _inserted(
+    prompt: str, blocks: Mapping[str, Block], name: str, added: AddedText
+) -> Iterator[tuple[str, Block]]:
+    """The blocks with an added one in its place."""
+    anchor = added.before or added.after
+    if anchor is not None:
+        _known(prompt, anchor, blocks)
+    names = list(blocks)
+    place = len(names) if anchor is None else names.index(anchor) + (added.after is not None)
+    follower = names[place] if place < len(names) else LAST
+    merge = added.merge if added.text is None else added.text
+    straight = added.straight if added.text is None else added.text
+    block = Block(f"added by {prompt}", merge, straight, before=follower)
+    yield from list(blocks.items())[:place]
+    yield name, block
+    yield from list(blocks.items())[place:]
+
+
+def _ordered(prompt: str, blocks: Mapping[str, Block], order: Iterable[str]) -> dict[str, Block]:
+    """The blocks in another order, of which each says what it stands before."""
+    names = list(order)
+    for name in names:
+        _known(prompt, name, blocks)
+    if sorted(names) != sorted(blocks):
+        raise UsageError(
+            f"the order of the prompt {prompt} names each of its blocks once: {', '.join(blocks)}"
+        )
+    followers = [*names[1:], LAST]
+    return {
+        name: replace(blocks[name], before=follower)
+        for name, follower in zip(names, followers, strict=True)
+    }
+
+
+def _known(prompt: str, block: str, blocks: Mapping[str, Block]) -> None:
+    if block not in blocks:
+        known = ", ".join(blocks)
+        elsewhere = " (which another prompt has)" if block in BLOCKS else ""
+        raise UsageError(
+            f"the prompt {prompt} names the block {block!r}{elsewhere}; those that it has: {known}"
+        )
