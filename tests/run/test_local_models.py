@@ -9,6 +9,8 @@ import duckdb
 import pytest
 from aiohttp import web
 
+from merge_runner.errors import UsageError
+from merge_runner.llm.models import load_models
 from tests.harness import watched
 
 ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0", "--json")
@@ -167,3 +169,12 @@ async def test_the_emulator_lists_its_model_as_real_servers_do(merge_runner, emu
     run = await merge_runner(*LOCAL, LOCAL_BASE_URL=emulator_url)
     assert run.code == 0, run.err
     assert "serves scripted-driver, which is asked" in run.err
+
+
+def test_only_a_server_of_ones_own_can_be_asked_for_a_name(tmp_path):
+    text = REGISTRY.replace('id = "qwen3"\n', "")
+    (tmp_path / "models.toml").write_text(text)
+    assert load_models(tmp_path)["named"].id == "default"
+    (tmp_path / "models.toml").write_text(text.replace('"local"', '"openai"'))
+    with pytest.raises(UsageError, match="`id` is missing"):
+        load_models(tmp_path)
