@@ -545,7 +545,7 @@ def _dry_run(plan: Plan, options: Options) -> Estimate:
         db = readable(options.db) if options.db.is_file() else Path(folder) / "none.duckdb"
         recorded = (options.cache / "cache.db").is_file()
         cache = options.cache if recorded else Path(folder) / "responses"
-        prepared = Sweep(plan, replace(options, db=db, cache=cache), say=say)
+        prepared = Sweep(plan, replace(options, db=db, cache=cache, dry_run=True), say=say)
         expected = asyncio.run(prepared.estimate())
         prepared.close()
     return expected

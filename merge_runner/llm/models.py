@@ -8,6 +8,7 @@ from merge_runner.config import (
     ModelEntry,
     endpoint_identity,
     find_experiments,
+    model_id,
     read_toml,
     validated,
 )
@@ -42,6 +43,8 @@ def _entries(path: Path) -> dict[str, ModelEntry]:
         try:
             FORMATS.require(entry.format)
             endpoint_identity(entry, {})
+            if "id" not in entry.model_fields_set and model_id(entry, {}) is not None:
+                raise UsageError("`id` is missing: the model's name at the provider")
         except UsageError as exc:
             raise UsageError(one_line(f"{where}: {exc}")) from exc
     return entries
