@@ -31,11 +31,12 @@ def load_models(beside: Path | None = None) -> dict[str, ModelEntry]:
     added = dict.fromkeys((folder or Path()) / REGISTRY for folder in (None, beside))
     entries: dict[str, ModelEntry] = {}
     for path in (own, *(each for each in added if each.is_file() and each != own)):
-        entries |= _entries(path)
+        entries |= read_models(path)
     return entries
 
 
-def _entries(path: Path) -> dict[str, ModelEntry]:
+def read_models(path: Path) -> dict[str, ModelEntry]:
+    """The entries of one file; raises UsageError."""
     entries = {}
     for name, table in read_toml(path).items():
         where = f"{path}: [{name}]"

@@ -9,7 +9,7 @@ import tomllib
 import pytest
 
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.models import load_models
+from merge_runner.llm.models import read_models
 from merge_runner.prompts.parse import parse_reply
 from tests.harness import PROJECT, watched
 
@@ -64,7 +64,7 @@ def registry(tmp_path):
     ],
 )
 async def test_an_entry_of_the_page_sends_what_the_page_says(merge_runner, registry, name, sent):
-    entry = load_models(registry)[name]
+    entry = read_models(registry)[name]
     body = FORMATS[entry.format].request(entry, "prompt").body
     assert sent.items() <= body.items()
     if entry.base_url is not None:
