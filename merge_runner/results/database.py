@@ -23,7 +23,7 @@ from merge_runner.records import SCRIPTED_FIELD
 from merge_runner.scenarios.merge.measures import measures_sql, measures_version
 from merge_runner.text_safety import first_line, quoted
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 SCHEMA = Path(__file__).with_name("schema.sql")
 """The tables; see ``schema_sql`` for all that a database has."""
 LOCK_RETRY_S = 0.05
@@ -40,6 +40,8 @@ Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
     "memory_limit": "200MB",  # the default is a share of the machine's; most of it caches the file
     "max_vacuum_tasks": 0,  # see merge_small_groups
+    # Of new files: the oldest DuckDB that can open them. Version 5 of the schema began with it.
+    "storage_compatibility_version": "v1.2.0",
     "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
 }
 TEXTS: Settings = {**SETTINGS, "memory_limit": "1GB"}
@@ -445,7 +447,7 @@ def _free_name(path: Path, version: int) -> Path:
 
 def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
     """Make a new file with all rows of the open one."""
-    with duckdb.connect(str(copy)) as made:
+    with duckdb.connect(str(copy), config=SETTINGS) as made:
         made.execute(schema_sql())
     connection.execute(f"ATTACH {quoted(copy)} AS copied")
     try:

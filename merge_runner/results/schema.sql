@@ -110,8 +110,9 @@ CREATE MACRO IF NOT EXISTS driver_name(model, endpoint) AS
 -- Who drove: two different drivers are joined by a plus, another sample set has its number.
 CREATE VIEW IF NOT EXISTS trial_drivers AS
 SELECT trial_id, spec_hash,
-    if(left_driver = right_driver, left_driver, left_driver || '+' || right_driver)
-        || if(sample_set > 0, '/set' || sample_set, '') AS driver
+    left_driver
+        || CASE WHEN left_driver <> right_driver THEN '+' || right_driver ELSE '' END
+        || CASE WHEN sample_set > 0 THEN '/set' || sample_set ELSE '' END AS driver
 FROM (
     SELECT trial_id, spec_hash, sample_set,
         driver_name(model_left, spec->>'$.left.endpoint') AS left_driver,
@@ -124,7 +125,7 @@ FROM (
 -- call ended without an answer, and with it the trial.
 CREATE VIEW IF NOT EXISTS attempts AS
 SELECT calls.*, source, variant, condition, sample_set,
-    if(side = 'left', model_left, model_right) AS model,
+    CASE side WHEN 'left' THEN model_left ELSE model_right END AS model,
     failure,
     CASE WHEN attempt < max(attempt) OVER call THEN 'retried'
         WHEN valid IS NULL THEN 'lost'

@@ -13,11 +13,11 @@
 CREATE OR REPLACE VIEW geometry AS
 WITH sizes AS (
     SELECT spec_hash,
-        coalesce((spec -> 'scenario' ->> 'vehicle_length_m')::DOUBLE, usual_length_m()) AS length_m,
-        coalesce((spec -> 'scenario' ->> 'vehicle_width_m')::DOUBLE, usual_width_m()) AS width_m,
-        coalesce((spec -> 'track' ->> 'merge_point_m')::DOUBLE, merge_point_m()) AS merge_point_m,
-        coalesce((spec -> 'track' ->> 'end_m')::DOUBLE, track_end_m()) AS end_m,
-        coalesce((spec -> 'track' ->> 'start_distance_m')::DOUBLE / 2 / merge_point_m,
+        coalesce((spec->>'$.scenario.vehicle_length_m')::DOUBLE, usual_length_m()) AS length_m,
+        coalesce((spec->>'$.scenario.vehicle_width_m')::DOUBLE, usual_width_m()) AS width_m,
+        coalesce((spec->>'$.track.merge_point_m')::DOUBLE, merge_point_m()) AS merge_point_m,
+        coalesce((spec->>'$.track.end_m')::DOUBLE, track_end_m()) AS end_m,
+        coalesce((spec->>'$.track.start_distance_m')::DOUBLE / 2 / merge_point_m,
             branch_sine()) AS sin1
     FROM specs
 ), angles AS (
@@ -39,8 +39,8 @@ SELECT spec_hash, length_m, width_m, merge_point_m, end_m,
     -- A vehicle at contact_m overlaps the other from there to contact_high_m, one at the merge point
     -- from merge_low_m to merge_high_m.
     merge_point_m - contact AS contact_m,
-    if(contact < along, merge_point_m + (along - contact) / cos1, contact_m + length_m)
-        AS contact_high_m,
+    CASE WHEN contact < along THEN merge_point_m + (along - contact) / cos1
+        ELSE contact_m + length_m END AS contact_high_m,
     merge_point_m - least(along2, contact) AS merge_low_m,
     merge_point_m + least(along, across / sin1) AS merge_high_m
 FROM reaches;
@@ -80,7 +80,8 @@ FROM pairs WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step);
 CREATE OR REPLACE VIEW merge_times AS
 SELECT *,
     least(left_s, right_s) AS first_s,
-    if(left_s IS NULL OR right_s IS NULL, NULL, greatest(left_s, right_s)) AS both_s
+    CASE WHEN left_s IS NOT NULL AND right_s IS NOT NULL THEN greatest(left_s, right_s) END
+        AS both_s
 FROM (SELECT trial_id, spec_hash,
     min(passing_s(point_m, left_before_m, left_m, time_before_s, time_s)) AS left_s,
     min(passing_s(point_m, right_before_m, right_m, time_before_s, time_s)) AS right_s,
@@ -101,10 +102,10 @@ SELECT *,
     (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
     least(rmse_left_mps, rmse_right_mps) >= 0.5 AS joint
 FROM (SELECT trial_id, spec_hash, time_window,
-    sqrt(avg((left_mps - if(source = 'human', mean_speed_mps() + relative_velocity_mps / 2,
-        left_first_mps)) ** 2)) AS rmse_left_mps,
-    sqrt(avg((right_mps - if(source = 'human', mean_speed_mps() - relative_velocity_mps / 2,
-        right_first_mps)) ** 2)) AS rmse_right_mps
+    sqrt(avg((left_mps - CASE source WHEN 'human'
+        THEN mean_speed_mps() + relative_velocity_mps / 2 ELSE left_first_mps END) ** 2)) AS rmse_left_mps,
+    sqrt(avg((right_mps - CASE source WHEN 'human'
+        THEN mean_speed_mps() - relative_velocity_mps / 2 ELSE right_first_mps END) ** 2)) AS rmse_right_mps
 FROM vehicle_pairs
 JOIN trials USING (trial_id, spec_hash)
 JOIN merge_times USING (trial_id, spec_hash)
@@ -139,7 +140,8 @@ WITH distances AS (
 ), collision_times AS (
     SELECT trial_id, spec_hash, min((abs(left_m - right_m) - length_m) / closing_mps) AS min_ttc_s
     FROM (
-        SELECT *, if(left_m > right_m, right_mps - left_mps, left_mps - right_mps) AS closing_mps
+        SELECT *, CASE WHEN left_m > right_m THEN right_mps - left_mps
+            ELSE left_mps - right_mps END AS closing_mps
         FROM vehicle_pairs JOIN geometry USING (spec_hash)
         WHERE greatest(left_m, right_m) >= merge_point_m
     )
@@ -164,21 +166,21 @@ WITH distances AS (
 SELECT
     trials.trial_id,
     trials.spec_hash,
-    if(finished, merge_m - length_m, NULL) AS gap_m,
-    if(finished, first_sample_m - length_m, NULL) AS gap_first_sample_m,
-    if(finished, mean_at_merge_m - length_m, NULL) AS gap_mean100_m,
+    CASE WHEN finished THEN merge_m - length_m END AS gap_m,
+    CASE WHEN finished THEN first_sample_m - length_m END AS gap_first_sample_m,
+    CASE WHEN finished THEN mean_at_merge_m - length_m END AS gap_mean100_m,
     rmse_left_mps,
     rmse_right_mps,
     rmse_mps,
     joint,
     first_s AS time_to_merge_s,
-    if(finished, abs(left_s - right_s), NULL) AS merge_interval_s,
+    CASE WHEN finished THEN abs(left_s - right_s) END AS merge_interval_s,
     -- from when the first vehicle's rear has left the merge point to when the second's front is there
-    if(finished, if(left_s < right_s, right_front_s - left_rear_s, left_front_s - right_rear_s), NULL)
-        AS post_encroachment_s,
+    CASE WHEN finished AND left_s < right_s THEN right_front_s - left_rear_s
+        WHEN finished THEN left_front_s - right_rear_s END AS post_encroachment_s,
     min_ttc_s,
     max_acceleration_mps2,
-    if(status = 'collided', NULL, conflict_resolution_s) AS conflict_resolution_s
+    CASE WHEN status <> 'collided' THEN conflict_resolution_s END AS conflict_resolution_s
 FROM (SELECT *, status = 'finished' AS finished FROM trials) AS trials
 LEFT JOIN merge_times USING (trial_id, spec_hash)
 LEFT JOIN geometry USING (spec_hash)
