@@ -326,6 +326,8 @@ def ledger(
         _agree(
             f"{aside.reserved_usd:.4f} USD are set aside for {aside.open_attempts} attempts at "
             f"{release}. If the provider did charge for them, --max-cost may be passed by as much",
+            "Release it?",
+            otherwise="nothing was released",
             yes=yes,
         )
         found = [spending.release(cache, release)]
@@ -338,15 +340,52 @@ def ledger(
         print_out("No sweep has spent anything.")
 
 
-def _agree(what: str, *, yes: bool) -> None:
-    """Say what a release means, and ask once."""
+@app.command()
+def forget(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME ...]", help="Sweeps or trials; * stands for anything."),
+    ] = None,
+    sweeps: Annotated[
+        list[str] | None, typer.Option("--sweep", metavar="ID", help="A sweep_id.")
+    ] = None,
+    trials: Annotated[
+        list[str] | None, typer.Option("--trial", metavar="ID", help="A trial_id.")
+    ] = None,
+    db: DbOption = DEFAULT_DB,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before removing.")] = False,
+) -> None:
+    """Remove sweeps and trials from the database; their replies stay in the cache."""
+    from merge_runner.results import forgetting
+
+    # A trial's id has a slash, a sweep's has none.
+    of_trials = [*(trials or ()), *(name for name in names or () if "/" in name)]
+    of_sweeps = [*(sweeps or ()), *(name for name in names or () if "/" not in name)]
+    if not of_trials and not of_sweeps:
+        raise UsageError("name a sweep or a trial; `merge-runner sql 'from sweeps'` lists sweeps")
+    going = forgetting.to_forget(db, of_sweeps, of_trials)
+    _agree(
+        f"these go from {db}: {going}",
+        "Remove them?",
+        otherwise="nothing was removed",
+        yes=yes,
+    )
+    gone = forgetting.forget(db, of_sweeps, of_trials)
+    say(
+        f"removed: {gone}. Their replies stay in the cache: the same `merge-runner sweep` plays "
+        "the trials again without a call"
+    )
+
+
+def _agree(what: str, question: str, *, otherwise: str, yes: bool) -> None:
+    """Say what is about to be done, and ask once; ``otherwise`` says that it was not done."""
     say(what)
     if yes:
         return
     if not sys.stdin.isatty():
-        raise UsageError("there is no terminal to ask at: add --yes to release it")
-    if not typer.confirm("Release it?", err=True):
-        raise UsageError("nothing was released")
+        raise UsageError(f"there is no terminal to ask at, so {otherwise}: add --yes")
+    if not typer.confirm(question, err=True):
+        raise UsageError(otherwise)
 
 
 @app.command()
