@@ -78,8 +78,10 @@ ImportedFile = Annotated[
     Path, typer.Argument(metavar="FILE", help="A recording (.parquet), or a cache folder.")
 ]
 RecordingOption = Annotated[
-    Path | None,
-    typer.Option("--recording", help="Also replay from this file, without importing it."),
+    list[Path] | None,
+    typer.Option(
+        "--recording", help="Also replay from this file, without importing it; may be repeated."
+    ),
 ]
 
 # A full disk, a limit of file sizes, and a device that fails.
@@ -167,7 +169,7 @@ def sweep(
 
     if max_cost is not None and not math.isfinite(max_cost):
         raise UsageError("--max-cost is a number of USD")
-    if recording is not None and not replay:
+    if recording and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
     if dask is not None and replay:
         raise UsageError("a replay needs no cluster: leave --dask out")
@@ -179,7 +181,7 @@ def sweep(
         tpm=tpm,
         max_cost_usd=max_cost,
         replay=replay,
-        recording=recording,
+        recordings=recording or (),
         emulator_options=_emulator_options(fault_rate, faults, seed),
         faults_identity=_faults(fault_rate, faults, seed).identity,
         strict_model=strict_model,
@@ -194,6 +196,12 @@ def sweep(
         sample_set=sample_set,
         order_seed=order_seed,
     )
+    if recording and reps is None and conditions is None and variants is None:
+        from merge_runner.run.recorded_plan import as_recorded
+
+        plan, note = as_recorded(plan, recording)
+        if note:
+            say(note)
     if dry_run:
         _print_estimate(_dry_run(plan, options), as_json=as_json)
     else:
@@ -454,28 +462,30 @@ def recording_export(
     file: RecordingFile,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
-    sweep_id: Annotated[
-        str | None, typer.Option("--sweep", help="A sweep_id; the newest sweep if not given.")
+    sweeps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sweep", help="A sweep_id, which may be repeated; the newest sweep if none is given."
+        ),
     ] = None,
     sign: Annotated[
         Path | None,
         typer.Option("--sign", metavar="KEY", help="Sign it with ssh-keygen or minisign."),
     ] = None,
 ) -> None:
-    """Write what a sweep asked and was answered into one file."""
+    """Write what sweeps asked and were answered into one file."""
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.results import signing
-    from merge_runner.results.recording import export_recording
-    from merge_runner.results.store import recorded_sweep
+    from merge_runner.results.recording import export_recording, provenance_of
+    from merge_runner.results.store import recorded_sweeps
 
     if sign is not None:
         signing.tool_for(sign)
-    row, keys = recorded_sweep(db, sweep_id)
-    found = row["sweep_id"]
+    rows, keys = recorded_sweeps(db, sweeps or ())
+    found = " and ".join(row["sweep_id"] for row in rows)
     if not keys:
         raise UsageError(f"the sweep {found} made no call: there is nothing to record")
-    provenance = {name: str(value) for name, value in row.items() if value is not None}
-    calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance)
+    calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance_of(rows))
     say(f"{calls} calls of {found} are in {file}")
     if sign is not None:
         say(f"signed: {signing.sign(file, sign)}")

@@ -203,15 +203,21 @@ def _attached(
                 ) from exc
             waited_s = time.monotonic() - began
             if waited_s >= patience_s:
-                raise StoreLocked(f"{path} is locked by another program") from exc
+                raise StoreLocked(f"{path} is held by {_holder(exc)}: close it there") from exc
             if waited_s > 1 and not told:
                 told = True
                 LOG.warning(
-                    "waiting up to %.0f s for another program to close %s", patience_s, path
+                    "waiting up to %.0f s for %s to close %s", patience_s, _holder(exc), path
                 )
             time.sleep(LOCK_RETRY_S)
         else:
             return connection, name
+
+
+def _holder(exc: duckdb.Error) -> str:
+    """Who holds the file, as DuckDB says it: the program and its process."""
+    found = re.search(r"lock is held in (.+) \(PID (\d+)\)", str(exc))
+    return f"{Path(found[1]).name} (PID {found[2]})" if found else "another program"
 
 
 def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:

@@ -1,4 +1,4 @@
-"""Removes named sweeps and trials from the database; the replies they stand on stay in the cache."""
+"""Removes named sweeps and trials from the database; their replies stay in the cache."""
 
 from __future__ import annotations
 
