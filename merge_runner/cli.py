@@ -259,6 +259,20 @@ def sql(
 
 
 @app.command()
+def export(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A new folder, or that of an earlier export.")
+    ],
+    db: DbOption = DEFAULT_DB,
+) -> None:
+    """Write every table and view as Parquet and CSV, with a dictionary of all columns."""
+    from merge_runner.results.export import export_tables
+
+    for path in export_tables(db, folder):
+        say(f"wrote {path}")
+
+
+@app.command()
 def digest(db: DbOption = DEFAULT_DB) -> None:
     """Print one line: a hash of all results, equal for equal results."""
     from merge_runner.results.store import results_digest

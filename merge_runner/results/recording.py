@@ -59,6 +59,22 @@ COLUMNS = {
     "body": "VARCHAR",
     "attempts": "VARCHAR",
 }
+MEANINGS = {
+    "call_key": "SHA-256 of the parts of the call's key: endpoint, path, headers, body and slot",
+    "provider": "whose format was spoken",
+    "endpoint": "where the call went, without a key; a name for a provider's own",
+    "model": "the id that was asked for",
+    "path": "of the request, below the base URL",
+    "headers": "JSON object: those that change an answer; never a key",
+    "condition": "slot: of the experiment",
+    "repetition": "slot: from 1",
+    "side": "slot: left or right",
+    "decision": "slot: counts those of this driver from 0",
+    "sample_set": "slot: another number is a fresh set of samples",
+    "body": "the exact JSON that was sent",
+    "attempts": "JSON array: number, outcome, status, reply, tokens, cost and time of each attempt",
+}
+"""What the columns mean, for docs/reference/recordings.md."""
 TEXTS = [name for name, kind in COLUMNS.items() if kind == "VARCHAR"]
 BATCH = 1_000
 HEADERS = TypeAdapter(dict[str, str])

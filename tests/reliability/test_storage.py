@@ -127,8 +127,9 @@ async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_
     async with watched(faults=FaultPlan(latency_s=0.2)) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         assert (await merge_runner(*part, "--reps", 1, **env)).code == 0
-        sweep = await merge_runner.fork(*part, "--reps", 3, **env)
-        await asyncio.sleep(1.5)  # it has begun, and its trials take longer
+        sweep = await merge_runner.start(*part, "--reps", 3, **env)
+        while server.requests <= 22:  # of the trial before
+            await asyncio.sleep(0.1)
         notebook = await asyncio.create_subprocess_exec(
             sys.executable, "-c", NOTEBOOK, tmp_path / "results/merge.duckdb", mode,
             stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
@@ -139,7 +140,7 @@ async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_
             said += await asyncio.wait_for(sweep.stderr.readline(), 60)
         os.kill(sweep.pid, signal.SIGINT)
         _, err = await sweep.communicate()
-        err = said.decode() + err
+        err = (said + err).decode()
         assert sweep.returncode == 130, err
         assert f"(PID {notebook.pid}): close it there" in err
         assert "run the same command again" in err

@@ -33,8 +33,19 @@ WITH sizes AS (
         (width_m * (1 + cos2) + length_m * sin2) / 2 / sin2 AS contact
     FROM angles
 )
-SELECT spec_hash, length_m, width_m, merge_point_m, end_m,
+SELECT
+    spec_hash,
+    -- of both vehicles
+    length_m,
+    -- of both vehicles
+    width_m,
+    -- where the branches meet, along either
+    merge_point_m,
+    -- where the track ends
+    end_m,
+    -- where a vehicle's centre is when its front reaches the merge point
     merge_point_m - length_m / 2 AS front_m,
+    -- where a vehicle's centre is when its rear has left the merge point
     merge_point_m + length_m / 2 AS rear_m,
     -- A vehicle at contact_m overlaps the other from there to contact_high_m, one at the merge point
     -- from merge_low_m to merge_high_m.
@@ -99,7 +110,9 @@ FROM (SELECT *, coalesce(merge_point_m, merge_point_m()) AS point_m
 -- simulator gave the vehicle; a recording begins up to a step later.
 CREATE OR REPLACE VIEW speed_deviations AS
 SELECT *,
+    -- the mean of both
     (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
+    -- whether both are at least 0.5 m/s
     least(rmse_left_mps, rmse_right_mps) >= 0.5 AS joint
 FROM (SELECT trial_id, spec_hash, time_window,
     sqrt(avg((left_mps - CASE source WHEN 'human'
@@ -166,20 +179,35 @@ WITH distances AS (
 SELECT
     trials.trial_id,
     trials.spec_hash,
+    -- net gap, |s_left - s_right| less the vehicle length of the trial's spec, when the first vehicle
+    -- reaches the merge point, interpolated linearly within the step; finished trials
     CASE WHEN finished THEN merge_m - length_m END AS gap_m,
+    -- the same at the first sample at or after that instant
     CASE WHEN finished THEN first_sample_m - length_m END AS gap_first_sample_m,
+    -- the same at the first sample at which the mean position has reached the merge point (Siebinga et
+    -- al.; 100 m in the human experiment)
     CASE WHEN finished THEN mean_at_merge_m - length_m END AS gap_mean100_m,
+    -- RMSE of the left vehicle's speed from its initial speed, from the start of control to the first
+    -- sample after the first merge
     rmse_left_mps,
+    -- the same of the right vehicle
     rmse_right_mps,
+    -- the mean of both
     rmse_mps,
+    -- whether both are at least 0.5 m/s
     joint,
+    -- when the first vehicle reaches the merge point
     first_s AS time_to_merge_s,
+    -- between the two vehicles' arrivals there
     CASE WHEN finished THEN abs(left_s - right_s) END AS merge_interval_s,
     -- from when the first vehicle's rear has left the merge point to when the second's front is there
     CASE WHEN finished AND left_s < right_s THEN right_front_s - left_rear_s
         WHEN finished THEN left_front_s - right_rear_s END AS post_encroachment_s,
+    -- smallest time to collision once a vehicle is past the merge point; NULL if they never close in
     min_ttc_s,
+    -- largest absolute acceleration of either vehicle under the drivers' control
     max_acceleration_mps2,
+    -- when the vehicles are first off a collision course; NULL after a collision
     CASE WHEN status <> 'collided' THEN conflict_resolution_s END AS conflict_resolution_s
 FROM (SELECT *, status = 'finished' AS finished FROM trials) AS trials
 LEFT JOIN merge_times USING (trial_id, spec_hash)
