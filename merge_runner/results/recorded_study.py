@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from merge_runner.llm.cache import CachedCall
-from merge_runner.results.recording import opened, read_provenance, sweeps_of
+from merge_runner.results.recording import opened, read_provenance, readable, sweeps_of
 from merge_runner.text_safety import one_line
 
 
@@ -125,7 +125,7 @@ def _counted(model: str, calls: Sequence[CachedCall]) -> str:
 
 def _conditions_and_repetitions(file: Path) -> dict[str, int]:
     """Each condition of which a call is recorded, and its highest repetition."""
-    with opened(file) as connection:
+    with opened(file) as connection, readable(file):
         return dict(
             connection.execute(
                 "SELECT condition, max(repetition) FROM recording GROUP BY ALL"

@@ -226,7 +226,7 @@ def _size(row: tuple[Any, ...]) -> int:
 def read_recording(file: Path) -> Iterator[CachedCall]:
     """All entries of a recording, each verified against its key; raises RecordingError."""
     with opened(file) as connection:
-        with _readable(file):
+        with readable(file):
             rows = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM recording")  # noqa: S608 # constants
         seen: set[str] = set()
         content = hashlib.sha256()
@@ -463,7 +463,7 @@ def opened(file: Path) -> duckdb.DuckDBPyConnection:
 def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
     """Raise RecordingError for more rows or longer texts than recordings have."""
     bytes_of_row = " + ".join(f"coalesce(strlen({name}), 0)" for name in TEXTS)
-    with _readable(file):
+    with readable(file):
         calls = _number(connection, "SELECT count(*) FROM recording")
         longest = 0
         if calls <= MOST_CALLS:
@@ -509,7 +509,7 @@ def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def _metadata(file: Path, connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
-    with _readable(file):
+    with readable(file):
         rows = connection.execute(
             f"SELECT key, value FROM parquet_kv_metadata({_pattern(file)})"  # noqa: S608 # quoted
         ).fetchall()
@@ -517,12 +517,13 @@ def _metadata(file: Path, connection: duckdb.DuckDBPyConnection) -> dict[str, st
 
 
 def _fetch(rows: duckdb.DuckDBPyConnection, file: Path) -> list[tuple[Any, ...]]:
-    with _readable(file):
+    with readable(file):
         return rows.fetchmany(BATCH)
 
 
 @contextmanager
-def _readable(file: Path) -> Iterator[None]:
+def readable(file: Path) -> Iterator[None]:
+    """What cannot be read of a recording is a RecordingError."""
     try:
         yield
     except (duckdb.Error, UnicodeDecodeError) as exc:

@@ -11,7 +11,7 @@ CREATE TABLE IF NOT EXISTS sweeps (
     name VARCHAR NOT NULL,            -- of its file, as in experiments/NAME.toml
     started_at TIMESTAMP NOT NULL,    -- when the run began
     ended_at TIMESTAMP,               -- NULL: running, or ended without a word
-    exit_code INTEGER,                -- 0 where all trials ended
+    exit_code INTEGER,                -- 0: all trials ended, and none was removed since
     config JSON NOT NULL,             -- what was to be played, by whom, with which parameters
     git_commit VARCHAR,               -- of the program, or its installed version
     git_dirty BOOLEAN,                -- whether the program had uncommitted changes

@@ -89,7 +89,10 @@ class Flusher:
     @property
     def problem(self) -> str:
         """Why trials are not stored, as a line of text; empty where nothing is wrong."""
-        return f"{self.left} trials wait to be stored: {self._problem}" if self._problem else ""
+        if self._problem is None:
+            return ""
+        what = f"{self.left} trials wait" if self.left else "how the sweep ended waits"
+        return f"{what} to be stored: {self._problem}"
 
     async def close(self) -> None:
         """Store what is left, and leave the database reachable.
@@ -106,10 +109,12 @@ class Flusher:
             if isinstance(self._problem, StoreLocked):
                 if not waiting:
                     self._say(
-                        f"everything is played; {self.problem}. Ctrl-C ends the waiting: their "
+                        f"the playing has ended; {self.problem}. Ctrl-C ends the waiting: all "
                         "replies are in the cache"
                     )
                 waiting = True
+            elif not self.left:
+                return  # whoever opens the database next will say what is wrong with it
             elif self._problem and loop.time() - began >= LAST_PATIENCE_S:
                 raise StoreError(f"{self.left} trials are not stored: {self._problem}. {AGAIN}")
             if self._problem:
@@ -150,7 +155,7 @@ class Flusher:
                 self._said = str(exc)
                 self._say(f"the sweep goes on; {self.problem}")
             if self._bytes > SPILLED_BYTES:
-                await asyncio.to_thread(self._spill_pending)
+                await self._spill_pending()
             return False
         else:
             self._problem = None
@@ -159,15 +164,15 @@ class Flusher:
         finally:
             self._tried.set()
 
-    def _spill_pending(self) -> None:
+    async def _spill_pending(self) -> None:
         """Move the trials in memory to the file, unless that cannot be written either."""
         for _ in range(0, len(self._pending), BATCH):
             batch = self._pending[:BATCH]
             try:
-                self._spill.put(batch, self._store.path.parent)
+                await asyncio.to_thread(self._spill.put, batch, self._store.path.parent)
             except OSError as exc:
-                LOG.warning("trials that wait to be stored stay in memory: %s", exc)
+                LOG.debug("trials that wait to be stored stay in memory: %s", exc)
                 return
-            # Others are added meanwhile, behind these.
+            # Others were added meanwhile, behind these.
             del self._pending[: len(batch)]
             self._bytes -= sum(map(size_of, batch))

@@ -136,7 +136,7 @@ async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_
         )  # fmt: skip
         await notebook.stdout.readline()
         said = b""
-        while b"everything is played" not in said:
+        while b"the playing has ended" not in said:
             said += await asyncio.wait_for(sweep.stderr.readline(), 60)
         os.kill(sweep.pid, signal.SIGINT)
         _, err = await sweep.communicate()
