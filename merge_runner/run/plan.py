@@ -50,7 +50,7 @@ class Options:
     tpm: int | None = None
     max_cost_usd: float | None = None
     replay: bool = False
-    recording: Path | None = None
+    recordings: Sequence[Path] = ()
     emulator_options: Sequence[str] = ()
     faults_identity: str = ""
     strict_model: bool = False

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -61,6 +61,7 @@ class Progress:
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
+    unstored: Callable[[], str] = str  # says why trials are not stored; empty: nothing is wrong
 
     @property
     def title(self) -> str:
@@ -179,6 +180,7 @@ class Progress:
         others = sum((meter.mismatches for meter in self.meters), Counter[str]())
         meters = self.runner.meters.items()
         return [
+            *(text for text in [self.unstored()] if text),
             *(f"another model answers: {pair}" for pair in sorted(others)),
             *(f"a scripted stand-in answers, not {name}" for name, m in meters if m.stand_ins),
         ]

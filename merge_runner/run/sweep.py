@@ -9,7 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import partial
+from functools import cached_property, partial
+from itertools import takewhile
 
 from merge_runner.audit import Audit, audit_sweep
 from merge_runner.config import ModelEntry
@@ -30,6 +31,7 @@ from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.progress_file import ProgressFile
 from merge_runner.results.provenance import git_state, versions
+from merge_runner.results.recorded_study import described
 from merge_runner.results.recording import Spilled
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
@@ -40,7 +42,7 @@ from merge_runner.run.clients import (
     start_endpoints,
 )
 from merge_runner.run.estimate import Estimate, estimate
-from merge_runner.run.flusher import Flusher
+from merge_runner.run.flusher import AGAIN, Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
 from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
@@ -63,7 +65,8 @@ class Outcome:
     wait for money, and their replies are in the cache. ``meter`` counts the calls of this run,
     ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` what all replies in
     the cache cost when they were made. ``facts`` summarises what the database holds of the sweep,
-    and ``audit`` the checks made there; both are None where nothing is stored. ``playing_s`` is how
+    and ``audit`` the checks made there; both are None where nothing is stored, or its user
+    ``gave_up`` waiting for the database. ``playing_s`` is how
     long the trials took, ``worst_stall_s`` the longest delay of the event loop.
     """
 
@@ -78,6 +81,7 @@ class Outcome:
     cache_cost_usd: float = 0.0
     facts: SweepFacts | None = None
     audit: Audit | None = None
+    gave_up: bool = False
     playing_s: float = 0.0
     worst_stall_s: float = 0.0
 
@@ -90,21 +94,20 @@ class Outcome:
 class Sweep:
     """One run of a plan.
 
-    Making it opens the cache and the database, asks a server of one's own what its model is
-    called, and does nothing else.
+    Making it opens the cache, and the database unless it is a replay; it asks a server of one's
+    own what its model is called, and does nothing else.
     """
 
     def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
         """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
         self._options = options
         self._say = say
-        recorded = partial(Spilled, options.recording) if options.recording else None
+        recorded = partial(Spilled, options.recordings) if options.recordings else None
         self._cache = ResponseCache(options.cache, overlay=recorded)
         plan = plan.with_entries(self._named(plan.entries))
         endpoints = {name: self._endpoint(plan, name) for name in plan.entries}
         self._plan = plan = replace(plan, endpoints=endpoints)
         self._arms = plan.by_label()
-        self._store = Store(options.db)
         specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
         with unreadable_is_usage():
@@ -134,6 +137,8 @@ class Sweep:
 
     async def run(self) -> Outcome:
         """Play what is missing and store it; what goes wrong is in the outcome."""
+        if self._options.replay and (misses := await self._all_missing()):
+            return self._not_recorded(misses)
         with unreadable_is_usage():
             sweep_id = self._begin()
         file = ProgressFile(self._options.db, sweep_id)
@@ -141,7 +146,38 @@ class Sweep:
             outcome = await self._run(sweep_id)
             self._progress.doing = "checking"
             file.write(self._progress.standing(sweep_id))
-            self._end(outcome)
+            if not outcome.gave_up:
+                self._end(outcome)
+        return outcome
+
+    @cached_property
+    def _store(self) -> Store:
+        return Store(self._options.db)
+
+    async def _all_missing(self) -> list[Miss]:
+        """The first calls of all trials if none is recorded; else nothing."""
+        runner = LocalRunner(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
+        misses: list[Miss] = []
+
+        def none_found() -> bool:
+            return not any(meter.calls_cached for meter in runner.meters.values())
+
+        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+            if isinstance(record, TrialRecord):
+                misses.extend(_misses(spec, record))
+
+        await runner.play(takewhile(lambda _: none_found(), self._todo), ended)
+        return misses if none_found() else []
+
+    def _not_recorded(self, misses: list[Miss]) -> Outcome:
+        """The outcome of a replay that stores nothing, since it has none of its calls."""
+        outcome = Outcome(self._plan, "", 0)
+        self._explain(misses, outcome)
+        held = described(self._options.recordings, self._cache.entries())
+        outcome.messages.append(
+            f"nothing of this replay is recorded, and nothing is stored: {held}"
+        )
+        self._cache.close()
         return outcome
 
     async def _run(self, sweep_id: str) -> Outcome:
@@ -152,6 +188,7 @@ class Sweep:
             runner = await self._runner(stack)
             self._progress.runner = runner
             flusher = Flusher(self._store, outcome.sweep_id, self._say)
+            self._progress.unstored = lambda: flusher.problem
             began = time.perf_counter()
             try:
                 async with display_progress(self._progress):
@@ -160,7 +197,7 @@ class Sweep:
                 outcome.playing_s = time.perf_counter() - began
                 outcome.worst_stall_s = self._progress.worst_stall_s
                 await self._store_rest(flusher, outcome)
-            self._explain_misses(outcome)
+            self._explain(self._misses, outcome)
             try:
                 outcome.cache_cost_usd = self._cache.cost_usd()
                 outcome.spending = self._ledger.read()
@@ -214,11 +251,11 @@ class Sweep:
         """Close what was opened, if the sweep is not run after all."""
         self._cache.close()
 
-    def _explain_misses(self, outcome: Outcome) -> None:
-        if not self._misses:
+    def _explain(self, misses: list[Miss], outcome: Outcome) -> None:
+        if not misses:
             return
         left_out: list[str] = []
-        for line in explain(self._misses, self._cache.entries(left_out)):
+        for line in explain(misses, self._cache.entries(left_out)):
             outcome.fail(ReplayMiss.exit_code, line)
         if left_out:
             outcome.messages.append(
@@ -290,11 +327,7 @@ class Sweep:
                 self._suspended = record
                 return
             self._progress.by_cell[spec.cell][record.status] += 1
-            self._misses += (
-                Miss(spec.trial_id, failed.request)
-                for failed in record.failed_calls
-                if failed.missed
-            )
+            self._misses += _misses(spec, record)
             flusher.add(record)
             self._watch_for_outage(record, runner)
 
@@ -320,18 +353,24 @@ class Sweep:
             raise error
 
     async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> None:
-        """Store what has ended and is not stored yet."""
-        try:
-            await flusher.close()
-            if flusher.differing:
-                outcome.fail(
-                    StoreError.exit_code,
-                    f"{len(flusher.differing)} trials are stored otherwise in {self._options.db}, "
-                    f"which is left as it is: {_differing(flusher.differing)}. Replay into "
-                    "another --db.",
-                )
-        except StoreError as exc:
-            outcome.fail(exc.exit_code, str(exc))
+        """Store what has ended and is not stored yet; Ctrl-C ends the waiting for that."""
+        closing = asyncio.create_task(flusher.close())
+        with on_interrupt(closing.cancel, closing.cancel):
+            await asyncio.wait([closing])
+        if closing.cancelled():
+            outcome.gave_up = True
+            outcome.fail(INTERRUPTED, f"Interrupted: {flusher.problem}. {AGAIN}")
+        elif isinstance(error := closing.exception(), StoreError):
+            outcome.fail(error.exit_code, str(error))
+        elif error is not None:
+            raise error
+        elif flusher.differing:
+            outcome.fail(
+                StoreError.exit_code,
+                f"{len(flusher.differing)} trials are stored otherwise in {self._options.db}, "
+                f"which is left as it is: {_differing(flusher.differing)}. Replay into "
+                "another --db.",
+            )
 
     def _end(self, outcome: Outcome) -> None:
         """Note how the sweep ended, read back what the database holds of it, and audit that."""
@@ -397,6 +436,11 @@ class Sweep:
                 "Set the base URL variable of its provider to the one to replay."
             )
         return recorded[0]
+
+
+def _misses(spec: TrialSpec, record: TrialRecord) -> list[Miss]:
+    """The calls of a trial for which nothing was recorded."""
+    return [Miss(spec.trial_id, call.request) for call in record.failed_calls if call.missed]
 
 
 def _differing(trials: Mapping[str, Sequence[str]]) -> str:
