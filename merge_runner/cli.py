@@ -9,6 +9,7 @@ import math
 import shutil
 import sys
 import tempfile
+from datetime import UTC, datetime
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
@@ -140,6 +141,13 @@ def sweep(
         float | None,
         typer.Option(help="Never spend more USD on this sweep, over all its runs.", min=0),
     ] = None,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Begin no trial from this local time on, such as 07:00; the next run goes on.",
+        ),
+    ] = None,
     dask: Annotated[
         str | None,
         typer.Option(
@@ -164,6 +172,7 @@ def sweep(
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
     from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.until import deadline
 
     if max_cost is not None and not math.isfinite(max_cost):
         raise UsageError("--max-cost is a number of USD")
@@ -184,6 +193,7 @@ def sweep(
         faults_identity=_faults(fault_rate, faults, seed).identity,
         strict_model=strict_model,
         dask=dask,
+        until=None if until is None else deadline(until, datetime.now(UTC)),
     )
     plan = make_plan(
         name,

@@ -178,7 +178,7 @@ class LlmClient:
     def _start(self, request: ChatRequest, order: int) -> Call:
         worst = self._worst_case(request)
         worst_usd = cost_usd(self.entry, worst) or 0.0
-        asked = Asked(self.driver, slot_text(request.slot), worst_usd)
+        asked = Asked(self.driver, slot_text(request.slot), worst_usd, self.name)
         call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._in_turn(call))
         self._calls[request.key] = call

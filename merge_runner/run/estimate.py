@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -10,9 +11,10 @@ from merge_runner.config import ModelEntry, driver_name
 from merge_runner.drivers.pace import model_pace
 from merge_runner.llm.cache import CallTotals
 from merge_runner.llm.prices import cost_usd
+from merge_runner.llm.trial_costs import Answers, TrialCalls, TrialCosts
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
 from merge_runner.scenarios.registry import new_world
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
@@ -93,20 +95,44 @@ def estimate(
     )
 
 
-def worst_trial_usd(plan: Plan) -> float:
-    """The most a trial can cost: up to the timeout, a token per byte, every answer at its cap."""
-    prompt_bytes = len(_typical_prompt(plan).encode()) * PROMPT_MARGIN
-    return sum(
-        math.ceil(plan.scenario.timeout_steps / model_pace(plan.scenario).interval_steps)
-        * (
-            cost_usd(
-                entry,
-                Usage(input_tokens=int(prompt_bytes), output_tokens=entry.max_output_tokens),
-            )
-            or 0.0
+def trial_costs(plan: Plan, facts: Mapping[str, CallTotals]) -> TrialCosts:
+    """What the trials of a plan are expected to cost; a cell is a prompt variant.
+
+    ``facts`` is as for ``estimate``.
+    """
+    variants = {spec.order: spec.variant or "" for spec in plan.trial_specs()}
+    calls = {variant: _trial_calls(plan, variant) for variant in plan.repetitions}
+    earlier = {
+        name: Answers(totals.measured, totals.measured * _measured_usd(plan.entries[name], totals))
+        for name, totals in facts.items()
+        if totals.measured
+    }
+    return TrialCosts(variants.__getitem__, calls, earlier)
+
+
+def _trial_calls(plan: Plan, variant: str) -> dict[str, TrialCalls]:
+    """The calls of each model in a trial: at most up to the timeout, every answer at its cap."""
+    sides = Counter(name for name in plan.sides.values() if name in plan.entries)
+    most = math.ceil(plan.scenario.timeout_steps / model_pace(plan.scenario).interval_steps)
+    # No tokeniser makes more tokens than bytes.
+    read = int(len(_typical_prompt(plan, variant).encode()) * PROMPT_MARGIN)
+    calls = {}
+    for name, number in sides.items():
+        entry = plan.entries[name]
+        worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
+        calls[name] = TrialCalls(
+            number * PROMPTS_PER_DRIVER, number * most, cost_usd(entry, worst) or 0.0
         )
-        for entry in (plan.entries[n] for n in plan.sides.values() if n in plan.entries)
+    return calls
+
+
+def _measured_usd(entry: ModelEntry, totals: CallTotals) -> float:
+    """What an answer has cost on average, at today's price."""
+    usage = Usage(
+        input_tokens=round(totals.input_tokens / totals.measured),
+        output_tokens=round(totals.output_tokens / totals.measured),
     )
+    return cost_usd(entry, usage) or 0.0
 
 
 def _per_call(plan: Plan, entry: ModelEntry, facts: CallTotals) -> _PerCall:
@@ -116,7 +142,8 @@ def _per_call(plan: Plan, entry: ModelEntry, facts: CallTotals) -> _PerCall:
             output_tokens=round(facts.output_tokens / facts.measured),
         )
         return _PerCall(usage, facts.latency_s / facts.measured, True)
-    prompt_tokens = len(_typical_prompt(plan).encode()) // 4  # English has about 4 bytes a token
+    longest = max((_typical_prompt(plan, variant) for variant in plan.repetitions), key=len)
+    prompt_tokens = len(longest.encode()) // 4  # English has about 4 bytes a token
     usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
     return _PerCall(usage, entry.typical_latency_s, False)
 
@@ -135,12 +162,8 @@ def _limited_s(options: Options, entry: ModelEntry, calls: int, each: _PerCall) 
     return max(60 * calls / rpm if rpm else 0.0, 60 * calls * tokens / tpm if tpm else 0.0)
 
 
-def _typical_prompt(plan: Plan) -> str:
-    """The longest variant's prompt in the middle of an approach."""
+def _typical_prompt(plan: Plan, variant: str) -> str:
+    """A variant's prompt in the middle of an approach."""
     world = new_world(plan.scenario, plan.conditions[0])
     rest = (0.25,) * (plan.scenario.plan_actions - plan.scenario.executed_actions)
-    prompts = (
-        render_prompt(world.observe("left"), rest, variant=variant, scenario=plan.scenario)
-        for variant in plan.repetitions
-    )
-    return max(prompts, key=len)
+    return render_prompt(world.observe("left"), rest, variant=variant, scenario=plan.scenario)

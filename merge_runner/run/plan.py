@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +24,7 @@ from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.ledger import Caps
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import Side, TrialSpec
@@ -38,9 +40,10 @@ PROMPTS_PER_DRIVER = 10.5
 class Options:
     """How a sweep runs; nothing here changes a result.
 
-    ``rpm`` and ``tpm`` override the registry's. ``dask`` names the cluster that plays the trials;
-    if None, this process plays them. ``faults_identity`` keeps the answers of an emulator that was
-    told to misbehave apart from those of the usual one.
+    ``rpm`` and ``tpm`` override the registry's. ``split_usd`` caps what single models cost.
+    ``dask`` names the cluster that plays the trials; if None, this process plays them.
+    ``faults_identity`` keeps the answers of an emulator that was told to misbehave apart from those
+    of the usual one. From ``until`` on no trial begins.
     """
 
     db: Path
@@ -49,12 +52,19 @@ class Options:
     rpm: int | None = None
     tpm: int | None = None
     max_cost_usd: float | None = None
+    split_usd: Mapping[str, float] = field(default_factory=dict)
     replay: bool = False
     recording: Path | None = None
     emulator_options: Sequence[str] = ()
     faults_identity: str = ""
     strict_model: bool = False
     dask: str | None = None
+    until: datetime | None = None
+
+    @property
+    def caps(self) -> Caps:
+        """What may be spent over all runs."""
+        return Caps(self.max_cost_usd, self.split_usd)
 
     @property
     def connections(self) -> int:
