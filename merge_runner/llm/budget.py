@@ -148,8 +148,7 @@ class Budget:
         self.ledger = ledger
         self.caps = caps
         self.costs = costs
-        named: dict[str | None, float | None] = {None: caps.total_usd, **caps.by_model}
-        self._pots = [Pot(model, cap) for model, cap in named.items() if cap is not None]
+        self._pots = [Pot(model, cap_usd) for model, cap_usd in caps]
         # What each trial that has begun was charged, and has set aside, by model.
         self._begun: dict[int, defaultdict[str, float]] = {}
         self._left: set[int] = set()

@@ -8,7 +8,7 @@ case until a user releases it, and stands in the call's list of attempts with an
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
@@ -150,12 +150,18 @@ class Caps:
     total_usd: float | None = None
     by_model: Mapping[str, float] = field(default_factory=dict)
 
+    def __iter__(self) -> Iterator[tuple[str | None, float]]:
+        """Each cap with its model, None for that of all."""
+        if self.total_usd is not None:
+            yield None, self.total_usd
+        yield from self.by_model.items()
+
     def pays(self, usd: float, model: str, spending: Spending) -> bool:
         """Whether so much more may be spent on a model."""
-        caps = {None: self.total_usd, model: self.by_model.get(model)}
         return all(
-            cap is None or spending.committed_for(name) + usd <= cap + TOLERANCE_USD
-            for name, cap in caps.items()
+            spending.committed_for(name) + usd <= cap_usd + TOLERANCE_USD
+            for name, cap_usd in self
+            if name in (None, model)
         )
 
     def check(self, paid: Collection[str]) -> None:

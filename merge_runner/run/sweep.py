@@ -38,7 +38,7 @@ from merge_runner.run.clients import (
     sealed_clients,
     start_endpoints,
 )
-from merge_runner.run.estimate import Estimate, estimate
+from merge_runner.run.estimate import Estimate, Todo, estimate
 from merge_runner.run.flusher import Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
@@ -180,22 +180,29 @@ class Sweep:
     async def estimate(self) -> Estimate:
         """What a live run takes: plays from recorded replies alone, and counts what is missing."""
         plan = self._plan
-        trials = 0
-        calls = dict.fromkeys(plan.entries, 0.0)
+        trials: Counter[str] = Counter()
+        calls = {variant: dict.fromkeys(plan.entries, 0.0) for variant in plan.repetitions}
 
-        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            nonlocal trials
+        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             if isinstance(record, TrialSuspended) or record.status != "failed":
                 return
-            trials += 1
+            variant = spec.variant or ""
+            trials[variant] += 1
             for side, name in plan.sides.items():
-                if name in calls:
+                if name in plan.entries:
                     answered = sum(row.side == side for row in record.decisions)
-                    calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
+                    calls[variant][name] += max(1.0, PROMPTS_PER_DRIVER - answered)
 
         clients = sealed_clients(plan, self._cache)
         await LocalRunner(plan, clients, in_flight=1).play(self._todo, ended)
-        return estimate(plan, self._options, trials=trials, calls=calls, facts=self._measured())
+        todo = {variant: Todo(trials[variant], calls[variant]) for variant in plan.repetitions}
+        return estimate(
+            plan,
+            self._options,
+            todo=todo,
+            facts=self._measured(),
+            spending=self._ledger.spending,
+        )
 
     def _measured(self) -> dict[str, CallTotals]:
         """What is known about each model's answers to requests like those of this sweep."""
@@ -334,13 +341,14 @@ class Sweep:
         if until is None:
             return
         # In short steps, since a machine that slept wakes up late.
-        while (left_s := until.timestamp() - time.time()) > 0:
-            await asyncio.sleep(min(left_s, LOOK_AT_CLOCK_S))
+        while time.time() < until.timestamp():
+            left_s = until.timestamp() - time.time()
+            await asyncio.sleep(max(0.0, min(left_s, LOOK_AT_CLOCK_S)))
         self._out_of_time = True
         runner.begin_no_more()
         self._say(
-            f"It is {until:%H:%M}: no other trial begins, and what {runner.running} trials have not "
-            f"finished in {GRACE_S:.0f} s goes on at the next run."
+            f"It is {until:%H:%M}: no other trial begins, and what the {runner.running} trials "
+            f"under way do not finish in {GRACE_S:.0f} s is left to the next run."
         )
         await asyncio.sleep(GRACE_S)
         interrupt()

@@ -10,7 +10,8 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import CallTotals
-from merge_runner.run.estimate import estimate
+from merge_runner.llm.ledger import Spending
+from merge_runner.run.estimate import Todo, estimate
 from merge_runner.run.plan import PROGRAMS, Options, make_plan
 
 
@@ -144,9 +145,9 @@ def test_the_estimate_takes_the_limits_into_account(limited, minutes):
     expected = estimate(
         plan,
         Options(Path("m.duckdb"), Path("responses"), **limited),
-        trials=plan.trials,
-        calls={"o3": plan.trials * 21},
+        todo={"baseline": Todo(plan.trials, {"o3": plan.trials * 21})},
         facts={"o3": CallTotals()},
+        spending=Spending(),
     )
     assert expected.minutes == pytest.approx(minutes, rel=0.08)
     assert expected.calls == 2310
