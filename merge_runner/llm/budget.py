@@ -360,7 +360,7 @@ class Unpaid:
         """Every trial may begin."""
 
     def leave(self, trial: int) -> None:
-        """The trial has no allowance."""
+        """No money is kept for the trial."""
 
     @asynccontextmanager
     async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[UnpaidAttempt]:

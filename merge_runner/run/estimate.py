@@ -136,7 +136,7 @@ def estimate(
         measured=tuple(
             driver_name(name, plan.endpoints[name]) for name in plan.entries if facts[name].measured
         ),
-        trials_within_cap=_within(trials, share),
+        trials_within_cap=None if share is None else sum(c.trials_within_cap or 0 for c in cells),
         cells=tuple(cells),
     )
 

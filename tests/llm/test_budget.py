@@ -77,7 +77,7 @@ async def soon(job):
 
 @settings(deadline=None, max_examples=30)
 @given(calls, st.integers(0, 60))
-def test_what_is_spent_and_set_aside_never_exceeds_a_cap(plan, trial_usd):
+def test_what_is_spent_and_set_aside_never_exceeds_the_cap(plan, trial_usd):
     async def all_calls(ledger):
         budget = Budget(ledger, Caps(CAP, {"m": PART}), each(trial_usd))
         reserve = ledger.reserve
