@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
 # o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and none can
 # cost more than 3.4 USD (2 x 12 prompts to the timeout, 16,000 tokens of output each).
-SHORT = "[repetitions]\nbaseline = 14\n[scenario]\ntimeout_s = 12\n"
+SHORT = "[repetitions]\nbaseline = 18\n[scenario]\ntimeout_s = 12\n"
 ROOM_FOR_SOME = 3.9
 
 
@@ -58,7 +58,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
     bill = Bill()
     async with watched(bill.middle) as server:
         env = account(server)
-        sweep = (*SWEEP, "--reps", 14, "--yes", *FAST)
+        sweep = (*SWEEP, "--reps", 18, "--yes", *FAST)
         run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)
         assert run.code == 3, run.err
         assert 0 < bill.usd <= ROOM_FOR_SOME
