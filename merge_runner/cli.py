@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
@@ -160,6 +161,13 @@ def sweep(
         float | None,
         typer.Option(help="Never spend more USD on this sweep, over all its runs.", min=0),
     ] = None,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Begin no trial from this local time on, such as 07:00; the next run goes on.",
+        ),
+    ] = None,
     dask: Annotated[
         str | None,
         typer.Option(
@@ -184,6 +192,7 @@ def sweep(
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
     from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.until import deadline
 
     if max_cost is not None and not math.isfinite(max_cost):
         raise UsageError("--max-cost is a number of USD")
@@ -204,6 +213,7 @@ def sweep(
         faults_identity=_faults(fault_rate, faults, seed).identity,
         strict_model=strict_model,
         dask=dask,
+        until=None if until is None else deadline(until, datetime.now(UTC)),
     )
     plan = make_plan(
         name,
@@ -215,8 +225,7 @@ def sweep(
         order_seed=order_seed,
         only=_levels(only or ()),
     )
-    if max_cost is None:
-        options = replace(options, max_cost_usd=plan.study.file.budget.total_usd)
+    options = plan.within_budget(options)
     if recording and reps is None and conditions is None and variants is None:
         from merge_runner.run.recorded_plan import as_recorded
 
@@ -599,7 +608,6 @@ def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> None:
 def _dry_run(plan: Plan, options: Options) -> Estimate:
     """What is neither stored nor recorded yet; makes no database or cache that is not there."""
     import asyncio
-    from dataclasses import replace
 
     from merge_runner.results.database import readable
     from merge_runner.run.sweep import Sweep
@@ -645,7 +653,9 @@ def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
 
 
 def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
-    from dataclasses import asdict
+    from dataclasses import asdict, astuple
+
+    from merge_runner.results.query_output import write_table
 
     if as_json:
         print_out(json.dumps(asdict(expected)))
@@ -664,6 +674,15 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         ("time", f"about {expected.minutes} minutes"),
     ):
         print_out(f"{name:<8}{text}")
+    if expected.trials_within_cap is not None:
+        print_out(f"cap     buys about {expected.trials_within_cap} trials")
+    if len(expected.cells) > 1:
+        headings = ["cell", "trials", "calls", "tokens in", "tokens out", "USD", "minutes"]
+        write_table(
+            [*headings, "trials within the cap"],
+            [tuple("" if v is None else v for v in astuple(c)) for c in expected.cells],
+            sys.stdout,
+        )
     print_out("Nothing was sent.")
 
 

@@ -56,6 +56,7 @@ class Progress:
     ledger: Ledger
     stored: Counter[Cell] = field(default_factory=Counter)
     cap_usd: float | None = None
+    until: datetime | None = None
     by_cell: defaultdict[Cell, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     started: float = field(default_factory=time.monotonic)
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
@@ -104,7 +105,7 @@ class Progress:
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
             ("cost", f"{self._cost_usd:.2f} USD{self._spent()}"),
             *(("calls waiting", "; ".join(texts)) for texts in [self._waiting()] if texts),
-            ("time", f"{elapsed:.0f} s{left}"),
+            ("time", f"{elapsed:.0f} s{left}{self._until()}"),
         ]
 
     def standing(self, sweep_id: str) -> Standing:
@@ -160,6 +161,9 @@ class Progress:
         if self.cap_usd is None:
             return ""
         return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+
+    def _until(self) -> str:
+        return "" if self.until is None else f", until {self.until:%a %H:%M}"
 
     def _cell(self, cell: Cell) -> CellStanding:
         playing = self.runner.playing

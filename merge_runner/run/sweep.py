@@ -41,13 +41,14 @@ from merge_runner.run.clients import (
     sealed_clients,
     start_endpoints,
 )
-from merge_runner.run.estimate import Estimate, estimate
+from merge_runner.run.estimate import Estimate, Todo, estimate
 from merge_runner.run.flusher import AGAIN, Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
 from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
+from merge_runner.run.until import GRACE_S
 from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
@@ -55,6 +56,7 @@ SHOWN = 5
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
 FROM_RECORDINGS = 16
+LOOK_AT_CLOCK_S = 1.0
 
 
 @dataclass(slots=True)
@@ -121,6 +123,7 @@ class Sweep:
         # Keyed by model and its number of answered calls, so that an answer starts a new count.
         self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
         self._suspended: TrialSuspended | None = None
+        self._out_of_time = False
         self._progress = Progress(
             plan=plan,
             planned=Counter(spec.cell for spec in specs.values()),
@@ -128,6 +131,7 @@ class Sweep:
             runner=LocalRunner(plan, {}, in_flight=0),  # nobody plays yet
             ledger=self._ledger,
             cap_usd=options.max_cost_usd,
+            until=options.until,
         )
 
     @property
@@ -223,29 +227,37 @@ class Sweep:
     async def estimate(self) -> Estimate:
         """What a live run takes: plays from recorded replies alone, and counts what is missing."""
         plan = self._plan
-        trials = 0
-        calls = dict.fromkeys(plan.entries, 0.0)
+        trials: Counter[str] = Counter()
+        calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in self._arms.items()}
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            nonlocal trials
             if isinstance(record, TrialSuspended) or record.status != "failed":
                 return
-            trials += 1
+            trials[spec.arm] += 1
             for side, name in self._arms[spec.arm].asked.items():
-                if name in calls:
+                if name in plan.entries:
                     answered = sum(row.side == side for row in record.decisions)
-                    calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
+                    calls[spec.arm][name] += max(1.0, PROMPTS_PER_DRIVER - answered)
 
         clients = sealed_clients(plan, self._cache)
         await LocalRunner(plan, clients, in_flight=1).play(self._todo, ended)
-        facts = {name: self._measured(name, entry) for name, entry in plan.entries.items()}
-        return estimate(plan, self._options, trials=trials, calls=calls, facts=facts)
+        todo = {label: Todo(trials[label], calls[label]) for label in self._arms}
+        return estimate(
+            plan,
+            self._options,
+            todo=todo,
+            facts=self._measured(),
+            spending=self._ledger.spending,
+        )
 
-    def _measured(self, name: str, entry: ModelEntry) -> CallTotals:
-        """What is known about answers to requests like those of this sweep."""
-        sent = FORMATS[entry.format].request(entry, "")
-        asked = manner(sent.path, canonical_json(sent.body))
-        return self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
+    def _measured(self) -> dict[str, CallTotals]:
+        """What is known about each model's answers to requests like those of this sweep."""
+        facts = {}
+        for name, entry in self._plan.entries.items():
+            sent = FORMATS[entry.format].request(entry, "")
+            asked = manner(sent.path, canonical_json(sent.body))
+            facts[name] = self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
+        return facts
 
     def close(self) -> None:
         """Close what was opened, if the sweep is not run after all."""
@@ -290,7 +302,7 @@ class Sweep:
             clients = sealed_clients(plan, self._cache)
             # Recorded replies come at once: more trials in flight would only take more memory.
             return LocalRunner(plan, clients, min(options.in_flight, FROM_RECORDINGS))
-        services = open_services(plan, options, self._cache, self._ledger, stack)
+        services = open_services(plan, options, self._cache, self._ledger, self._measured(), stack)
         urls = await start_endpoints(plan.entries, options.emulator_options, stack)
         known = frozenset(
             name
@@ -342,15 +354,46 @@ class Sweep:
             )
             work.cancel()
 
+        clock = asyncio.create_task(self._stop_in_time(runner, interrupted))
         with on_interrupt(interrupted, drain.cancel):
             await asyncio.wait([drain])
             await asyncio.wait([work])
-        if work.cancelled():
+        clock.cancel()
+        self._note_end(work, outcome)
+
+    def _note_end(self, work: asyncio.Task[None], outcome: Outcome) -> None:
+        """Note how the playing ended, if not with the last trial."""
+        left = self._progress.total - self._progress.ways.total()
+        if self._out_of_time and left and (work.cancelled() or work.exception() is None):
+            outcome.fail(
+                INTERRUPTED,
+                f"Stopped as --until says; {left} trials have not ended, and their replies are "
+                "kept. Run the same command again to go on.",
+            )
+        elif work.cancelled():
             outcome.fail(INTERRUPTED, "Interrupted. Run the same command again to go on.")
         elif isinstance(error := work.exception(), MergeRunnerError):
             outcome.fail(error.exit_code, str(error))
         elif error is not None:
             raise error
+
+    async def _stop_in_time(self, runner: TrialRunner, interrupt: Callable[[], None]) -> None:
+        """At the time of ``--until`` begin no more trials; a while later stop those under way."""
+        until = self._options.until
+        if until is None:
+            return
+        # In short steps, since a machine that slept wakes up late.
+        while time.time() < until.timestamp():
+            left_s = until.timestamp() - time.time()
+            await asyncio.sleep(max(0.0, min(left_s, LOOK_AT_CLOCK_S)))
+        self._out_of_time = True
+        runner.begin_no_more()
+        self._say(
+            f"It is {until:%H:%M}: no other trial begins, and what the {runner.running} trials "
+            f"under way do not finish in {GRACE_S:.0f} s is left to the next run."
+        )
+        await asyncio.sleep(GRACE_S)
+        interrupt()
 
     async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> None:
         """Store what has ended and is not stored yet; Ctrl-C ends the waiting for that."""
