@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from merge_runner import __version__
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import printable
@@ -99,6 +100,11 @@ def main() -> None:
             raise
         say(f"error: {exc}")
         sys.exit(exc.exit_code)
+    except ModuleNotFoundError as exc:
+        if debug or str(exc.name).startswith(("merge_runner", "analysis")):
+            raise
+        say(f"error: this needs {exc.name}, which is not installed: pip install {exc.name}")
+        sys.exit(UsageError.exit_code)
     except RuntimeError as exc:
         if debug or str(exc) != "Query interrupted":  # what DuckDB raises on Ctrl-C
             raise
@@ -111,11 +117,23 @@ def main() -> None:
         sys.exit(1)
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print_out(f"merge-runner {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def common(
     debug: Annotated[
         bool, typer.Option("--debug", help="Show a traceback on errors.")
     ] = False,  # typer's way to declare a flag
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
 ) -> None:
     """Finds out whether a language model drives like a human."""
 

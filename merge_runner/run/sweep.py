@@ -21,7 +21,7 @@ from merge_runner.errors import (
     TrialSuspended,
     UsageError,
 )
-from merge_runner.llm.cache import CallTotals, ResponseCache
+from merge_runner.llm.cache import CachedCall, CallTotals, ResponseCache
 from merge_runner.llm.content_hashes import canonical_json, manner, spec_hash
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger, Spending
@@ -45,6 +45,7 @@ from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
+from merge_runner.run.shipped import shipped_recording
 from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
@@ -93,7 +94,7 @@ class Sweep:
         """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
         self._options = options
         self._say = say
-        recorded = partial(Spilled, options.recording) if options.recording else None
+        recorded = partial(self._recorded, plan) if options.replay else None
         self._cache = ResponseCache(options.cache, overlay=recorded)
         endpoints = {name: self._endpoint(plan, name) for name in plan.entries}
         self._plan = plan = replace(plan, endpoints=endpoints)
@@ -200,6 +201,15 @@ class Sweep:
         sent = FORMATS[entry.format].request(entry, "")
         asked = manner(sent.path, canonical_json(sent.body))
         return self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
+
+    def _recorded(self, plan: Plan) -> Mapping[str, CachedCall]:
+        """What the named recording holds, or else the one that ships with the program."""
+        file = self._options.recording or shipped_recording(plan, self._cache)
+        if file is None:
+            return {}
+        if file != self._options.recording:
+            self._say(f"The replies are from the recording that ships with merge-runner: {file}")
+        return Spilled(file)
 
     def close(self) -> None:
         """Close what was opened, if the sweep is not run after all."""
