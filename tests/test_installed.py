@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tarfile
@@ -117,3 +118,40 @@ def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the
     }
     assert {"merge_runner/py.typed", "analysis/py.typed", *shipped} <= from_checkout
     assert not {name for name in from_checkout if name.startswith(("tests", "benchmarks"))}
+
+
+def test_the_oldest_packages_that_are_tested_are_those_that_pyproject_names():
+    lock = (PROJECT / "requirements-lowest.lock").read_text()
+    tested = dict(re.findall(r"^([a-z0-9-]+)==([0-9.]+)", lock, re.MULTILINE))
+    for requirement in DESCRIBED["dependencies"]:
+        name, oldest = requirement.split(">=")
+        assert re.fullmatch(rf"{re.escape(oldest)}(\.0)*", tested[name]), name
+
+
+def test_the_citation_is_of_this_version_and_names_the_paper():
+    text = (PROJECT / "CITATION.cff").read_text()
+    told = dict(re.findall(r"^([a-z-]+): (.+)$", text, re.MULTILINE))
+    assert told["cff-version"] == "1.2.0"
+    assert told["version"] == DESCRIBED["version"]
+    assert told["license"] == DESCRIBED["license"]
+    authors = (PROJECT / "LICENSE").read_text().split("(c) 2026 ")[1].split("\n")[0]
+    assert f"authors:\n  - name: {authors}\n" in text
+    assert "arXiv:2604.09609" in text
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv")
+def test_make_says_the_exit_code_of_the_program(tmp_path):
+    missed = run(
+        PROJECT, "make", "replay", "MODEL=o3", "RECORDING=",
+        f"ARGS=--reps 1 --conditions N_0_0 --db {tmp_path}/db --cache {tmp_path}/cache",
+    )  # fmt: skip
+    assert "replay] Error 4" in missed.err
+    assert missed.code == 2
+
+
+def test_make_hands_nothing_to_an_inner_make(tmp_path):
+    inner = tmp_path / "Makefile"
+    inner.write_text((PROJECT / "Makefile").read_text().split("help:")[0] + "\ninner:\n\t@env\n")
+    seen = run(tmp_path, "make", "inner", "MODEL=o3", "ARGS=-x").out
+    assert not re.search(r"^(MAKEFLAGS|ARGS|MODEL)=", seen, re.MULTILINE)
