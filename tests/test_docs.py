@@ -36,7 +36,7 @@ LINKING = [
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
 # The environment is the project's own: a make in another folder must not install into it.
 INSTALLED = (
-    "make() { command make -o .venv/python -o .venv/runtime -o .venv/dev "
+    "make() { command make -o .venv/python -o .venv/runtime -o .venv/dev -o .venv/dask "
     '-o .venv-peer/installed "$@"; }\n'
 )
 # Of our program these run in the test's own process, where the libraries are loaded already: they
@@ -51,6 +51,7 @@ LINKED = (
     "Makefile",
     "pyproject.toml",
     "requirements.lock",
+    "requirements-dask.lock",
     "requirements-dev.lock",
     "requirements-peer.lock",
     "benchmarks",
@@ -216,7 +217,7 @@ def test_every_command_and_every_make_target_is_in_the_docs():
 
 def test_the_reference_of_commands_has_every_command_and_every_option_and_no_other():
     text = (DOCS / "reference/commands.md").read_text()
-    options = {"--debug", "--help"}
+    options = {"--debug", "--help", "--version"}
     for name, command in typer.main.get_command(app).commands.items():
         for part, inner in getattr(command, "commands", {"": command}).items():
             words = f"{name} {part}".strip()
