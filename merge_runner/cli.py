@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from merge_runner import __version__
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import printable
@@ -119,6 +120,11 @@ def main() -> None:
             raise
         say(f"error: {exc}")
         sys.exit(exc.exit_code)
+    except ModuleNotFoundError as exc:
+        if debug or str(exc.name).startswith(("merge_runner", "analysis")):
+            raise
+        say(f"error: this needs {exc.name}, which is not installed: pip install {exc.name}")
+        sys.exit(UsageError.exit_code)
     except RuntimeError as exc:
         if debug or str(exc) != "Query interrupted":  # what DuckDB raises on Ctrl-C
             raise
@@ -131,11 +137,23 @@ def main() -> None:
         sys.exit(1)
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print_out(f"merge-runner {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def common(
     debug: Annotated[
         bool, typer.Option("--debug", help="Show a traceback on errors.")
     ] = False,  # typer's way to declare a flag
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
 ) -> None:
     """Finds out whether a language model drives like a human."""
 
@@ -226,11 +244,12 @@ def sweep(
         only=_levels(only or ()),
     )
     options = plan.within_budget(options)
-    if recording and reps is None and conditions is None and variants is None:
-        from merge_runner.run.recorded_plan import as_recorded
+    if replay:
+        from merge_runner.run.recorded_plan import replayed
 
-        plan, note = as_recorded(plan, recording)
-        if note:
+        whole = any(part is not None for part in (reps, conditions, variants))
+        plan, options, notes = replayed(plan, options, whole=whole)
+        for note in notes:
             say(note)
     if dry_run:
         _print_estimate(_dry_run(plan, options), as_json=as_json)

@@ -278,7 +278,10 @@ def read_database(
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open an existing database for reading, of this schema or an older one; raises UsageError."""
     if not path.is_file():
-        raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
+        raise UsageError(
+            f"there is no database {path}; `merge-runner sweep baseline` makes one, --db names "
+            "another"
+        )
     with (
         unreadable_is_usage(),
         open_database(path, read_only=True, patience_s=patience_s, instance=instance) as connection,

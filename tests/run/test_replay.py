@@ -67,6 +67,27 @@ async def test_the_committed_recording_replays_to_its_digest(merge_runner):
     assert (await merge_runner("digest")).out == GOLDEN
 
 
+async def test_without_replies_of_its_own_a_replay_takes_the_recording_that_ships(
+    merge_runner, tmp_path
+):
+    part = ("baseline", "--reps", 1, "--conditions", "N_0_0,L_4_8")
+    for _ in range(2):  # the first one makes the cache folder, which says nothing of replies
+        run = await merge_runner("replay", *part)
+        assert run.code == 0, run.err
+        shipped = tmp_path.joinpath(run.err.split("ships with merge-runner: ")[1].split("\n")[0])
+        assert shipped.samefile(RECORDING)
+    (tmp_path / "own.toml").write_text("repetitions = { baseline = 1 }")
+    assert (await merge_runner("replay", "own.toml", "--reps", 1)).code == 4
+
+
+async def test_replies_of_ones_own_are_not_mixed_with_those_that_ship(merge_runner):
+    part = ("baseline", "--reps", 1, "--conditions")
+    assert (await merge_runner("sweep", *part, "N_0_0")).code == 0
+    replay = await merge_runner("replay", *part, "N_0_0", "--db", "other")
+    assert (replay.code, "ships with" in replay.err) == (0, False)
+    assert (await merge_runner("replay", *part, "L_4_8", "--db", "other")).code == 4
+
+
 async def test_the_recording_is_what_the_emulator_answers_today(merge_runner, tmp_path):
     part = ("--reps", 1, "--json")
     live = await merge_runner("sweep", "baseline", *part)
