@@ -180,8 +180,9 @@ class ModelEntry(Frozen):
     nor one of ``aliases`` is reported as a mismatch. ``parameters`` go into the request as they
     are; what is not listed is not sent, so that the provider's default applies;
     ``applied_defaults`` puts on record which, and ``rejects`` names parameters that the model
-    refuses or does not heed. ``price`` is ``free``, ``genai-prices`` (the table of that package) or
-    explicit figures. ``rpm`` and ``tpm`` are requests and tokens a minute.
+    refuses or does not heed. ``efforts`` are the levels of ``reasoning_effort`` as parameters, for
+    a model that has no parameter of this name. ``price`` is ``free``, ``genai-prices`` (the table
+    of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a minute.
     ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of ``--dry-run`` alone. A
     reply longer than ``max_reply_mb`` (unpacked) is refused.
     """
@@ -195,6 +196,7 @@ class ModelEntry(Frozen):
     parameters: dict[str, Json] = {}
     applied_defaults: dict[str, Json] = {}
     rejects: tuple[str, ...] = ()
+    efforts: dict[str, dict[str, Json]] = {}
     max_output_tokens: Count
     cap_field: Literal["max_completion_tokens", "max_tokens"] = "max_completion_tokens"
     rpm: Count | None = None

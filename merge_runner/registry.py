@@ -31,12 +31,17 @@ _owner = [""]
 _changes = [0]
 
 
-@contextmanager
-def registering(owner: str) -> Iterator[None]:
-    """What is registered meanwhile takes the place of all that the same owner had registered."""
+def unregister(owner: str) -> None:
+    """Take out all that an owner has registered."""
     for registry in _registries:
         registry.drop(owner)
     _changes[0] += 1
+
+
+@contextmanager
+def registering(owner: str) -> Iterator[None]:
+    """What is registered meanwhile takes the place of all that the same owner had registered."""
+    unregister(owner)
     _owner.append(owner)
     try:
         yield

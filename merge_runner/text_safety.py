@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import re
 from typing import Any, TextIO
 
 
@@ -16,6 +18,16 @@ def printable(text: str) -> str:
 def one_line(text: str) -> str:
     """A printable text on one line: a name that somebody else chose may hold any character."""
     return "".join(c if c.isprintable() else "?" for c in text)
+
+
+_NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_.+-]")
+LONGEST_IN_A_NAME = 40
+
+
+def in_a_name(text: str) -> str:
+    """A text as a part of a trial's id; one that must be changed for that has a hash at its end."""
+    plain = _NOT_IN_A_NAME.sub("_", text)[:LONGEST_IN_A_NAME]
+    return plain if plain == text else f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 def in_spreadsheet(value: object) -> object:

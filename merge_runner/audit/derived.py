@@ -42,6 +42,7 @@ from merge_runner.records import (
     TrialSpec,
 )
 from merge_runner.results.comparison import (
+    FACTORS,
     LONG,
     PLACES,
     Difference,
@@ -329,10 +330,19 @@ def _findings(
         ignored.add("error")  # the reason, in words
     wanted = {**rows_of(record), "calls": [attempt.derived for attempt in trial.attempts]}
     for table, stored in tables.items():
+        if table == FACTORS:
+            _leave_others(stored, trial)
         for difference in stored.differences(
             trial.key, wanted[table], ignored=ignored, tolerance=TOLERANCE
         ):
             yield _finding(trial.key[0], difference)
+
+
+def _leave_others(stored: Stored, trial: _Trial) -> None:
+    """Keep the factors that the sweep names: another study may have others for the same trial."""
+    at = stored.names.index("factor")
+    rows = stored.rows.get(trial.key, [])
+    stored.rows[trial.key] = [row for row in rows if row[at] in trial.factors]
 
 
 def _finding(trial_id: str, found: Difference) -> Finding:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,8 +16,7 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import between_body_and_slot
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.geometry import Track, track_of
-
-NOT_IN_AN_ID = r"[^A-Za-z0-9_.+-]"
+from merge_runner.text_safety import in_a_name
 
 
 class _Facts(BaseModel):
@@ -53,7 +51,7 @@ class ArmFacts(_Facts):
     def levels(self) -> str:
         """The part of its trials' ids that is for its factors, spelled as the plan spells it."""
         return "".join(
-            f"/{name}={re.sub(NOT_IN_AN_ID, '_', level)}"
+            f"/{name}={in_a_name(level)}"
             for name, level in self.factors.items()
             if name not in ("prompt", "opponent")
         )

@@ -164,8 +164,11 @@ class Caps:
             if name in (None, model)
         )
 
-    def check(self, paid: Collection[str]) -> None:
-        """Raise UsageError where a split does not suit the paid models of a study."""
+    def check(self, paid: Collection[str], named: Collection[str] = ()) -> None:
+        """Raise UsageError where a split does not suit the paid models of a study.
+
+        ``named`` are others that its file names, of which this run asks none.
+        """
         if not self.by_model:
             return
         names = ", ".join(sorted(paid))
@@ -174,7 +177,7 @@ class Caps:
                 f"the budget is split by model, and {', '.join(missing)} has no part: give one to "
                 f"each of {names}"
             )
-        if unknown := sorted({*self.by_model} - {*paid}):
+        if unknown := sorted({*self.by_model} - {*paid, *named}):
             raise UsageError(
                 f"the budget has a part for {', '.join(unknown)}, which the study does not pay "
                 f"for; valid: {names or 'none'}"

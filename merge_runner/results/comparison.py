@@ -24,10 +24,11 @@ BATCH = 16
 _OF_THESE = (
     "SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)"
 )
+FACTORS = "trial_factors"
 # What identifies a row within a trial.
 PLACES: dict[str, tuple[str, ...]] = {
     "trials": (),
-    "trial_factors": ("factor",),
+    FACTORS: ("factor",),
     "states": ("step", "side"),
     "decisions": ("decision", "side"),
     "calls": ("decision", "side", "attempt"),

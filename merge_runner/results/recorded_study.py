@@ -14,6 +14,14 @@ from merge_runner.results.recording import opened, read_provenance, readable, sw
 from merge_runner.text_safety import one_line
 
 
+class _Arm(BaseModel):
+    """What is read of an arm of a study."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    label: str
+
+
 class _Config(BaseModel):
     """What is read of a sweep's configuration."""
 
@@ -23,17 +31,22 @@ class _Config(BaseModel):
     repetitions: dict[str, int]
     conditions: tuple[str, ...]
     sample_set: int
+    arms: tuple[_Arm, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedSweep:
-    """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition."""
+    """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition.
+
+    ``arms`` has the labels of the arms of a study, and is empty for a plain sweep.
+    """
 
     name: str
     model: str
     repetitions: dict[str, int]
     conditions: tuple[str, ...]
     sample_set: int
+    arms: frozenset[str] = frozenset()
 
     def __str__(self) -> str:
         """As a part of a sentence."""
@@ -45,7 +58,8 @@ class RecordedSweep:
 
     def command(self, files: Sequence[Path]) -> str:
         """What replays it; its names may be anybody's, and are quoted for a shell."""
-        words = ["merge-runner", "replay", self.name, "--model", self.model]
+        words = ["merge-runner", "replay", self.name]
+        words += [word for model in self.model.split(",") for word in ("--model", model)]
         words += ["--sample-set", str(self.sample_set)] * bool(self.sample_set)
         words += [word for file in files for word in ("--recording", str(file))]
         return one_line(shlex.join(words))
@@ -73,6 +87,7 @@ def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
                     repetitions={v: min(n, most) for v, n in config.repetitions.items()},
                     conditions=tuple(conditions),
                     sample_set=config.sample_set,
+                    arms=frozenset(arm.label for arm in config.arms),
                 )
             )
     return found
@@ -93,7 +108,8 @@ def _joined(one: RecordedSweep, other: RecordedSweep) -> RecordedSweep:
     variants = dict.fromkeys([*one.repetitions, *other.repetitions])
     repetitions = {v: max(one.repetitions.get(v, 0), other.repetitions.get(v, 0)) for v in variants}
     conditions = tuple(dict.fromkeys([*one.conditions, *other.conditions]))
-    return replace(one, repetitions=repetitions, conditions=conditions)
+    arms = one.arms | other.arms
+    return replace(one, repetitions=repetitions, conditions=conditions, arms=arms)
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:

@@ -13,6 +13,7 @@ from merge_runner.records import (
     Attempt,
     ChatRequest,
     TrialRecord,
+    TrialSpec,
     is_scripted,
 )
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -25,7 +26,7 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
     """All rows of a trial, by table."""
     return {
         "trials": [trial_row(record)],
-        "trial_factors": list(factor_rows(record)),
+        "trial_factors": list(factor_rows(record.spec)),
         "states": list(state_rows(record)),
         "decisions": list(decision_rows(record)),
         "calls": list(call_rows(record)),
@@ -57,10 +58,10 @@ def trial_row(record: TrialRecord) -> Row:
     )
 
 
-def factor_rows(record: TrialRecord) -> Iterator[Row]:
+def factor_rows(spec: TrialSpec) -> Iterator[Row]:
     """Rows of ``trial_factors``."""
-    for factor, value in record.spec.factors:
-        yield record.spec.trial_id, record.spec.spec_hash, factor, value
+    for factor, value in spec.factors:
+        yield spec.trial_id, spec.spec_hash, factor, value
 
 
 def state_rows(record: TrialRecord) -> Iterator[Row]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,7 +18,7 @@ import duckdb
 
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.records import TrialRecord
-from merge_runner.results.comparison import PLACES, TrialKey, rows_of_trials, stored_rows
+from merge_runner.results.comparison import FACTORS, PLACES, TrialKey, rows_of_trials, stored_rows
 from merge_runner.results.database import (
     PATIENCE_S,
     SCHEMA_VERSION,
@@ -86,9 +86,16 @@ class Store:
             migrate(path)
 
     def begin_sweep(
-        self, sweep: SweepRow, specs: dict[str, str], stored: Iterable[TrialKey]
+        self,
+        sweep: SweepRow,
+        specs: dict[str, str],
+        stored: Sequence[TrialKey],
+        factors: Sequence[Row] = (),
     ) -> None:
-        """Add a sweep, what its spec hashes stand for, and those of its trials already stored."""
+        """Add a sweep, what its spec hashes stand for, and those of its trials already stored.
+
+        ``factors`` are the levels of these trials, which another study may have stored without.
+        """
         with self._writing() as connection:
             connection.execute(
                 "INSERT INTO sweeps VALUES (?, ?, ?, NULL, NULL, ?, ?, ?, ?)",
@@ -104,6 +111,7 @@ class Store:
             )
             _add_specs(connection, specs)
             append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
+            _add_factors(connection, factors)
 
     def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
         """Note when and how a sweep ended."""
@@ -389,6 +397,14 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
         )
 
 
+def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:
+    """Add levels that are not stored yet."""
+    keys = [row[:2] for row in rows]
+    columns = "trial_id, spec_hash, factor"
+    there = set(rows_of_trials(connection, columns, "trial_factors", keys).fetchall())
+    append(connection, "trial_factors", (row for row in rows if row[:3] not in there))
+
+
 def _add_specs(connection: duckdb.DuckDBPyConnection, specs: dict[str, str]) -> None:
     for item in specs.items():
         connection.execute("INSERT OR IGNORE INTO specs VALUES (?, ?)", list(item))
@@ -436,6 +452,7 @@ def _add_trials(
             again.append((key, rows))
     for table in PLACES:
         append(connection, table, chain.from_iterable(rows[table] for rows in new.values()))
+    _add_factors(connection, [row for _, rows in again for row in rows[FACTORS]])
     return len(new), list(_differing(connection, again))
 
 
@@ -444,7 +461,9 @@ def _differing(
 ) -> Iterator[tuple[str, list[str]]]:
     """Trials whose stored values differ from those just played: their ids, with the columns."""
     keys = [key for key, _ in played]
-    tables = [stored_rows(connection, table, keys) for table in PLACES] if played else []
+    # The levels of a study are no results: another one may name others for the same trial.
+    compared = [table for table in PLACES if table != FACTORS] if played else []
+    tables = [stored_rows(connection, table, keys) for table in compared]
     for key, rows in played:
         columns = [
             difference.name

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -37,10 +36,11 @@ from merge_runner.study.file import (
     read_study,
 )
 from merge_runner.study.parts import adopt
+from merge_runner.text_safety import in_a_name
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 PROMPTS_PER_DRIVER = 10.5
-_NOT_IN_AN_ID = re.compile(r"[^A-Za-z0-9_.+-]")
+DRIVERS_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,9 +155,10 @@ class Plan:
     @property
     def driver(self) -> str:
         """The drivers with their endpoints; see ``pair_name``."""
-        return ", ".join(
-            dict.fromkeys(pair_name(arm.asked.values(), self.endpoints) for arm in self.arms)
-        )
+        pairs = (pair_name(arm.asked.values(), self.endpoints) for arm in self.arms)
+        names = list(dict.fromkeys(pairs))
+        more = f" and {len(names) - DRIVERS_SHOWN} more" if len(names) > DRIVERS_SHOWN else ""
+        return ", ".join(names[:DRIVERS_SHOWN]) + more
 
     def within_budget(self, options: Options) -> Options:
         """The options with the caps of the study's budget; ``--max-cost`` goes before its total.
@@ -168,8 +169,9 @@ class Plan:
         total_usd = budget.total_usd if options.max_cost_usd is None else options.max_cost_usd
         options = replace(options, max_cost_usd=total_usd, split_usd=budget.split)
         paid = {self.registered[n] for n, entry in self.entries.items() if entry.price != "free"}
-        left_out = {*self.study.file.models} - {*self.models}  # whose parts are for another day
-        options.caps.check(paid | (left_out & {*budget.split}))
+        file = self.study.file
+        named = [*file.models, *map(level_text, file.factors.get(OPPONENT, ()))]
+        options.caps.check(paid, {name for pair in named for name in both_sides(pair).values()})
         return options
 
     def by_label(self) -> dict[str, Arm]:
@@ -289,7 +291,7 @@ class Plan:
         set_ = f"/set{self.sample_set}" if self.sample_set else ""
         # The prompt and the opponent stand in it already.
         levels = "".join(
-            f"/{name}={_NOT_IN_AN_ID.sub('_', level)}"
+            f"/{name}={in_a_name(level)}"
             for name, level in arm.factors.items()
             if name not in (PROMPT, OPPONENT)
         )
@@ -389,6 +391,13 @@ def _repetitions(
     listed = levels or [*given] or ["baseline"] * (for_all is not None)
     for variant in (*given, *listed, *(variants or ())):
         blocks_of(variant)
+    bases = {prompt.based_on for prompt in study.file.prompts.values()}
+    for name in [*study.file.prompts, *given]:
+        if name not in {*listed, *bases, *(variants or ())}:
+            raise UsageError(
+                f"the prompt {name} is in {study.path} and never played: name it in the factor "
+                f"{PROMPT}, which has {', '.join(listed) or 'none'}"
+            )
     wanted: dict[str, int] = {}
     for variant in listed if variants is None else variants:
         repetitions = chosen or given.get(variant, for_all)

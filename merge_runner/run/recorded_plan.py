@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.results.recorded_study import recorded_part
@@ -40,7 +41,10 @@ def _shipped(plan: Plan, folder: Path) -> Path | None:
 def _has_replies(folder: Path, plan: Plan) -> bool:
     if not (folder / "cache.db").is_file():
         return False
-    cache = ResponseCache(folder, read_only=True)
+    try:
+        cache = ResponseCache(folder, read_only=True)
+    except UsageError:
+        return True  # of another version, which says so when the replay opens it
     try:
         return any(cache.stats(entry.id).totals for entry in plan.entries.values())
     finally:
@@ -58,7 +62,7 @@ def as_recorded(plan: Plan, recordings: Sequence[Path]) -> tuple[Plan, str]:
     arms = tuple(
         replace(arm, repetitions=min(arm.repetitions, held.repetitions[arm.variant]))
         for arm in plan.arms
-        if held.repetitions.get(arm.variant)
+        if held.repetitions.get(arm.variant) and (not held.arms or arm.label in held.arms)
     )
     conditions = tuple(one for one in plan.conditions if one in held.conditions)
     if not arms or not conditions:

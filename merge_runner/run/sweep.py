@@ -25,7 +25,7 @@ from merge_runner.errors import (
 from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.content_hashes import canonical_json, manner
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.ledger import Ledger, Spending
+from merge_runner.llm.ledger import Ledger, Spending, scopes
 from merge_runner.llm.meter import Meter
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
@@ -33,6 +33,7 @@ from merge_runner.results.progress_file import ProgressFile
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recorded_study import described
 from merge_runner.results.recording import Spilled
+from merge_runner.results.rows import factor_rows
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     EndpointPlan,
@@ -52,6 +53,7 @@ from merge_runner.run.until import GRACE_S
 from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
+GO_ON = "Run the same command again to go on."
 SHOWN = 5
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
@@ -115,11 +117,13 @@ class Sweep:
         with unreadable_is_usage():
             ended = set() if options.replay else self._store.ended_trials(specs)
         self._stored = [key for key in specs if key in ended]
+        self._stored_specs = [specs[key] for key in self._stored]
         self._todo = [spec for key, spec in specs.items() if key not in ended]
         if self._todo and not (self._is_silent or options.dask):  # workers may see other servers
             check_served(plan.entries)
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
+        self._options = options = self._less_what_is_spent(options)
         # Keyed by model and its number of answered calls, so that an answer starts a new count.
         self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
         self._suspended: TrialSuspended | None = None
@@ -133,6 +137,23 @@ class Sweep:
             cap_usd=options.max_cost_usd,
             until=options.until,
         )
+
+    def _less_what_is_spent(self, options: Options) -> Options:
+        """The options with a cap that is lower by what other ledgers of this study hold.
+
+        There are some where a study was run before its file had a budget, or has none any more.
+        """
+        own, name = self._plan.ledger, self._plan.name
+        others = [
+            scope
+            for scope in scopes(self._cache)
+            if (scope.startswith(f"{name}/") if own == name else scope == name)
+        ]
+        spent_usd = sum(Ledger(self._cache, scope).read().committed_usd for scope in others)
+        if options.max_cost_usd is None or not spent_usd or self._is_silent:
+            return options
+        self._say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
+        return replace(options, max_cost_usd=max(0.0, options.max_cost_usd - spent_usd))
 
     @property
     def trials_to_play(self) -> int:
@@ -292,6 +313,7 @@ class Sweep:
             ),
             self._plan.specs(),
             self._stored,
+            [row for spec in self._stored_specs for row in factor_rows(spec)],
         )
         return sweep_id
 
@@ -371,7 +393,7 @@ class Sweep:
                 "kept. Run the same command again to go on.",
             )
         elif work.cancelled():
-            outcome.fail(INTERRUPTED, "Interrupted. Run the same command again to go on.")
+            outcome.fail(INTERRUPTED, f"Interrupted. {GO_ON}")
         elif isinstance(error := work.exception(), MergeRunnerError):
             outcome.fail(error.exit_code, str(error))
         elif error is not None:
@@ -402,7 +424,8 @@ class Sweep:
             await asyncio.wait([closing])
         if closing.cancelled():
             outcome.gave_up = True
-            outcome.fail(INTERRUPTED, f"Interrupted: {flusher.problem}. {AGAIN}")
+            why = f": {flusher.problem}. {AGAIN}" if flusher.problem else ". " + GO_ON
+            outcome.fail(INTERRUPTED, f"Interrupted{why}")
         elif isinstance(error := closing.exception(), StoreError):
             outcome.fail(error.exit_code, str(error))
         elif error is not None:

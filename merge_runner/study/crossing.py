@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -13,7 +14,8 @@ from merge_runner.config import ModelEntry, ScenarioConfig, both_sides, validate
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
-from merge_runner.llm.formats.parameters import with_parameter
+from merge_runner.llm.formats.parameters import known_parameters, with_parameter
+from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES, Side
 from merge_runner.registry import require
 from merge_runner.scenarios.registry import SCENARIOS
@@ -58,6 +60,7 @@ def cross(
     if PROMPT in file.factors or len(repetitions) > 1:
         factors[PROMPT] = tuple(repetitions)
     axes = {MODEL: tuple(models), **factors}
+    _check_names(file, registry)
     _check_axes(file, axes, only)
     varying = [name for name, levels in axes.items() if len(levels) > 1]
     arms = []
@@ -71,11 +74,33 @@ def cross(
         except UsageError as exc:
             if not file.factors:
                 raise
-            where = ", ".join(f"{name} = {json.dumps(levels[name])}" for name in axes)
-            raise UsageError(f"{exc}; to leave such crossings out: skip = [{{ {where} }}]") from exc
+            raise UsageError(f"{exc}; {_hint(exc, levels)}") from exc
     if not arms:
         raise UsageError("nothing is left to play: look at skip, and at --only")
+    _refuse_twins(arms)
     return arms
+
+
+def _hint(error: UsageError, levels: Levels) -> str:
+    """How to leave out the crossings that cannot be: by those levels that the error names."""
+    text = str(error)
+    named = [name for name in levels if name == MODEL or re.search(rf"\b{name}\b", text)]
+    where = ", ".join(f"{name} = {json.dumps(levels[name])}" for name in named)
+    return f"to leave such crossings out, write above [factors]: skip = [{{ {where} }}]"
+
+
+def _refuse_twins(arms: Iterable[Arm]) -> None:
+    """Raise UsageError where two arms are the same trials, as with a model as its own opponent."""
+    known: dict[tuple[str, ...], Arm] = {}
+    for arm in arms:
+        apart = [f"{n}={level}" for n, level in arm.factors.items() if n not in (PROMPT, OPPONENT)]
+        twin = known.setdefault((arm.model, arm.variant, *apart), arm)
+        if twin is not arm:
+            raise UsageError(
+                f"the crossings {twin.label!r} and {arm.label!r} are the same trials: leave one "
+                f'out, by skip = [{{ model = "{arm.sides["left"]}", '
+                f'opponent = "{arm.factors.get(OPPONENT, SELF)}" }}]'
+            )
 
 
 def level_text(level: JsonValue) -> str:
@@ -97,11 +122,7 @@ def _arm(
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
     for name in {*sides.values()} - {*registry}:
         pace_of(scenario, PROGRAMS[name].in_spec(name))
-    parameters = {
-        name: level
-        for name, level in levels.items()
-        if name not in (MODEL, PROMPT, OPPONENT) and name not in ScenarioConfig.model_fields
-    }
+    parameters = {name: level for name, level in levels.items() if _is_parameter(name)}
     changed = set(both_sides(str(levels[MODEL])).values())
     if not changed & {*registry}:
         _refuse_parameters(str(levels[MODEL]), parameters)
@@ -137,6 +158,26 @@ def _sides(model: str, opponent: str) -> dict[Side, str]:
     if "+" in model:
         raise UsageError(f"{model} is a pair already, and has no other opponent than {SELF}")
     return dict(zip(SIDES, (model, opponent), strict=True))
+
+
+def _is_parameter(name: str) -> bool:
+    return name not in (MODEL, PROMPT, OPPONENT) and name not in ScenarioConfig.model_fields
+
+
+def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
+    """Raise UsageError for a factor that no model at all takes, as one that is misspelled."""
+    if MODEL in file.factors:
+        raise UsageError("models are no factor: write models = [...] above the factors")
+    if "skip" in file.factors:
+        raise UsageError("skip is no factor: write it above [factors]")
+    known = known_parameters(registry.values())
+    for name in filter(_is_parameter, file.factors):
+        if name not in known:
+            raise UsageError(
+                f"unknown factor {name!r}; valid: {PROMPT}, {OPPONENT}, a parameter "
+                f"({', '.join(sorted(known))}) or a switch of the scenario "
+                f"({', '.join(ScenarioConfig.model_fields)})"
+            )
 
 
 def _entry(
@@ -180,20 +221,23 @@ def _check_axes(
     file: StudyFile, axes: Mapping[str, Sequence[JsonValue]], only: Mapping[str, Sequence[str]]
 ) -> None:
     """Raise UsageError for levels that are not there, or there twice, and for names of none."""
-    if MODEL in file.factors:
-        raise UsageError("models are no factor: write models = [...] above the factors")
     for name, levels in axes.items():
         texts = [level_text(level) for level in levels]
         if not texts or len({*texts}) < len(texts):
             raise UsageError(f"the factor {name} needs levels, each of them once")
-    named = [
-        *((name, level) for row in file.skip for name, level in _pairs(row)),
-        *((name, text) for name, texts in only.items() for text in texts),
-    ]
-    for name, level in named:
-        if name != PROMPT or name in axes:
-            levels = require(axes, "factor", name)
-            require({level_text(each): each for each in levels}, f"level of {name}", level)
+    for name, wanted in only.items():
+        for text in wanted:
+            _check_level(axes, name, text)
+    # What is left out may be a model or a prompt that is not asked for today.
+    whole = {**axes, PROMPT: tuple(VARIANTS), MODEL: (*axes[MODEL], *file.models)}
+    for row in file.skip:
+        for name, text in _pairs(row):
+            _check_level(whole, name, text)
+
+
+def _check_level(axes: Mapping[str, Sequence[JsonValue]], name: str, text: str) -> None:
+    levels = require(axes, "factor", name)
+    require({level_text(each): each for each in levels}, f"level of {name}", text)
 
 
 def _pairs(row: Levels) -> Iterator[tuple[str, str]]:

@@ -188,7 +188,7 @@ def read_study(name: str) -> Study:
         file=file,
         text=path.read_text(encoding="utf-8"),
         path=path,
-        plugins={Path(each).name: _source(path, each) for each in file.plugins.files},
+        plugins={each: _source(path, each) for each in file.plugins.files},
     )
 
 

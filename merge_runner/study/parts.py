@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import re
 import sys
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.abc import InspectLoader
 from importlib.util import module_from_spec, spec_from_loader
-from types import CodeType
+from pathlib import Path
+from traceback import extract_tb
+from types import CodeType, ModuleType
 
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of
-from merge_runner.registry import FAULTS, load_plugins, registering
+from merge_runner.registry import FAULTS, changes, load_plugins, registering, unregister
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
 from merge_runner.study.file import AddedText, Study, StudyCondition, StudyPrompt
 
 LAST = "the end"
+
+
+PACKAGE = "study_plugins"
+"""The package of a study's plug-ins: one imports from another by ``from .other import thing``."""
+_lock = threading.RLock()
+_adopted: list[tuple[Study, int]] = []
 
 
 def adopt(study: Study) -> None:
@@ -25,23 +34,59 @@ def adopt(study: Study) -> None:
     Raises UsageError.
     """
     load_plugins()  # first: a study may build on what is installed
-    load_plugin_files(study.plugins)
-    with registering("study"):
-        for condition in study.file.conditions or ():
-            if condition.is_own:
-                CONDITIONS.register(condition.name, _condition(condition))
-        for name, prompt in study.file.prompts.items():
-            VARIANTS.register(name, _variant(name, prompt))
+    with _lock:  # a Dask worker may play for several threads at once
+        if _adopted == [(study, changes())]:
+            return
+        _adopted.clear()
+        load_plugin_files(study.plugins)
+        with registering("study"):
+            for condition in study.file.conditions or ():
+                if condition.is_own:
+                    CONDITIONS.register(condition.name, _condition(condition))
+            for name, prompt in _by_dependence(study.file.prompts):
+                VARIANTS.register(name, _variant(name, prompt))
+        _adopted.append((study, changes()))
 
 
 def load_plugin_files(sources: Mapping[str, str]) -> None:
-    """Run plug-ins, given by file name and source; one that runs already as it is stays."""
-    for file, source in sources.items():
-        name = f"study_{re.sub(r'[^A-Za-z0-9_]', '_', file.removesuffix('.py'))}"
-        loaded = sys.modules.get(name)
-        if loaded is None or loaded.__loader__ != _Source(file, source):
-            with registering(name):
-                _run(name, _Source(file, source))
+    """Run plug-ins, given by file name and source, in place of those of the study before.
+
+    All of them are run anew where one was edited, since one may import from another.
+    """
+    wanted = {_module(file): _Source(file, source) for file, source in sources.items()}
+    if len(wanted) < len(sources):
+        raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
+    loaded = {
+        name: module.__loader__
+        for name, module in sys.modules.items()
+        if name.startswith(f"{PACKAGE}.")
+    }
+    if loaded == wanted:
+        return
+    for name in loaded:
+        del sys.modules[name]
+        unregister(name)
+    package = sys.modules[PACKAGE] = ModuleType(PACKAGE)
+    package.__path__ = []
+    for name, source in wanted.items():
+        _run(name, source)
+
+
+def _module(file: str) -> str:
+    stem = re.sub(r"[^A-Za-z0-9_]", "_", Path(file).stem)
+    return f"{PACKAGE}.{stem}"
+
+
+def _by_dependence(prompts: Mapping[str, StudyPrompt]) -> Iterator[tuple[str, StudyPrompt]]:
+    """The prompts, each after the one that it is based on."""
+    waiting = dict(prompts)
+    while waiting:
+        ready = [name for name, prompt in waiting.items() if prompt.based_on not in waiting]
+        if not ready:
+            if own := [name for name in waiting if name in VARIANTS]:
+                raise UsageError(f"there is a variant {own[0]!r} already")
+            raise UsageError(f"the prompts {', '.join(waiting)} are based on each other")
+        yield from ((name, waiting.pop(name)) for name in ready)
 
 
 @dataclass(frozen=True)
@@ -66,13 +111,16 @@ def _run(name: str, loader: _Source) -> None:
     assert spec is not None
     module = sys.modules[name] = module_from_spec(spec)
     try:
-        loader.exec_module(module)
-    except UsageError as exc:
+        with registering(name):
+            loader.exec_module(module)
+    except (UsageError, AssertionError, *FAULTS) as exc:
         del sys.modules[name]
-        raise UsageError(f"the plug-in {loader.file} fails: {exc}") from exc
-    except FAULTS as exc:
-        del sys.modules[name]
-        raise UsageError(f"the plug-in {loader.file} fails: {type(exc).__name__}: {exc}") from exc
+        unregister(name)
+        lines = [f.lineno for f in extract_tb(exc.__traceback__) if f.filename == loader.file]
+        line = lines[-1] if lines else getattr(exc, "lineno", None)
+        where = f"{loader.file}, line {line}" if line else loader.file
+        said = str(exc) if isinstance(exc, UsageError) else f"{type(exc).__name__}: {exc}"
+        raise UsageError(f"the plug-in {where}, fails: {said}") from exc
 
 
 def _condition(condition: StudyCondition) -> Condition:

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.run.plan import make_plan
+from merge_runner.run.plan import Options, make_plan
 
 HEAD = 'description = "x"\nrepetitions = 2\nconditions = ["N_0_0"]\n'
 
@@ -116,6 +116,48 @@ def test_only_plays_a_part(plan_of):
     assert {s.trial_id: s.spec_hash for s in plan.trial_specs()}.items() <= whole.items()
 
 
+def test_what_is_left_out_may_be_of_a_model_or_a_prompt_that_is_not_asked_for_today(plan_of):
+    text = (
+        'models = ["emulator", "local"]\nskip = [{ model = "emulator", prompt = "A2" }]\n'
+        '[factors]\nprompt = ["baseline", "A2"]\n'
+    )
+    assert arms(plan_of(text, ["local"])) == {"baseline", "A2"}
+    assert arms(plan_of(text, ["emulator"], variants=["baseline"])) == {"baseline"}
+
+
+def test_levels_that_are_no_names_have_ids_of_their_own(plan_of):
+    levels = json.dumps(["é", "ü", "a/b", "x" * 300], ensure_ascii=False)
+    plan = plan_of(f"[factors]\nresponse_format = {levels}\n")
+    ids = {spec.trial_id for spec in plan.trial_specs()}
+    assert len(ids) == 8
+    assert all(trial_id.isascii() and len(trial_id) < 120 for trial_id in ids)
+
+
+def test_effort_is_translated_for_a_model_that_has_no_parameter_of_this_name(plan_of):
+    plan = plan_of('[factors]\nreasoning_effort = ["low", "high"]\n', ["gemini-2.5-pro", "o3"])
+    sent = {
+        name: entry.parameters.get("thinkingConfig", entry.parameters.get("reasoning_effort"))
+        for name, entry in plan.entries.items()
+    }
+    assert sent == {
+        "gemini-2.5-pro reasoning_effort=low": {"thinkingBudget": 1024},
+        "gemini-2.5-pro reasoning_effort=high": {"thinkingBudget": 24576},
+        "o3 reasoning_effort=low": "low",
+        "o3 reasoning_effort=high": "high",
+    }
+
+
+def test_a_split_budget_suits_a_part_of_the_study(plan_of, tmp_path):
+    text = (
+        'models = ["o3", "gemini-2.5-pro"]\n[factors]\ntemperature = [1.0]\n'
+        '[budget]\ntotal_usd = 5\nsplit = { o3 = 3, "gemini-2.5-pro" = 2 }\n'
+    )
+    options = Options(tmp_path / "m.duckdb", tmp_path / "cache")
+    for only in (None, {"model": ["o3"]}):
+        caps = plan_of(text, only=only).within_budget(options).caps
+        assert (caps.total_usd, caps.by_model["o3"]) == (5, 3)
+
+
 def test_plain_sweeps_have_one_arm_for_each_prompt():
     plan = make_plan("ablations", "emulator")
     assert [arm.label for arm in plan.arms] == ["baseline", *(f"A{i}" for i in range(1, 8))]
@@ -126,7 +168,21 @@ def test_plain_sweeps_have_one_arm_for_each_prompt():
 @pytest.mark.parametrize(
     ("text", "models", "says"),
     [
-        ("[factors]\ntemprature = [1]\n", ["o3"], "o3 takes no parameter temprature; valid: max_"),
+        (
+            "[factors]\ntemprature = [1]\n",
+            ["o3"],
+            "unknown factor 'temprature'; valid: prompt, opp",
+        ),
+        (
+            "[factors]\ntop_k = [1]\n",
+            ["o3"],
+            "o3 takes no parameter top_k; valid: max_output_tokens",
+        ),
+        ('[factors]\ntemperature = ["hot"]\n', [], "temperature = 'hot' is no number from 0 to 2"),
+        ("[factors]\ntemperature = [3]\n", [], "temperature = 3 is no number from 0 to 2"),
+        ("[factors]\nskip = [1]\n", [], "skip is no factor: write it above [factors]"),
+        ('[factors]\nopponent = ["self", "emulator"]\n', [], "are the same trials: leave one out"),
+        ('[prompts.x]\nremove = ["C2"]\n', [], "the prompt x is in"),
         ("[factors]\ntemperature = [0.2]\n", ["o3"], "no parameter temperature but its default"),
         ("[factors]\ntemperature = [0.2]\n", ["o3"], 'skip = [{ model = "o3", temperature = 0.2'),
         ("[factors]\ntemperature = [0.2]\n", ["constant"], "is a program and takes no temperature"),

@@ -127,7 +127,30 @@ def test_a_plug_in_beside_the_study_drives_and_an_edit_of_it_is_another_driver(p
     assert plan.config()["study"]["plugins"] == {"mine.py": DRIVER.format(action=-0.2)}
 
 
+def test_an_edit_of_what_a_plug_in_imports_is_another_driver(tmp_path):
+    study = tmp_path / "mine.toml"
+    study.write_text(HEAD + '[plugins]\nfiles = ["gains.py", "mine.py"]\n')
+    driver = "from .gains import GAIN\n" + DRIVER.format(action="GAIN")
+    (tmp_path / "mine.py").write_text(driver)
+    hashes = []
+    for gain in (-0.1, -0.9):
+        (tmp_path / "gains.py").write_text(f"GAIN = {gain}\n")
+        hashes.append(make_plan(str(study), ["braking"]).trial_specs()[0].spec_hash)
+    assert hashes[0] != hashes[1]
+
+
+def test_a_prompt_may_be_based_on_one_that_stands_below_it(plan_of):
+    plan_of(
+        '[factors]\nprompt = ["a"]\n[prompts.a]\nbased_on = "b"\nremove = ["C1"]\n'
+        '[prompts.b]\nremove = ["C2"]\n'
+    )
+    assert not {"C1", "C2"} & {*blocks_of("a")}
+
+
 def test_what_an_earlier_study_added_is_gone(plan_of):
+    plan_of('[plugins]\nfiles = ["mine.py"]\n', ["braking"], plugin=DRIVER.format(action=0))
+    with pytest.raises(UsageError, match="unknown model 'braking'"):
+        plan_of("", ["braking"])
     plan_of(persona())
     with pytest.raises(UsageError, match="unknown variant 'taxi'"):
         plan_of('[factors]\nprompt = ["taxi"]\n')
@@ -144,8 +167,14 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
         ('[prompts.x]\nadd = [{ after = "C0" }]\n', None, "give it a text, or merge and straight"),
         ("[prompts.x]\nad = []\n", None, "unknown key 'prompts.x.ad'; valid: based_on, remove"),
         ('[plugins]\nfiles = ["none.py"]\n', None, "the plug-in none.py cannot be read"),
-        ('[plugins]\nfiles = ["mine.py"]\n', "1 / 0", "mine.py fails: ZeroDivisionError"),
-        ('[plugins]\nfiles = ["mine.py"]\n', "def", "mine.py fails: SyntaxError"),
+        (
+            '[plugins]\nfiles = ["mine.py"]\n',
+            "\n1 / 0",
+            "mine.py, line 2, fails: ZeroDivisionError",
+        ),
+        ('[plugins]\nfiles = ["mine.py"]\n', "def", "mine.py, line 1, fails: SyntaxError"),
+        ('[plugins]\nfiles = ["mine.py"]\n', "assert 0, 'no'", "fails: AssertionError: no"),
+        ('[plugins]\nfiles = ["mine.py", "a/mine.py"]\n', "", "cannot be read"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(plan_of, text, plugin, says):

@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from pydantic import JsonValue
 
 from merge_runner.config import PROVIDERS, ModelEntry
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 
-CAP = "max_output_tokens"
+CAP, EFFORT = "max_output_tokens", "reasoning_effort"
+# From the least to the most that any provider takes.
+RANGES = {
+    "temperature": (0, 2),
+    "top_p": (0, 1),
+    "min_p": (0, 1),
+    "presence_penalty": (-2, 2),
+    "frequency_penalty": (-2, 2),
+}
+
+
+def known_parameters(entries: Iterable[ModelEntry]) -> set[str]:
+    """The parameters that some model takes, by common names."""
+    return {CAP, EFFORT}.union(
+        *(form.parameters for form in FORMATS.values()),
+        *(provider.parameters for provider in PROVIDERS.values()),
+        *(entry.parameters for entry in entries),
+    )
 
 
 def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValue) -> ModelEntry:
@@ -20,6 +39,9 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
         if type(level) is not int or level < 1:
             raise UsageError(f"{CAP} is a whole number from 1")
         return entry.model_copy(update={CAP: level})
+    _check_range(parameter, level)
+    if parameter == EFFORT and entry.efforts:
+        return _with_effort(name, entry, level)
     unset = parameter not in entry.parameters
     if unset and parameter in entry.applied_defaults and entry.applied_defaults[parameter] == level:
         return entry
@@ -38,6 +60,21 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
     return entry.model_copy(
         update={"parameters": _set(entry.parameters, places.get(parameter, (parameter,)), level)}
     )
+
+
+def _check_range(parameter: str, level: JsonValue) -> None:
+    if parameter not in RANGES:
+        return
+    low, high = RANGES[parameter]
+    if isinstance(level, bool | str | list | dict) or level is None or not low <= level <= high:
+        raise UsageError(f"{parameter} = {level!r} is no number from {low} to {high}")
+
+
+def _with_effort(name: str, entry: ModelEntry, level: JsonValue) -> ModelEntry:
+    if level not in entry.efforts:
+        raise UsageError(f"{name} has no {EFFORT} {level!r}; valid: {', '.join(entry.efforts)}")
+    parameters = {**entry.parameters, **entry.efforts[str(level)]}
+    return entry.model_copy(update={"parameters": parameters})
 
 
 def _set(
