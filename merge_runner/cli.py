@@ -243,8 +243,9 @@ def sweep(
         order_seed=order_seed,
         only=_levels(only or ()),
     )
-    options = plan.within_budget(options)
-    if replay:
+    if not replay:
+        options = plan.within_budget(options)
+    else:
         from merge_runner.run.recorded_plan import replayed
 
         whole = any(part is not None for part in (reps, conditions, variants))
@@ -443,7 +444,7 @@ def forget(
         otherwise="nothing was removed",
         yes=yes,
     )
-    gone = forgetting.forget(db, of_sweeps, of_trials)
+    gone = forgetting.forget(db, of_sweeps, of_trials, going)
     say(
         f"removed: {gone}. Their replies stay in the cache: the same `merge-runner sweep` plays "
         "the trials again without a call"

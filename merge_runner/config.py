@@ -517,10 +517,12 @@ def validated(model: type[ModelT], value: object, where: str) -> ModelT:
         raise UsageError(one_line(f"{where}: {'; '.join(_explain(exc, model))}")) from exc
 
 
-def find_experiments() -> Path:
-    """The experiments folder: of the working directory, else what ships with the program."""
+def experiments() -> list[Path]:
+    """The folders of studies: that of the working directory goes before what ships."""
     here = Path("experiments")
-    return here if here.is_dir() else SHIPPED_EXPERIMENTS
+    if here.is_dir() and not (SHIPPED_EXPERIMENTS.is_dir() and here.samefile(SHIPPED_EXPERIMENTS)):
+        return [here, SHIPPED_EXPERIMENTS]
+    return [here if here.is_dir() else SHIPPED_EXPERIMENTS]
 
 
 def _base_url(entry: ModelEntry, provider: Provider, env: Mapping[str, str]) -> str:

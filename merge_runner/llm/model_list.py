@@ -12,7 +12,8 @@ from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import RawReply
 from merge_runner.llm.transport import TransportFailure
 
-TIMEOUT_S = 10.0
+# A server that answers one call at a time may be busy with one.
+TIMEOUT_S = 60.0
 POLL_S = 0.5
 
 

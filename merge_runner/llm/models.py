@@ -7,7 +7,7 @@ from pathlib import Path
 from merge_runner.config import (
     ModelEntry,
     endpoint_identity,
-    find_experiments,
+    experiments,
     model_id,
     read_toml,
     validated,
@@ -23,15 +23,15 @@ REGISTRY = "models.toml"
 def load_models(beside: Path | None = None) -> dict[str, ModelEntry]:
     """The entries by name, each with a known format and provider; raises UsageError.
 
-    Those of a ``models.toml`` in the working directory, or ``beside`` a study, are added to the
-    registry, and take the place of those of the same name.
+    Those of a ``models.toml`` in the working directory, in its ``experiments``, or ``beside`` a
+    study are added to those that ship, and take the place of those of the same name.
     """
     load_plugins()  # before the file is read: an error in a plug-in is none of the file's
-    own = find_experiments() / REGISTRY
-    added = dict.fromkeys((folder or Path()) / REGISTRY for folder in (None, beside))
+    folders = [*reversed(experiments()), Path(), *([] if beside is None else [beside])]
     entries: dict[str, ModelEntry] = {}
-    for path in (own, *(each for each in added if each.is_file() and each != own)):
-        entries |= read_models(path)
+    for path in dict.fromkeys(folder / REGISTRY for folder in folders):
+        if path.is_file():
+            entries |= read_models(path)
     return entries
 
 

@@ -75,8 +75,13 @@ def to_forget(db: Path, sweeps: Sequence[str], trials: Sequence[str]) -> Forgott
         return _mark(connection, sweeps, trials)
 
 
-def forget(db: Path, sweeps: Sequence[str], trials: Sequence[str]) -> Forgotten:
-    """Remove sweeps and trials, and the specs that no trial is left of; see ``to_forget``."""
+def forget(db: Path, sweeps: Sequence[str], trials: Sequence[str], agreed: Forgotten) -> Forgotten:
+    """Remove sweeps and trials, and the specs that no trial is left of; see ``to_forget``.
+
+    Raises UsageError where that is not any more what was ``agreed`` to.
+    """
+    if to_forget(db, sweeps, trials) != agreed:
+        raise UsageError(f"{db} has changed meanwhile, and nothing was removed: ask again")
     Store(db)  # brings an older database up to date
     with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
         try:

@@ -121,12 +121,11 @@ def estimate(
     arms = plan.by_label()
     calls = {label: _calls(plan, arms[label], cell.calls, facts) for label, cell in todo.items()}
     whole = [made for cell in calls.values() for made in cell]
-    share = _share_within(options.caps, spending, whole)
     cells = []
     for label, cell in todo.items():
         sums = _sums(calls[label])
         minutes = _minutes(options, cell.trials, calls[label])
-        within = _within(cell.trials, share)
+        within = _within(cell.trials, _share_within(options.caps, spending, calls[label], whole))
         cells.append(CellEstimate(label, cell.trials, *sums, minutes, within))
     trials = sum(cell.trials for cell in todo.values())
     return Estimate(
@@ -138,7 +137,7 @@ def estimate(
         measured=tuple(
             driver_name(name, plan.endpoints[name]) for name in plan.entries if facts[name].measured
         ),
-        trials_within_cap=None if share is None else sum(c.trials_within_cap or 0 for c in cells),
+        trials_within_cap=_sum_within(cells),
         cells=tuple(cells),
     )
 
@@ -169,16 +168,32 @@ def _sums(calls: Sequence[_Calls]) -> tuple[int, int, int, float | None]:
     )
 
 
-def _share_within(caps: Caps, spending: Spending, calls: Sequence[_Calls]) -> float | None:
-    """The part of the calls that the money left buys; None without a cap or a price."""
-    if caps == NO_CAPS or any(each.cost_usd is None for each in calls):
+def _share_within(
+    caps: Caps, spending: Spending, calls: Sequence[_Calls], whole: Sequence[_Calls]
+) -> float | None:
+    """The part of a cell's calls that the money left buys; None without a cap or a price.
+
+    Each cap is spread evenly over what draws on it in the ``whole`` run.
+    """
+    if caps == NO_CAPS or any(each.cost_usd is None for each in whole):
         return None
     shares = [1.0]
     for model, cap_usd in caps:
-        cost_usd = sum(each.cost_usd or 0.0 for each in calls if model in (None, each.model))
-        if cost_usd:
-            shares.append((cap_usd - spending.committed_for(model)) / cost_usd)
+        if _usd(calls, model):
+            left_usd = cap_usd - spending.committed_for(model)
+            shares.append(left_usd / _usd(whole, model))
     return max(0.0, min(shares))
+
+
+def _usd(calls: Sequence[_Calls], model: str | None) -> float:
+    """What calls cost a cap: that of one model, or None, that of all."""
+    return sum(each.cost_usd or 0.0 for each in calls if model in (None, each.model))
+
+
+def _sum_within(cells: Sequence[CellEstimate]) -> int | None:
+    within = [cell.trials_within_cap for cell in cells]
+    known = [trials for trials in within if trials is not None]
+    return sum(known) if known and len(known) == len(within) else None
 
 
 def _within(trials: int, share: float | None) -> int | None:

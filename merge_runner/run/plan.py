@@ -116,7 +116,8 @@ class Plan:
         """
         if self.study.file.budget != BudgetTerms():
             return self.name
-        return f"{self.name}/{self.model}/set{self.sample_set}"
+        models = ",".join(sorted(self.model.split(",")))
+        return f"{self.name}/{models}/set{self.sample_set}"
 
     @property
     def registered(self) -> dict[str, str]:
@@ -167,12 +168,18 @@ class Plan:
         """
         budget = self.study.file.budget
         total_usd = budget.total_usd if options.max_cost_usd is None else options.max_cost_usd
-        options = replace(options, max_cost_usd=total_usd, split_usd=budget.split)
         paid = {self.registered[n] for n, entry in self.entries.items() if entry.price != "free"}
         file = self.study.file
         named = [*file.models, *map(level_text, file.factors.get(OPPONENT, ()))]
-        options.caps.check(paid, {name for pair in named for name in both_sides(pair).values()})
-        return options
+        sides = {name for pair in named for name in both_sides(pair).values()}
+        Caps(budget.total_usd, budget.split).check(paid, sides | {*self.registered.values()})
+        return replace(options, max_cost_usd=total_usd, split_usd=budget.split)
+
+    @property
+    def capped_by(self) -> str:
+        """Where a user raises what may be spent."""
+        own = self.study.file.budget != BudgetTerms()
+        return f"[budget] of {self.study.path}, or --max-cost," if own else "--max-cost"
 
     def by_label(self) -> dict[str, Arm]:
         """The arms by the labels that their trials carry."""

@@ -239,7 +239,7 @@ class Sweep:
             outcome.fail(
                 TrialSuspended.exit_code,
                 f"{outcome.suspended} trials wait for money: {self._suspended}. Their "
-                "replies are kept: raise --max-cost and run the same command again",
+                f"replies are kept: raise {self._plan.capped_by} and run the same command again",
             )
         if ways["failed"] and not self._misses:
             outcome.fail(1, f"{ways['failed']} trials failed")

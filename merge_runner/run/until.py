@@ -20,11 +20,13 @@ def deadline(text: str, now: datetime) -> datetime:
         named: time | datetime = time.fromisoformat(text)
     except ValueError:
         named = _date_time(text)
+    if isinstance(named, time) and named.tzinfo is not None:
+        raise UsageError(f"--until {text}: a time of day is local; with a zone, name the date, too")
     if isinstance(named, datetime):
         found = named.astimezone()  # one without a zone is local
     else:
         # Through local times without a zone, since a night may have 23 or 25 hours.
-        today = datetime.combine(now.astimezone().replace(tzinfo=None), named.replace(tzinfo=None))
+        today = datetime.combine(now.astimezone().replace(tzinfo=None), named)
         found = today.astimezone()
         if found <= now:
             found = (today + timedelta(days=1)).astimezone()

@@ -17,7 +17,7 @@ from merge_runner.config import (
     NotNegative,
     Positive,
     ScenarioConfig,
-    find_experiments,
+    experiments,
     read_toml,
     validated,
 )
@@ -177,11 +177,16 @@ def read_study(name: str) -> Study:
     """The study ``experiments/NAME.toml``, or that of a path; raises UsageError."""
     path = Path(name)
     if path.suffix != ".toml":
-        folder = find_experiments()
-        path = folder / f"{name}.toml"
-        known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "models")
-        if name not in known:
-            raise UsageError(f"there is no sweep {name!r}; valid: {', '.join(known)}, or a path")
+        files = {
+            file.stem: file
+            for folder in reversed(experiments())
+            for file in folder.glob("*.toml")
+            if file.stem != "models"
+        }
+        if name not in files:
+            known = ", ".join(sorted(files))
+            raise UsageError(f"there is no sweep {name!r}; valid: {known}, or a path")
+        path = files[name]
     file = validated(StudyFile, read_toml(path), str(path))
     return Study(
         name=path.stem,
