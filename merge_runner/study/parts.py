@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import re
 import sys
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.abc import InspectLoader
 from importlib.util import module_from_spec, spec_from_loader
 from types import CodeType
 
+from merge_runner.config import validated
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of
-from merge_runner.registry import FAULTS, load_plugins, registering
+from merge_runner.registry import FAULTS, load_plugins, note_study, registering
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
-from merge_runner.study.file import AddedText, Study, StudyCondition, StudyPrompt
+from merge_runner.study.file import AddedText, Study, StudyCondition, StudyFile, StudyPrompt
 
 LAST = "the end"
+_adopted: list[Study] = []
 
 
 def adopt(study: Study) -> None:
@@ -26,11 +29,34 @@ def adopt(study: Study) -> None:
     """
     load_plugins()  # first: a study may build on what is installed
     load_plugin_files(study.plugins)
+    _register(study.file)
+    _adopted[:] = [study]
+    note_study([study.text, *study.plugins.values()])
+
+
+def adopted() -> Study | None:
+    """The study whose parts are registered now, if any."""
+    return _adopted[-1] if _adopted else None
+
+
+def adopt_declared(text: str) -> None:
+    """Register the prompts and conditions of a study's file, but run none of its plug-ins.
+
+    Raises UsageError.
+    """
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as exc:
+        raise UsageError(f"the stored study cannot be read: {exc}") from exc
+    _register(validated(StudyFile, content, "the stored study"))
+
+
+def _register(file: StudyFile) -> None:
     with registering("study"):
-        for condition in study.file.conditions or ():
+        for condition in file.conditions or ():
             if condition.is_own:
                 CONDITIONS.register(condition.name, _condition(condition))
-        for name, prompt in study.file.prompts.items():
+        for name, prompt in file.prompts.items():
             VARIANTS.register(name, _variant(name, prompt))
 
 
