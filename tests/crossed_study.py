@@ -66,7 +66,7 @@ def play(folder: Path, prepare: Callable[..., Run]) -> Mine:
     ran = prepare(folder, "sweep", "mine.toml", "--yes", "--db", "t.duckdb", *FAST)
     assert ran.code == 0, ran.err
 
-    def run(*arguments: object) -> Run:
-        return prepare(folder, *arguments, "--db", "t.duckdb")
+    def run(*arguments: object, db: str = "t.duckdb") -> Run:
+        return prepare(folder, *arguments, "--db", db)
 
     return Mine(folder, folder / "t.duckdb", ran.out, run)

@@ -39,6 +39,7 @@ from merge_runner.records import SIDES, Side
 from merge_runner.registry import require
 from merge_runner.results.levels import LEVELS
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF
 from merge_runner.text_safety import quoted
 
 HUMAN = "human"
@@ -50,8 +51,8 @@ COLUMNS_OF_GROUPS = [
 BASELINE = "baseline"
 MEAN_SPEED = "mean_speed_mps"
 # Factors that every study has, and levels that others are compared with.
-FIRST = ("model", "prompt")
-USUAL = (BASELINE, "default", "self")
+FIRST = (MODEL, PROMPT)
+USUAL = (BASELINE, DEFAULT, SELF)
 NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5

@@ -12,12 +12,10 @@ from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 from analysis.explorer.catalogue import FACTOR, Catalogue
 from analysis.explorer.reading import Row
 from merge_runner.audit.expected import ArmFacts, ModelFacts
-from merge_runner.config import both_sides, pair_name
+from merge_runner.config import both_sides, find_experiments, pair_name
 from merge_runner.drivers.registry import stand_in
-from merge_runner.errors import UsageError
 from merge_runner.results.progress_file import Standing, read_standing
-from merge_runner.study.crossing import OPPONENT, PROMPT, SELF
-from merge_runner.study.file import read_study
+from merge_runner.study.crossing import MODEL, OPPONENT, PROMPT, SELF
 
 OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"
 SWEEPS = """
@@ -77,9 +75,9 @@ class Arm(ArmFacts):
     @property
     def state(self) -> dict[str, str]:
         """The filter of its trials."""
-        left, right = self.sides.values()
+        left, right = self.sides["left"], self.sides["right"]
         alone = left == right or self.factors.get(OPPONENT, SELF) != SELF
-        levels = {"model": left if alone else f"{left}+{right}", **self.factors}
+        levels = {MODEL: left if alone else f"{left}+{right}", **self.factors}
         levels.pop(PROMPT, None)
         return {"variant": self.variant, **{f"{FACTOR}{n}": level for n, level in levels.items()}}
 
@@ -456,11 +454,8 @@ def _again(entry: ListedSweep) -> str:
 def _study_of(entry: ListedSweep) -> str:
     """The name of a sweep's study, or the file that it was read from, wherever that lies."""
     name = str(entry.row["name"])
-    try:
-        known = read_study(name).name == name
-    except UsageError:
-        known = False
-    return name if known or not entry.config.study else f"{name}.toml"
+    known = {path.stem for path in find_experiments().glob("*.toml")}
+    return name if name in known or not entry.config.study else f"{name}.toml"
 
 
 def _later(entry: ListedSweep, newer: list[ListedSweep]) -> str:

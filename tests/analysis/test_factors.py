@@ -34,6 +34,11 @@ def test_the_summary_of_a_sweep_counts_by_model_and_by_each_factor(played):
     assert by_factor["model"] == [["cheap", "24"], ["dear", "12"]]
     assert by_factor["temperature"] == [["1.0", "18"], ["0.2", "18"]]
     assert by_factor["opponent"] == [["self", "24"], ["sleepy", "12"]]
+    (played.folder / "again.duckdb").write_bytes(played.db.read_bytes())
+    again = played.run("sweep", "mine.toml", "--yes", "--json", db="again.duckdb").summary
+    trials = {(one["factor"], one["level"]): one["trials"] for one in again["outcomes_by_level"]}
+    assert trials["temperature", "0.2"] == 18
+    assert trials["model", "dear"] == 12
 
 
 def test_conditions_of_another_mean_speed_stay_in_the_group_of_their_driver(study):

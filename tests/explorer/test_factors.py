@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from urllib.parse import parse_qs, urlsplit
 
 import duckdb
@@ -57,6 +59,31 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
     stopped = TestClient(explorer(Site(copy), {HOST}), base_url=f"http://{HOST}").get("/").text
     assert "18 of 36 trials have an outcome" in stopped
     assert "<code>merge-runner sweep mine.toml --model cheap --model dear</code>" in stopped
+
+
+ASK = """
+import sys
+from pathlib import Path
+from analysis.explorer.analysis_process import worker
+from merge_runner.study.file import read_study
+from merge_runner.study.parts import adopt
+
+adopt(read_study(sys.argv[2]))
+child = worker(Path(sys.argv[1]))
+said, _ = child.ask(["tables", "factors"], seconds=60, most_bytes=2**24)
+child.close()
+print(said["tables"][0])
+"""
+
+
+def test_what_the_pages_compute_knows_the_study_that_the_explorer_was_given(played):
+    told = subprocess.run(
+        [sys.executable, "-c", ASK, played.db, played.folder / "mine.toml"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "opponent=sleepy/duration_s" in told.stdout
 
 
 def test_an_exported_list_filters_by_factor(played, tmp_path, browser):
