@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, unquote, urlsplit
 
 import duckdb
 import pytest
@@ -13,6 +13,7 @@ from starlette.testclient import TestClient
 from analysis.explorer.app import explorer
 from analysis.explorer.export import export_folder
 from analysis.explorer.site import Site
+from analysis.explorer.urls import StaticLinks
 
 HOST = "127.0.0.1:8700"
 
@@ -59,6 +60,11 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
     stopped = TestClient(explorer(Site(copy), {HOST}), base_url=f"http://{HOST}").get("/").text
     assert "18 of 36 trials have an outcome" in stopped
     assert "<code>merge-runner sweep mine.toml --model cheap --model dear</code>" in stopped
+
+
+def test_the_exported_page_of_a_sweep_of_several_models_is_where_its_link_leads():
+    link = StaticLinks().sweep("mine-cheap,dear+sleepy-20261122T1324")
+    assert link == unquote(link) == "sweep-mine-cheap_dear_sleepy-20261122T1324.html"
 
 
 ASK = """
