@@ -16,7 +16,7 @@ import typer
 
 from analysis.human.commands import INTERRUPTED, human_app
 from analysis.table_format import TableFormat
-from merge_runner.cli import DbOption, app, listed, main, print_out, say
+from merge_runner.cli import DbOption, StudyOption, app, levels, listed, main, print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB, refuse_another_kind
 
@@ -34,6 +34,15 @@ ModelsOption = Annotated[
     str | None,
     typer.Option("--models", help="Only these drivers, separated by commas; human is one."),
 ]
+WhereOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--where",
+        metavar="FACTOR=LEVEL",
+        help="Only drivers' trials at this level of a factor of their study, or of model or "
+        "prompt; may be given more than once.",
+    ),
+]
 
 
 @app.command()
@@ -43,6 +52,8 @@ def tables(
     ] = None,
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
+    where: WhereOption = None,
+    study_file: StudyOption = None,
     output: Annotated[
         TableFormat, typer.Option("--format", help="Form of the tables.")
     ] = TableFormat.TEXT,
@@ -68,7 +79,7 @@ def tables(
     from analysis.tables import finished_tables
     from analysis.tables.formats import render
 
-    made = finished_tables(db, listed(models), names or ())
+    made = finished_tables(db, drivers(models), names or (), where=_at(where))
     if against is not None:
         from analysis.tables.against import against as beside
 
@@ -81,14 +92,17 @@ def explain(
     table: Annotated[str, typer.Argument(metavar="TABLE", help="A table's name.")],
     cell: Annotated[str, typer.Argument(metavar="CELL", help="ROW, or ROW:COLUMN.")],
     db: DbOption = DEFAULT_DB,
+    where: WhereOption = None,
+    study_file: StudyOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Say where a cell of a table comes from: its meaning, the query, and the trials."""
     from analysis.explain import explain as explain_cell
     from analysis.tables import finished_tables
 
-    study = _study(db, None)
-    found = explain_cell(study, finished_tables(db, None, [table], study)[0], cell)
+    study = _study(db, None, where)
+    made = finished_tables(db, None, [table], study, study.where)
+    found = explain_cell(study, made[0], cell)
     if as_json:
         print_out(json.dumps(asdict(found), indent=2, ensure_ascii=False))
     else:
@@ -102,11 +116,13 @@ def figures(
     ),
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
+    where: WhereOption = None,
+    study_file: StudyOption = None,
 ) -> None:
     """Draw Figure 2, the ablation matrix and the distributions, as PDF and PNG."""
     from analysis.figures.gallery import write_figures
 
-    for path in write_figures(_study(db, models), out):
+    for path in write_figures(_study(db, models, where), out):
         say(f"wrote {path}")
 
 
@@ -120,19 +136,43 @@ def report(
     ] = None,
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
+    where: WhereOption = None,
+    study_file: StudyOption = None,
 ) -> None:
     """Write tables, figures, provenance and conclusions as one HTML file, and all as files."""
     from analysis.report.writer import write_report
 
     refuse_another_kind(out, HTML, "page of HTML")
-    for path in write_report(db, listed(models), out, files):
+    for path in write_report(db, drivers(models), out, files, _at(where)):
         say(f"wrote {path}")
 
 
-def _study(db: Path, models: str | None) -> Study:
+def _study(db: Path, models: str | None, where: Sequence[str] | None) -> Study:
     from analysis.data.study import Study
 
-    return Study(db, listed(models))
+    return Study(db, drivers(models), _at(where))
+
+
+def _at(where: Sequence[str] | None) -> dict[str, list[str]] | None:
+    return levels(where, "--where") if where else None
+
+
+def drivers(text: str | None) -> list[str] | None:
+    """The drivers that an option names; a comma within brackets stands between a driver's levels.
+
+    >>> drivers("human, o3 [reasoning_effort=low, temperature=0.2]")
+    ['human', 'o3 [reasoning_effort=low, temperature=0.2]']
+    """
+    if text is None:
+        return None
+    parts, depth = [""], 0
+    for character in text:
+        depth += {"[": 1, "]": -1}.get(character, 0)
+        if character == "," and depth <= 0:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return [part.strip() for part in parts if part.strip()]
 
 
 @app.command()
@@ -154,6 +194,7 @@ def view(
         ),
     ] = None,
     db: DbOption = DEFAULT_DB,
+    study_file: StudyOption = None,
 ) -> None:
     """Serve the explorer: watch trials, read decisions, follow a sweep in a browser."""
     if export is None and single is None:

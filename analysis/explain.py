@@ -85,8 +85,8 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
     predicate = row.counts or _predicate(table, column)
     if column is not None and column.within:
         predicate += f" AND {column.within}"
-    whose = {"own": row.groups, "reference": (row.reference,), "both": (*row.groups, row.reference)}
-    groups = row.groups if column is None or not row.reference else whose[column.of]
+    whose = {"own": row.groups, "reference": row.references, "both": (*row.groups, *row.references)}
+    groups = row.groups if column is None or not row.references else whose[column.of]
     return tuple(
         _published(group, row, column)
         or (
@@ -124,9 +124,15 @@ def query_of(group: Group, predicate: str) -> str:
         "SELECT trials.trial_id, condition, status, merged_first, "  # noqa: S608 # ours
         "trial_metrics.* EXCLUDE (trial_id, spec_hash) FROM trials "
         "JOIN trial_metrics USING (trial_id, spec_hash) "
-        f"WHERE trials.spec_hash = '{group.spec_hash}'{variant}{narrowed} AND {predicate} "
+        f"WHERE trials.spec_hash {_among(group)}{variant}{narrowed} AND {predicate} "
         "ORDER BY ALL"
     )
+
+
+def _among(group: Group) -> str:
+    """Which specs its trials have: several where its conditions differ in their mean speeds."""
+    names = [quoted(name) for name in sorted(group.trials["spec_hash"].unique())]
+    return f"IN ({', '.join(names)})" if len(names) > 1 else f"= '{group.spec_hash}'"
 
 
 def _decided(group: Group, column: str) -> str:

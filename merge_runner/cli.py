@@ -92,6 +92,27 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the summary as o
 NameArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="experiments/NAME.toml, or a path.")
 ]
+
+
+def _adopt(file: str | None) -> str | None:
+    if file is not None:
+        from merge_runner.study.file import read_study
+        from merge_runner.study.parts import adopt
+
+        adopt(read_study(file))
+    return file
+
+
+StudyOption = Annotated[
+    str | None,
+    typer.Option(
+        "--study",
+        metavar="FILE",
+        callback=_adopt,
+        help="The study of the trials: its plug-ins run, and its prompts, conditions, drivers and "
+        "metrics are known.",
+    ),
+]
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
 ImportedFile = Annotated[
     Path, typer.Argument(metavar="FILE", help="A recording (.parquet), or a cache folder.")
@@ -241,7 +262,7 @@ def sweep(
         listed(variants),
         sample_set=sample_set,
         order_seed=order_seed,
-        only=_levels(only or ()),
+        only=levels(only or (), "--only"),
     )
     if not replay:
         options = plan.within_budget(options)
@@ -346,6 +367,7 @@ def audit(
         Path | None,
         typer.Option("--cache", help="Also compare every attempt with this cache folder."),
     ] = None,
+    study: StudyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check that each sample is there, once, and that all else follows from the replies."""
@@ -723,15 +745,15 @@ def _emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list
     return ["--fault-rate", str(fault_rate), "--seed", str(seed)]
 
 
-def _levels(only: Sequence[str]) -> dict[str, list[str]]:
-    """The levels of each factor that --only names; raises UsageError."""
-    levels: dict[str, list[str]] = {}
-    for each in only:
+def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:
+    """The levels of each factor that an option names; raises UsageError."""
+    found: dict[str, list[str]] = {}
+    for each in given:
         factor, equals, level = each.partition("=")
         if not equals:
-            raise UsageError(f"--only {each}: write FACTOR=LEVEL, as in --only temperature=0.2")
-        levels.setdefault(factor.strip(), []).append(level.strip())
-    return levels
+            raise UsageError(f"{option} {each}: write FACTOR=LEVEL, as in {option} temperature=0.2")
+        found.setdefault(factor.strip(), []).append(level.strip())
+    return found
 
 
 def listed(text: str | None) -> list[str] | None:

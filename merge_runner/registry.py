@@ -10,7 +10,7 @@ imported before the first look into any table; what it registers is then as good
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -105,6 +105,19 @@ class Registry(Mapping[str, T]):
         """How many there are."""
         load_plugins()
         return len(self._things)
+
+
+_study_texts: list[str] = []
+
+
+def study_texts() -> Sequence[str]:
+    """The file of the study that is adopted and the sources of its plug-ins; empty without one."""
+    return _study_texts
+
+
+def note_study(texts: Iterable[str]) -> None:
+    """Keep the texts of the study that is adopted now."""
+    _study_texts[:] = texts
 
 
 # What the code of somebody else may raise while it is imported.

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import settings
 
 from merge_runner.results.store import results_digest
+from tests.crossed_study import play
 from tests.harness import PROGRAM, Run, environment
 from tests.zygote import Zygote
 
@@ -104,6 +105,12 @@ def quiet(prepare, tmp_path_factory):
     folder = tmp_path_factory.mktemp("quiet")
     assert prepare(folder, "sweep", "baseline", "--reps", 1).code == 0
     return results_digest(folder / "results/merge.duckdb")
+
+
+@pytest.fixture(scope="session")
+def played(prepare, tmp_path_factory):
+    """A study with several factors and models; see ``tests.crossed_study``."""
+    return play(tmp_path_factory.mktemp("mine"), prepare)
 
 
 def beside(emulator_url, arguments, changes):

@@ -7,6 +7,7 @@ is kept, and the next run computes them again.
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 from collections.abc import Sequence
 from functools import cache
@@ -18,7 +19,7 @@ import duckdb
 import analysis
 import merge_runner
 from merge_runner.errors import StoreError
-from merge_runner.registry import plugin_sources, plugins
+from merge_runner.registry import plugin_sources, plugins, study_texts
 from merge_runner.results.database import (
     SCHEMA_VERSION,
     open_database,
@@ -39,6 +40,7 @@ CREATE TABLE IF NOT EXISTS finished (
 # What tables are made of: all but prompts, texts, requests and replies.
 ROWS = {
     "trials": "trials",
+    "trial_factors": "trial_factors",
     "states": "states",
     "decisions": "(FROM decisions SELECT * EXCLUDE (prompt, rationale))",
     "calls": "(FROM calls SELECT * EXCLUDE (request, reply, error))",
@@ -64,7 +66,10 @@ LOG = logging.getLogger(__name__)
 
 @cache
 def program() -> str:
-    """A hash of all that computes: our code, the published values, the libraries, the plug-ins."""
+    """A hash of all that computes: our code, the published values, the libraries, the plug-ins.
+
+    Those of a study are not among them.
+    """
     digest = hashlib.sha256()
     for name in LIBRARIES:
         digest.update(f"{name} {version(name)}\n".encode())
@@ -88,7 +93,8 @@ def state(connection: duckdb.DuckDBPyConnection) -> str:
             for name, rows in ROWS.items()
         )
     ).fetchall()
-    return hashlib.sha256(f"{program()} {sorted(sums)}".encode()).hexdigest()
+    study = json.dumps(study_texts()) if study_texts() else ""
+    return hashlib.sha256(f"{program()} {study}{sorted(sums)}".encode()).hexdigest()
 
 
 def has(connection: duckdb.DuckDBPyConnection, table: str) -> bool:

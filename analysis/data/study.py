@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +33,27 @@ from analysis.data.load import (
 from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
 from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import UsageError
+from merge_runner.llm.content_hashes import canonical_json, spec_hash
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.records import SIDES, Side
+from merge_runner.registry import require
+from merge_runner.results.levels import LEVELS
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF
 from merge_runner.text_safety import quoted
 
 HUMAN = "human"
 # What tells groups apart, and is no measure.
 COLUMNS_OF_GROUPS = [
-    "driver", "task", "mark", "apart", "trace", "left_scripted", "right_scripted",
+    "driver", "task", "usual", "mark", "apart", "shared", "trace", "left_scripted",
+    "right_scripted",
 ]  # fmt: skip
 BASELINE = "baseline"
+MEAN_SPEED = "mean_speed_mps"
+# Factors that every study has, and levels that others are compared with.
+FIRST = (MODEL, PROMPT)
+USUAL = (BASELINE, DEFAULT, SELF)
+NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
 
@@ -52,6 +64,8 @@ class Group:
 
     ``trials`` are rows of ``load_trials``; for humans before an import only the outcomes that are
     published, and ``measured`` is False. ``setting`` is the prompt variant, empty for humans.
+    ``spec_hash`` is that of its trials, or of those at the usual mean speed where a condition has
+    another. ``levels`` are those of its study's factors, and its model and prompt, by factor.
     ``driver`` is its ``name`` with the ``mark`` that tells it from itself under other settings, and
     with ``[scripted]`` where a stand-in answered only some of its trials. ``label`` is how tables
     name the driver, ``models`` are the names that were asked for, left and right, an equal one
@@ -77,6 +91,7 @@ class Group:
     equal: int = 0
     narrowed: str = ""
     published_outcomes: pd.DataFrame | None = None
+    levels: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def id(self) -> str:
@@ -141,10 +156,19 @@ class Study:
     ``state`` is that of the results before they were read: rows may be stored meanwhile.
     """
 
-    def __init__(self, db: Path | str = DEFAULT_DB, models: Sequence[str] | None = None) -> None:
-        """Read the trials; ``models`` keeps these drivers alone. Raises UsageError."""
+    def __init__(
+        self,
+        db: Path | str = DEFAULT_DB,
+        models: Sequence[str] | None = None,
+        where: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
+        """Read the trials; ``models`` keeps these drivers alone, ``where`` these levels of factors.
+
+        Raises UsageError.
+        """
         self.db = Path(db)
         self.chosen = models
+        self.where = where
         self.state = present_state(self.db)
         specs = load_specs(self.db)
         trials = trials_with_metrics(self.db).merge(
@@ -154,7 +178,9 @@ class Study:
         recorded = trials["source"] == HUMAN
         self.imported = imported(trials[recorded]) if recorded.any() else None
         self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
-        every = _model_groups(trials[~recorded], _tasks(specs))
+        every = _model_groups(trials[~recorded], specs)
+        levels = self._read(LEVELS)
+        every = [replace(group, levels=_levels(levels, group)) for group in every]
         valid = [HUMAN, *dict.fromkeys(group.driver for group in every)]
         wanted = valid if models is None else list(models)
         unknown = [name for name in wanted if name not in valid]
@@ -162,7 +188,9 @@ class Study:
             named = f"no driver {unknown[0]!r}" if unknown else "nothing that --models names"
             raise UsageError(f"{db} holds {named}; valid: {', '.join(valid)}")
         self.empty = not every
-        self.models = [group for group in every if group.driver in wanted]
+        self.models = _at(
+            where or {}, [group for group in every if group.driver in wanted], self.db
+        )
         self.groups = [self.human, *self.models] if HUMAN in wanted else self.models
 
     @property
@@ -273,17 +301,81 @@ def _published_group() -> Group:
     )  # fmt: skip
 
 
+def _levels(levels: pd.DataFrame, group: Group) -> dict[str, str]:
+    """The levels of a group, model and prompt first."""
+    found = of_group(levels, group, group.trials).drop_duplicates("factor")
+    named = dict(zip(found["factor"], found["value"], strict=True))
+    return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
+
+
+def levels_of(groups: Iterable[Group]) -> dict[str, list[str]]:
+    """The levels of each factor that these groups have, as a reader expects them.
+
+    Usual ones first, then numbers by size, then the rest by name.
+    """
+    found: dict[str, set[str]] = {}
+    for group in groups:
+        for factor, level in group.levels.items():
+            found.setdefault(factor, set()).add(level)
+    return {factor: sorted(levels, key=_place) for factor, levels in found.items()}
+
+
+def _place(level: str) -> tuple[bool, float, str]:
+    number = float(level) if NUMBER.fullmatch(level) else inf
+    return level not in USUAL, number, level
+
+
+def _at(where: Mapping[str, Sequence[str]], groups: list[Group], db: Path) -> list[Group]:
+    """The groups at these levels; raises UsageError where there is none, or no such level."""
+    there = levels_of(groups)
+    for factor, levels in where.items():
+        known = require(there, "factor", factor)
+        for level in levels:
+            require(dict.fromkeys(known), f"level of {factor}", level)
+    kept = [
+        group
+        for group in groups
+        if all(group.levels.get(factor) in levels for factor, levels in where.items())
+    ]
+    if where and not kept:
+        asked = " and ".join(f"{factor}={'|'.join(levels)}" for factor, levels in where.items())
+        raise UsageError(f"{db} holds no trial with {asked}: there are some with each alone")
+    return kept
+
+
+def _without(spec: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {name: value for name, value in spec.items() if name not in names}
+
+
 def _tasks(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Spec hash to a hash of what it covers beside the prompt: equal for variants of one study."""
+    """Spec hash to a hash of what it covers beside the prompt and the mean speed.
+
+    It is equal for all variants and conditions of one study.
+    """
     tasks = {}
-    for spec_hash, spec in specs.items():
-        beside = {name: value for name, value in spec.items() if name != "prompt_blocks"}
-        text = json.dumps(beside, sort_keys=True)
-        tasks[spec_hash] = hashlib.sha256(text.encode()).hexdigest()[:8]
+    for name, spec in specs.items():
+        text = json.dumps(_without(spec, "prompt_blocks", MEAN_SPEED), sort_keys=True)
+        tasks[name] = hashlib.sha256(text.encode()).hexdigest()[:8]
     return tasks
 
 
-def _model_groups(trials: pd.DataFrame, tasks: dict[str, str]) -> list[Group]:
+def _usual(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> pd.Series:
+    """The spec hash of each trial, or what it would be at the usual mean speed.
+
+    It stays as it is where a condition was driven at several mean speeds: these must not be mixed.
+    """
+    others = {
+        name: spec_hash(canonical_json(_without(spec, MEAN_SPEED)))
+        for name, spec in specs.items()
+        if MEAN_SPEED in spec
+    }
+    usual = trials["spec_hash"].replace(others)
+    speeds = trials.groupby([usual, "condition"])["spec_hash"].transform("nunique")
+    mixed = usual.isin(usual[speeds > 1])
+    return usual.mask(mixed, trials["spec_hash"])
+
+
+def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> list[Group]:
     """Groups by driver and variant, scripted stand-ins last.
 
     Where a driver was run under several settings of the task, all but the most frequent carry a
@@ -292,12 +384,15 @@ def _model_groups(trials: pd.DataFrame, tasks: dict[str, str]) -> list[Group]:
     """
     if trials.empty:
         return []
-    task = trials["spec_hash"].map(lambda spec_hash: tasks.get(spec_hash, spec_hash[:8]))
-    keyed = trials.assign(task=task)
+    tasks = _tasks(specs)
+    task = trials["spec_hash"].map(lambda name: tasks.get(name, name[:8]))
+    keyed = trials.assign(task=task, usual=_usual(trials, specs))
     keyed["mark"] = _marks(keyed, ["driver"], "task")
-    keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "spec_hash")
+    keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "usual")
     keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
-    keys = ["driver", "mark", "apart", "scripted", "variant", "spec_hash"]
+    # Two names of one model have equal specs, as under two prices.
+    keyed["shared"] = keyed.groupby(["spec_hash", "variant"])["driver"].transform("nunique") > 1
+    keys = ["driver", "mark", "apart", "scripted", "variant", "usual"]
     groups = [_model_group(rows) for _, rows in keyed.groupby(keys)]
     return sorted(
         groups,
@@ -320,13 +415,13 @@ def _model_group(rows: pd.DataFrame) -> Group:
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
     distinct = _distinct(rows)
     narrowed = [f"scripted = {str(scripted).lower()}"] if first["apart"] else []
-    if len(distinct) < len(rows):
+    if len(distinct) < len(rows) or rows["shared"].any():
         names = ", ".join(quoted(trial_id) for trial_id in distinct["trial_id"])
         narrowed.append(f"trials.trial_id IN ({names})")
     return Group(
         driver,
         first["variant"],
-        first["spec_hash"],
+        min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
         distinct.drop(columns=COLUMNS_OF_GROUPS),
         label=f"{driver} ({posing})" if scripted else driver,
         models=tuple(dict.fromkeys(models.values())),

@@ -12,6 +12,7 @@ from typing import Any
 
 from analysis.explorer.catalogue import State
 from analysis.explorer.child import Child, Ended, NoAnswer
+from merge_runner.study.parts import adopted
 
 Request = tuple[str, ...]
 REMEMBERED = 100
@@ -42,8 +43,10 @@ class Waiting:
 
 
 def worker(db: Path) -> Child:
-    """The process that computes; raises NoAnswer."""
-    return Child("analysis.explorer.analysis_worker", str(db))
+    """The process that computes, with the same study's plug-ins as this one; raises NoAnswer."""
+    study = adopted()
+    own = [str(study.path)] if study else []
+    return Child("analysis.explorer.analysis_worker", str(db), *own)
 
 
 class Computing:

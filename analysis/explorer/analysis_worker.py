@@ -24,6 +24,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 if TYPE_CHECKING:
     from analysis.data.study import Group, Study
+    from analysis.explain import Source
 
 
 class Numbers:
@@ -95,7 +96,6 @@ class Numbers:
         if column_name not in columns:
             return {"absent": f"the table {name} has no column {column_name!r}"}
         row, column = rows[row_id], columns[column_name]
-        specs = {group.id: group.spec_hash for group in self.study.groups}
         return self._counted() | {
             "value": shown_value(column, row.values.get(column.name)),
             "heading": table.heading,
@@ -107,8 +107,7 @@ class Numbers:
                     "group": source.group,
                     "text": source.text,
                     "query": source.query,
-                    "spec": specs.get(source.group),
-                    "names": source.trials,
+                    "trials": self._keys(source),
                 }
                 for source in sources_of(self.study, table, row, column)
             ],
@@ -121,8 +120,7 @@ class Numbers:
         """
         from analysis.explain import sources_of
 
-        specs = {group.id: group.spec_hash for group in self.study.groups}
-        sets: dict[tuple[tuple[str, str | None], ...], int] = {}
+        sets: dict[tuple[tuple[str, str], ...], int] = {}
         cells = {}
         for name, table in self._finished(names).items():
             for row in table.rows:
@@ -130,13 +128,26 @@ class Numbers:
                     if column.kind == "text" or row.values.get(column.name) is None:
                         continue
                     behind = tuple(
-                        (trial, specs[source.group])
+                        key
                         for source in sources_of(self.study, table, row, column)
-                        for trial in source.trials
+                        for key in self._keys(source)
                     )
                     if behind:
                         cells[f"{name}/{row.id}:{column.name}"] = sets.setdefault(behind, len(sets))
         return {"cells": cells, "sets": list(sets)}
+
+    def _keys(self, source: Source) -> list[tuple[str, str]]:
+        """The (trial, spec) of a source's trials."""
+        return [(name, self._specs[source.group][name]) for name in source.trials]
+
+    @cached_property
+    def _specs(self) -> dict[str, dict[str, str]]:
+        """Of each group that has traces the spec of each trial."""
+        return {
+            group.id: dict(zip(group.trials["trial_id"], group.trials["spec_hash"], strict=True))
+            for group in self.study.groups
+            if group.measured
+        }
 
 
 def human_panels(study: Study) -> dict[str, Any]:
@@ -220,5 +231,10 @@ def _published_gaps() -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    for study in sys.argv[2:]:
+        from merge_runner.study.file import read_study
+        from merge_runner.study.parts import adopt
+
+        adopt(read_study(study))
     numbers = Numbers(Path(sys.argv[1]))
     serve(lambda request: (numbers.answer(request), b""))

@@ -16,8 +16,9 @@ from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, schema_sql, spill_folder
+from merge_runner.results.levels import LEVELS
 from merge_runner.served_model import ALIASES, others_among
-from merge_runner.text_safety import csv_writer
+from merge_runner.text_safety import csv_writer, quoted
 
 PAGE = 100
 # Equal where the same trials are listed; unlike a stamp it does not change when a table is kept.
@@ -34,9 +35,9 @@ WHERE one.model = ? AND one.variant = ? AND base.variant = 'baseline' AND one.so
 ORDER BY one.trial_id, one.spec_hash, base.spec_hash
 """
 # What is known of each trial. Texts and prompts stay in the database. ``tried`` are its attempts,
-# counted where they are alike; ``flaws`` says of each invalid reply what is wrong with it, and
-# ``posed`` on which sides a stand-in answered.
-LISTED = """
+# counted where they are alike; ``levels`` are those of its study's own factors, ``flaws`` says of
+# each invalid reply what is wrong with it, and ``posed`` on which sides a stand-in answered.
+LISTED = f"""
 CREATE SEQUENCE numbers;
 CREATE TABLE listed (
     number INTEGER DEFAULT nextval('numbers'), trial_id VARCHAR, spec_hash VARCHAR,
@@ -50,15 +51,18 @@ CREATE TABLE listed (
     cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[], left_range_mps FLOAT[],
     right_range_mps FLOAT[], flaws VARCHAR[], posed VARCHAR[],
     tried STRUCT(requested VARCHAR, served VARCHAR, answered BOOLEAN, outcome VARCHAR,
-        unpriced BIGINT, times BIGINT)[]
+        unpriced BIGINT, times BIGINT)[],
+    levels VARCHAR[]
 );
+CREATE TABLE levels (number INTEGER, factor VARCHAR, level VARCHAR);
+CREATE VIEW new_levels AS {LEVELS};
 CREATE VIEW tried AS SELECT number, unnest(tried, recursive := true) FROM listed;
 CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
 CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
     fallbacks BIGINT, flaws VARCHAR[]);
 CREATE TABLE called AS SELECT trial_id, spec_hash, attempts, cost_usd, posed, tried FROM listed;
-"""
+"""  # noqa: S608 # constants
 # The trials of each sweep, and how often what went wrong in a trial. Equal failures are counted
 # together: an error is named by its words before the particulars, without numbers and hashes.
 GROUPED = """
@@ -80,6 +84,7 @@ FROM tried SEMI JOIN others USING (requested, served) WHERE answered GROUP BY AL
 FORGET = """
 DELETE FROM memory.listed WHERE status = 'failed' OR (trial_id, spec_hash, status, end_time_s)
     NOT IN (SELECT (trial_id, spec_hash, status, end_time_s) FROM trials);
+DELETE FROM memory.levels WHERE number NOT IN (SELECT number FROM memory.listed);
 DELETE FROM memory.planned;
 INSERT INTO memory.planned SELECT DISTINCT * FROM sweep_trials;
 DELETE FROM memory.sweeps;
@@ -92,6 +97,8 @@ INSERT INTO memory.trials BY NAME
     ORDER BY trial_id, spec_hash LIMIT 2000;
 INSERT OR IGNORE INTO memory.specs
     FROM specs SEMI JOIN memory.trials USING (spec_hash);
+INSERT INTO memory.trial_factors FROM trial_factors SEMI JOIN memory.trials
+    USING (trial_id, spec_hash);
 INSERT INTO memory.states BY NAME
     FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
 INSERT INTO memory.decided
@@ -126,12 +133,16 @@ SELECT trials.trial_id, trials.spec_hash, source, model_left, model_right,
     time_to_merge_s, gap_m, rmse_mps, joint, coalesce(decisions, 0) AS decisions,
     coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
     coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps, left_range_mps,
-    right_range_mps, flaws, posed, tried
+    right_range_mps, flaws, posed, tried, levels
 FROM trials
 JOIN trial_metrics USING (trial_id, spec_hash)
 JOIN trial_drivers USING (trial_id, spec_hash)
 LEFT JOIN decided USING (trial_id, spec_hash)
 LEFT JOIN called USING (trial_id, spec_hash)
+LEFT JOIN (
+    SELECT trial_id, spec_hash, list(factor || '=' || value ORDER BY factor) AS levels
+    FROM trial_factors WHERE factor <> 'prompt' GROUP BY ALL
+) USING (trial_id, spec_hash)
 LEFT JOIN (
     SELECT trial_id, spec_hash,
         list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'left' AND drawn) AS left_mps,
@@ -146,13 +157,17 @@ LEFT JOIN (
             USING (trial_id, spec_hash))
     WHERE time_s >= 0 GROUP BY ALL
 ) USING (trial_id, spec_hash);
-TRUNCATE trials; TRUNCATE states; TRUNCATE decided; TRUNCATE called;
+INSERT INTO levels SELECT number, factor, value FROM new_levels
+    JOIN listed USING (trial_id, spec_hash) WHERE factor <> 'prompt';
+TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states; TRUNCATE decided; TRUNCATE called;
 """
 # Trials that a stand-in drove, without a note on it yet: by the models asked for, and its sides.
 UNNAMED = """
 SELECT model_left, model_right, posed, list(number)
 FROM listed WHERE scripted AND stand_in IS NULL GROUP BY ALL
 """
+# Before the name of a factor: its facet.
+FACTOR = "factor."
 # Facets of which a trial may have several values, and the tables that hold these.
 SEVERAL = {"sweep": "members", "cause": "causes"}
 SORTS = {
@@ -167,14 +182,15 @@ SORTS = {
 SHOWN = "* EXCLUDE (flaws, posed, tried)"
 SPEEDS = "left_mps, right_mps, left_range_mps, right_range_mps"
 WITHOUT_SPEEDS = f"* EXCLUDE (flaws, posed, tried, {SPEEDS})"
-EXPORTED = f"* EXCLUDE (flaws, posed, tried, number, model_left, model_right, {SPEEDS})"
+EXPORTED = f"* EXCLUDE (flaws, posed, tried, levels, number, model_left, model_right, {SPEEDS})"
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
     """Which trials are wanted; an empty text wants all. ``q`` is part of a name.
 
-    ``trials`` are (trial, spec), where those behind a cell of a table are wanted.
+    ``levels`` are (factor, level). ``trials`` are (trial, spec), where those behind a cell of a
+    table are wanted.
     """
 
     sweep: str = ""
@@ -185,6 +201,7 @@ class Filter:
     validity: str = ""
     cause: str = ""
     q: str = ""
+    levels: tuple[tuple[str, str], ...] = ()
     trials: tuple[tuple[str, str], ...] | None = None
 
     def where(self, leave_out: str = "") -> tuple[str, list[Any]]:
@@ -198,6 +215,10 @@ class Filter:
                     else f"{name} = ?"
                 )
                 values.append(value)
+        for factor, level in self.levels:
+            if f"{FACTOR}{factor}" != leave_out:
+                parts.append("number IN (SELECT number FROM levels WHERE factor = ? AND level = ?)")
+                values += [factor, level]
         if self.q:
             parts.append("contains(lower(trial_id), lower(?))")
             values.append(self.q)
@@ -210,10 +231,11 @@ class Filter:
     @property
     def chosen(self) -> dict[str, str]:
         """What is asked for, by name."""
-        return {name: value for name in (*FACETS, "q") if (value := getattr(self, name))}
+        named = {name: value for name in (*FACETS, "q") if (value := getattr(self, name))}
+        return named | {f"{FACTOR}{factor}": level for factor, level in self.levels}
 
 
-FACETS = tuple(f.name for f in fields(Filter) if f.name not in {"q", "trials"})
+FACETS = tuple(f.name for f in fields(Filter) if f.name not in {"q", "levels", "trials"})
 
 
 @dataclass(slots=True)
@@ -269,7 +291,8 @@ class Catalogue:
 
     def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
         """Each facet's values with how many trials they would leave, the other facets as wanted."""
-        found: dict[str, list[tuple[str, int]]] = {name: [] for name in FACETS}
+        factors = [f"{FACTOR}{name}" for name in self.factors()]
+        found: dict[str, list[tuple[str, int]]] = {name: [] for name in (*FACETS, *factors)}
         counts, values = [], list[Any]()
         for name in FACETS:
             where, wants = wanted.where(leave_out=name)
@@ -279,9 +302,22 @@ class Catalogue:
                 f"WHERE {where} AND value IS NOT NULL GROUP BY ALL"
             )
             values += wants
+        for name in factors:
+            where, wants = wanted.where(leave_out=name)
+            counts.append(
+                "SELECT ? || factor AS facet, level AS value, count(*) AS trials "  # noqa: S608 # constants
+                f"FROM listed JOIN levels USING (number) WHERE factor = ? AND {where} GROUP BY ALL"
+            )
+            values += [FACTOR, name.removeprefix(FACTOR), *wants]
         for row in self.ask(f"{' UNION ALL '.join(counts)} ORDER BY ALL", *values):
             found[row["facet"]].append((row["value"], row["trials"]))
         return found
+
+    def factors(self) -> list[str]:
+        """The factors of the listed studies, with ``model`` where there is any, but no prompt."""
+        rows = self.ask("SELECT DISTINCT factor FROM levels ORDER BY ALL")
+        names = [str(row["factor"]) for row in rows]
+        return names if names != ["model"] else []
 
     def totals(self, wanted: Filter) -> dict[str, Row]:
         """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``.
@@ -373,8 +409,9 @@ class Catalogue:
         where, values = wanted.where()
         with tempfile.TemporaryDirectory(dir=spill_folder()) as folder, self._lock:
             path = Path(folder) / f"trials.{form}"
+            columns = f"{EXPORTED}{self._columns()}"
             chosen = self._memory.sql(
-                f"SELECT {EXPORTED} FROM listed WHERE {where} ORDER BY {order_by(sort)}",  # noqa: S608 # constants
+                f"SELECT {columns} FROM listed WHERE {where} ORDER BY {order_by(sort)}",  # noqa: S608 # constants
                 params=values,
             )
             if form == "csv":
@@ -384,6 +421,16 @@ class Catalogue:
             else:
                 chosen.write_parquet(str(path))
             return path.read_bytes()
+
+    def _columns(self) -> str:
+        """A column for each factor of the listed studies but the model, which has one."""
+        return "".join(
+            f", (SELECT level FROM levels WHERE levels.number = listed.number "  # noqa: S608 # quoted
+            f"AND factor = {quoted(name)}) AS "
+            + '"{}"'.format(f"{FACTOR}{name}".replace('"', '""'))
+            for name in self.factors()
+            if name != "model"
+        )
 
     def _begin(self, file: int) -> None:
         """Forget everything."""

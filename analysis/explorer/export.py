@@ -19,7 +19,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from analysis.explorer.catalogue import FACETS, SEVERAL, Filter
+from analysis.explorer.catalogue import FACETS, FACTOR, SEVERAL, Filter
 from analysis.explorer.details import read_decisions, read_trial
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.computed import computed
@@ -195,6 +195,11 @@ def _listing(site: Site, rows: list[Row], behind: Mapping[str, Any]) -> str:
         name: sorted(Counter(v for of in of_row for v in of[name] if v is not None).items())
         for name in FACETS
     }
+    for row, of in zip(rows, of_row, strict=True):
+        of["levels"] = row["levels"] or []
+    counts = Counter(level for of in of_row for level in of["levels"])
+    for (factor, level), count in sorted((tuple(n.split("=", 1)), k) for n, k in counts.items()):
+        facets.setdefault(f"{FACTOR}{factor}", []).append((level, count))
     return site.render(
         "listing.html",
         here="trials",

@@ -7,14 +7,15 @@ from collections import Counter
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
-from analysis.explorer.catalogue import Catalogue
+from analysis.explorer.catalogue import FACTOR, Catalogue
 from analysis.explorer.reading import Row
-from merge_runner.audit.expected import ModelFacts
-from merge_runner.config import both_sides, pair_name
+from merge_runner.audit.expected import ArmFacts, ModelFacts
+from merge_runner.config import both_sides, find_experiments, pair_name
 from merge_runner.drivers.registry import stand_in
 from merge_runner.results.progress_file import Standing, read_standing
+from merge_runner.study.crossing import MODEL, OPPONENT, PROMPT, SELF
 
 OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"
 SWEEPS = """
@@ -30,7 +31,8 @@ FROM sweeps LEFT JOIN (
 ORDER BY started_at DESC, sweep_id DESC
 """
 CELLS = f"""
-SELECT coalesce(variant, '') AS variant, condition,
+SELECT model_left, model_right, coalesce(variant, '') AS variant, coalesce(levels, []) AS levels,
+    condition,
     count(*) FILTER (status <> 'failed') AS ended, count(*) FILTER (status = 'failed') AS failed,
     count(*) FILTER (status = 'collided') AS collided, sum(decisions)::BIGINT AS decisions,
     sum(invalid)::BIGINT AS invalid, sum(fallbacks)::BIGINT AS fallbacks
@@ -55,6 +57,31 @@ REASONS = {
 }
 
 
+# Who drives left and right, the prompt, and the levels of the other factors as texts.
+ArmKey = tuple[str, str, str, tuple[str, ...]]
+
+
+class Arm(ArmFacts):
+    """An arm of a study's factors, by its ``label`` on the page."""
+
+    label: str
+
+    @property
+    def key(self) -> ArmKey:
+        """What its trials have in common."""
+        levels = (f"{name}={level}" for name, level in self.factors.items() if name != PROMPT)
+        return self.sides["left"], self.sides["right"], self.variant, tuple(sorted(levels))
+
+    @property
+    def state(self) -> dict[str, str]:
+        """The filter of its trials."""
+        left, right = self.sides["left"], self.sides["right"]
+        alone = left == right or self.factors.get(OPPONENT, SELF) != SELF
+        levels = {MODEL: left if alone else f"{left}+{right}", **self.factors}
+        levels.pop(PROMPT, None)
+        return {"variant": self.variant, **{f"{FACTOR}{n}": level for n, level in levels.items()}}
+
+
 class Config(BaseModel):
     """What a sweep planned, as far as its row tells; an older program may have told less."""
 
@@ -67,11 +94,24 @@ class Config(BaseModel):
     conditions: tuple[str, ...] = ()
     sample_set: int = 0
     max_cost_usd: float | None = None
+    arms: tuple[Arm, ...] = ()
+    study: dict[str, JsonValue] = {}
+
+    @property
+    def drivers(self) -> tuple[str, ...]:
+        """Who drives but for opponents."""
+        return tuple(self.model.split(","))
 
     @property
     def driver(self) -> str:
         """The drivers with their endpoints."""
-        return pair_name(both_sides(self.model).values(), self.endpoints)
+        names = (pair_name(both_sides(name).values(), self.endpoints) for name in self.drivers)
+        return ", ".join(names)
+
+    @property
+    def planned(self) -> dict[str, int]:
+        """How many repetitions each arm has by its label; where only prompts vary, each prompt."""
+        return {arm.label: arm.repetitions for arm in self.arms} or self.repetitions
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +138,9 @@ class ListedSweep:
             part = f", in {scripted} of {trials} trials" if scripted < trials else ""
             return f"{self.row['stand_ins']}{part}"
         asked = {model.provider for model in self.config.models.values()}
-        return stand_in(both_sides(self.config.model)) if "emulator" in asked and not trials else ""
+        if "emulator" not in asked or trials:
+            return ""
+        return "; ".join(stand_in(both_sides(name)) for name in self.config.drivers)
 
     @property
     def state(self) -> str:
@@ -120,7 +162,7 @@ class ListedSweep:
     @property
     def planned(self) -> int:
         """How many trials it wants; 0 where that is not known."""
-        return sum(self.config.repetitions.values()) * len(self.config.conditions)
+        return sum(self.config.planned.values()) * len(self.config.conditions)
 
     @property
     def ended(self) -> int:
@@ -151,9 +193,10 @@ class ListedSweep:
 
 @dataclass(frozen=True, slots=True)
 class VariantCondition:
-    """Trials of one variant and condition; ``running`` is None where nobody knows.
+    """Trials of one variant, or arm, and condition; ``running`` is None where nobody knows.
 
-    ``decisions`` and ``invalid`` are those of stored trials.
+    ``decisions`` and ``invalid`` are those of stored trials; ``state`` is the filter of the
+    variant's or arm's trials.
     """
 
     variant: str
@@ -165,6 +208,7 @@ class VariantCondition:
     suspended: int = 0
     decisions: int = 0
     invalid: int = 0
+    state: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,11 +306,13 @@ def config_of(text: str) -> Config:
 def cells_of(entry: ListedSweep, stored: list[Row]) -> dict[tuple[str, str], VariantCondition]:
     """Every cell that was planned, and any other that holds a trial."""
     planned = {
-        (variant, condition): repetitions
-        for variant, repetitions in entry.config.repetitions.items()
+        (label, condition): repetitions
+        for label, repetitions in entry.config.planned.items()
         for condition in entry.config.conditions
     }
-    found = {(row["variant"], row["condition"]): row for row in stored}
+    arms = {arm.key: arm for arm in entry.config.arms}
+    states = {arm.label: arm.state for arm in arms.values()}
+    found = {(_label(row, arms), row["condition"]): row for row in stored}
     told = {(cell.variant, cell.condition): cell for cell in entry.live.cells} if entry.live else {}
     cells = {}
     for key in planned | found:
@@ -281,8 +327,16 @@ def cells_of(entry: ListedSweep, stored: list[Row]) -> dict[tuple[str, str], Var
             suspended=now.suspended if now else 0,
             decisions=row.get("decisions", 0),
             invalid=row.get("invalid", 0),
+            state=states.get(key[0], {"variant": key[0]}),
         )
     return cells
+
+
+def _label(row: Row, arms: dict[ArmKey, Arm]) -> str:
+    """The arm of stored trials by its label, or their prompt where only prompts vary."""
+    key = row["model_left"], row["model_right"], row["variant"], tuple(row["levels"])
+    arm = arms.get(key)
+    return arm.label if arm else str(row["variant"])
 
 
 def rates_of(
@@ -389,10 +443,19 @@ def _finished(entry: ListedSweep, mismatches: int) -> Assessment:
 
 
 def _again(entry: ListedSweep) -> str:
-    words = ["merge-runner", "sweep", entry.row["name"], "--model", entry.config.model or "?"]
+    words = ["merge-runner", "sweep", _study_of(entry)]
+    for name in entry.config.drivers:
+        words += ["--model", name or "?"]
     if entry.config.sample_set:
         words += ["--sample-set", str(entry.config.sample_set)]
     return shlex.join(words)
+
+
+def _study_of(entry: ListedSweep) -> str:
+    """The name of a sweep's study, or the file that it was read from, wherever that lies."""
+    name = str(entry.row["name"])
+    known = {path.stem for path in find_experiments().glob("*.toml")}
+    return name if name in known or not entry.config.study else f"{name}.toml"
 
 
 def _later(entry: ListedSweep, newer: list[ListedSweep]) -> str:

@@ -7,6 +7,8 @@ from collections.abc import Collection, Mapping
 from typing import Any
 from urllib.parse import quote, urlencode
 
+# What an address may spell in another way.
+_ODD = re.compile(r"[^A-Za-z0-9_.-]")
 # Without exponents and names: float() also reads "1e999" and "nan".
 _SECONDS = re.compile(r"[0-9]{1,12}(\.[0-9]{1,6})?")
 
@@ -103,8 +105,8 @@ class StaticLinks(Links):
         return super().cell(table, row, column) if known else ""
 
     def sweep(self, sweep_id: str) -> str:
-        """A sweep's page."""
-        return f"sweep-{quote(sweep_id, safe='')}.html"
+        """A sweep's page: a file, whose name means the same in an address."""
+        return f"sweep-{_ODD.sub('_', sweep_id)}.html"
 
 
 def bundle_name(condition: str) -> str:

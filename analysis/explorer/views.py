@@ -119,6 +119,8 @@ def facts(row: Row) -> list[str]:
     found = [f"{row['condition']}: {text}."]
     if row["variant"] is not None:
         found.append(f"{row['variant']}: {prompt_text(row['variant'])}.")
+    if row["levels"]:
+        found.append(f"{', '.join(row['levels'])}.")
     if row["rmse_mps"] is not None:
         found.append(f"RMSE of the speed {row['rmse_mps']:.2f} m/s.")
     if row["decisions"]:

@@ -32,6 +32,7 @@ from analysis.figures.drawing import (
     velocity_text,
     wrapped,
 )
+from analysis.figures.factor_figure import figure_of_factors
 from analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     Point,
@@ -207,6 +208,11 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
         distributions,
         "Every metric that is not a share, of all trials that count in it: medians, quartiles, "
         "whiskers to 1.5 times the quartiles' distance, and every trial.",
+    ),
+    "factors": (
+        figure_of_factors,
+        "Each factor's levels, pooled over all other factors, by every metric: its rate, mean or "
+        "median with the 95 % interval that the table of this name prints.",
     ),
 }
 

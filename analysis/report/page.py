@@ -16,6 +16,7 @@ from analysis.explain import Source, sources_of, sql_command
 from analysis.figures.gallery import FIGURES
 from analysis.report.alarms import alarms, posing
 from analysis.report.conclusions import not_shown, nothing, shown
+from analysis.stats.factors import levels_by_factor
 from analysis.tables.against import PAPER, against, in_paper
 from analysis.tables.formats import table_view
 from analysis.tables.model import Column, Row, Table
@@ -43,6 +44,7 @@ class Links:
 def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
     """The report as one HTML document; ``figures`` maps names to SVG in Base64."""
     links = Links(study)
+    left_out = () if levels_by_factor(study) else ("factors",)
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
@@ -62,8 +64,9 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         figures=[
             {"name": name, "caption": FIGURES[name][1], "data": data}
             for name, data in figures.items()
+            if name not in left_out
         ],
-        tables=[table_view(table, links.to) for table in tables],
+        tables=[table_view(table, links.to) for table in tables if table.name not in left_out],
         beside=[table_view(against(table, PAPER), links.to) for table in tables if in_paper(table)],
         sources=[(number, sources) for sources, number in links.found.items()],
         listed=LISTED,

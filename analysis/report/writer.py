@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from analysis.data.derived_cache import finished, keep_finished
@@ -18,18 +18,22 @@ from merge_runner.errors import UsageError
 
 
 def write_report(
-    db: Path, models: Sequence[str] | None, out: Path, files: Path | None
+    db: Path,
+    models: Sequence[str] | None,
+    out: Path,
+    files: Path | None,
+    where: Mapping[str, Sequence[str]] | None = None,
 ) -> Iterator[Path]:
     """Write the report, and every table and figure into the folder ``files``; yields the paths.
 
-    ``models`` restricts the report to these drivers. Raises UsageError.
+    ``models`` and ``where`` restrict the report as they do a study. Raises UsageError.
     """
-    study = Study(db, models)
-    tables = finished_tables(db, models, study=study)
+    study = Study(db, models, where)
+    tables = finished_tables(db, models, study=study, where=where)
     if files is not None:
         yield from write_figures(study, files)
         yield from write_tables(tables, files)
-    text = report_html(study, tables, finished_figures(study, options_text(db, models)))
+    text = report_html(study, tables, finished_figures(study, options_text(db, models, where)))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +26,7 @@ TABLES = {
     "ablation-qualitative": "ablations",
     "ablation-quantitative": "ablations",
     "contrasts": "contrasts",
+    "factors": "factors",
     "differences": "differences",
     "who-first-variants": "variants",
     "gap-variants": "variants",
@@ -48,15 +49,19 @@ def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
 
 
 def finished_tables(
-    db: Path, models: Sequence[str] | None, names: Sequence[str] = (), study: Study | None = None
+    db: Path,
+    models: Sequence[str] | None,
+    names: Sequence[str] = (),
+    study: Study | None = None,
+    where: Mapping[str, Sequence[str]] | None = None,
 ) -> list[Table]:
     """The named tables of a database, or all: read from it where stored, else computed.
 
-    ``models`` restricts the tables to these drivers; ``study`` is their study, if the caller
-    already has it. Raises UsageError for an unknown name.
+    ``models`` and ``where`` restrict the tables as they do a study; ``study`` is theirs, if the
+    caller already has it. Raises UsageError for an unknown name.
     """
     wanted = _valid(names)
-    options = options_text(db, models)
+    options = options_text(db, models, where)
     state = study.state if study else present_state(db)
     kept = finished(db, state, options, wanted)
     found = {name: from_text(text) for name, text in kept.items()}
@@ -65,7 +70,7 @@ def finished_tables(
     if missing:
         from analysis.data.study import Study
 
-        study = study or Study(db, models)
+        study = study or Study(db, models, where)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
         # The state is the one before the study was read: trials stored since then outdate it.
         keep_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})

@@ -196,7 +196,7 @@ def _percent(value: float | None, metric: Metric) -> float | None:
 
 def shared_notes(study: Study) -> list[str]:
     """Notes on replies that variants share with the baseline, where their prompts are equal."""
-    named = {group.spec_hash: group.id for group in study.models}
+    named = {name: group.id for group in study.models for name in group.trials["spec_hash"]}
     return [
         f"{named[row.spec_hash]}: {row.shared} of {row.calls} calls share their reply with "
         f"{named[row.baseline]}, where prompt and slot are equal: the groups are not independent, "

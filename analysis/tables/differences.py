@@ -114,7 +114,7 @@ def _row(human: Group, group: Group, found: Interaction) -> Row:
         },
         f"{found.outcome}: {said}" if said else "",
         counts=COUNTS[found.outcome],
-        reference=human.id,
+        references=(human.id,),
         published=() if of_traces else OF_HUMANS,
         cited="" if of_traces else FILES[found.outcome],
     )

@@ -26,7 +26,7 @@ class Column:
     ``meaning`` describes its values in words, and ``counts`` is the SQL predicate for the trials
     that they rest on. If ``optional``, a value may be missing without a note. ``within`` narrows
     these trials further, even in rows that have a predicate of their own. ``of`` says whose trials
-    the values rest on: those of the row, those of its ``reference``, or both.
+    the values rest on: those of the row, those of its ``references``, or both.
     """
 
     name: str
@@ -48,8 +48,8 @@ class Row:
     ``printed`` names the columns whose values are published ones or rest on them. ``published``
     names the columns that rest on the published human outcomes where the others rest on human
     trials. ``beside`` is the paper's driver whose row it is compared with, if any, and
-    ``stand_in_for`` the models in whose names a scripted stand-in answered. ``reference`` is the
-    group that the comparing columns compare it with, and ``cited`` the shipped file that its
+    ``stand_in_for`` the models in whose names a scripted stand-in answered. ``references`` are the
+    groups that the comparing columns compare it with, and ``cited`` the shipped file that its
     ``published`` columns are computed from.
     """
 
@@ -61,7 +61,7 @@ class Row:
     printed: tuple[str, ...] = ()
     beside: str = ""
     stand_in_for: tuple[str, ...] = ()
-    reference: str = ""
+    references: tuple[str, ...] = ()
     published: tuple[str, ...] = ()
     cited: str = ""
 
@@ -132,12 +132,14 @@ def from_text(text: str) -> Table:
         for name in intervals & row["values"].keys():
             if row["values"][name] is not None:
                 row["values"][name] = tuple(row["values"][name])
-        for name in ("groups", "printed", "stand_in_for", "published"):
+        for name in ("groups", "printed", "stand_in_for", "references", "published"):
             row[name] = tuple(row[name])
     rows = [Row(**row) for row in content["rows"]]
     return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})
 
 
-def options_text(db: Path, models: Sequence[str] | None) -> str:
+def options_text(
+    db: Path, models: Sequence[str] | None, where: Mapping[str, Sequence[str]] | None = None
+) -> str:
     """What a table depends on besides the results; the path, since its notes name the database."""
-    return json.dumps([str(db), models])
+    return json.dumps([str(db), models, where])

@@ -45,18 +45,19 @@ def measured_notes(study: Study) -> list[str]:
 
 
 def _own_notes(study: Study, groups: list[Group]) -> list[str]:
-    """Notes on the trials in conditions that no human drove."""
-    notes = []
+    """Notes on the trials in conditions that no human drove, an equal one once."""
+    whose: dict[str, list[str]] = {}
     for group in groups:
         mine = group.trials.loc[~group.trials["condition"].isin(HUMAN_CONDITIONS), "condition"]
         if len(mine):
             names = [name for name in study.conditions if name in set(mine)]
-            notes.append(
-                f"{group.id}: no human drove {', '.join(names)} ({len(mine)} trials): beside the "
-                "humans, rates and regressions rest on these too, differences of means and the "
-                "human ceiling on the other conditions alone"
+            note = (
+                f"no human drove {', '.join(names)} ({len(mine)} trials): beside the humans, rates "
+                "and regressions rest on these too, differences of means and the human ceiling on "
+                "the other conditions alone"
             )
-    return notes
+            whose.setdefault(note, []).append(group.id)
+    return [f"{', '.join(ids)}: {note}" for note, ids in whose.items()]
 
 
 def repeated_note(group: Group) -> str:

@@ -142,7 +142,7 @@ def _with_difference(row: Row, baseline: Group | None, one: Corrected) -> Row:
     found = one.found
     return replace(
         row,
-        reference=baseline.id,
+        references=(baseline.id,),
         values={
             **row.values,
             "difference": found.value,

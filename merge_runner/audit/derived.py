@@ -310,7 +310,7 @@ def _seat(trial: _Trial, spec: Spec, paces: Mapping[Side, Pace]) -> set[str]:
 def _not_here(program: str) -> str:
     return (
         f"the decisions of {program!r}, which is no driver here; valid: {', '.join(PROGRAMS)} "
-        "(install the package that registers it)"
+        "(install the package that registers it, or name the study: --study FILE)"
     )
 
 

@@ -57,6 +57,12 @@ class ArmFacts(_Facts):
         )
 
 
+class StudyFacts(_Facts):
+    """The file of a sweep's study as a text; its plug-ins, which lie beside it, are not read."""
+
+    text: str
+
+
 class SweepConfig(_Facts):
     """The configuration of a sweep as its row holds it.
 
@@ -71,6 +77,7 @@ class SweepConfig(_Facts):
     conditions: tuple[str, ...]
     sample_set: int
     prompt_blocks: dict[str, dict[str, str]]
+    study: StudyFacts | None = None
     stored_arms: tuple[ArmFacts, ...] = Field(default=(), alias="arms")
 
     @cached_property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +30,7 @@ from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.records import SIDES
 from merge_runner.results.database import append, by_name, read_database, room_for_texts
 from merge_runner.served_model import other_models
+from merge_runner.study.parts import adopt_declared, adopted
 from merge_runner.text_safety import first_line
 
 TABLES = """
@@ -166,9 +167,21 @@ def _audit(
     audit.notes += meaningless_ids(connection)
     audit.notes += _alike_notes(connection)
     if derive and config is not None:
+        _adopt_stored(config)
         check_derived(connection, specs, config, audit)
     audit.findings = [replace(finding, sweep=sweep_id) for finding in audit.findings]
     return audit
+
+
+def _adopt_stored(config: SweepConfig) -> None:
+    """Register the prompts and conditions of a sweep's study, unless a user named a study.
+
+    The stored plug-ins are somebody's code and never run; trials that need them are not derived,
+    and neither are those of a study that cannot be read here.
+    """
+    if config.study is not None and adopted() is None:
+        with suppress(UsageError):
+            adopt_declared(config.study.text)
 
 
 def _models(config: SweepConfig) -> set[tuple[str, str, str]]:

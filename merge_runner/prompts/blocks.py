@@ -107,9 +107,13 @@ class Variant:
 
 def _named(template: str) -> list[str]:
     try:
-        return [name for _, name, _, _ in Formatter().parse(template) if name is not None]
+        parts = [part for part in Formatter().parse(template) if part[1] is not None]
     except ValueError as exc:
         raise UsageError(f"a prompt block cannot be read, {exc}: {template!r}") from exc
+    # Fields are texts already; a width could be so large that it fills the memory.
+    if any(spec or conversion for _, _, spec, conversion in parts):
+        raise UsageError(f"in a prompt block a field stands alone in its braces: {template!r}")
+    return [name for _, name, _, _ in parts if name is not None]
 
 
 _SITUATION_BEFORE = """\

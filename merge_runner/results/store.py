@@ -37,6 +37,7 @@ from merge_runner.results.database import (
     unreadable_is_usage,
     update_measures,
 )
+from merge_runner.results.levels import LEVELS
 from merge_runner.results.rows import Row, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.served_model import other_models, sql_of
@@ -326,6 +327,7 @@ class SweepFacts:
     """What the database says of one sweep.
 
     ``outcomes`` holds (variant, condition, status, merged_first, had a fallback, trials),
+    ``levels`` (factor, level, status, merged_first, trials),
     ``ledger`` (driver, variant, fate, outcome, attempts) as the view ``attempts`` names them,
     ``failed`` (trial_id, error), ``others`` (model requested, model served, answers) where another
     model answered, and ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
@@ -333,6 +335,7 @@ class SweepFacts:
     """
 
     outcomes: list[tuple[str, str, str, str | None, bool, int]]
+    levels: list[tuple[str, str, str, str | None, int]]
     ledger: list[tuple[str, str, str, str, int]]
     failed: list[tuple[str, str]]
     others: list[tuple[str, str, int]]
@@ -368,6 +371,11 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 "count(*) FROM trials LEFT JOIN (SELECT trial_id, spec_hash, "
                 "bool_or(fallback) AS fallen_back FROM decisions GROUP BY ALL) "
                 "USING (trial_id, spec_hash)",
+                "GROUP BY ALL ORDER BY ALL",
+            ),
+            levels=rows(
+                "SELECT factor, value, status, merged_first, count(*) "  # noqa: S608 # constants
+                f"FROM trials JOIN ({LEVELS}) USING (trial_id, spec_hash)",
                 "GROUP BY ALL ORDER BY ALL",
             ),
             ledger=rows(

@@ -7,15 +7,18 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from typing import Any, get_args
 
+from merge_runner.config import both_sides
 from merge_runner.errors import ReplayMiss
 from merge_runner.records import Status
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
 from merge_runner.run.sweep import Outcome
+from merge_runner.study.crossing import PROMPT
 
 # Places in a row of ``SweepFacts.outcomes``.
 VARIANT, CONDITION, STATUS, FELL_BACK = 0, 1, 2, 4
+Groups = defaultdict[tuple[object, ...], Counter[str]]
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
 LEDGER = ("model", "variant", "fate", "outcome", "attempts")
 FAILURES_SHOWN = NOTES_SHOWN = 10
@@ -65,6 +68,10 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
             for (variant, condition), counts in (
                 _counts(facts, VARIANT, CONDITION) if facts else {}
             ).items()
+        ],
+        "outcomes_by_level": [
+            {"factor": factor, "level": level, **_named(counts)}
+            for (factor, level), counts in (_by_level(facts) if facts else {}).items()
         ],
         "outcomes_without_fallbacks": (_named(_counts(facts, FELL_BACK)[False,]) if facts else {}),
     }
@@ -166,7 +173,7 @@ def _mismatches(facts: SweepFacts | None) -> dict[str, int]:
 
 
 def _table(plan: Plan, facts: SweepFacts) -> Iterator[str]:
-    """Counts per condition, and per variant where there are several."""
+    """Counts per condition, and per variant, model and level of a factor where these vary."""
     by_condition = _counts(facts, CONDITION)
     yield _row("condition", COLUMNS)
     for condition in plan.conditions:
@@ -178,6 +185,24 @@ def _table(plan: Plan, facts: SweepFacts) -> Iterator[str]:
         yield _row("variant", COLUMNS)
         for variant in plan.repetitions:
             yield _row(variant, _named(by_variant[variant,]).values())
+    by_level = _by_level(facts)
+    for factor, levels in _varying(plan).items():
+        width = max(map(len, (factor, *levels))) + 1
+        yield ""
+        yield _row(factor, COLUMNS, width)
+        for level in levels:
+            yield _row(level, _named(by_level[factor, level]).values(), width)
+
+
+def _varying(plan: Plan) -> dict[str, list[str]]:
+    """The models, and the factors but the prompt, where there are several, with their levels."""
+    models = ["+".join(dict.fromkeys(both_sides(name).values())) for name in plan.models]
+    found = {"model": models}
+    for arm in plan.arms:
+        for factor, level in arm.factors.items():
+            found.setdefault(factor, []).append(level)
+    levels = {name: list(dict.fromkeys(each)) for name, each in found.items() if name != PROMPT}
+    return {name: each for name, each in levels.items() if len(each) > 1}
 
 
 def _stand_in(driver: str, model: str, provider: str, scripted: int, answers: int) -> str:
@@ -188,15 +213,26 @@ def _stand_in(driver: str, model: str, provider: str, scripted: int, answers: in
     return f"{driver}: a scripted stand-in answered, not {model}{part}"
 
 
-def _counts(facts: SweepFacts, *by: int) -> defaultdict[tuple[object, ...], Counter[str]]:
+def _counts(facts: SweepFacts, *by: int) -> Groups:
     """Counts of trials by COLUMNS, for each group of rows that are equal in these places."""
-    groups: defaultdict[tuple[object, ...], Counter[str]] = defaultdict(Counter)
+    groups: Groups = defaultdict(Counter)
     for row in facts.outcomes:
         _, _, status, merged_first, _, trials = row
-        counts = groups[tuple(row[place] for place in by)]
-        counts["trials"] += trials
-        counts[f"{merged_first} first" if status == "finished" else status] += trials
+        _count(groups[tuple(row[place] for place in by)], status, merged_first, trials)
     return groups
+
+
+def _by_level(facts: SweepFacts) -> Groups:
+    """The same for each level of each factor."""
+    groups: Groups = defaultdict(Counter)
+    for factor, level, status, merged_first, trials in facts.levels:
+        _count(groups[factor, level], status, merged_first, trials)
+    return groups
+
+
+def _count(counts: Counter[str], status: str, merged_first: str | None, trials: int) -> None:
+    counts["trials"] += trials
+    counts[f"{merged_first} first" if status == "finished" else status] += trials
 
 
 def _named(counts: Counter[str]) -> dict[str, int]:
@@ -208,7 +244,7 @@ def _statuses(facts: SweepFacts) -> dict[str, int]:
     return {status: groups[status,]["trials"] for status in get_args(Status)}
 
 
-def _row(name: str, values: Iterable[object]) -> str:
+def _row(name: str, values: Iterable[object], width: int = 10) -> str:
     # The widths do not depend on the counts, so that two runs can be compared side by side; rich
     # would fit them to the content.
-    return f"{name:<10}" + "".join(f"{value:>12}" for value in values)
+    return f"{name:<{max(width, 10)}}" + "".join(f"{value:>12}" for value in values)

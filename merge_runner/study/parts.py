@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import threading
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.abc import InspectLoader
@@ -13,15 +14,21 @@ from pathlib import Path
 from traceback import extract_tb
 from types import CodeType, ModuleType
 
+from merge_runner.config import validated
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of
-from merge_runner.registry import FAULTS, changes, load_plugins, registering, unregister
+from merge_runner.registry import (
+    FAULTS,
+    changes,
+    load_plugins,
+    note_study,
+    registering,
+    unregister,
+)
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
-from merge_runner.study.file import AddedText, Study, StudyCondition, StudyPrompt
+from merge_runner.study.file import AddedText, Study, StudyCondition, StudyFile, StudyPrompt
 
 LAST = "the end"
-
-
 PACKAGE = "study_plugins"
 """The package of a study's plug-ins: one imports from another by ``from .other import thing``."""
 _lock = threading.RLock()
@@ -39,13 +46,35 @@ def adopt(study: Study) -> None:
             return
         _adopted.clear()
         load_plugin_files(study.plugins)
-        with registering("study"):
-            for condition in study.file.conditions or ():
-                if condition.is_own:
-                    CONDITIONS.register(condition.name, _condition(condition))
-            for name, prompt in _by_dependence(study.file.prompts):
-                VARIANTS.register(name, _variant(name, prompt))
+        _register(study.file)
+        note_study([study.text, *study.plugins.values()])
         _adopted.append((study, changes()))
+
+
+def adopted() -> Study | None:
+    """The study whose parts are registered now, if any."""
+    return _adopted[-1][0] if _adopted else None
+
+
+def adopt_declared(text: str) -> None:
+    """Register the prompts and conditions of a study's file, but run none of its plug-ins.
+
+    Raises UsageError.
+    """
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as exc:
+        raise UsageError(f"the stored study cannot be read: {exc}") from exc
+    _register(validated(StudyFile, content, "the stored study"))
+
+
+def _register(file: StudyFile) -> None:
+    with registering("study"):
+        for condition in file.conditions or ():
+            if condition.is_own:
+                CONDITIONS.register(condition.name, _condition(condition))
+        for name, prompt in _by_dependence(file.prompts):
+            VARIANTS.register(name, _variant(name, prompt))
 
 
 def load_plugin_files(sources: Mapping[str, str]) -> None:

@@ -82,7 +82,7 @@ def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
     notes = [note for one in json.loads(audit.out)["audits"] for note in one["notes"]]
     assert any(
         "the decisions of 'impulsive', which is no driver here; valid: constant, projected-order "
-        "(install the package that registers it)" in note
+        "(install the package that registers it, or name the study: --study FILE)" in note
         for note in notes
     ), notes
     done = study.run("view", "--trials", "*", "--single", "bare.html")

@@ -242,3 +242,9 @@ def test_the_seven_ablations_remove_seven_different_blocks():
     assert not VARIANTS["baseline"].removes | VARIANTS["baseline"].adds
     removed = [variant.removes for variant in VARIANTS.values()]
     assert len(frozenset().union(*removed)) == len(REMOVED)
+
+
+@pytest.mark.parametrize("field", ["{own_speed:>999999999}", "{own_speed!r}"])
+def test_a_field_of_a_block_stands_alone_in_its_braces(field):
+    with pytest.raises(UsageError, match="a field stands alone in its braces"):
+        Block("too wide", f"You drive at {field} m/s.", None)

@@ -65,7 +65,8 @@ def _news(shown: object, seen: str, state: str = "all") -> str:
 
 def _values(site: Site, sweep: Sweep) -> dict[str, object]:
     """What the templates of a sweep show."""
-    variants = _ordered({variant for variant, _ in sweep.cells}, VARIANTS)
+    usual = sweep.entry.config.planned if sweep.entry.config.arms else VARIANTS
+    variants = _ordered({variant for variant, _ in sweep.cells}, usual)
     conditions = _ordered({condition for _, condition in sweep.cells}, HUMAN_CONDITIONS)
     rows = [
         (condition, [sweep.cells.get((variant, condition)) for variant in variants])
@@ -76,6 +77,7 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
         "entry": sweep.entry,
         "assessment": sweep.assessment,
         "variants": variants,
+        "states": {variant: cell.state for (variant, _), cell in sweep.cells.items()},
         "matrix": rows,
         "totals": [_total(variant, [cells[i] for _, cells in rows]) for i, variant in
                    enumerate(variants)],
@@ -141,6 +143,7 @@ def _total(variant: str, cells: list[VariantCondition | None]) -> VariantConditi
         suspended=sum(cell.suspended for cell in there),
         decisions=sum(cell.decisions for cell in there),
         invalid=sum(cell.invalid for cell in there),
+        state=there[0].state,
     )
 
 

@@ -18,6 +18,7 @@ ABOUT = {
     "ablation-qualitative": "Table VI: the indicators of every driver and variant",
     "ablation-quantitative": "Table VII: the measures of every driver and variant",
     "contrasts": "every variant against its baseline, every baseline against the humans",
+    "factors": "each level of a study's factors, models and prompts, pooled over the others",
     "differences": "who merges first and the gap, against the humans in one model of both",
     "who-first-variants": "Table III for every prompt variant, and what differs from the baseline",
     "gap-variants": "Table IV for every prompt variant, and what differs from the baseline",

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from analysis.explorer.catalogue import FACETS, PAGE, SORTS, Filter
+from analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.site import NothingNew, NotThere, Site
@@ -95,15 +95,18 @@ def cell_request(cell: str) -> tuple[str, str, str, str]:
 
 def behind(content: dict[str, Any]) -> tuple[tuple[str, str], ...]:
     """The (trial, spec) of all groups behind a cell."""
-    return tuple(
-        (name, source["spec"]) for source in content["sources"] for name in source["names"]
-    )
+    return tuple((name, spec) for source in content["sources"] for name, spec in source["trials"])
 
 
 def filter_of(asked: Mapping[str, str]) -> Filter:
     """The filter in an address."""
     given: dict[str, Any] = {name: asked[name] for name in (*FACETS, "q") if name in asked}
-    return replace(Filter(), **given)
+    levels = [
+        (name.removeprefix(FACTOR), level)
+        for name, level in asked.items()
+        if name.startswith(FACTOR) and level
+    ]
+    return replace(Filter(), **given, levels=tuple(levels))
 
 
 def sort_of(asked: Mapping[str, str]) -> str:

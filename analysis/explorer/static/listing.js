@@ -16,7 +16,9 @@
     note.hidden = false;
   }
   const fits = (row, name, value) => name === "q"
-    ? row.dataset.name.includes(value.toLowerCase()) : row.dataset[name].split("\n").includes(value);
+    ? row.dataset.name.includes(value.toLowerCase())
+    : name.startsWith("factor.") ? row.dataset.levels.split("\n").includes(`${name.slice(7)}=${value}`)
+    : row.dataset[name].split("\n").includes(value);
   const filter = () => {
     const wanted = [...new FormData(form)].filter(([, value]) => value);
     rows.forEach((row, i) => {

@@ -213,6 +213,7 @@ def test_every_figure_says_who_is_a_stand_in_and_names_its_variant(name, long_na
     if name != "figure2":
         assert any("A2" in text for text in marked)
         assert any("A1" in text for text in marked)
+    if name not in {"figure2", "factors"}:  # a level is of several drivers
         assert any("A7" in text and "o3" in text for text in shown)
 
 

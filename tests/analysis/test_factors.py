@@ -1,0 +1,183 @@
+"""A study by its factors: its groups, its tables, its audit, and what its plug-in adds."""
+
+from __future__ import annotations
+
+import json
+
+import duckdb
+import pytest
+
+from analysis.commands import drivers
+from analysis.data.study import Study
+from analysis.explain import explain
+from analysis.stats.factors import levels_by_factor
+from analysis.tables import make_tables
+from merge_runner.errors import UsageError
+from tests.crossed_study import PLUGIN
+
+CHEAP_COLD = "cheap+sleepy [temperature=0.2]"
+
+
+@pytest.fixture(scope="module")
+def study(played):
+    return Study(played.db)
+
+
+def value(table, row_id, column):
+    (row,) = [row for row in table.rows if row.id == row_id]
+    return row.values[column]
+
+
+def test_the_summary_of_a_sweep_counts_by_model_and_by_each_factor(played):
+    blocks = [block.splitlines() for block in played.out.split("\n\n")]
+    by_factor = {block[0].split()[0]: [row.split()[:2] for row in block[1:]] for block in blocks}
+    assert by_factor["model"] == [["cheap", "24"], ["dear", "12"]]
+    assert by_factor["temperature"] == [["1.0", "18"], ["0.2", "18"]]
+    assert by_factor["opponent"] == [["self", "24"], ["sleepy", "12"]]
+    (played.folder / "again.duckdb").write_bytes(played.db.read_bytes())
+    again = played.run("sweep", "mine.toml", "--yes", "--json", db="again.duckdb").summary
+    trials = {(one["factor"], one["level"]): one["trials"] for one in again["outcomes_by_level"]}
+    assert trials["temperature", "0.2"] == 18
+    assert trials["model", "dear"] == 12
+
+
+def test_conditions_of_another_mean_speed_stay_in_the_group_of_their_driver(study):
+    names = {f"{model} [temperature={t}]" for model in ("cheap", "dear") for t in ("0.2", "1.0")}
+    assert {group.driver for group in study.models} == names | {
+        CHEAP_COLD,
+        "cheap+sleepy [temperature=1.0]",
+    }
+    for group in study.models:
+        assert set(group.trials["condition"]) == {"N_0_0", "L_4_0", "X_0_15"}
+        assert group.trials["spec_hash"].nunique() == 2
+
+
+def test_two_mean_speeds_of_one_condition_are_never_pooled(played, tmp_path):
+    copy = tmp_path / "t.duckdb"
+    copy.write_bytes(played.db.read_bytes())
+    with duckdb.connect(str(copy)) as connection:
+        for table in ("trials", "states", "decisions", "calls", "trial_factors"):
+            connection.execute(
+                f"INSERT INTO {table} SELECT * REPLACE ('again/' || trial_id AS trial_id, "
+                f"'faster' AS spec_hash) FROM {table} WHERE trial_id LIKE '%X_0_15%'"
+            )
+        connection.execute(
+            "INSERT INTO specs SELECT 'faster', json_merge_patch(spec, '{\"mean_speed_mps\": 12}') "
+            "FROM specs WHERE spec->>'$.mean_speed_mps' IS NOT NULL LIMIT 1"
+        )
+    for group in Study(copy).models:
+        assert (group.trials.groupby("condition")["spec_hash"].nunique() == 1).all(), group.id
+
+
+def test_where_keeps_the_trials_of_these_levels_and_names_the_valid_ones(played):
+    kept = Study(played.db, where={"temperature": ["0.2"], "model": ["cheap"]})
+    assert [group.driver for group in kept.models] == ["cheap [temperature=0.2]", CHEAP_COLD]
+    assert kept.groups[0].id == "human"
+    with pytest.raises(UsageError, match="unknown factor 'mood'; valid: model, prompt, opponent, "):
+        Study(played.db, where={"mood": ["good"]})
+    with pytest.raises(UsageError, match=r"unknown level of temperature '0.3'; valid: 0.2, 1.0"):
+        Study(played.db, where={"temperature": ["0.3"]})
+    with pytest.raises(UsageError, match="no trial with model=dear and opponent=sleepy"):
+        Study(played.db, where={"model": ["dear"], "opponent": ["sleepy"]})
+
+
+def test_tables_that_are_kept_are_those_of_their_levels(played):
+    for level, other in (("0.2", "1.0"), ("1.0", "0.2")) * 2:
+        asked = ("tables", "ablation-quantitative", "--where", f"temperature={level}")
+        out = played.run(*asked).out
+        assert f"cheap [temperature={level}]" in out
+        assert f"temperature={other}" not in out
+
+
+def test_a_driver_whose_name_has_commas_and_brackets_can_be_chosen(played):
+    assert drivers("human, a [x=1, y=2],b") == ["human", "a [x=1, y=2]", "b"]
+    found = played.run("tables", "attempts", "--models", CHEAP_COLD, "--format", "json")
+    (table,) = json.loads(found.out)["tables"]
+    assert [row["row"] for row in table["rows"]] == [f"{CHEAP_COLD}/baseline"]
+
+
+def test_a_levels_row_pools_its_trials_and_is_compared_with_the_first_level(study, played):
+    (table,) = make_tables(study, ["factors"])
+    rows = duckdb.connect(str(played.db), read_only=True).execute(
+        "SELECT value, count(*) FILTER (status = 'collided'), count(*) FROM trials JOIN "
+        "trial_factors USING (trial_id, spec_hash) WHERE factor = 'opponent' GROUP BY ALL"
+    ).fetchall()  # fmt: skip
+    rates = {level: 100 * collided / trials for level, collided, trials in rows}
+    for level, rate in rates.items():
+        assert value(table, f"opponent={level}/collided_percent", "value") == pytest.approx(rate)
+    row = "opponent=sleepy/collided_percent"
+    assert value(table, row, "difference") == pytest.approx(rates["sleepy"] - rates["self"])
+    low, high = value(table, row, "difference_ci")
+    assert low < rates["sleepy"] - rates["self"] < high
+    assert value(table, "opponent=self/collided_percent", "trials") == 24
+    levels = [row.values["level"] for row in table.rows if row.id.endswith("/gap_m")]
+    assert levels == ["cheap", "dear", "self", "sleepy", "0.2", "1.0"]
+
+
+def test_the_notes_say_which_cells_a_level_lacks(study):
+    (table,) = make_tables(study, ["factors"])
+    (note,) = [note for note in table.notes if note.startswith("model: ")]
+    assert note.startswith(
+        "model: not balanced, so that pooled values are confounded: dear lacks 6 "
+    )
+    assert "(L_4_0 prompt=baseline opponent=sleepy temperature=0.2; " in note
+    assert any(note.startswith("temperature: balanced: every level") for note in table.notes)
+
+
+def test_means_are_compared_within_the_cells_that_both_levels_have(study):
+    (table,) = make_tables(study, ["factors"])
+    cheap, dear = (
+        {cell: gaps["gap_m"].mean() for cell, gaps in level.pooled.finished.groupby("cell")}
+        for level in levels_by_factor(study)[0]
+    )
+    # The same stand-in answers under both names, so that equal cells hold equal trials.
+    assert set(dear) < set(cheap)
+    assert value(table, "model=dear/gap_m", "difference") == pytest.approx(0, abs=1e-9)
+    pooled = [value(table, f"model={name}/gap_m", "value") for name in ("cheap", "dear")]
+    assert abs(pooled[1] - pooled[0]) > 0.1
+
+
+def test_a_difference_leads_to_the_trials_of_both_levels(study):
+    (table,) = make_tables(study, ["factors"])
+    found = explain(study, table, "opponent=sleepy/collided_percent:difference")
+    assert sum(len(source.trials) for source in found.sources) == 36
+    with duckdb.connect(str(study.db), read_only=True) as connection:
+        for source in found.sources:
+            listed = connection.execute(source.query).fetchall()
+            assert tuple(trial for trial, *_ in listed) == source.trials
+
+
+def test_stand_ins_are_never_pooled_with_models(played, tmp_path):
+    copy = tmp_path / "t.duckdb"
+    copy.write_bytes(played.db.read_bytes())
+    with duckdb.connect(str(copy)) as connection:
+        connection.execute("UPDATE trials SET scripted = false WHERE model_left = 'dear'")
+        connection.execute("UPDATE calls SET scripted = false WHERE trial_id LIKE 'dear/%'")
+    found = levels_by_factor(Study(copy))
+    assert {level.pooled.scripted for levels in found for level in levels} == {False, True}
+    for level in (level for levels in found for level in levels):
+        assert {name.startswith("dear") for name in level.groups} == {not level.pooled.scripted}
+        assert level.id.endswith(" [scripted]") == level.pooled.scripted
+
+
+def test_a_metric_of_the_studys_plug_in_is_shown_only_where_the_study_is_named(played):
+    plain = played.run("tables", "factors")
+    assert "duration" not in plain.out
+    named = played.run("tables", "factors", "--study", "mine.toml")
+    assert "duration (s)" in named.out, named.err
+    edited = PLUGIN.replace('label="duration"', 'label="whole time"')
+    (played.folder / "mine.py").write_text(edited)
+    again = played.run("tables", "factors", "--study", "mine.toml")
+    (played.folder / "mine.py").write_text(PLUGIN)
+    assert "whole time (s)" in again.out, "what was kept before the edit is not shown"
+
+
+def test_an_audit_derives_a_studys_prompts_and_conditions_without_its_file_but_runs_no_plug_in(
+    played,
+):
+    alone = json.loads(played.run("audit", "--json").out)
+    assert alone["ok"]
+    assert alone["audits"][0]["counts"]["derived anew"] == 36
+    assert "'sleepy', which is no driver here" in " ".join(alone["audits"][0]["notes"])
+    named = json.loads(played.run("audit", "--json", "--study", "mine.toml").out)
+    assert not any("not derived" in note for note in named["audits"][0]["notes"])

@@ -1,0 +1,102 @@
+"""A study's factors in the explorer: facets, pages of trials and sweeps, and exported lists."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from urllib.parse import parse_qs, unquote, urlsplit
+
+import duckdb
+import pytest
+from starlette.testclient import TestClient
+
+from analysis.explorer.app import explorer
+from analysis.explorer.export import export_folder
+from analysis.explorer.site import Site
+from analysis.explorer.urls import StaticLinks
+
+HOST = "127.0.0.1:8700"
+
+
+@pytest.fixture(scope="module")
+def client(played):
+    return TestClient(explorer(Site(played.db), {HOST}), base_url=f"http://{HOST}")
+
+
+def test_the_list_of_trials_filters_by_factor(client):
+    page = client.get("/trials").text
+    assert '<select name="factor.temperature"' in page
+    text = client.get("/trials?factor.temperature=0.2&factor.opponent=sleepy").text
+    assert "<strong>6</strong> trials" in text
+    assert '<option value="1.0">1.0 (6)</option>' in text
+    assert '<option value="0.2" selected>0.2 (6)</option>' in text
+    assert "<strong>0</strong> trials" in client.get("/trials?factor.mood=good").text
+    rows = client.get("/trials.csv?factor.temperature=0.2").text.splitlines()
+    assert rows[0].endswith(",factor.opponent,factor.temperature")
+    assert {row[-4:] for row in rows[1:]} == {",0.2"}
+
+
+def test_a_trials_page_names_its_levels(client):
+    page = client.get("/trials/cheap+sleepy/baseline/N_0_0/rep01/temperature=0.2").text
+    assert "opponent=sleepy, temperature=0.2." in page
+
+
+def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, tmp_path):
+    page = client.get("/").text
+    assert "mine: cheap, dear drives" in page
+    assert page.count('class="ended"') >= 18
+    assert "dear temperature=0.2" in page
+    links = [a.split('"')[0].replace("&amp;", "&") for a in page.split('href="')[1:]]
+    cells = [a for a in links if "condition=N_0_0" in a]
+    assert len(cells) == 6
+    for link in cells:
+        assert parse_qs(urlsplit(link).query)["factor.opponent"]
+        assert "<strong>2</strong> trials" in client.get(link).text, link
+    copy = tmp_path / "t.duckdb"
+    copy.write_bytes(played.db.read_bytes())
+    with duckdb.connect(str(copy)) as connection:
+        connection.execute("UPDATE sweeps SET exit_code = 3")
+        connection.execute("DELETE FROM trials WHERE trial_id LIKE '%rep02%'")
+    stopped = TestClient(explorer(Site(copy), {HOST}), base_url=f"http://{HOST}").get("/").text
+    assert "18 of 36 trials have an outcome" in stopped
+    assert "<code>merge-runner sweep mine.toml --model cheap --model dear</code>" in stopped
+
+
+def test_the_exported_page_of_a_sweep_of_several_models_is_where_its_link_leads():
+    link = StaticLinks().sweep("mine-cheap,dear+sleepy-20261122T1324")
+    assert link == unquote(link) == "sweep-mine-cheap_dear_sleepy-20261122T1324.html"
+
+
+ASK = """
+import sys
+from pathlib import Path
+from analysis.explorer.analysis_process import worker
+from merge_runner.study.file import read_study
+from merge_runner.study.parts import adopt
+
+adopt(read_study(sys.argv[2]))
+child = worker(Path(sys.argv[1]))
+said, _ = child.ask(["tables", "factors"], seconds=60, most_bytes=2**24)
+child.close()
+print(said["tables"][0])
+"""
+
+
+def test_what_the_pages_compute_knows_the_study_that_the_explorer_was_given(played):
+    told = subprocess.run(
+        [sys.executable, "-c", ASK, played.db, played.folder / "mine.toml"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "opponent=sleepy/duration_s" in told.stdout
+
+
+def test_an_exported_list_filters_by_factor(played, tmp_path, browser):
+    list(export_folder(played.db, tmp_path / "out", ["cheap*"]))
+    page = browser.new_page()
+    page.goto(f"file://{tmp_path}/out/trials.html?factor.temperature=0.2")
+    assert page.inner_text("#listed") == "12"
+    page.select_option("[name='factor.opponent']", "sleepy")
+    assert page.inner_text("#listed") == "6"
+    page.close()
