@@ -10,7 +10,6 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
@@ -181,7 +180,10 @@ def sweep(
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
+    import asyncio
+
     from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.unsent import unsent
 
     if max_cost is not None and not math.isfinite(max_cost):
         raise UsageError("--max-cost is a number of USD")
@@ -213,10 +215,9 @@ def sweep(
         order_seed=order_seed,
         only=_levels(only or ()),
     )
-    if max_cost is None:
-        options = replace(options, max_cost_usd=plan.study.file.budget.total_usd)
+    options = plan.with_budget(options)
     if dry_run:
-        _print_estimate(_dry_run(plan, options), as_json=as_json)
+        _print_estimate(asyncio.run(unsent(plan, options, say=say)), as_json=as_json)
     else:
         _run(plan, options, yes=yes, as_json=as_json)
 
@@ -531,24 +532,6 @@ def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> None:
     for message in outcome.messages:
         say(f"error: {message}")
     sys.exit(outcome.exit_code)
-
-
-def _dry_run(plan: Plan, options: Options) -> Estimate:
-    """What is neither stored nor recorded yet; makes no database or cache that is not there."""
-    import asyncio
-    from dataclasses import replace
-
-    from merge_runner.results.database import readable
-    from merge_runner.run.sweep import Sweep
-
-    with tempfile.TemporaryDirectory() as folder:
-        db = readable(options.db) if options.db.is_file() else Path(folder) / "none.duckdb"
-        recorded = (options.cache / "cache.db").is_file()
-        cache = options.cache if recorded else Path(folder) / "responses"
-        prepared = Sweep(plan, replace(options, db=db, cache=cache), say=say)
-        expected = asyncio.run(prepared.estimate())
-        prepared.close()
-    return expected
 
 
 def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:

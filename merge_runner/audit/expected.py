@@ -54,7 +54,7 @@ class ArmFacts(_Facts):
         """The part of its trials' ids that is for its factors, spelled as the plan spells it."""
         return "".join(
             f"/{name}={re.sub(NOT_IN_AN_ID, '_', level)}"
-            for name, level in self.factors.items()
+            for name, level in sorted(self.factors.items())
             if name not in ("prompt", "opponent")
         )
 

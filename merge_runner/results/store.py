@@ -179,13 +179,20 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 @contextmanager
 def answers(path: Path, sql: str) -> Iterator[tuple[list[str], Iterator[tuple[Any, ...]]]]:
     """The column names and the rows of a query; the database is locked until they are read."""
+    with answer(path, sql) as result:
+        yield [column[0] for column in result.description or ()], fetched(result)
+
+
+@contextmanager
+def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
+    """The result of a query, to be fetched; the database is locked until then."""
     # The settings hold for a whole instance, and cannot be taken back.
     with (
         read_database(path, Instance(TEXTS, confine=False)) as connection,
         at_signals(connection.interrupt),
         answering(connection, sql) as result,
     ):
-        yield [column[0] for column in result.description or ()], fetched(result)
+        yield result
 
 
 @contextmanager

@@ -26,7 +26,13 @@ from merge_runner.records import SIDES, Side, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS, MEAN_SPEED_MPS
 from merge_runner.scenarios.registry import SCENARIOS, new_world, task_of
 from merge_runner.study.crossing import OPPONENT, PROMPT, Arm, cross, level_text
-from merge_runner.study.file import EVERY_CONDITION, EVERY_PROMPT, Study, StudyFile, read_study
+from merge_runner.study.file import (
+    EVERY_CONDITION,
+    EVERY_PROMPT,
+    StudyFile,
+    StudySource,
+    read_study,
+)
 from merge_runner.study.parts import adopt
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
@@ -75,7 +81,7 @@ class Plan:
     """
 
     name: str
-    study: Study
+    study: StudySource
     models: tuple[str, ...]
     arms: tuple[Arm, ...]
     entries: dict[str, ModelEntry]
@@ -99,6 +105,12 @@ class Plan:
         if self.study.file.budget.total_usd is not None:
             return self.name
         return f"{self.name}/{self.model}/set{self.sample_set}"
+
+    def with_budget(self, options: Options) -> Options:
+        """The options, with the study's own cap where they have none."""
+        if options.max_cost_usd is None:
+            return replace(options, max_cost_usd=self.study.file.budget.total_usd)
+        return options
 
     @property
     def registered(self) -> dict[str, str]:
@@ -252,7 +264,7 @@ class Plan:
         # The prompt and the opponent stand in it already.
         levels = "".join(
             f"/{name}={_NOT_IN_AN_ID.sub('_', level)}"
-            for name, level in arm.factors.items()
+            for name, level in sorted(arm.factors.items())
             if name not in (PROMPT, OPPONENT)
         )
         return f"{arm.model}/{arm.variant}/{condition}/rep{repetition:02d}{set_}{levels}"
@@ -340,7 +352,7 @@ def _conditions(
 
 
 def _repetitions(
-    study: Study, variants: Sequence[str] | None, chosen: int | None
+    study: StudySource, variants: Sequence[str] | None, chosen: int | None
 ) -> dict[str, int]:
     """The wanted prompts with their repetitions per condition; raises UsageError."""
     if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:

@@ -156,7 +156,7 @@ class StudyFile(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
-class Study:
+class StudySource:
     """A study's file as it was read, with the source of its plug-ins by file name."""
 
     name: str
@@ -173,7 +173,7 @@ class Study:
         return bool(file.factors or file.prompts or file.plugins.files or own_conditions)
 
 
-def read_study(name: str) -> Study:
+def read_study(name: str) -> StudySource:
     """The study ``experiments/NAME.toml``, or that of a path; raises UsageError."""
     path = Path(name)
     if path.suffix != ".toml":
@@ -183,7 +183,7 @@ def read_study(name: str) -> Study:
         if name not in known:
             raise UsageError(f"there is no sweep {name!r}; valid: {', '.join(known)}, or a path")
     file = validated(StudyFile, read_toml(path), str(path))
-    return Study(
+    return StudySource(
         name=path.stem,
         file=file,
         text=path.read_text(encoding="utf-8"),

@@ -14,12 +14,12 @@ from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of
 from merge_runner.registry import FAULTS, load_plugins, registering
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
-from merge_runner.study.file import AddedText, Study, StudyCondition, StudyPrompt
+from merge_runner.study.file import AddedText, StudyCondition, StudyPrompt, StudySource
 
 LAST = "the end"
 
 
-def adopt(study: Study) -> None:
+def adopt(study: StudySource) -> None:
     """Register what a study adds, in place of what the study before it added.
 
     Raises UsageError.
