@@ -37,6 +37,7 @@ PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
 LONGEST_URL, LONGEST_HOST = 2000, 253
 _LABEL = re.compile(r"[a-z0-9_-]{1,63}", re.I)
 USUAL_SCENARIO = "merge"
+UNNAMED = "default"
 MOST_STEPS = MOST_REPETITIONS = 100_000
 
 
@@ -175,20 +176,21 @@ class ModelEntry(Frozen):
     """One model of ``experiments/models.toml``.
 
     ``provider`` is one of PROVIDERS, ``format`` one of the wire formats (llm/formats). ``id`` is
-    what is sent; a served model that is neither it nor one of ``aliases`` is reported as a
-    mismatch. ``parameters`` go into the request as they are; what is not listed is not sent, so
-    that the provider's default applies; ``applied_defaults`` puts on record which, and ``rejects``
-    names parameters that the model refuses or does not heed. ``price`` is
-    ``free``, ``genai-prices`` (the table of that package) or explicit figures. ``rpm`` and ``tpm``
-    are requests and tokens a minute. ``typical_output_tokens`` and ``typical_latency_s`` serve the
-    estimate of ``--dry-run`` alone. A reply longer than ``max_reply_mb`` (unpacked) is refused.
+    what is sent (UNNAMED: what a server of one's own serves); a served model that is neither it
+    nor one of ``aliases`` is reported as a mismatch. ``parameters`` go into the request as they
+    are; what is not listed is not sent, so that the provider's default applies;
+    ``applied_defaults`` puts on record which, and ``rejects`` names parameters that the model
+    refuses or does not heed. ``price`` is ``free``, ``genai-prices`` (the table of that package) or
+    explicit figures. ``rpm`` and ``tpm`` are requests and tokens a minute.
+    ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of ``--dry-run`` alone. A
+    reply longer than ``max_reply_mb`` (unpacked) is refused.
     """
 
     nested: ClassVar[Mapping[str, type[BaseModel]]] = {"price": Price}
 
     provider: str
     format: str
-    id: str
+    id: str = UNNAMED
     aliases: tuple[str, ...] = ()
     parameters: dict[str, Json] = {}
     applied_defaults: dict[str, Json] = {}
@@ -218,6 +220,8 @@ class Provider:
     ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are the members that
     every error of the provider has, by its documentation: one without them may be a gateway's.
     ``parameters`` are those that its servers take beside those of the wire format.
+    ``model_env`` is the variable that names the model of an entry without a name; a provider with
+    one also lists its models at ``/models``. ``if_nobody`` says what to do where nobody answers.
     """
 
     base_url: str
@@ -227,6 +231,8 @@ class Provider:
     key_needed: bool = True
     error_members: frozenset[str] = frozenset()
     parameters: frozenset[str] = frozenset()
+    model_env: str | None = None
+    if_nobody: str = "check the network"
 
 
 PROVIDERS: Registry[Provider] = Registry("provider")
@@ -281,10 +287,18 @@ PROVIDERS.register(
             {"top_k", "min_p", "typical_p", "repeat_penalty", "repetition_penalty", "grammar"}
             | {"structured_outputs", "chat_template_kwargs", "mirostat_mode", "options"}
         ),
+        model_env="LOCAL_MODEL",
+        if_nobody="start a server (docs/how-to/local-models.md)",
     ),
 )
 PROVIDERS.register(
-    "emulator", Provider("http://127.0.0.1/v1", "EMULATOR_BASE_URL", key_needed=False)
+    "emulator",
+    Provider(
+        "http://127.0.0.1/v1",
+        "EMULATOR_BASE_URL",
+        key_needed=False,
+        if_nobody="start it with `merge-runner emulate`",
+    ),
 )
 
 
@@ -330,6 +344,14 @@ def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.e
         base_url=_base_url(entry, provider, env),
         auth_headers=_auth_headers(entry.auth or provider.auth, key),
     )
+
+
+def model_id(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str | None:
+    """What is sent as the model, by the entry or the environment; None: the server says it."""
+    variable = PROVIDERS.require(entry.provider).model_env
+    if variable is None or entry.id != UNNAMED:
+        return entry.id
+    return env.get(variable) or None
 
 
 def endpoint_identity(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:

@@ -7,7 +7,7 @@ MergeRunnerError
 ├── SweepStopped           the sweep cannot go on; what is done is kept
 │   ├── EndpointRefused    bad key, unknown or retired model                    exit 2
 │   ├── QuotaExhausted     the account has nothing left                         exit 3
-│   ├── ProviderDown       trials fail and nothing is answered any more         exit 1
+│   ├── ProviderDown       nobody listens, or nothing is answered any more      exit 1
 │   ├── ModelSwapped       --strict-model, and another model answers            exit 1
 │   ├── ClusterFailed      the cluster that plays cannot go on                  exit 1
 │   └── CacheFailed        replies cannot be kept or read                       exit 1
@@ -79,7 +79,7 @@ class QuotaExhausted(SweepStopped):
 
 
 class ProviderDown(SweepStopped):
-    """One trial after the other fails, and no call is answered between them."""
+    """Nobody listens, or one trial after the other fails and no call is answered between them."""
 
 
 class ModelSwapped(SweepStopped):

@@ -22,7 +22,7 @@ PROJECT = Path(__file__).parent.parent
 PROGRAM = Path(sys.executable).with_name("merge-runner")
 RECORDING = PROJECT / "cache/recordings/emulator-baseline.parquet"
 # Variables that would change what a run does.
-CONFIGURING = ("_API_KEY", "_BASE_URL", "_PROXY", "_proxy")
+CONFIGURING = ("_API_KEY", "_BASE_URL", "_PROXY", "_proxy", "LOCAL_MODEL")
 # No account's limits, which would make a sweep take minutes.
 FAST = ("--rpm", 10**6, "--tpm", 10**9)
 Middle = Callable[[web.Request, Callable[[web.Request], Awaitable[web.StreamResponse]]], Awaitable]

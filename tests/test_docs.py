@@ -148,7 +148,8 @@ async def test_every_command_of_the_docs_does_what_it_says(folder, here):
     """What stands on the pages twice is run once, where the later pages need nothing of it."""
     done: list[str] = []
     async with watched() as server:
-        account = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        at = f"{server.url}/v1"
+        account = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": at, "LOCAL_BASE_URL": at}
         for page in PAGES:
             for command in commands(page):
                 if command in {"make test", *done}:

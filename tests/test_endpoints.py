@@ -15,7 +15,7 @@ from merge_runner.config import (
 )
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.models import load_models
+from merge_runner.llm.models import read_models
 from merge_runner.study.file import read_study
 
 REGISTRY = PROJECT / "experiments/models.toml"
@@ -218,7 +218,7 @@ def test_a_running_emulator_is_found_by_its_variable(env, url):
 
 
 def test_the_registry_that_we_ship_is_valid():
-    models = load_models(REGISTRY)
+    models = read_models(REGISTRY)
     assert {"o3", "gemini-2.5-pro", "emulator", "local"} <= models.keys()
     assert any(model.provider == "anthropic" for model in models.values())
     for name, model in models.items():
@@ -230,7 +230,7 @@ def test_the_registry_that_we_ship_is_valid():
 
 
 def test_the_models_of_the_paper_are_those_it_names():
-    models = load_models(REGISTRY)
+    models = read_models(REGISTRY)
     assert (models["o3"].provider, models["o3"].id) == ("openai", "o3-2025-04-16")
     assert models["o3"].shutdown.isoformat() == "2026-12-11"
     gemini = models["gemini-2.5-pro"]
@@ -262,10 +262,10 @@ def test_an_unknown_key_of_the_registry_is_one_line_that_names_the_valid_ones(
 ):
     file = tmp_path / "models.toml"
     file.write_text(VALID)
-    assert load_models(file)["m"].id == "x"
+    assert read_models(file)["m"].id == "x"
     file.write_text(VALID + more)
     with pytest.raises(UsageError) as caught:
-        load_models(file)
+        read_models(file)
     text = str(caught.value)
     assert "\n" not in text
     assert f"{unknown}'; valid: {', '.join(owner.model_fields)}" in text
@@ -307,11 +307,11 @@ def test_a_registry_that_is_wrong_is_one_line_that_says_where(tmp_path, text, na
     file = tmp_path / "models.toml"
     file.write_text(text)
     with pytest.raises(UsageError) as caught:
-        load_models(file)
+        read_models(file)
     assert named in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_a_registry_that_is_missing_is_an_error(tmp_path):
     with pytest.raises(UsageError, match="does not exist"):
-        load_models(tmp_path / "models.toml")
+        read_models(tmp_path / "models.toml")

@@ -76,6 +76,8 @@ SELECT 'trials', trial_id, count(*) FROM trials
 ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human' GROUP BY ALL
 UNION ALL SELECT 'states', trial_id, count(*) FROM states
 ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY ALL
+UNION ALL SELECT 'trial_factors', trial_id, count(*) FROM trial_factors
+ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY ALL
 UNION ALL SELECT 'decisions', trial_id, count(*) FROM decisions
 ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY ALL
 UNION ALL SELECT 'calls', trial_id, count(*) FROM calls

@@ -350,6 +350,14 @@ class ResponseCache:
         overlaid = sorted({r.endpoint for r in requests if r.model == model})
         return overlaid or sorted(self.stats(model).totals)
 
+    def recorded_models(self, provider: str) -> list[str]:
+        """The models of a provider that have replied: the recording's, else the folder's."""
+        for entries in (self._overlay.values(), self._own_entries([])):
+            requests = (entry.request for entry in entries)
+            if models := {r.model for r in requests if r.provider == provider}:
+                return sorted(models)
+        return []
+
     def stats(self, model: str) -> ModelStats:
         """What the folder knows of a model."""
         return self._stats(model) or self._counted_anew()[model]

@@ -6,9 +6,16 @@ import asyncio
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
-from merge_runner.errors import EndpointRefused, MergeRunnerError, QuotaExhausted
+from merge_runner.errors import EndpointRefused, MergeRunnerError, ProviderDown, QuotaExhausted
 from merge_runner.llm.call import Call
-from merge_runner.llm.first_call import NOBODY_S, FirstCall, refusal, set_base_url, set_key
+from merge_runner.llm.first_call import (
+    NOBODY_S,
+    FirstCall,
+    if_nobody,
+    refusal,
+    set_base_url,
+    set_key,
+)
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import AttemptOutcome, RawReply
 from merge_runner.llm.retry import RequestFailed, TryAgain, backoff_s
@@ -61,9 +68,8 @@ class Consequences:
         refused = call.attempts[-1].outcome == "no_connection"
         if self.first.passed or not refused or waited_s < NOBODY_S:
             return None
-        return EndpointRefused(
-            f"{self.driver}: nobody answers there ({call.last_failure}): check the network, "
-            f"or {set_base_url(self.name, self.entry)}"
+        return ProviderDown(
+            f"{self.driver}: {call.last_failure}: {if_nobody(self.name, self.entry)}"
         )
 
     def _wrong_endpoint(self, raw: RawReply, outcome: AttemptOutcome) -> MergeRunnerError | None:

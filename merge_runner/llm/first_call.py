@@ -66,6 +66,14 @@ def refusal(name: str, entry: ModelEntry, raw: RawReply, outcome: AttemptOutcome
     return f"the request is refused: {_set_parameter(name, entry, raw)} ({outcome.message})"
 
 
+def if_nobody(name: str, entry: ModelEntry) -> str:
+    """What to do where nobody answers."""
+    return (
+        f"{PROVIDERS[entry.provider].if_nobody}, or {set_base_url(name, entry)}; then run the same "
+        "command again"
+    )
+
+
 def set_base_url(name: str, entry: ModelEntry) -> str:
     """What to do about the base URL of an entry, and where it is set."""
     provider = PROVIDERS[entry.provider]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import ssl
+from collections.abc import Mapping
 from typing import Any
 from uuid import uuid4
 
@@ -102,9 +103,25 @@ class HttpTransport:
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Post the hashed bytes; raises TransportFailure."""
+        headers = request.headers
+        if self._endpoint.provider == "emulator":
+            slot = canonical_json(request.slot.as_dict())
+            headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
+        body = request.body.encode()
+        return await self._reply("POST", request.path, headers, body, timeout_s)
+
+    async def get(self, path: str, *, timeout_s: float) -> RawReply:
+        """Ask for what the server tells of itself; raises TransportFailure."""
+        return await self._reply("GET", path, {}, b"", timeout_s)
+
+    async def _reply(
+        self, method: str, path: str, headers: Mapping[str, str], body: bytes, timeout_s: float
+    ) -> RawReply:
+        own_id = self._own + next(self._ids)
+        request = self._http_request(method, path, headers, body, own_id)
         try:
             async with asyncio.timeout(timeout_s):
-                return await self._exchange(request, attempt)
+                return await self._exchange(request, own_id)
         except TransportFailure:
             self._trust.doubted = True
             raise
@@ -114,10 +131,8 @@ class HttpTransport:
         except (httpx.RequestError, aiohttp.ClientError) as exc:
             raise self._failure(exc) from exc
 
-    async def _exchange(self, request: ChatRequest, attempt: int) -> RawReply:
-        own_id = self._own + next(self._ids)
-        posted = self._http_request(request, attempt, own_id)
-        reply = await self._client.send(posted, stream=True)
+    async def _exchange(self, request: httpx.Request, own_id: str) -> RawReply:
+        reply = await self._client.send(request, stream=True)
         try:
             self._check_id(reply, own_id)
             encoding = reply.headers.get("content-encoding", "")
@@ -128,21 +143,16 @@ class HttpTransport:
         headers = {name.lower(): value for name, value in reply.headers.items()}
         return RawReply(reply.status_code, headers, self._mask(body))
 
-    def _http_request(self, request: ChatRequest, attempt: int, own_id: str) -> httpx.Request:
+    def _http_request(
+        self, method: str, path: str, headers: Mapping[str, str], body: bytes, own_id: str
+    ) -> httpx.Request:
         """The request, made without the client, which would compose all its headers each time."""
-        headers = {**self._headers, **request.headers, **self._endpoint.auth_headers}
-        headers |= dict.fromkeys(ID_HEADERS, own_id)
-        if self._endpoint.provider == "emulator":
-            headers[SLOT_HEADER] = canonical_json(request.slot.as_dict())
-            headers[ATTEMPT_HEADER] = str(attempt)
+        sent = {**self._headers, **headers, **self._endpoint.auth_headers}
+        sent |= dict.fromkeys(ID_HEADERS, own_id)
         if self._trust.one_each:
-            headers["connection"] = "close"
+            sent["connection"] = "close"
         return httpx.Request(
-            "POST",
-            self._url(request.path),
-            headers=headers,
-            content=request.body.encode(),
-            extensions=NO_TIMEOUT,
+            method, self._url(path), headers=sent, content=body, extensions=NO_TIMEOUT
         )
 
     def _check_id(self, reply: httpx.Response, own_id: str) -> None:
@@ -161,9 +171,15 @@ class HttpTransport:
         if isinstance(cause, aiohttp.ClientConnectorCertificateError):
             return TransportFailure("bad_certificate", reason, sent=False, action="refused")
         if isinstance(cause, aiohttp.ClientConnectorError):
-            return TransportFailure("no_connection", reason, sent=False)
+            return TransportFailure("no_connection", self._unreached(cause, reason), sent=False)
         self._trust.doubted = True
         return TransportFailure("connection_lost", reason)
+
+    def _unreached(self, error: aiohttp.ClientConnectorError, reason: str) -> str:
+        proxy = isinstance(error, aiohttp.ClientProxyConnectionError)
+        if isinstance(error.os_error, ConnectionRefusedError) and not proxy:
+            return f"nothing listens at {self._endpoint.base_url}"
+        return f"{self._endpoint.base_url} cannot be reached ({reason})"
 
     def _url(self, path: str) -> httpx.URL:
         if path not in self._urls:

@@ -8,6 +8,7 @@ from merge_runner.config import (
     ModelEntry,
     endpoint_identity,
     find_experiments,
+    model_id,
     read_toml,
     validated,
 )
@@ -30,11 +31,12 @@ def load_models(beside: Path | None = None) -> dict[str, ModelEntry]:
     added = dict.fromkeys((folder or Path()) / REGISTRY for folder in (None, beside))
     entries: dict[str, ModelEntry] = {}
     for path in (own, *(each for each in added if each.is_file() and each != own)):
-        entries |= _entries(path)
+        entries |= read_models(path)
     return entries
 
 
-def _entries(path: Path) -> dict[str, ModelEntry]:
+def read_models(path: Path) -> dict[str, ModelEntry]:
+    """The entries of one file; raises UsageError."""
     entries = {}
     for name, table in read_toml(path).items():
         where = f"{path}: [{name}]"
@@ -42,6 +44,8 @@ def _entries(path: Path) -> dict[str, ModelEntry]:
         try:
             FORMATS.require(entry.format)
             endpoint_identity(entry, {})
+            if "id" not in entry.model_fields_set and model_id(entry, {}) is not None:
+                raise UsageError("`id` is missing: the model's name at the provider")
         except UsageError as exc:
             raise UsageError(one_line(f"{where}: {exc}")) from exc
     return entries

@@ -46,7 +46,7 @@ class Options:
 
     ``rpm`` and ``tpm`` override the registry's. ``dask`` names the cluster that plays the trials;
     if None, this process plays them. ``faults_identity`` keeps the answers of an emulator that was
-    told to misbehave apart from those of the usual one.
+    told to misbehave apart from those of the usual one. A ``dry_run`` sends nothing.
     """
 
     db: Path
@@ -61,6 +61,7 @@ class Options:
     faults_identity: str = ""
     strict_model: bool = False
     dask: str | None = None
+    dry_run: bool = False
 
     @property
     def connections(self) -> int:
@@ -162,6 +163,13 @@ class Plan:
         for arm in self.arms:
             endpoints = {name: self.endpoints[name] for name in arm.entries}
             yield arm.label, replace(self, arms=(arm,), entries=arm.entries, endpoints=endpoints)
+
+    def with_entries(self, entries: dict[str, ModelEntry]) -> Plan:
+        """The same with other entries for the same names, in its arms too."""
+        arms = (
+            replace(arm, entries={name: entries[name] for name in arm.entries}) for arm in self.arms
+        )
+        return replace(self, arms=tuple(arms), entries=entries)
 
     def specs(self) -> dict[str, str]:
         """Spec hash to the canonical JSON that it covers."""

@@ -42,6 +42,7 @@ from merge_runner.run.clients import (
 from merge_runner.run.estimate import Estimate, estimate
 from merge_runner.run.flusher import Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
+from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
 from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
@@ -87,7 +88,11 @@ class Outcome:
 
 
 class Sweep:
-    """One run of a plan. Making it opens the cache and the database, and nothing else."""
+    """One run of a plan.
+
+    Making it opens the cache and the database, asks a server of one's own what its model is
+    called, and does nothing else.
+    """
 
     def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
         """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
@@ -95,6 +100,7 @@ class Sweep:
         self._say = say
         recorded = partial(Spilled, options.recording) if options.recording else None
         self._cache = ResponseCache(options.cache, overlay=recorded)
+        plan = plan.with_entries(self._named(plan.entries))
         endpoints = {name: self._endpoint(plan, name) for name in plan.entries}
         self._plan = plan = replace(plan, endpoints=endpoints)
         self._arms = plan.by_label()
@@ -105,6 +111,8 @@ class Sweep:
             ended = set() if options.replay else self._store.ended_trials(specs)
         self._stored = [key for key in specs if key in ended]
         self._todo = [spec for key, spec in specs.items() if key not in ended]
+        if self._todo and not (self._is_silent or options.dask):  # workers may see other servers
+            check_served(plan.entries)
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
         # Keyed by model and its number of answered calls, so that an answer starts a new count.
@@ -360,6 +368,18 @@ class Sweep:
                     f"in between ({record.error}): the rest is not tried. When the service answers "
                     "again, run the same command to go on"
                 )
+
+    @property
+    def _is_silent(self) -> bool:
+        """Whether nothing may be sent."""
+        return self._options.replay or self._options.dry_run
+
+    def _named(self, entries: Mapping[str, ModelEntry]) -> dict[str, ModelEntry]:
+        """The entries, each with its model's name: as told, as recorded, or as its server says."""
+        if self._is_silent:
+            recorded = partial(recorded_name, cache=self._cache, strict=self._options.replay)
+            return with_names(entries, recorded)
+        return with_names(entries, partial(served_name, say=self._say))
 
     def _endpoint(self, plan: Plan, name: str) -> str:
         """The endpoint's identity: in a replay, the one under which the model is recorded."""

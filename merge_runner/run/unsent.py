@@ -19,7 +19,7 @@ async def unsent(plan: Plan, options: Options, *, say: Callable[[str], None]) ->
         db = readable(options.db) if options.db.is_file() else Path(folder) / "none.duckdb"
         recorded = (options.cache / "cache.db").is_file()
         cache = options.cache if recorded else Path(folder) / "responses"
-        prepared = Sweep(plan, replace(options, db=db, cache=cache), say=say)
+        prepared = Sweep(plan, replace(options, db=db, cache=cache, dry_run=True), say=say)
         expected = await prepared.estimate()
         prepared.close()
     return expected

@@ -103,6 +103,8 @@ def _arm(
         if name not in (MODEL, PROMPT, OPPONENT) and name not in ScenarioConfig.model_fields
     }
     changed = set(both_sides(str(levels[MODEL])).values())
+    if not changed & {*registry}:
+        _refuse_parameters(str(levels[MODEL]), parameters)
     entries: dict[str, ModelEntry] = {}
     asked = {}
     for side, name in sides.items():
@@ -144,15 +146,19 @@ def _entry(
     entry = registry.get(name)
     changed = []
     for parameter, level in parameters.items():
-        if level == DEFAULT:
+        if entry is None or level == DEFAULT:
             continue
-        if entry is None:
-            raise UsageError(f"{name} is a program and takes no {parameter}, only {DEFAULT!r}")
         with_it = with_parameter(name, entry, parameter, level)
         if with_it != entry:
             changed.append(f"{parameter}={level_text(level)}")
         entry = with_it
     return " ".join([name, *changed]), entry
+
+
+def _refuse_parameters(program: str, parameters: Levels) -> None:
+    for parameter, level in parameters.items():
+        if level != DEFAULT:
+            raise UsageError(f"{program} is a program and takes no {parameter}, only {DEFAULT!r}")
 
 
 def _scenario(scenario: ScenarioConfig, levels: Levels) -> ScenarioConfig:

@@ -20,7 +20,12 @@ seed = 4
 delay_s = 0.01
 rates = { malformed = 0.2, rate_limit = 0.2 }
 """
-MIXED = ("sweep", "baseline", "--model", "emulator+constant", "--reps", 1, "--conditions", "L_4_0")
+STUDY = """
+repetitions = 1
+conditions = ["L_4_0"]
+factors = { opponent = ["constant"] }
+"""
+MIXED = ("sweep", "study.toml")
 # Of which row a value is changed, and to what, where another row or value tells more.
 ROWS = {
     "states": "step = 9 AND side = 'left'",
@@ -44,6 +49,7 @@ def made(prepare, tmp_path_factory):
     """A model against a program, with bad answers and retries; and the cache of it."""
     folder = tmp_path_factory.mktemp("made")
     (folder / "faults.toml").write_text(FAULTS)
+    (folder / "study.toml").write_text(STUDY)
     run = prepare(folder, *MIXED, "--faults", "faults.toml")
     assert run.code == 0, run.err
     return folder

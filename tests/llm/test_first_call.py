@@ -105,9 +105,17 @@ async def test_a_wrong_configuration_is_told_by_one_call(begin, reply, advice):
 @in_virtual_time
 async def test_where_nobody_listens_the_run_ends_within_seconds(begin):
     client = begin(REFUSED)
-    with pytest.raises(EndpointRefused, match=r"nobody answers there \(refused\).*OPENAI_BASE_URL"):
+    with pytest.raises(ProviderDown, match=r"refused: check the network, or set OPENAI_BASE_URL"):
         await client.ask("prompt", slot())
     assert 5 <= now_s() < 12
+
+
+@in_virtual_time
+async def test_a_server_that_has_answered_is_waited_for_as_long_as_a_call_may_take(begin):
+    client = begin(answer(), *[REFUSED] * 9, answer())
+    assert (await client.ask("prompt", slot())).outcome == "ok"
+    assert (await client.ask("prompt", slot(2))).outcome == "ok"
+    assert now_s() > 60
 
 
 @in_virtual_time

@@ -1,0 +1,54 @@
+"""The models that a server says it serves, by ``GET /models``."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+
+from merge_runner.config import Endpoint
+from merge_runner.llm.first_call import NOBODY_S
+from merge_runner.llm.formats.base import as_dict, as_dicts, as_text
+from merge_runner.llm.http import HttpTransport
+from merge_runner.llm.http_outcome import RawReply
+from merge_runner.llm.transport import TransportFailure
+
+TIMEOUT_S = 10.0
+POLL_S = 0.5
+
+
+def listed_models(endpoint: Endpoint, *, patient: bool = False) -> list[str]:
+    """The ids of the models; raises TransportFailure, ``no_list`` where another thing answers.
+
+    A ``patient`` one waits some seconds for a server that is just starting.
+    """
+    # In a thread of its own, since the caller may be in an event loop.
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(asyncio.run, _listed(endpoint, NOBODY_S if patient else 0.0)).result()
+
+
+async def _listed(endpoint: Endpoint, patience_s: float) -> list[str]:
+    transport = HttpTransport(endpoint, connections=1)
+    try:
+        return _ids(await _reply(transport, patience_s))
+    finally:
+        await transport.close()
+
+
+async def _reply(transport: HttpTransport, patience_s: float) -> RawReply:
+    """The reply of whoever listens; connections that are refused are tried again."""
+    began_s = asyncio.get_running_loop().time()
+    while True:
+        try:
+            return await transport.get("/models", timeout_s=TIMEOUT_S)
+        except TransportFailure as exc:
+            waited_s = asyncio.get_running_loop().time() - began_s
+            if exc.outcome != "no_connection" or waited_s >= patience_s:
+                raise
+        await asyncio.sleep(POLL_S)
+
+
+def _ids(raw: RawReply) -> list[str]:
+    payload = as_dict(raw.payload)
+    if raw.status != 200 or "data" not in payload:
+        raise TransportFailure("no_list", f"HTTP {raw.status}: {raw.error.message or 'no list'}")
+    return [name for model in as_dicts(payload["data"]) if (name := as_text(model.get("id")))]

@@ -1,0 +1,1 @@
+"""Studies: their files, their parts, and what their factors cross to."""

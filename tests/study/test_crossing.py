@@ -1,0 +1,149 @@
+"""What the factors of a study cross to, and what of it is refused before anything is asked."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from merge_runner.errors import UsageError
+from merge_runner.run.plan import make_plan
+
+HEAD = 'description = "x"\nrepetitions = 2\nconditions = ["N_0_0"]\n'
+
+
+@pytest.fixture
+def plan_of(tmp_path):
+    """Makes the plan of a study's text."""
+
+    def plan(text, models=(), **asked):
+        file = tmp_path / "mine.toml"
+        file.write_text(HEAD + text)
+        return make_plan(str(file), models, **asked)
+
+    return plan
+
+
+def arms(plan):
+    return {arm.label for arm in plan.arms}
+
+
+def bodies(plan):
+    return {
+        json.loads(plan.spec(arm, "N_0_0"))["left"]["body"].get("temperature") for arm in plan.arms
+    }
+
+
+def test_models_factors_and_prompts_are_crossed_and_named_by_what_varies(plan_of):
+    plan = plan_of(
+        'models = ["emulator", "local"]\n'
+        '[factors]\nprompt = ["baseline", "A2"]\ntemperature = [0.2, 1.0]\nseed = [7]\n'
+    )
+    assert len(plan.arms) == 2 * 2 * 2
+    assert "emulator temperature=0.2 A2" in arms(plan)
+    specs = plan.trial_specs()
+    assert plan.trials == len(specs) == len({spec.trial_id for spec in specs}) == 16
+    named = {spec.trial_id: dict(spec.factors) for spec in specs}
+    assert named["emulator/A2/N_0_0/rep01/temperature=0.2/seed=7"] == {
+        "prompt": "A2",
+        "temperature": "0.2",
+        "seed": "7",
+    }
+    assert bodies(plan) == {0.2, 1.0}
+
+
+def test_a_level_is_another_request_and_another_spec(plan_of):
+    plan = plan_of("[factors]\ntemperature = [0.2, 1.0]\n")
+    first, second = plan.trial_specs()[0], plan.trial_specs()[1]
+    assert first.spec_hash != second.spec_hash
+    assert set(plan.entries) == {"emulator temperature=0.2", "emulator temperature=1.0"}
+    assert set(plan.registered.values()) == {"emulator"}
+
+
+def test_what_is_the_default_already_is_not_sent(plan_of):
+    plan = plan_of("[factors]\ntemperature = [1.0]\n", ["o3"])
+    assert plan.entries == make_plan("baseline", "o3").entries
+
+
+def test_default_leaves_a_parameter_as_the_registry_has_it(plan_of):
+    plan = plan_of('[factors]\nreasoning_effort = ["default", "low"]\n', ["o3"])
+    efforts = [entry.parameters["reasoning_effort"] for entry in plan.entries.values()]
+    assert efforts == ["medium", "low"]
+
+
+def test_common_names_stand_where_the_format_wants_them(plan_of):
+    plan = plan_of('[factors]\nreasoning_effort = ["low"]\n', ["gpt-6-sol"])
+    (entry,) = plan.entries.values()
+    assert entry.parameters["reasoning"] == {"effort": "low"}
+    plan = plan_of("[factors]\nthinking_budget = [128]\n", ["gemini-2.5-pro"])
+    (entry,) = plan.entries.values()
+    assert entry.parameters["thinkingConfig"] == {"thinkingBudget": 128}
+
+
+def test_an_opponent_drives_on_the_right_and_keeps_its_own_parameters(plan_of):
+    plan = plan_of('[factors]\ntemperature = [0.2]\nopponent = ["self", "constant", "local"]\n')
+    sides = [(arm.asked["left"], arm.asked["right"]) for arm in plan.arms]
+    assert sides == [
+        ("emulator temperature=0.2", "emulator temperature=0.2"),
+        ("emulator temperature=0.2", "constant"),
+        ("emulator temperature=0.2", "local"),
+    ]
+    assert {spec.model_right for spec in plan.trial_specs()} == {"emulator", "constant", "local"}
+
+
+def test_a_switch_of_the_scenario_is_a_factor(plan_of):
+    plan = plan_of('[factors]\ncollision_rule = ["euclid2d", "rectangle"]\n')
+    assert [arm.scenario.collision_rule for arm in plan.arms] == ["euclid2d", "rectangle"]
+    assert len({spec.spec_hash for spec in plan.trial_specs()}) == 2
+
+
+def test_skip_leaves_crossings_out_and_may_list_levels(plan_of):
+    text = (
+        'models = ["o3", "gemini-2.5-pro"]\nskip = [{ model = "o3", temperature = [0.2, 0.5] }]\n'
+        "[factors]\ntemperature = [0.2, 0.5, 1.0]\n"
+    )
+    assert arms(plan_of(text)) == {
+        "o3 temperature=1.0",
+        *(f"gemini-2.5-pro temperature={level}" for level in (0.2, 0.5, 1.0)),
+    }
+
+
+def test_only_plays_a_part(plan_of):
+    text = 'models = ["emulator", "local"]\n[factors]\ntemperature = [0.2, 1.0]\n'
+    plan = plan_of(text, only={"temperature": ["0.2"], "model": ["local"]})
+    assert arms(plan) == {"local temperature=0.2"}
+    whole = {spec.trial_id: spec.spec_hash for spec in plan_of(text).trial_specs()}
+    assert {s.trial_id: s.spec_hash for s in plan.trial_specs()}.items() <= whole.items()
+
+
+def test_plain_sweeps_have_one_arm_for_each_prompt():
+    plan = make_plan("ablations", "emulator")
+    assert [arm.label for arm in plan.arms] == ["baseline", *(f"A{i}" for i in range(1, 8))]
+    assert "arms" not in plan.config()
+    assert all(not spec.factors for spec in plan.trial_specs())
+
+
+@pytest.mark.parametrize(
+    ("text", "models", "says"),
+    [
+        ("[factors]\ntemprature = [1]\n", ["o3"], "o3 takes no parameter temprature; valid: max_"),
+        ("[factors]\ntemperature = [0.2]\n", ["o3"], "no parameter temperature but its default"),
+        ("[factors]\ntemperature = [0.2]\n", ["o3"], 'skip = [{ model = "o3", temperature = 0.2'),
+        ("[factors]\ntemperature = [0.2]\n", ["constant"], "is a program and takes no temperature"),
+        ("[factors]\ntemperature = []\n", ["o3"], "the factor temperature needs levels"),
+        ("[factors]\ntemperature = [1, 1]\n", ["o3"], "needs levels, each of them once"),
+        ('[factors]\nmodel = ["o3"]\n', [], "models are no factor"),
+        ('[factors]\nprompt = ["A9"]\n', [], "unknown variant 'A9'; valid: baseline, A1"),
+        ('[factors]\nopponent = ["nobody"]\n', [], "unknown model 'nobody'; valid: emulator"),
+        ('[factors]\nopponent = ["constant"]\n', ["o3+local"], "is a pair already"),
+        ('[factors]\ncollision_rule = ["round"]\n', [], "collision_rule"),
+        ("skip = [{ speed = 1 }]\n[factors]\nseed = [1]\n", [], "unknown factor 'speed'; valid"),
+        ("skip = [{ seed = 2 }]\n[factors]\nseed = [1]\n", [], "unknown level of seed '2'; valid"),
+        ("skip = [{ seed = 1 }]\n[factors]\nseed = [1]\n", [], "nothing is left to play"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_valid_choices(plan_of, text, models, says):
+    with pytest.raises(UsageError) as caught:
+        plan_of(text, models)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)

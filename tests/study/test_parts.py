@@ -1,0 +1,155 @@
+"""The prompts, conditions and plug-ins that a study adds."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
+from merge_runner.prompts.blocks import block_digests, blocks_of
+from merge_runner.prompts.render import render_prompt
+from merge_runner.run.plan import make_plan
+from merge_runner.scenarios.registry import new_world
+
+HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
+DRIVER = """
+from merge_runner.drivers.registry import PROGRAMS, Program
+
+class Braking:
+    def __init__(self, seat):
+        self.seat = seat
+
+    async def decide(self, observation, number):
+        return self.seat.held({action})
+
+PROGRAMS.register("braking", Program(Braking, "brakes"))
+"""
+
+
+@pytest.fixture
+def plan_of(tmp_path):
+    """Makes the plan of a study's text."""
+
+    def plan(text, models=(), plugin=None, conditions=True):
+        file = tmp_path / "mine.toml"
+        file.write_text((HEAD if conditions else "repetitions = 1\n") + text)
+        if plugin is not None:
+            (tmp_path / "mine.py").write_text(plugin)
+        return make_plan(str(file), models)
+
+    return plan
+
+
+def prompt(variant):
+    world = new_world(ScenarioConfig(), "N_0_0")
+    scenario = ScenarioConfig()
+    return render_prompt(world.observe("left"), None, variant=variant, scenario=scenario)
+
+
+def persona(text="You are a taxi driver."):
+    added = f'add = [{{ after = "C3.human", text = "{text}" }}]'
+    return f'[factors]\nprompt = ["taxi"]\n[prompts.taxi]\n{added}\n'
+
+
+def test_a_paragraph_is_added_where_it_belongs(plan_of):
+    plan_of(persona("You drive {own_speed_kmh} km/h, {own_speed_mph} mph."))
+    lines = prompt("taxi").split("\n\n")
+    place = lines.index("You drive 36.00 km/h, 22.37 mph.")
+    assert lines[place - 1].startswith("Drive the way a human driver")
+    assert lines[:place] + lines[place + 1 :] == prompt("baseline").split("\n\n")
+
+
+def test_an_edited_prompt_is_another_spec_at_once(plan_of):
+    texts = ["You are late.", "You are early."]
+    specs = [plan_of(persona(text)).trial_specs()[0].spec_hash for text in texts]
+    assert specs[0] != specs[1]
+    assert "You are early." in prompt("taxi")
+    assert "You are late." not in prompt("taxi")
+
+
+def test_blocks_are_removed_replaced_and_reordered(plan_of):
+    names = list(blocks_of("A2"))
+    order = [name for name in (names[0], *reversed(names[1:])) if name != "C3.safety"]
+    plan_of(
+        '[factors]\nprompt = ["other"]\n[prompts.other]\nbased_on = "A2"\nremove = ["C3.safety"]\n'
+        'replace = { "C3.human" = "Drive like a robot." }\n'
+        f"order = {json.dumps(order)}\n"
+    )
+    assert list(blocks_of("other")) == order
+    assert "Drive like a robot." in prompt("other")
+
+
+def test_the_order_of_a_prompt_is_in_its_hash(plan_of):
+    names = list(blocks_of("baseline"))
+    swapped = [*names[:2], names[3], names[2], *names[4:]]
+    plan_of(
+        f'[factors]\nprompt = ["other"]\n[prompts.other]\norder = {json.dumps(swapped)}\n',
+    )
+    assert block_digests("other") != block_digests("baseline")
+
+
+OWN = """
+[[conditions]]
+name = "X"
+projected_headway_m = 1
+relative_velocity_mps = 0.5
+mean_speed_mps = {speed}
+"""
+
+
+def test_an_own_condition_is_played_and_another_mean_speed_is_another_spec(plan_of):
+    specs = []
+    for speed in (10.0, 12.0):
+        specs += plan_of(OWN.format(speed=speed), conditions=False).trial_specs()
+        assert new_world(ScenarioConfig(), "X").observe("left").own_speed_mps == speed + 0.25
+    assert len({spec.spec_hash for spec in specs}) == 2
+    plain = make_plan("baseline", "emulator").trial_specs()[0].spec_hash
+    assert specs[0].spec_hash == plain  # its headway and velocity stand in the trial's row
+
+
+def test_all_stands_for_the_conditions_of_the_scenario(plan_of):
+    text = (
+        'conditions = ["all", { name = "Y", projected_headway_m = 1, relative_velocity_mps = 0 }]\n'
+    )
+    plan = plan_of(text, conditions=False)
+    assert len(plan.conditions) == 12
+
+
+def test_a_plug_in_beside_the_study_drives_and_an_edit_of_it_is_another_driver(plan_of):
+    text = '[plugins]\nfiles = ["mine.py"]\n'
+    hashes = []
+    for action in (-0.1, -0.1, -0.2):
+        plan = plan_of(text, ["braking"], plugin=DRIVER.format(action=action))
+        hashes.append(plan.trial_specs()[0].spec_hash)
+    assert hashes[0] == hashes[1] != hashes[2]
+    assert plan.config()["study"]["plugins"] == {"mine.py": DRIVER.format(action=-0.2)}
+
+
+def test_what_an_earlier_study_added_is_gone(plan_of):
+    plan_of(persona())
+    with pytest.raises(UsageError, match="unknown variant 'taxi'"):
+        plan_of('[factors]\nprompt = ["taxi"]\n')
+
+
+@pytest.mark.parametrize(
+    ("text", "plugin", "says"),
+    [
+        (persona("{speed}"), None, "names {speed}"),
+        (persona().replace("C3.human", "C9"), None, "names the block 'C9'; those that it has: C0"),
+        (persona().replace("C3.human", "A"), None, "the prompt taxi names the block 'A'"),
+        ('[prompts.baseline]\nremove = ["C2"]\n', None, "there is a variant 'baseline' already"),
+        ('[prompts.x]\norder = ["C0"]\n', None, "names each of its blocks once: C0, C1"),
+        ('[prompts.x]\nadd = [{ after = "C0" }]\n', None, "give it a text, or merge and straight"),
+        ("[prompts.x]\nad = []\n", None, "unknown key 'prompts.x.ad'; valid: based_on, remove"),
+        ('[plugins]\nfiles = ["none.py"]\n', None, "the plug-in none.py cannot be read"),
+        ('[plugins]\nfiles = ["mine.py"]\n', "1 / 0", "mine.py fails: ZeroDivisionError"),
+        ('[plugins]\nfiles = ["mine.py"]\n', "def", "mine.py fails: SyntaxError"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(plan_of, text, plugin, says):
+    with pytest.raises(UsageError) as caught:
+        plan_of(text, plugin=plugin)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
