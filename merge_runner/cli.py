@@ -6,6 +6,7 @@ import errno
 import gc
 import json
 import math
+import shlex
 import shutil
 import sys
 import tempfile
@@ -134,6 +135,18 @@ def common(
     ] = False,  # typer's way to declare a flag
 ) -> None:
     """Finds out whether a language model drives like a human."""
+
+
+@app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
+) -> None:
+    """Write a folder with a study that runs as it is, to be changed into your own."""
+    from merge_runner.study.folder import write_folder
+
+    for path in write_folder(folder):
+        say(f"wrote {path}")
+    print_out(f"go on: cd {shlex.quote(str(folder))} && merge-runner sweep study.toml")
 
 
 @app.command()
