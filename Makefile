@@ -8,13 +8,15 @@ Q ?= select model_left, variant, status, count(*) as trials from trials group by
 PYTHON ?= python3
 RUN := .venv/bin/merge-runner
 export Q
+# A make that a recipe runs, as the tests do, is another one: it inherits neither words nor variables.
+unexport MODEL SWEEP ARGS RECORDING PYTHON MAKEFLAGS MFLAGS MAKEOVERRIDES
 
 .PHONY: help sweep replay report view sql test lint check bench lock
 
 help:
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
 
-sweep: .venv/runtime $(if $(findstring --dask,$(ARGS)),.venv/dev) ## the main job: MODEL=, SWEEP=, ARGS=
+sweep: .venv/runtime $(if $(findstring --dask,$(ARGS)),.venv/dask) ## the main job: MODEL=, SWEEP=, ARGS=
 	@$(RUN) sweep $(SWEEP) --model $(MODEL) $(ARGS)
 
 replay: .venv/runtime ## the same from recorded replies alone: MODEL=, SWEEP=, RECORDING=, ARGS=
@@ -45,11 +47,15 @@ bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/reference/perf
 
 lock: ## renew the lock files (needs uv)
 	uv pip compile $(LOCK) --group dev -o requirements-dev.lock pyproject.toml
-	uv pip compile $(LOCK) --group build --extra view -c requirements-dev.lock -o requirements.lock pyproject.toml
+	uv pip compile $(LOCK) --group build -c requirements-dev.lock -o requirements.lock pyproject.toml
+	uv pip compile $(LOCK) --extra dask -c requirements-dev.lock $(OTHERS) -o requirements-dask.lock pyproject.toml
+	uv pip compile $(LOCK) --group test --resolution lowest-direct -o requirements-lowest.lock pyproject.toml
 	uv pip compile $(LOCK) --group pyproject.toml:peer -o requirements-peer.lock
 
 LOCK := --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock"
+# What requirements.lock has already.
+OTHERS = $(shell sed -n 's/^\([a-z0-9-]*\)==.*/--no-emit-package \1/p' requirements.lock)
 PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 
 .venv/python:
@@ -66,6 +72,11 @@ PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 .venv/dev: .venv/runtime requirements-dev.lock
 	@echo "installing the pinned development packages into .venv" >&2
 	@$(PIP) install --require-hashes -r requirements-dev.lock
+	@touch $@
+
+.venv/dask: .venv/runtime requirements-dask.lock
+	@echo "installing the pinned packages of the extra dask into .venv" >&2
+	@$(PIP) install --require-hashes --no-deps -r requirements-dask.lock
 	@touch $@
 
 .venv-peer/installed: requirements-peer.lock

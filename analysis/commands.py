@@ -167,12 +167,7 @@ def view(
 
 
 def _serve(db: Path, port: int, bind: str) -> None:
-    try:
-        from analysis.explorer.server import serve
-    except ModuleNotFoundError as exc:
-        raise UsageError(
-            f"the explorer needs {exc.name}: pip install 'merge-runner[view]'"
-        ) from exc
+    from analysis.explorer.server import serve
 
     def announce(address: str) -> None:
         print_out(address)

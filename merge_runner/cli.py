@@ -11,6 +11,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from merge_runner import __version__
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import printable
@@ -95,8 +97,10 @@ ImportedFile = Annotated[
     Path, typer.Argument(metavar="FILE", help="A recording (.parquet), or a cache folder.")
 ]
 RecordingOption = Annotated[
-    Path | None,
-    typer.Option("--recording", help="Also replay from this file, without importing it."),
+    list[Path] | None,
+    typer.Option(
+        "--recording", help="Also replay from this file, without importing it; may be repeated."
+    ),
 ]
 
 # A full disk, a limit of file sizes, and a device that fails.
@@ -116,6 +120,11 @@ def main() -> None:
             raise
         say(f"error: {exc}")
         sys.exit(exc.exit_code)
+    except ModuleNotFoundError as exc:
+        if debug or str(exc.name).startswith(("merge_runner", "analysis")):
+            raise
+        say(f"error: this needs {exc.name}, which is not installed: pip install {exc.name}")
+        sys.exit(UsageError.exit_code)
     except RuntimeError as exc:
         if debug or str(exc) != "Query interrupted":  # what DuckDB raises on Ctrl-C
             raise
@@ -128,11 +137,23 @@ def main() -> None:
         sys.exit(1)
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print_out(f"merge-runner {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def common(
     debug: Annotated[
         bool, typer.Option("--debug", help="Show a traceback on errors.")
     ] = False,  # typer's way to declare a flag
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
 ) -> None:
     """Finds out whether a language model drives like a human."""
 
@@ -170,6 +191,13 @@ def sweep(
         float | None,
         typer.Option(help="Never spend more USD on this sweep, over all its runs.", min=0),
     ] = None,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Begin no trial from this local time on, such as 07:00; the next run goes on.",
+        ),
+    ] = None,
     dask: Annotated[
         str | None,
         typer.Option(
@@ -197,10 +225,11 @@ def sweep(
 
     from merge_runner.run.plan import Options, make_plan
     from merge_runner.run.unsent import unsent
+    from merge_runner.run.until import deadline
 
     if max_cost is not None and not math.isfinite(max_cost):
         raise UsageError("--max-cost is a number of USD")
-    if recording is not None and not replay:
+    if recording and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
     if dask is not None and replay:
         raise UsageError("a replay needs no cluster: leave --dask out")
@@ -212,11 +241,12 @@ def sweep(
         tpm=tpm,
         max_cost_usd=max_cost,
         replay=replay,
-        recording=recording,
+        recordings=recording or (),
         emulator_options=_emulator_options(fault_rate, faults, seed),
         faults_identity=_faults(fault_rate, faults, seed).identity,
         strict_model=strict_model,
         dask=dask,
+        until=None if until is None else deadline(until, datetime.now(UTC)),
     )
     plan = make_plan(
         name,
@@ -228,7 +258,14 @@ def sweep(
         order_seed=order_seed,
         only=_levels(only or ()),
     )
-    options = plan.with_budget(options)
+    options = plan.within_budget(options)
+    if replay:
+        from merge_runner.run.recorded_plan import replayed
+
+        whole = any(part is not None for part in (reps, conditions, variants))
+        plan, options, notes = replayed(plan, options, whole=whole)
+        for note in notes:
+            say(note)
     if dry_run:
         _print_estimate(asyncio.run(unsent(plan, options, say=say)), as_json=as_json)
     else:
@@ -285,6 +322,20 @@ def sql(
             writers[output](names, rows, spooled)
         spooled.seek(0)
         shutil.copyfileobj(spooled, sys.stdout)
+
+
+@app.command()
+def export(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A new folder, or that of an earlier export.")
+    ],
+    db: DbOption = DEFAULT_DB,
+) -> None:
+    """Write every table and view as Parquet and CSV, with a dictionary of all columns."""
+    from merge_runner.results.export import export_tables
+
+    for path in export_tables(db, folder):
+        say(f"wrote {path}")
 
 
 @app.command()
@@ -363,6 +414,8 @@ def ledger(
         _agree(
             f"{aside.reserved_usd:.4f} USD are set aside for {aside.open_attempts} attempts at "
             f"{release}. If the provider did charge for them, --max-cost may be passed by as much",
+            "Release it?",
+            otherwise="nothing was released",
             yes=yes,
         )
         found = [spending.release(cache, release)]
@@ -375,15 +428,52 @@ def ledger(
         print_out("No sweep has spent anything.")
 
 
-def _agree(what: str, *, yes: bool) -> None:
-    """Say what a release means, and ask once."""
+@app.command()
+def forget(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME ...]", help="Sweeps or trials; * stands for anything."),
+    ] = None,
+    sweeps: Annotated[
+        list[str] | None, typer.Option("--sweep", metavar="ID", help="A sweep_id.")
+    ] = None,
+    trials: Annotated[
+        list[str] | None, typer.Option("--trial", metavar="ID", help="A trial_id.")
+    ] = None,
+    db: DbOption = DEFAULT_DB,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before removing.")] = False,
+) -> None:
+    """Remove sweeps and trials from the database; their replies stay in the cache."""
+    from merge_runner.results import forgetting
+
+    # A trial's id has a slash, a sweep's has none.
+    of_trials = [*(trials or ()), *(name for name in names or () if "/" in name)]
+    of_sweeps = [*(sweeps or ()), *(name for name in names or () if "/" not in name)]
+    if not of_trials and not of_sweeps:
+        raise UsageError("name a sweep or a trial; `merge-runner sql 'from sweeps'` lists sweeps")
+    going = forgetting.to_forget(db, of_sweeps, of_trials)
+    _agree(
+        f"these go from {db}: {going}",
+        "Remove them?",
+        otherwise="nothing was removed",
+        yes=yes,
+    )
+    gone = forgetting.forget(db, of_sweeps, of_trials)
+    say(
+        f"removed: {gone}. Their replies stay in the cache: the same `merge-runner sweep` plays "
+        "the trials again without a call"
+    )
+
+
+def _agree(what: str, question: str, *, otherwise: str, yes: bool) -> None:
+    """Say what is about to be done, and ask once; ``otherwise`` says that it was not done."""
     say(what)
     if yes:
         return
     if not sys.stdin.isatty():
-        raise UsageError("there is no terminal to ask at: add --yes to release it")
-    if not typer.confirm("Release it?", err=True):
-        raise UsageError("nothing was released")
+        raise UsageError(f"there is no terminal to ask at, so {otherwise}: add --yes")
+    if not typer.confirm(question, err=True):
+        raise UsageError(otherwise)
 
 
 @app.command()
@@ -452,28 +542,30 @@ def recording_export(
     file: RecordingFile,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
-    sweep_id: Annotated[
-        str | None, typer.Option("--sweep", help="A sweep_id; the newest sweep if not given.")
+    sweeps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sweep", help="A sweep_id, which may be repeated; the newest sweep if none is given."
+        ),
     ] = None,
     sign: Annotated[
         Path | None,
         typer.Option("--sign", metavar="KEY", help="Sign it with ssh-keygen or minisign."),
     ] = None,
 ) -> None:
-    """Write what a sweep asked and was answered into one file."""
+    """Write what sweeps asked and were answered into one file."""
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.results import signing
-    from merge_runner.results.recording import export_recording
-    from merge_runner.results.store import recorded_sweep
+    from merge_runner.results.recording import export_recording, provenance_of
+    from merge_runner.results.store import recorded_sweeps
 
     if sign is not None:
         signing.tool_for(sign)
-    row, keys = recorded_sweep(db, sweep_id)
-    found = row["sweep_id"]
+    rows, keys = recorded_sweeps(db, sweeps or ())
+    found = " and ".join(row["sweep_id"] for row in rows)
     if not keys:
         raise UsageError(f"the sweep {found} made no call: there is nothing to record")
-    provenance = {name: str(value) for name, value in row.items() if value is not None}
-    calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance)
+    calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance_of(rows))
     say(f"{calls} calls of {found} are in {file}")
     if sign is not None:
         say(f"signed: {signing.sign(file, sign)}")
@@ -578,7 +670,9 @@ def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
 
 
 def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
-    from dataclasses import asdict
+    from dataclasses import asdict, astuple
+
+    from merge_runner.results.query_output import write_table
 
     if as_json:
         print_out(json.dumps(asdict(expected)))
@@ -597,6 +691,15 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         ("time", f"about {expected.minutes} minutes"),
     ):
         print_out(f"{name:<8}{text}")
+    if expected.trials_within_cap is not None:
+        print_out(f"cap     buys about {expected.trials_within_cap} trials")
+    if len(expected.cells) > 1:
+        headings = ["cell", "trials", "calls", "tokens in", "tokens out", "USD", "minutes"]
+        write_table(
+            [*headings, "trials within the cap"],
+            [tuple("" if v is None else v for v in astuple(c)) for c in expected.cells],
+            sys.stdout,
+        )
     print_out("Nothing was sent.")
 
 

@@ -27,7 +27,7 @@ from pydantic import (
 )
 
 from merge_runner.errors import UsageError
-from merge_runner.paths import PROJECT
+from merge_runner.paths import SHIPPED_EXPERIMENTS
 from merge_runner.records import Side
 from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
@@ -330,8 +330,9 @@ def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.e
     key = next((env[variable] for variable in key_envs if env.get(variable)), None)
     if key is None and provider.key_needed:
         raise UsageError(
-            f"{name} needs a key: set {' or '.join(key_envs)}. Without one: `make sweep` runs the "
-            f"emulator, and `make replay MODEL={name} RECORDING=FILE.parquet` replays a recording."
+            f"{name} needs a key: set {' or '.join(key_envs)}. Without one: `merge-runner "
+            "sweep baseline` runs the emulator, and `merge-runner replay baseline --model "
+            f"{name} --recording FILE.parquet` replays a recording."
         )
     if key is not None and not (key.isascii() and key.isprintable() and " " not in key):
         raise UsageError(
@@ -515,9 +516,9 @@ def validated(model: type[ModelT], value: object, where: str) -> ModelT:
 
 
 def find_experiments() -> Path:
-    """The experiments folder: of the working directory, else of the project."""
+    """The experiments folder: of the working directory, else what ships with the program."""
     here = Path("experiments")
-    return here if here.is_dir() else PROJECT / "experiments"
+    return here if here.is_dir() else SHIPPED_EXPERIMENTS
 
 
 def _base_url(entry: ModelEntry, provider: Provider, env: Mapping[str, str]) -> str:

@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
 from merge_runner.config import resolve_endpoint
 from merge_runner.drivers.base import Driver, Seat
 from merge_runner.drivers.registry import PROGRAMS, Program
-from merge_runner.errors import UsageError
+from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.registry import Registry
 from merge_runner.run import summary
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
-from merge_runner.run.sweep import Outcome, Sweep
+from merge_runner.run.recorded_plan import replayed
+from merge_runner.run.sweep import Sweep
 from merge_runner.run.unsent import unsent
 from merge_runner.study.crossing import level_text
 from merge_runner.text_safety import printable
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from pydantic import JsonValue
 
 T = TypeVar("T")
+PARTS = ("repetitions", "conditions", "variants")
 _playing = threading.Lock()
 
 
@@ -179,40 +181,36 @@ class Study:
 
     async def arun(self, *, yes: bool = False, **how: Unpack[RunOptions]) -> StudyOutcome:
         """See ``run``."""
-        return await self._played(how, may_spend=yes)
-
-    def replay(self, recording: Path | str | None = None) -> StudyOutcome:
-        """Play all trials from recorded replies alone, those of the file first: no key, no call."""
-        return _now(self.areplay(recording), "areplay")
-
-    async def areplay(self, recording: Path | str | None = None) -> StudyOutcome:
-        """See ``replay``."""
-        file = None if recording is None else Path(recording)
-        return await self._played({}, replay=True, recording=file)
-
-    async def _played(
-        self,
-        how: RunOptions,
-        *,
-        may_spend: bool = False,
-        replay: bool = False,
-        recording: Path | None = None,
-    ) -> StudyOutcome:
         with _alone():
             plan = self.plan()
             options = self._options(plan, **how)
-            options = replace(options, replay=replay, recording=recording)
             prepared = Sweep(plan, options, say=_say)
-            try:
-                if not replay and prepared.trials_to_play:
-                    await _check(plan, prepared, may_spend=may_spend)
-                outcome = await prepared.run()
-            finally:
-                prepared.close()
-        return _shown(outcome, options)
+            if prepared.trials_to_play:
+                try:
+                    await _check(plan, prepared, may_spend=yes)
+                except MergeRunnerError:
+                    prepared.close()
+                    raise
+            return await _played(prepared, options)
+
+    def replay(self, *recordings: Path | str) -> StudyOutcome:
+        """Play all trials from recorded replies alone, those of the files first; sends nothing."""
+        return _now(self.areplay(*recordings), "areplay")
+
+    async def areplay(self, *recordings: Path | str) -> StudyOutcome:
+        """See ``replay``."""
+        with _alone():
+            plan = self.plan()
+            options = self._options(plan)
+            options = replace(options, replay=True, recordings=tuple(map(Path, recordings)))
+            part = any(self._wanted[each] is not None for each in PARTS)
+            plan, options, notes = replayed(plan, options, whole=part)
+            for note in notes:
+                _say(note)
+            return await _played(Sweep(plan, options, say=_say), options)
 
     def _options(self, plan: Plan, **how: Unpack[RunOptions]) -> Options:
-        return plan.with_budget(Options(self.db, self.cache, **how))
+        return plan.within_budget(Options(self.db, self.cache, **how))
 
 
 def _texts(levels: JsonValue) -> list[str]:
@@ -244,7 +242,8 @@ async def _check(plan: Plan, prepared: Sweep, *, may_spend: bool) -> None:
     )
 
 
-def _shown(outcome: Outcome, options: Options) -> StudyOutcome:
+async def _played(prepared: Sweep, options: Options) -> StudyOutcome:
+    outcome = await prepared.run()
     return StudyOutcome(
         exit_code=outcome.exit_code,
         messages=outcome.messages,

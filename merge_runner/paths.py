@@ -1,4 +1,4 @@
-"""Default paths, and a check before a file is overwritten."""
+"""Default paths, what ships with the program, and a check before a file is overwritten."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ from pathlib import Path
 
 from merge_runner.errors import UsageError
 
-PROJECT = Path(__file__).resolve().parent.parent
+PACKAGE = Path(__file__).resolve().parent
+PROJECT = PACKAGE.parent
+# In a checkout these are links to the top-level folders, in a wheel copies of them.
+SHIPPED_EXPERIMENTS = PACKAGE / "experiments"
+SHIPPED_RECORDINGS = PACKAGE / "recordings"
 DEFAULT_DB = Path("results/merge.duckdb")
 DEFAULT_CACHE = Path("cache/responses")
 

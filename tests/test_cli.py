@@ -32,7 +32,7 @@ def test_the_menu_is_what_was_promised():
     assert options >= SWEEP_OPTIONS
     assert set(command.commands["recording"].commands) == {"export", "import", "verify", "info"}
     assert package.__all__ == ["__version__"]
-    assert [e.value for e in entry_points(name="merge-runner")] == ["analysis.commands:main"]
+    assert [e.value for e in entry_points(name="merge-runner")] == ["merge_runner.__main__:main"]
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ from pydantic import BaseModel, JsonValue, ValidationError
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
+from merge_runner.results import frames
 from merge_runner.results.database import read_database
-from merge_runner.results.store import query
 from merge_runner.scenarios.merge.geometry import TRACK, Track
 from merge_runner.served_model import ALIASES, PAIRS, Pair, others_among
 
@@ -123,8 +123,7 @@ class _Spec(BaseModel):
 
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     """The rows of one read-only query; raises UsageError."""
-    names, rows = query(Path(db), sql)
-    return pd.DataFrame(rows, columns=names)
+    return frames.load(Path(db), sql)
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
@@ -135,12 +134,7 @@ def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
 def load_each(queries: Mapping[str, str], db: Path | str = DEFAULT_DB) -> dict[str, pd.DataFrame]:
     """The rows of our own queries, by name; opening a database takes longer than most of them."""
     with read_database(Path(db)) as connection:
-        found = {}
-        for name, sql in queries.items():
-            result = connection.execute(sql)
-            columns = [column[0] for column in result.description or ()]
-            found[name] = pd.DataFrame(result.fetchall(), columns=columns)
-        return found
+        return {name: frames.frame(connection.execute(sql)) for name, sql in queries.items()}
 
 
 def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:

@@ -444,5 +444,8 @@ def stamp_of(db: Path) -> tuple[int, ...]:
         else:
             found += [stat.st_ino, stat.st_mtime_ns, stat.st_size]
     if not found[0]:
-        raise UsageError(f"there is no database {db}; `make sweep` makes one, --db names another")
+        raise UsageError(
+            f"there is no database {db}; `merge-runner sweep baseline` makes one, --db names "
+            "another"
+        )
     return tuple(found)

@@ -64,7 +64,9 @@ def nothing(study: Study) -> str:
     if study.chosen is not None:
         return "Nothing: no driver that was played with the baseline prompt is chosen."
     if study.empty:
-        return "Nothing yet: there is no trial of a driver. `make sweep` plays some."
+        return (
+            "Nothing yet: there is no trial of a driver. `merge-runner sweep baseline` plays some."
+        )
     if any(group.setting and group.scripted for group in study.baselines):
         return "Nothing: with the baseline prompt only scripted stand-ins drove."
     return "Nothing yet: no driver was played with the baseline prompt."

@@ -30,7 +30,9 @@ def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) 
         for group in shown
     ]
     if study.empty:
-        notes.append(f"{study.db} holds no trial of a model; `make sweep` plays some")
+        notes.append(
+            f"{study.db} holds no trial of a model; `merge-runner sweep baseline` plays some"
+        )
     if study.human in study.groups:
         notes += [*_human_notes(study, pooled), *_own_notes(study, shown)]
     return [*notes, *(f"{group.id}: {repeated_note(group)}" for group in shown if group.repeated)]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +30,7 @@ from merge_runner.results.recording import (
     is_covered,
     read_provenance,
     read_recording,
+    sweeps_of,
 )
 from merge_runner.results.rows import Row
 from merge_runner.served_model import other_models
@@ -70,6 +72,14 @@ class Drive(NamedTuple):
     side: Side
 
 
+class RecordedSweep(NamedTuple):
+    """A sweep's configuration, as text too, and whether it claims that all its trials ended."""
+
+    text: str
+    config: SweepConfig
+    ended: bool
+
+
 # How often each decision of each driver was asked for.
 Drives = defaultdict[Drive, Counter[int]]
 
@@ -90,21 +100,21 @@ def audit_recording(file: Path) -> Audit:
                     drives[_drive(entry)][entry.request.slot.decision] += 1
         except RecordingError as exc:
             return Audit(str(file), findings=[Finding("recording", str(exc))])
-        config = _config(provenance)
-        if config is not None:
-            append(connection, "sweeps", [(provenance["config"],)])
+        sweeps = list(_sweeps(provenance))
+        append(connection, "sweeps", [(sweep.text,) for sweep in sweeps])
         connection.execute(REPEATED_IDS)
         append(connection, "other_models", other_models(connection))
         audit.counts = dict(connection.execute(COUNTS).fetchall())
         audit.counts["drives"] = len(drives)
         audit.counts |= dict(connection.execute(OUTCOMES).fetchall())
-        audit.findings += _numbering(drives, config)
+        audit.findings += _numbering(drives, [sweep.config for sweep in sweeps])
         audit.findings += shared_replies(connection)
         audit.findings += run_checks(connection, ("served", "attempt"))
-        audit.findings += _missing(drives, config, ended=_ended(provenance))
+        for sweep in sweeps:
+            audit.findings += _missing(drives, sweep.config) if sweep.ended else ()
         audit.notes += [] if is_covered(provenance) else [UNCOVERED]
         audit.notes += meaningless_ids(connection)
-        audit.notes += [] if config else [NO_CONFIG]
+        audit.notes += [] if sweeps else [NO_CONFIG]
     return audit
 
 
@@ -152,28 +162,30 @@ def _json(text: str | None) -> object:
         return None
 
 
-def _config(provenance: dict[str, str]) -> SweepConfig | None:
-    try:
-        return SweepConfig.model_validate_json(provenance.get("config", ""))
-    except ValidationError:
-        return None
+def _sweeps(provenance: dict[str, str]) -> Iterator[RecordedSweep]:
+    """The sweeps that a recording says it holds, without those whose configuration is unreadable.
+
+    One whose trials all ended claims that of each trial something is recorded.
+    """
+    for row in sweeps_of(provenance):
+        text = row.get("config", "")
+        with suppress(ValidationError):
+            config = SweepConfig.model_validate_json(text)
+            ended = "ended_at" in row and row.get("exit_code", "0") == "0"
+            yield RecordedSweep(text, config, ended)
 
 
-def _numbering(drives: Drives, config: SweepConfig | None) -> Iterator[Finding]:
+def _numbering(drives: Drives, configs: Sequence[SweepConfig]) -> Iterator[Finding]:
     """Every driver is asked from its first decision to its last, once per arm at most.
 
     Where a driver takes control at its own tunnel's exit, the later one begins later.
     """
-    late = config is not None and any(
-        arm.scenario.get("control_start") == "own_exit" for arm in config.arms
+    late = any(
+        arm.scenario.get("control_start") == "own_exit" for config in configs for arm in config.arms
     )
     for drive, numbers in drives.items():
         # Without a word on arms: as many as there are first requests.
-        arms = (
-            sum(drive.repetition <= arm.repetitions for arm in config.arms)
-            if config
-            else numbers[min(numbers)]
-        )
+        arms = _arms(configs, drive.repetition) if configs else numbers[min(numbers)]
         before = min(numbers) - 1 if late else -1
         for number in sorted(numbers):
             if number > before + 1:
@@ -186,15 +198,25 @@ def _numbering(drives: Drives, config: SweepConfig | None) -> Iterator[Finding]:
             before = number
 
 
-def _ended(provenance: dict[str, str]) -> bool:
-    """Whether the recorded sweep claims that all its trials ended."""
-    return "ended_at" in provenance and provenance.get("exit_code", "0") == "0"
+def _arms(configs: Sequence[SweepConfig], repetition: int) -> int:
+    """How many different prompts may ask for a decision: those of equal arms are the same."""
+    return len(
+        {
+            (
+                arm.variant,
+                canonical_json(config.prompt_blocks.get(arm.variant)),
+                *arm.asked.values(),
+                arm.levels,
+            )
+            for config in configs
+            for arm in config.arms
+            if repetition <= arm.repetitions
+        }
+    )
 
 
-def _missing(drives: Drives, config: SweepConfig | None, *, ended: bool) -> Iterator[Finding]:
+def _missing(drives: Drives, config: SweepConfig) -> Iterator[Finding]:
     """Of a sweep that has ended, every trial asks each of its models for a first decision."""
-    if config is None or not ended:
-        return
     asked = [side for side in SIDES if any(a.asked[side] in config.models for a in config.arms)]
     recorded = {(drive.trial, drive.side) for drive in drives}
     cells = {(trial["condition"], trial["rep"]) for trial in config.trials.values()}

@@ -21,6 +21,7 @@ async def emulator_process(options: Sequence[str] = ()) -> AsyncIterator[str]:
     """
     process = await asyncio.create_subprocess_exec(
         sys.executable,
+        "-P",  # no file of the working folder is taken for one of our modules
         "-m",
         "merge_runner",
         "emulate",

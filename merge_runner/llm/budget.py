@@ -1,12 +1,14 @@
-"""A cap on what a sweep spends, over all its runs, that holds whatever happens.
+"""Caps on what sweeps spend, over all their runs, that hold whatever happens.
 
 The worst case of an attempt is set aside when it queues for its turn, and durably, in the ledger,
 right before it is sent. ``async with budget.attempt(...)`` surrounds all that; PaidAttempt says
 where the money goes when the attempt ends, however it ends.
 
-So that money finishes trials instead of beginning ever more of them, a trial gets an allowance when
-it first spends: the worst case of a whole trial. Trials get theirs in the order of the sweep, as
-those before them end.
+So that money finishes trials instead of beginning ever more of them, a trial begins only where what
+it is expected to cost (trial_costs.py) fits beside what the trials that have begun are still
+expected to cost. Expectations err, so the oldest trial goes first: an attempt leaves room for what
+older trials need, and for no younger one's. So the oldest trial has all the money that is left, and
+is suspended only where that does not pay for a single attempt.
 
 A server may ignore the output cap. What a reply cost beyond its worst case is taken from what is
 left, and from then on the worst case is multiplied by as much as that driver's dearest reply
@@ -17,20 +19,25 @@ reply at most, the last one, can pass the cap.
 from __future__ import annotations
 
 import asyncio
+import bisect
 import contextlib
-from collections.abc import AsyncIterator, Iterable, Sequence
+import itertools
+from collections import defaultdict
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.cache import CachedCall
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
+from merge_runner.llm.ledger import NO_CAPS, TOLERANCE_USD, Asked, Caps, Ledger, Spending
 from merge_runner.llm.shared_services import CachePort
+from merge_runner.llm.trial_costs import TrialCosts
 from merge_runner.records import Attempt
 
-# A trial of ours that could free money may wait for another process that waits for us: after this
-# long it is no longer counted on.
+# An older trial that has money kept for it may wait for another process that waits for us: after
+# this long, with nothing in flight, it is no longer counted on.
 PATIENCE_S = 90.0
+NOTHING_EXPECTED = TrialCosts(str, {}, {})
 
 
 @dataclass(slots=True)
@@ -44,94 +51,132 @@ class PaidAttempt:
     - after it (it may have been charged) leaves it in the ledger, until a user releases it;
     - after ``settle`` or ``keep`` has what is not spent of it given back by the ledger, where the
       cost is known.
+
+    What it gives back its trial may spend again.
     """
 
     budget: Budget
     trial: int
     key: str
     asked: Asked
-    aside_usd: float
-    _queued: bool = True
-    _freed_usd: float = 0.0
+    aside_usd: float = 0.0
+    queued: bool = True
+    # What its trial was charged, by model; a trial that begins anew has another account.
+    account: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    _cost_usd: float | None = None
+
+    @property
+    def charged_usd(self) -> float:
+        """What it takes of the money in the end: its cost, the worst case if that is unknown."""
+        if self.queued:
+            return 0.0
+        return self.aside_usd if self._cost_usd is None else self._cost_usd
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
         """The attempt is sent now, after these: what is set aside for it becomes durable."""
         await self.budget.make_durable(self, attempts)
-        self._queued = False
 
     async def settle(self, attempts: Sequence[Attempt]) -> None:
         """The attempt, the last of these, brought no answer; its cost may be unknown."""
         await self.budget.ledger.settle(self.key, attempts, self.aside_usd)
-        if attempts[-1].cost_usd == 0:
-            self._freed_usd = self.aside_usd  # the trial needs it again
+        self._cost_usd = attempts[-1].cost_usd
 
     async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer that the attempt brought, and what it cost, in one transaction."""
-        return await self.budget.ledger.keep(entry, self.aside_usd)
+        kept = await self.budget.ledger.keep(entry, self.aside_usd)
+        self._cost_usd = entry.attempts[-1].cost_usd
+        if self._cost_usd is not None:
+            self.budget.costs.learn(self.trial, self.asked.model, self._cost_usd)
+        return kept
 
     def close(self) -> None:
         """The attempt has ended."""
-        queued_usd = self.aside_usd if self._queued else 0.0
-        freed_usd = queued_usd or self._freed_usd
-        self.budget.give_back(self.trial, queued_usd=queued_usd, freed_usd=freed_usd)
+        self.budget.end(self)
+
+
+@dataclass(slots=True)
+class Pot:
+    """The money under one cap, in USD: that of one model, or of all (None).
+
+    ``queued_usd`` is set aside in this process alone; ``in_flight`` counts the attempts with money
+    of this pot, and ``largest_usd`` is the most that was set aside for one.
+    """
+
+    model: str | None
+    cap_usd: float
+    in_flight: int = 0
+    queued_usd: float = 0.0
+    largest_usd: float = 0.0
+
+    def pays(self, models: Collection[str]) -> bool:
+        """Whether it pays for any of these models."""
+        return self.model is None or self.model in models
+
+    def part(self, by_model: Mapping[str, float]) -> float:
+        """The part of such a sum that it pays."""
+        return sum(by_model.values()) if self.model is None else by_model.get(self.model, 0.0)
+
+    def left_usd(self, spending: Spending) -> float:
+        """What is neither spent nor set aside."""
+        return self.cap_usd - spending.committed_for(self.model) - self.queued_usd
+
+    def twice_usd(self, aside_usd: float) -> float:
+        """What must be left beside an attempt so that all in flight may cost twice as much."""
+        # A server that ignores the output cap is known only by its first dear reply, when the
+        # others are sent already.
+        return (self.in_flight + 1) * max(aside_usd, self.largest_usd) if self.in_flight else 0.0
+
+
+@dataclass(slots=True, eq=False)
+class _Place:
+    """A place in a line, that of the oldest trial first."""
+
+    trial: int
+    number: int
+    told: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 class Budget:
-    """Spending of one sweep in USD; without a cap nothing is refused, and all of it recorded.
+    """Spending under the caps in USD; without a cap nothing is refused, and all of it recorded.
 
     A trial is named by its order in the sweep.
     """
 
     def __init__(
-        self, ledger: Ledger, *, cap_usd: float | None = None, trial_usd: float = 0.0
+        self, ledger: Ledger, caps: Caps = NO_CAPS, costs: TrialCosts = NOTHING_EXPECTED
     ) -> None:
-        """``trial_usd`` is the worst case of a whole trial."""
         self.ledger = ledger
-        self.cap_usd = cap_usd
-        self._trial_usd = trial_usd
-        self._allowances: dict[int, float] = {}
-        self._at_the_door: list[int] = []  # once for each side that asks
-        self._stuck: set[int] = set()
+        self.caps = caps
+        self.costs = costs
+        self._pots = [Pot(model, cap_usd) for model, cap_usd in caps]
+        # What each trial that has begun was charged, and has set aside, by model.
+        self._begun: dict[int, defaultdict[str, float]] = {}
         self._left: set[int] = set()
-        self._in_flight = 0
-        self._largest_usd = 0.0
-        self._queued_usd = 0.0
-        self._changed = asyncio.Event()
+        # Trials at the door by the models that they ask, attempts by their model: where one cap is
+        # used up, what other caps pay for goes on.
+        self._door: defaultdict[frozenset[str], list[_Place]] = defaultdict(list)
+        self._attempts: defaultdict[str, list[_Place]] = defaultdict(list)
+        self._numbers = itertools.count()
 
     async def admit(self, trial: int) -> None:
-        """Wait for a trial's allowance; raises TrialSuspended when no trial's end can free it."""
-        if self.cap_usd is None:
+        """Wait until a trial may begin; raises TrialSuspended when no trial's end can let it."""
+        if not self._pots or trial in self._begun:
             return
         if trial in self._left:
             raise TrialSuspended("its trial is suspended")
-        self._at_the_door.append(trial)
-        try:
-            # The oldest trial first: if younger ones were let by, it might wait for ever.
-            while trial not in self._allowances:
-                allowed = sum(self._allowances.values())
-                fits = (
-                    self._committed_usd + allowed + self._trial_usd <= self.cap_usd + TOLERANCE_USD
-                )
-                if fits and trial == min(self._at_the_door):
-                    self._allowances[trial] = self._trial_usd
-                elif not fits and not self._allowances and not self._in_flight:
-                    raise self._suspended(f"a whole trial may cost {self._trial_usd:.2f} USD")
-                else:
-                    await self._changed.wait()
-        finally:
-            self._at_the_door.remove(trial)
-            self._tell()
+        line = self._door[frozenset(self.costs.of(trial))]
+        await self._in_line(line, trial, lambda first, _: self._begins(trial, first))
 
     def leave(self, trial: int) -> None:
-        """The trial has ended or is suspended: what is left of its allowance is free."""
+        """The trial has ended or is suspended, and needs no more money."""
         self._left.add(trial)
-        if self._allowances.pop(trial, None) is not None:
+        if self._begun.pop(trial, None) is not None:
             self._tell()
 
     def readmit(self, trials: Iterable[int]) -> None:
         """The worker that played these trials is gone, and they may be admitted anew."""
         for trial in trials:
-            self._allowances.pop(trial, None)
+            self._begun.pop(trial, None)
             self._left.discard(trial)
         self._tell()
 
@@ -147,102 +192,162 @@ class Budget:
     async def set_aside(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
         """Set an attempt's worst case aside, more where its server ignores the output cap.
 
-        Waits while other attempts or trials may free money, then raises TrialSuspended. The caller
-        closes what is returned; ``attempt`` does so by itself.
+        Waits while other attempts or older trials may free money, then raises TrialSuspended. The
+        caller closes what is returned; ``attempt`` does so by itself.
         """
-        waited_s = 0.0
-        while not self._taken(trial, aside_usd := self._expected_usd(asked)):
-            self._stuck.add(trial)
-            try:
-                # Nothing in flight can free money any more, and each trial that could is stuck.
-                if not self._in_flight and (
-                    self._allowances.keys() <= self._stuck or waited_s >= PATIENCE_S
-                ):
-                    raise self._suspended(f"the next call may cost {aside_usd:.4f} USD")
-                waited_s += await self._change()
-            finally:
-                self._stuck.discard(trial)
-        self._in_flight += 1
-        self._largest_usd = max(self._largest_usd, aside_usd)
-        self._queued_usd += aside_usd
-        return PaidAttempt(self, trial, key, asked, aside_usd)
+        paid = PaidAttempt(self, trial, key, asked)
+        if not self._pots:
+            paid.aside_usd = self._expected_usd(asked)
+        else:
+            line = self._attempts[asked.model]
+            await self._in_line(
+                line, trial, lambda first, waited_s: first and self._taken(paid, waited_s)
+            )
+        return paid
 
     async def make_durable(self, paid: PaidAttempt, attempts: Sequence[Attempt]) -> None:
         """Move what is set aside for an attempt to the ledger; raises TrialSuspended."""
-        if not await self.ledger.reserve(
-            paid.key, attempts, paid.aside_usd, self.cap_usd, paid.asked
-        ):
-            raise self._suspended("another run of the sweep spends from the same cap")
-        self._queued_usd -= paid.aside_usd
+        if not await self.ledger.reserve(paid.key, attempts, paid.aside_usd, self.caps, paid.asked):
+            raise TrialSuspended("another run spends from the same cap, and has used it up")
+        self._unqueue(paid)
 
-    def give_back(self, trial: int, *, queued_usd: float, freed_usd: float) -> None:
-        """An attempt has ended: ``queued_usd`` was set aside for it in this process alone.
-
-        ``freed_usd`` of the trial's allowance was not spent.
-        """
-        self._in_flight -= 1
-        self._queued_usd -= queued_usd
-        if trial in self._allowances:
-            self._allowances[trial] = min(self._trial_usd, self._allowances[trial] + freed_usd)
+    def end(self, paid: PaidAttempt) -> None:
+        """An attempt has ended."""
+        for pot in self._pots_of(paid.asked):
+            pot.in_flight -= 1
+        paid.account[paid.asked.model] += paid.charged_usd - paid.aside_usd
+        if paid.queued:
+            self._unqueue(paid)
         self._tell()
+
+    def _unqueue(self, paid: PaidAttempt) -> None:
+        paid.queued = False
+        for pot in self._pots_of(paid.asked):
+            pot.queued_usd -= paid.aside_usd
+
+    def _begins(self, trial: int, first: bool) -> bool:
+        """Whether a trial may begin: there is money for it beside all that have begun."""
+        if trial in self._begun:  # its other driver stood in the line, too
+            return True
+        if not first:
+            return False
+        needed, spending = self.costs.of(trial), self.ledger.read()
+        for pot in self._pots:
+            if not pot.pays(needed):
+                continue
+            begun = [other for other in self._begun if pot.pays(self.costs.of(other))]
+            beside_usd = self._needed_usd(pot, begun) + self._before_usd(pot, trial)
+            left_usd = pot.left_usd(spending) - pot.part(needed) + TOLERANCE_USD
+            if left_usd < 0 and not begun and not pot.in_flight:
+                raise self._suspended(
+                    f"a whole trial may cost {pot.part(needed):.2f} USD", pot, spending
+                )
+            if left_usd < beside_usd:
+                return False
+        self._begun[trial] = defaultdict(float)
+        return True
+
+    def _taken(self, paid: PaidAttempt, waited_s: float) -> bool:
+        """Whether there is money for an attempt, which is taken."""
+        aside_usd, spending = self._expected_usd(paid.asked), self.ledger.read()
+        pots = self._pots_of(paid.asked)
+        for pot in pots:
+            left_usd = pot.left_usd(spending) - aside_usd + TOLERANCE_USD
+            if left_usd < 0 and not pot.in_flight:
+                raise self._suspended(f"the next call may cost {aside_usd:.4f} USD", pot, spending)
+            counted_on = pot.in_flight or waited_s < PATIENCE_S
+            older = (trial for trial in self._begun if trial < paid.trial and counted_on)
+            older_usd = self._needed_usd(pot, older)
+            if left_usd < max(older_usd, pot.twice_usd(aside_usd)):
+                return False
+        for pot in pots:
+            pot.in_flight += 1
+            pot.queued_usd += aside_usd
+            pot.largest_usd = max(pot.largest_usd, aside_usd)
+        paid.aside_usd = aside_usd
+        paid.account = self._begun.get(paid.trial, paid.account)
+        paid.account[paid.asked.model] += aside_usd
+        return True
 
     def _expected_usd(self, asked: Asked) -> float:
         """The worst case, as many times as this driver's dearest reply has cost it."""
         return asked.honest_usd * self.ledger.spending.times(asked.driver)
 
-    @property
-    def _committed_usd(self) -> float:
-        return self.ledger.read().committed_usd + self._queued_usd
+    def _pots_of(self, asked: Asked) -> list[Pot]:
+        return [pot for pot in self._pots if pot.pays((asked.model,))]
 
-    def _taken(self, trial: int, worst_usd: float) -> bool:
-        """Whether there is money for an attempt; taken from the trial's allowance if it lasts."""
-        if self.cap_usd is None:
-            return True
-        own = min(worst_usd, self._allowances.get(trial, 0.0))
-        # Beside this attempt there must be room for the rest of all allowances, and, where several
-        # are in flight, for each of them to cost twice its worst case: a server that ignores the
-        # output cap is known only by its first dear reply, when the others are sent already.
-        others = self._in_flight + 1 if self._in_flight else 0
-        spare_usd = max(
-            sum(self._allowances.values()) - own, others * max(worst_usd, self._largest_usd)
+    def _needed_usd(self, pot: Pot, trials: Iterable[int]) -> float:
+        """What these begun trials are still expected to cost a pot."""
+        return sum(max(0.0, self._rest_usd(pot, trial)) for trial in trials)
+
+    def _rest_usd(self, pot: Pot, trial: int) -> float:
+        return pot.part(self.costs.of(trial)) - pot.part(self._begun[trial])
+
+    def _before_usd(self, pot: Pot, trial: int) -> float:
+        """What older trials will take that are the first of other lines at the door."""
+        first = (places[0].trial for places in self._door.values() if places)
+        return sum(
+            pot.part(self.costs.of(older))
+            for older in first
+            if older < trial and older not in self._begun
         )
-        if self._committed_usd + worst_usd + spare_usd > self.cap_usd + TOLERANCE_USD:
-            return False
-        if own:
-            self._allowances[trial] -= own
-        return True
 
-    async def _change(self) -> float:
-        """Wait for a change, for a while only; returns for how long in s."""
-        # For ever it could be that another process holds a claim that a trial of ours waits for,
-        # and waits for one of ours.
-        loop = asyncio.get_running_loop()
-        began = loop.time()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(PATIENCE_S):
-                await self._changed.wait()
-        return loop.time() - began
+    async def _in_line(
+        self, line: list[_Place], trial: int, serve: Callable[[bool, float], bool]
+    ) -> None:
+        """Wait until ``serve`` says True.
+
+        It is told whether this trial is the first in the line, and how long it has waited, in s.
+        """
+        place, waited_s = _Place(trial, next(self._numbers)), 0.0
+        bisect.insort(line, place, key=lambda each: (each.trial, each.number))
+        try:
+            while not serve(line[0] is place, waited_s):
+                waited_s += await _told(place)
+        finally:
+            line.remove(place)
+            self._tell()
 
     def _tell(self) -> None:
-        # A new event for the next change: whoever waits for that must not see this one again.
-        self._changed.set()
-        self._changed = asyncio.Event()
+        """Something has changed for those who are first in their lines, or may go on anyway."""
+        for line in (*self._door.values(), *self._attempts.values()):
+            for place in line[:1]:
+                place.told.set()
+        for place in itertools.chain.from_iterable(self._door.values()):
+            if place.trial in self._begun:
+                place.told.set()
 
-    def _suspended(self, what: str) -> TrialSuspended:
-        spending, allowed = self.ledger.spending, sum(self._allowances.values())
-        aside = spending.reserved_usd + self._queued_usd
+    def _suspended(self, what: str, pot: Pot, spending: Spending) -> TrialSuspended:
+        sums = spending.part(pot.model) if pot.model else spending
+        aside_usd = sums.reserved_usd + pot.queued_usd
+        committed_usd = pot.cap_usd - pot.left_usd(spending)
+        kept_usd = self._needed_usd(pot, self._begun)
         return TrialSuspended(
-            f"{what}, and {self._committed_usd:.4f} of {self.cap_usd:g} USD are spent or set aside "
-            f"({spending.spent_usd:.4f} spent"
+            f"{what}, and {committed_usd:.4f} of {pot.cap_usd:g} USD"
+            + (f" for {pot.model}" if pot.model else "")
+            + f" are spent or set aside ({sums.spent_usd:.4f} spent"
             + (
-                f", {aside:.4f} set aside for {spending.open_attempts} attempts whose cost is not "
-                "known: `merge-runner ledger`"
-                if aside > TOLERANCE_USD
+                f", {aside_usd:.4f} set aside for {spending.open_attempts} attempts whose cost is "
+                "not known: `merge-runner ledger`"
+                if aside_usd > TOLERANCE_USD
                 else ""
             )
             + ")"
-            + (f"; {allowed:.4f} more are kept for the trials that have begun" if allowed else "")
+            + (f"; {kept_usd:.4f} more are kept for the trials that have begun" if kept_usd else "")
         )
+
+
+async def _told(place: _Place) -> float:
+    """Wait for a change, for a while only; returns for how long in s."""
+    # For ever it could be that another process holds a claim that a trial of ours waits for, and
+    # waits for one of ours.
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    place.told.clear()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(PATIENCE_S):
+            await place.told.wait()
+    return loop.time() - began
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +360,7 @@ class Unpaid:
         """Every trial may begin."""
 
     def leave(self, trial: int) -> None:
-        """The trial has no allowance."""
+        """No money is kept for the trial."""
 
     @asynccontextmanager
     async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[UnpaidAttempt]:

@@ -75,7 +75,8 @@ class LlmClient:
     who ask for the same key, and goes on when they are cancelled, so that what is paid for is
     kept; ``drain`` waits for it. ``budget`` is None for a model that costs nothing. ``first`` is
     the run's first call to the endpoint, which goes alone. ``sealed`` says that nothing may be
-    asked anew; ``strict`` that an answer of another model stops the sweep.
+    asked anew; ``strict`` that an answer of another model stops the sweep. ``model`` is its name in
+    the registry where ``name`` also tells its parameters.
     """
 
     name: str
@@ -87,6 +88,7 @@ class LlmClient:
     budget: BudgetPort | None = None
     sealed: bool = False
     strict: bool = False
+    model: str = ""
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
     meter: Meter = field(default_factory=Meter)
     _calls: dict[str, Call] = field(default_factory=dict)
@@ -178,7 +180,7 @@ class LlmClient:
     def _start(self, request: ChatRequest, order: int) -> Call:
         worst = self._worst_case(request)
         worst_usd = cost_usd(self.entry, worst) or 0.0
-        asked = Asked(self.driver, slot_text(request.slot), worst_usd)
+        asked = Asked(self.driver, slot_text(request.slot), worst_usd, self.model or self.name)
         call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._in_turn(call))
         self._calls[request.key] = call

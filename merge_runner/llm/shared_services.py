@@ -79,7 +79,7 @@ class BudgetPort(Protocol):
     """See budget.Budget."""
 
     async def admit(self, trial: int) -> None:
-        """Wait for a trial's allowance."""
+        """Wait until a trial may begin."""
         ...
 
     def leave(self, trial: int) -> None:

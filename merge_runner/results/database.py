@@ -40,6 +40,8 @@ Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
     "memory_limit": "200MB",  # the default is a share of the machine's; most of it caches the file
     "max_vacuum_tasks": 0,  # see merge_small_groups
+    # Of new files: the oldest DuckDB that can open them. Version 5 of the schema began with it.
+    "storage_compatibility_version": "v1.2.0",
     "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
 }
 TEXTS: Settings = {**SETTINGS, "memory_limit": "1GB"}
@@ -201,15 +203,21 @@ def _attached(
                 ) from exc
             waited_s = time.monotonic() - began
             if waited_s >= patience_s:
-                raise StoreLocked(f"{path} is locked by another program") from exc
+                raise StoreLocked(f"{path} is held by {_holder(exc)}: close it there") from exc
             if waited_s > 1 and not told:
                 told = True
                 LOG.warning(
-                    "waiting up to %.0f s for another program to close %s", patience_s, path
+                    "waiting up to %.0f s for %s to close %s", patience_s, _holder(exc), path
                 )
             time.sleep(LOCK_RETRY_S)
         else:
             return connection, name
+
+
+def _holder(exc: duckdb.Error) -> str:
+    """Who holds the file, as DuckDB says it: the program and its process."""
+    found = re.search(r"lock is held in (.+) \(PID (\d+)\)", str(exc))
+    return f"{Path(found[1]).name} (PID {found[2]})" if found else "another program"
 
 
 def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
@@ -270,7 +278,10 @@ def read_database(
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open an existing database for reading, of this schema or an older one; raises UsageError."""
     if not path.is_file():
-        raise UsageError(f"there is no database {path}; `make sweep` makes one, --db names another")
+        raise UsageError(
+            f"there is no database {path}; `merge-runner sweep baseline` makes one, --db names "
+            "another"
+        )
     with (
         unreadable_is_usage(),
         open_database(path, read_only=True, patience_s=patience_s, instance=instance) as connection,
@@ -445,7 +456,7 @@ def _free_name(path: Path, version: int) -> Path:
 
 def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
     """Make a new file with all rows of the open one."""
-    with duckdb.connect(str(copy)) as made:
+    with duckdb.connect(str(copy), config=SETTINGS) as made:
         made.execute(schema_sql())
     connection.execute(f"ATTACH {quoted(copy)} AS copied")
     try:

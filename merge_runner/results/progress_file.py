@@ -140,14 +140,26 @@ def read_standing(db: Path, sweep_id: str) -> Standing | None:
     return standing if standing and standing.sweep_id == sweep_id else None
 
 
+def running(db: Path) -> list[Standing]:
+    """Where the sweeps into this database stand that are running now."""
+    return [standing for _, standing in _standings(db) if standing.alive]
+
+
 def clear_dead(db: Path) -> None:
     """Remove what killed sweeps left, and nothing else."""
-    folder = _folder(db)
     with suppress(OSError):
-        for path in () if folder.is_symlink() else folder.iterdir():
-            standing = _read(path)
-            if standing and not standing.alive:
+        for path, standing in _standings(db):
+            if not standing.alive:
                 path.unlink(missing_ok=True)
+
+
+def _standings(db: Path) -> list[tuple[Path, Standing]]:
+    folder = _folder(db)
+    try:
+        paths = [] if folder.is_symlink() else list(folder.iterdir())
+    except OSError:
+        return []
+    return [(path, standing) for path in paths if (standing := _read(path))]
 
 
 def _folder(db: Path) -> Path:

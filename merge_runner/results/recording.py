@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import duckdb
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
@@ -42,6 +42,8 @@ UNCOVERED = (
     "from"
 )
 PROVENANCE_HASH = "provenance_sha256"
+SWEEPS = "sweeps"
+"""Holds the rows of several sweeps; a recording of one sweep has the columns of its row instead."""
 COLUMNS = {
     "call_key": "VARCHAR",
     "provider": "VARCHAR",
@@ -57,9 +59,26 @@ COLUMNS = {
     "body": "VARCHAR",
     "attempts": "VARCHAR",
 }
+MEANINGS = {
+    "call_key": "SHA-256 of the parts of the call's key: endpoint, path, headers, body and slot",
+    "provider": "whose format was spoken",
+    "endpoint": "where the call went, without a key; a name for a provider's own",
+    "model": "the id that was asked for",
+    "path": "of the request, below the base URL",
+    "headers": "JSON object: those that change an answer; never a key",
+    "condition": "slot: of the experiment",
+    "repetition": "slot: from 1",
+    "side": "slot: left or right",
+    "decision": "slot: counts those of this driver from 0",
+    "sample_set": "slot: another number is a fresh set of samples",
+    "body": "the exact JSON that was sent",
+    "attempts": "JSON array: number, outcome, status, reply, tokens, cost and time of each attempt",
+}
+"""What the columns mean, for docs/reference/recordings.md."""
 TEXTS = [name for name, kind in COLUMNS.items() if kind == "VARCHAR"]
 BATCH = 1_000
 HEADERS = TypeAdapter(dict[str, str])
+ROWS = TypeAdapter(list[dict[str, str]])
 # Far beyond any sweep; a file that claims more was made to do harm.
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
@@ -206,8 +225,8 @@ def _size(row: tuple[Any, ...]) -> int:
 
 def read_recording(file: Path) -> Iterator[CachedCall]:
     """All entries of a recording, each verified against its key; raises RecordingError."""
-    with _opened(file) as connection:
-        with _readable(file):
+    with opened(file) as connection:
+        with readable(file):
             rows = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM recording")  # noqa: S608 # constants
         seen: set[str] = set()
         content = hashlib.sha256()
@@ -235,16 +254,17 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
 
 
 class Spilled(Mapping[str, CachedCall]):
-    """The verified entries of a recording by key; SQLite keeps large ones in a temporary file.
+    """The verified entries of recordings by key; SQLite keeps large ones in a temporary file.
 
-    Raises RecordingError.
+    Raises RecordingError, also where two recordings hold different replies to one call.
     """
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, files: Iterable[Path]) -> None:
         self._db = sqlite3.connect("", check_same_thread=False)
         self._db.execute("CREATE TABLE entries (key TEXT PRIMARY KEY, entry TEXT)")
-        rows = ((entry.request.key, entry.to_json()) for entry in read_recording(file))
-        self._db.executemany("INSERT INTO entries VALUES (?, ?)", rows)
+        for file in files:
+            rows = self._alike(file)
+            self._db.executemany("INSERT OR IGNORE INTO entries VALUES (?, ?)", rows)
 
     def __getitem__(self, key: str) -> CachedCall:
         row = self._db.execute("SELECT entry FROM entries WHERE key = ?", [key]).fetchone()
@@ -258,6 +278,18 @@ class Spilled(Mapping[str, CachedCall]):
 
     def __iter__(self) -> Iterator[str]:
         return (key for (key,) in self._db.execute("SELECT key FROM entries"))
+
+    def _alike(self, file: Path) -> Iterator[tuple[str, str]]:
+        """Keys and entries of another file, none of which says otherwise than those before."""
+        for entry in read_recording(file):
+            key = entry.request.key
+            before = self.get(key)
+            if before and before.attempts[-1].reply != entry.attempts[-1].reply:
+                raise RecordingError(
+                    f"{file} holds another reply to the call {key} than a recording named before "
+                    "it: replay them one by one, each into a --db of its own"
+                )
+            yield key, entry.to_json()
 
     def __len__(self) -> int:
         count: int = self._db.execute("SELECT count(*) FROM entries").fetchone()[0]
@@ -392,8 +424,8 @@ def _entry(row: dict[str, Any]) -> CachedCall:
     return CachedCall(request, attempts)
 
 
-def _opened(file: Path) -> duckdb.DuckDBPyConnection:
-    """A connection with the view ``recording``; raises RecordingError for a foreign file."""
+def opened(file: Path) -> duckdb.DuckDBPyConnection:
+    """A connection with the view ``recording``, not verified; RecordingError for a foreign file."""
     if not file.is_file():
         raise UsageError(f"there is no recording {file}")
     connection = in_memory(READING)
@@ -431,7 +463,7 @@ def _opened(file: Path) -> duckdb.DuckDBPyConnection:
 def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
     """Raise RecordingError for more rows or longer texts than recordings have."""
     bytes_of_row = " + ".join(f"coalesce(strlen({name}), 0)" for name in TEXTS)
-    with _readable(file):
+    with readable(file):
         calls = _number(connection, "SELECT count(*) FROM recording")
         longest = 0
         if calls <= MOST_CALLS:
@@ -454,12 +486,30 @@ def _number(connection: duckdb.DuckDBPyConnection, sql: str) -> int:
 
 def read_provenance(file: Path) -> dict[str, str]:
     """What a recording says about its origin, not verified; raises RecordingError."""
-    with _opened(file) as connection:
+    with opened(file) as connection:
         return _metadata(file, connection)
 
 
+def sweeps_of(provenance: dict[str, str]) -> list[dict[str, str]]:
+    """The rows of the sweeps whose calls a recording holds, as it says itself."""
+    if SWEEPS not in provenance:
+        return [provenance]
+    try:
+        return ROWS.validate_json(provenance[SWEEPS])
+    except ValidationError:
+        return []
+
+
+def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
+    """What a recording says of the sweeps that it is made of; see ``sweeps_of``."""
+    rows = [
+        {name: str(value) for name, value in row.items() if value is not None} for row in sweeps
+    ]
+    return rows[0] if len(rows) == 1 else {SWEEPS: canonical_json(rows)}
+
+
 def _metadata(file: Path, connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
-    with _readable(file):
+    with readable(file):
         rows = connection.execute(
             f"SELECT key, value FROM parquet_kv_metadata({_pattern(file)})"  # noqa: S608 # quoted
         ).fetchall()
@@ -467,12 +517,13 @@ def _metadata(file: Path, connection: duckdb.DuckDBPyConnection) -> dict[str, st
 
 
 def _fetch(rows: duckdb.DuckDBPyConnection, file: Path) -> list[tuple[Any, ...]]:
-    with _readable(file):
+    with readable(file):
         return rows.fetchmany(BATCH)
 
 
 @contextmanager
-def _readable(file: Path) -> Iterator[None]:
+def readable(file: Path) -> Iterator[None]:
+    """What cannot be read of a recording is a RecordingError."""
     try:
         yield
     except (duckdb.Error, UnicodeDecodeError) as exc:

@@ -45,6 +45,7 @@ from merge_runner.text_safety import first_line
 
 # Columns that differ from run to run: whether the run made an attempt itself, and when.
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
+SWEEPS = "FROM sweeps ORDER BY started_at"
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,24 +292,25 @@ def _by_trial(
             yield (trial_id, spec_hash), begun.pop((trial_id, spec_hash))
 
 
-def recorded_sweep(path: Path, sweep_id: str | None) -> tuple[dict[str, Any], list[str]]:
-    """The row of a sweep (the newest if None is named) and the keys of the calls that it used.
+def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str, Any]], list[str]]:
+    """The rows of sweeps (the newest if none is named) and the keys of the calls that they used.
 
     Raises UsageError.
     """
     with read_database(path) as connection:
-        sweeps = list(by_name(connection.execute("FROM sweeps ORDER BY started_at")))
-        sweep = next((s for s in reversed(sweeps) if sweep_id in (None, s["sweep_id"])), None)
-        if sweep is None:
-            names = ", ".join(sorted(sweep["sweep_id"] for sweep in sweeps)) or "none"
-            raise UsageError(f"{path} holds no sweep {sweep_id or ''}; valid: {names}")
+        sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(SWEEPS))}
+        wanted = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
+        if unknown := [sweep_id for sweep_id in wanted if sweep_id not in sweeps]:
+            names = ", ".join(sorted(sweeps)) or "none"
+            raise UsageError(f"{path} holds no sweep {unknown[0]}; valid: {names}")
         keys = connection.execute(
             "SELECT DISTINCT call_key FROM decisions SEMI JOIN "
-            "(SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?) "
+            "(SELECT trial_id, spec_hash FROM sweep_trials SEMI JOIN (SELECT unnest(?) AS sweep_id)"
+            " USING (sweep_id)) "
             "USING (trial_id, spec_hash) WHERE call_key IS NOT NULL ORDER BY call_key",
-            [sweep["sweep_id"]],
+            [wanted],
         ).fetchall()
-    return sweep, [key for (key,) in keys]
+    return [sweeps[sweep_id] for sweep_id in wanted], [key for (key,) in keys]
 
 
 @dataclass(frozen=True, slots=True)

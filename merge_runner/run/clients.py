@@ -18,16 +18,16 @@ from merge_runner.config import (
 from merge_runner.emulator.process import emulator_process
 from merge_runner.errors import UsageError
 from merge_runner.llm.budget import Budget
-from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import NO_CAPS, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.prices import is_known
 from merge_runner.llm.shared_limits import SharedLimits, limits_file
 from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
 from merge_runner.llm.transport import SealedTransport
-from merge_runner.run.estimate import worst_trial_usd
+from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan
 
 # For the database, the cache, the log and what libraries open for themselves.
@@ -74,14 +74,20 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
 
 
 def open_services(
-    plan: Plan, options: Options, cache: ResponseCache, ledger: Ledger, stack: AsyncExitStack
+    plan: Plan,
+    options: Options,
+    cache: ResponseCache,
+    ledger: Ledger,
+    measured: Mapping[str, CallTotals],
+    stack: AsyncExitStack,
 ) -> LocalServices:
     """The services of a run; closing ``stack`` gives up its claims.
 
+    ``measured`` is what the cache knows about each model's earlier answers to similar requests.
     Raises UsageError where a spending cap could not be enforced.
     """
     for name, entry in plan.entries.items():
-        if options.max_cost_usd is not None and not is_known(entry):
+        if options.caps != NO_CAPS and not is_known(entry):
             raise UsageError(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
@@ -104,7 +110,7 @@ def open_services(
                 rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]], shared=shared
             )
         limiters[name] = by_model[model]
-    budget = Budget(ledger, cap_usd=options.max_cost_usd, trial_usd=worst_trial_usd(plan))
+    budget = Budget(ledger, options.caps, trial_costs(plan, measured))
     return LocalServices(limiters=limiters, budget=budget)
 
 
@@ -171,6 +177,7 @@ def live_clients(
             limiter=limiters[name],
             budget=None if entry.price == "free" else budget,
             strict=endpoint_plan.strict,
+            model=model,
             first=FirstCall(passed=name in endpoint_plan.passed, known=name in endpoint_plan.known),
         )
     return clients

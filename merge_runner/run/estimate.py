@@ -3,20 +3,53 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
 from merge_runner.drivers.pace import model_pace
 from merge_runner.llm.cache import CallTotals
+from merge_runner.llm.ledger import NO_CAPS, Caps, Spending
 from merge_runner.llm.prices import cost_usd
+from merge_runner.llm.trial_costs import Answers, TrialCalls, TrialCosts
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
 from merge_runner.scenarios.registry import new_world
+from merge_runner.study.crossing import Arm
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
 PROMPT_MARGIN = 1.25
+
+
+@dataclass(frozen=True, slots=True)
+class Todo:
+    """What a cell has yet to do: trials that are neither stored nor recorded, and their calls.
+
+    ``calls`` is roughly how many each model has yet to answer.
+    """
+
+    trials: int
+    calls: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class CellEstimate:
+    """The part of one cell: trials, calls, tokens, USD (None: unknown) and minutes if alone.
+
+    ``trials_within_cap`` is how many of the trials the money that is left buys, if it is spread
+    evenly over what all cells have yet to do.
+    """
+
+    cell: str
+    trials: int
+    calls: int
+    input_tokens: int
+    output_tokens: int
+    cost_usd: float | None
+    minutes: float
+    trials_within_cap: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +57,7 @@ class Estimate:
     """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
 
     ``measured`` lists the drivers whose tokens and latency are taken from their earlier answers.
+    ``trials_within_cap`` is None without a cap, or where a price is unknown.
     """
 
     driver: str
@@ -35,113 +69,202 @@ class Estimate:
     minutes: float
     free: bool
     measured: tuple[str, ...]
+    trials_within_cap: int | None
+    cells: tuple[CellEstimate, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Calls:
+    """How many calls a model of the registry has yet to answer in one cell, and what one takes."""
+
+    model: str
+    entry: ModelEntry
+    number: int
+    each: _PerCall
+
+    @property
+    def usage(self) -> Usage:
+        return self.each.usage
+
+    @property
+    def latency_s(self) -> float:
+        return self.each.latency_s
+
+    @property
+    def cost_usd(self) -> float | None:
+        """What they cost together."""
+        price = cost_usd(self.entry, self.usage)
+        return None if price is None else self.number * price
 
 
 @dataclass(frozen=True, slots=True)
 class _PerCall:
-    """What one call of a model takes, as measured or as listed in the registry."""
+    """The tokens of a call and its latency in s, as measured or as listed in the registry."""
 
     usage: Usage
     latency_s: float
-    measured: bool
 
 
 def estimate(
     plan: Plan,
     options: Options,
     *,
-    trials: int,
-    calls: Mapping[str, float],
+    todo: Mapping[str, Todo],
     facts: Mapping[str, CallTotals],
+    spending: Spending,
 ) -> Estimate:
-    """The estimate for what a live run of a plan has yet to do.
+    """The estimate for what a live run of a plan has yet to do, by the labels of its arms.
 
-    ``trials`` counts those neither stored nor recorded; ``calls`` is roughly how many each model
-    has yet to answer; ``facts`` is what the cache knows about each model's earlier answers to
-    similar requests at its endpoint.
+    ``facts`` is what the cache knows about each model's earlier answers to similar requests at its
+    endpoint, ``spending`` what counts against the caps already.
     """
-    all_calls = input_tokens = output_tokens = 0
-    cost: float | None = 0.0
-    slowest_s = 0.0
-    measured = []
-    for name, entry in plan.entries.items():
-        made = round(calls[name])
-        each = _per_call(plan, entry, facts[name])
-        price = cost_usd(entry, each.usage)
-        tokens_in, tokens_out = each.usage.input_tokens or 0, each.usage.output_tokens or 0
-        all_calls += made
-        input_tokens += made * tokens_in
-        output_tokens += made * tokens_out
-        cost = None if cost is None or price is None else cost + made * price
-        measured += [driver_name(name, plan.endpoints[name])] if each.measured else []
-        at_once = min(options.connections, 2 * max(trials, 1))
-        slowest_s = max(
-            slowest_s,
-            math.ceil(made / at_once) * each.latency_s,
-            _limited_s(options, entry, made, each),
-        )
+    arms = plan.by_label()
+    calls = {label: _calls(plan, arms[label], cell.calls, facts) for label, cell in todo.items()}
+    whole = [made for cell in calls.values() for made in cell]
+    share = _share_within(options.caps, spending, whole)
+    cells = []
+    for label, cell in todo.items():
+        sums = _sums(calls[label])
+        minutes = _minutes(options, cell.trials, calls[label])
+        within = _within(cell.trials, share)
+        cells.append(CellEstimate(label, cell.trials, *sums, minutes, within))
+    trials = sum(cell.trials for cell in todo.values())
     return Estimate(
-        driver=plan.driver,
-        trials=trials,
-        calls=all_calls,
-        input_tokens=input_tokens,
-        output_tokens=output_tokens,
-        cost_usd=None if cost is None else round(cost, 2),
-        minutes=round(slowest_s / 60, 1),
+        plan.driver,
+        trials,
+        *_sums(whole),
+        minutes=_minutes(options, trials, whole),
         free=all(entry.price == "free" for entry in plan.entries.values()),
-        measured=tuple(measured),
+        measured=tuple(
+            driver_name(name, plan.endpoints[name]) for name in plan.entries if facts[name].measured
+        ),
+        trials_within_cap=None if share is None else sum(c.trials_within_cap or 0 for c in cells),
+        cells=tuple(cells),
     )
 
 
-def worst_trial_usd(plan: Plan) -> float:
-    """The most a trial can cost: up to the timeout, a token per byte, every answer at its cap."""
-    prompt_bytes = len(_typical_prompt(plan).encode()) * PROMPT_MARGIN
-    return sum(
-        math.ceil(plan.scenario.timeout_steps / model_pace(plan.scenario).interval_steps)
-        * (
-            cost_usd(
-                entry,
-                Usage(input_tokens=int(prompt_bytes), output_tokens=entry.max_output_tokens),
-            )
-            or 0.0
+def _calls(
+    plan: Plan, arm: Arm, calls: Mapping[str, float], facts: Mapping[str, CallTotals]
+) -> list[_Calls]:
+    return [
+        _Calls(
+            plan.registered[name],
+            entry,
+            round(calls[name]),
+            _per_call(plan, arm, entry, facts[name]),
         )
-        for arm in plan.arms[:1]
-        for entry in (arm.entries[n] for n in arm.asked.values() if n in arm.entries)
+        for name, entry in arm.entries.items()
+    ]
+
+
+def _sums(calls: Sequence[_Calls]) -> tuple[int, int, int, float | None]:
+    """The sums of calls, input tokens, output tokens and USD."""
+    costs = [each.cost_usd for each in calls]
+    known = [cost for cost in costs if cost is not None]
+    return (
+        sum(each.number for each in calls),
+        sum(each.number * (each.usage.input_tokens or 0) for each in calls),
+        sum(each.number * (each.usage.output_tokens or 0) for each in calls),
+        round(sum(known), 2) if len(known) == len(costs) else None,
     )
 
 
-def _per_call(plan: Plan, entry: ModelEntry, facts: CallTotals) -> _PerCall:
+def _share_within(caps: Caps, spending: Spending, calls: Sequence[_Calls]) -> float | None:
+    """The part of the calls that the money left buys; None without a cap or a price."""
+    if caps == NO_CAPS or any(each.cost_usd is None for each in calls):
+        return None
+    shares = [1.0]
+    for model, cap_usd in caps:
+        cost_usd = sum(each.cost_usd or 0.0 for each in calls if model in (None, each.model))
+        if cost_usd:
+            shares.append((cap_usd - spending.committed_for(model)) / cost_usd)
+    return max(0.0, min(shares))
+
+
+def _within(trials: int, share: float | None) -> int | None:
+    return None if share is None else int(trials * share)
+
+
+def _minutes(options: Options, trials: int, calls: Sequence[_Calls]) -> float:
+    """How long the slowest model takes, by its latency or by its limits."""
+    at_once = min(options.connections, 2 * max(trials, 1))
+    slowest_s = 0.0
+    for model in {each.model for each in calls}:
+        own = [each for each in calls if each.model == model]
+        in_turn_s = math.ceil(sum(each.number for each in own) / at_once) * own[0].latency_s
+        slowest_s = max(slowest_s, in_turn_s, sum(_limited_s(options, each) for each in own))
+    return round(slowest_s / 60, 1)
+
+
+def trial_costs(plan: Plan, facts: Mapping[str, CallTotals]) -> TrialCosts:
+    """What the trials of a plan are expected to cost; a cell is an arm.
+
+    ``facts`` is as for ``estimate``.
+    """
+    labels = {spec.order: spec.arm for spec in plan.trial_specs()}
+    calls = {arm.label: _trial_calls(plan, arm) for arm in plan.arms}
+    earlier: defaultdict[str, Answers] = defaultdict(Answers)
+    for name, totals in facts.items():
+        if totals.measured:
+            one_usd = cost_usd(plan.entries[name], _measured_usage(totals)) or 0.0
+            earlier[plan.registered[name]].add(totals.measured * one_usd, totals.measured)
+    return TrialCosts(labels.__getitem__, calls, earlier)
+
+
+def _trial_calls(plan: Plan, arm: Arm) -> dict[str, TrialCalls]:
+    """The calls of each model in a trial: at most up to the timeout, every answer at its cap.
+
+    A model that drives on both sides with different parameters counts with the dearer ones.
+    """
+    sides = Counter(name for name in arm.asked.values() if name in arm.entries)
+    most = math.ceil(arm.scenario.timeout_steps / model_pace(arm.scenario).interval_steps)
+    # No tokeniser makes more tokens than bytes.
+    read = int(len(_typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
+    calls: dict[str, TrialCalls] = {}
+    for name, number in sides.items():
+        entry = arm.entries[name]
+        worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
+        made = TrialCalls(number * PROMPTS_PER_DRIVER, number * most, cost_usd(entry, worst) or 0.0)
+        other = calls.get(model := plan.registered[name])
+        calls[model] = made if other is None else made.and_(other)
+    return calls
+
+
+def _measured_usage(totals: CallTotals) -> Usage:
+    """The tokens of an answer on average."""
+    return Usage(
+        input_tokens=round(totals.input_tokens / totals.measured),
+        output_tokens=round(totals.output_tokens / totals.measured),
+    )
+
+
+def _per_call(plan: Plan, arm: Arm, entry: ModelEntry, facts: CallTotals) -> _PerCall:
     if facts.measured:
-        usage = Usage(
-            input_tokens=round(facts.input_tokens / facts.measured),
-            output_tokens=round(facts.output_tokens / facts.measured),
-        )
-        return _PerCall(usage, facts.latency_s / facts.measured, True)
-    prompt_tokens = len(_typical_prompt(plan).encode()) // 4  # English has about 4 bytes a token
+        return _PerCall(_measured_usage(facts), facts.latency_s / facts.measured)
+    # English has about 4 bytes a token.
+    prompt_tokens = len(_typical_prompt(plan, arm).encode()) // 4
     usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
-    return _PerCall(usage, entry.typical_latency_s, False)
+    return _PerCall(usage, entry.typical_latency_s)
 
 
-def _limited_s(options: Options, entry: ModelEntry, calls: int, each: _PerCall) -> float:
+def _limited_s(options: Options, calls: _Calls) -> float:
     """How long the limits stretch the calls, in s.
 
     Within a minute's window a call counts with its output cap until its reply is in, and with
     its actual tokens from then on.
     """
-    rpm, tpm = options.rates(entry)
-    waiting = min(each.latency_s / 60, 1.0)
-    tokens = (each.usage.input_tokens or 0) + (
-        waiting * entry.max_output_tokens + (1 - waiting) * (each.usage.output_tokens or 0)
+    rpm, tpm = options.rates(calls.entry)
+    waiting = min(calls.latency_s / 60, 1.0)
+    tokens = (calls.usage.input_tokens or 0) + (
+        waiting * calls.entry.max_output_tokens + (1 - waiting) * (calls.usage.output_tokens or 0)
     )
-    return max(60 * calls / rpm if rpm else 0.0, 60 * calls * tokens / tpm if tpm else 0.0)
+    number = calls.number
+    return max(60 * number / rpm if rpm else 0.0, 60 * number * tokens / tpm if tpm else 0.0)
 
 
-def _typical_prompt(plan: Plan) -> str:
-    """The longest variant's prompt in the middle of an approach."""
-    world = new_world(plan.scenario, plan.conditions[0])
-    rest = (0.25,) * (plan.scenario.plan_actions - plan.scenario.executed_actions)
-    prompts = (
-        render_prompt(world.observe("left"), rest, variant=variant, scenario=plan.scenario)
-        for variant in plan.repetitions
-    )
-    return max(prompts, key=len)
+def _typical_prompt(plan: Plan, arm: Arm) -> str:
+    """An arm's prompt in the middle of an approach."""
+    scenario = arm.scenario
+    world = new_world(scenario, plan.conditions[0])
+    rest = (0.25,) * (scenario.plan_actions - scenario.executed_actions)
+    return render_prompt(world.observe("left"), rest, variant=arm.variant, scenario=scenario)

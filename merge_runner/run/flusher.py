@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import sys
 from collections.abc import Callable
 from itertools import accumulate, chain
@@ -11,18 +12,26 @@ from itertools import accumulate, chain
 from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.records import TrialRecord
 from merge_runner.results.store import Store
+from merge_runner.run.spill import Spill
 
 EVERY_S = 1.0
 BATCH = 64
 """Trials in one transaction: few enough that a reader gets its turn soon."""
 MOST_PENDING = 4 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
-# How many bytes may wait in memory while storing fails, as when another program holds the file.
-MOST_STUCK_BYTES = 2**29
+# While storing fails, as when another program holds the file: how many bytes may wait in memory
+# before they are spilled, and before trials wait because spilling fails, too.
+SPILLED_BYTES, MOST_STUCK_BYTES = 2**27, 2**29
 LOCK_PATIENCE_S = 2.0
-# How long the end of a sweep retries: longer for a lock, which somebody will release, than for
-# anything else, such as a full disk.
-LAST_LOCK_PATIENCE_S, LAST_PATIENCE_S = 60.0, 3.0
+# How long the end of a sweep retries what is no lock, such as a full disk. A lock is waited for.
+LAST_PATIENCE_S = 3.0
+
+
+AGAIN = (
+    "When that is fixed, run the same command again: it writes them from the recorded replies "
+    "without a call."
+)
+LOG = logging.getLogger(__name__)
 
 
 def size_of(record: TrialRecord) -> int:
@@ -35,9 +44,9 @@ def size_of(record: TrialRecord) -> int:
 class Flusher:
     """Collects ended trials and stores them about once a second.
 
-    Trials that cannot be stored wait in memory, up to a limit, while others are played; where
-    storing is merely slow, new trials wait for it. ``differing`` maps trials that were already
-    stored with other values to the columns that differ.
+    Trials that cannot be stored wait in memory, and many of them in a file beside the database,
+    while others are played; where storing is merely slow, new trials wait for it. ``differing``
+    maps trials that were already stored with other values to the columns that differ.
     """
 
     def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
@@ -47,6 +56,7 @@ class Flusher:
         self._say = say
         self._pending: list[TrialRecord] = []
         self._bytes = 0
+        self._spill = Spill()
         self._problem: StoreError | None = None
         self._said = ""
         self._closing = False
@@ -71,24 +81,44 @@ class Flusher:
             return self._bytes > MOST_STUCK_BYTES
         return len(self._pending) > MOST_PENDING or self._bytes > MOST_PENDING_BYTES
 
+    @property
+    def left(self) -> int:
+        """How many trials are not stored yet."""
+        return len(self._pending) + self._spill.trials
+
+    @property
+    def problem(self) -> str:
+        """Why trials are not stored, as a line of text; empty where nothing is wrong."""
+        if self._problem is None:
+            return ""
+        what = f"{self.left} trials wait" if self.left else "how the sweep ended waits"
+        return f"{what} to be stored: {self._problem}"
+
     async def close(self) -> None:
-        """Store what is left; raises StoreError if that does not work after a while."""
+        """Store what is left, and leave the database reachable.
+
+        Waits for a program that holds it as long as that does; raises StoreError for anything else
+        that lasts.
+        """
         self._closing = True
         self._awake.set()
         await self._task
-        began = asyncio.get_running_loop().time()
-        while self._pending:
-            if await self._flush():
-                continue
-            locked = isinstance(self._problem, StoreLocked)
-            patience_s = LAST_LOCK_PATIENCE_S if locked else LAST_PATIENCE_S
-            if asyncio.get_running_loop().time() - began >= patience_s:
-                raise StoreError(
-                    f"{len(self._pending)} trials are not stored: {self._problem}. When that is "
-                    "fixed, run the same command again: it writes them from the recorded replies "
-                    "without a call."
-                )
-            await asyncio.sleep(min(EVERY_S, patience_s))
+        loop = asyncio.get_running_loop()
+        began, waiting = loop.time(), False
+        while not await self._flush() or self.left:
+            if isinstance(self._problem, StoreLocked):
+                if not waiting:
+                    self._say(
+                        f"the playing has ended; {self.problem}. Ctrl-C ends the waiting: all "
+                        "replies are in the cache"
+                    )
+                waiting = True
+            elif not self.left:
+                return  # whoever opens the database next will say what is wrong with it
+            elif self._problem and loop.time() - began >= LAST_PATIENCE_S:
+                raise StoreError(f"{self.left} trials are not stored: {self._problem}. {AGAIN}")
+            if self._problem:
+                await asyncio.sleep(EVERY_S)
 
     async def _run(self) -> None:
         while not self._closing:
@@ -96,11 +126,15 @@ class Flusher:
                 async with asyncio.timeout(EVERY_S):
                     await self._awake.wait()
             self._awake.clear()
-            while self._pending and not self._closing and await self._flush():
+            while self.left and not self._closing and await self._flush():
                 continue
 
     async def _flush(self) -> bool:
-        """Write one batch; False if that did not work."""
+        """Write one batch, which may be empty; False if that did not work."""
+        if not self._pending and self._spill.trials and self._problem is None:
+            taken = await asyncio.to_thread(self._spill.take)
+            self._bytes += sum(map(size_of, taken))
+            self._pending = taken + self._pending
         sizes = accumulate(map(size_of, self._pending[:BATCH]))
         # At least one: a single trial may be larger than a batch should be.
         number = max(1, sum(size <= BATCH_BYTES for size in sizes))
@@ -110,13 +144,18 @@ class Flusher:
             self.differing |= await asyncio.to_thread(
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
             )
+        except asyncio.CancelledError:
+            self._pending = batch + self._pending
+            raise
         except StoreError as exc:
             self._problem = exc
             # Back in front, so that trials are stored in the order in which they ended.
             self._pending = batch + self._pending
-            if str(exc) != self._said:  # it is tried again every second
+            if self.left and str(exc) != self._said:  # it is tried again every second
                 self._said = str(exc)
-                self._say(f"waiting to store {len(self._pending)} trials: {exc}")
+                self._say(f"the sweep goes on; {self.problem}")
+            if self._bytes > SPILLED_BYTES:
+                await self._spill_pending()
             return False
         else:
             self._problem = None
@@ -124,3 +163,16 @@ class Flusher:
             return True
         finally:
             self._tried.set()
+
+    async def _spill_pending(self) -> None:
+        """Move the trials in memory to the file, unless that cannot be written either."""
+        for _ in range(0, len(self._pending), BATCH):
+            batch = self._pending[:BATCH]
+            try:
+                await asyncio.to_thread(self._spill.put, batch, self._store.path.parent)
+            except OSError as exc:
+                LOG.debug("trials that wait to be stored stay in memory: %s", exc)
+                return
+            # Others were added meanwhile, behind these.
+            del self._pending[: len(batch)]
+            self._bytes -= sum(map(size_of, batch))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 
 from merge_runner.config import (
@@ -20,6 +21,7 @@ from merge_runner.drivers.registry import EMULATOR, PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.ledger import Caps
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import SIDES, Side, TrialSpec
@@ -29,6 +31,7 @@ from merge_runner.study.crossing import OPPONENT, PROMPT, Arm, cross, level_text
 from merge_runner.study.file import (
     EVERY_CONDITION,
     EVERY_PROMPT,
+    BudgetTerms,
     StudyFile,
     StudySource,
     read_study,
@@ -44,9 +47,10 @@ _NOT_IN_AN_ID = re.compile(r"[^A-Za-z0-9_.+-]")
 class Options:
     """How a sweep runs; nothing here changes a result.
 
-    ``rpm`` and ``tpm`` override the registry's. ``dask`` names the cluster that plays the trials;
-    if None, this process plays them. ``faults_identity`` keeps the answers of an emulator that was
-    told to misbehave apart from those of the usual one. A ``dry_run`` sends nothing.
+    ``rpm`` and ``tpm`` override the registry's. ``split_usd`` caps what single models cost.
+    ``dask`` names the cluster that plays the trials; if None, this process plays them.
+    ``faults_identity`` keeps the answers of an emulator that was told to misbehave apart from those
+    of the usual one. A ``dry_run`` sends nothing. From ``until`` on no trial begins.
     """
 
     db: Path
@@ -55,13 +59,20 @@ class Options:
     rpm: int | None = None
     tpm: int | None = None
     max_cost_usd: float | None = None
+    split_usd: Mapping[str, float] = field(default_factory=dict)
     replay: bool = False
-    recording: Path | None = None
+    recordings: Sequence[Path] = ()
     emulator_options: Sequence[str] = ()
     faults_identity: str = ""
     strict_model: bool = False
     dask: str | None = None
     dry_run: bool = False
+    until: datetime | None = None
+
+    @property
+    def caps(self) -> Caps:
+        """What may be spent over all runs."""
+        return Caps(self.max_cost_usd, self.split_usd)
 
     @property
     def connections(self) -> int:
@@ -103,15 +114,9 @@ class Plan:
 
         A study with a budget of its own has one ledger over all its models and samples.
         """
-        if self.study.file.budget.total_usd is not None:
+        if self.study.file.budget != BudgetTerms():
             return self.name
         return f"{self.name}/{self.model}/set{self.sample_set}"
-
-    def with_budget(self, options: Options) -> Options:
-        """The options, with the study's own cap where they have none."""
-        if options.max_cost_usd is None:
-            return replace(options, max_cost_usd=self.study.file.budget.total_usd)
-        return options
 
     @property
     def registered(self) -> dict[str, str]:
@@ -153,6 +158,19 @@ class Plan:
         return ", ".join(
             dict.fromkeys(pair_name(arm.asked.values(), self.endpoints) for arm in self.arms)
         )
+
+    def within_budget(self, options: Options) -> Options:
+        """The options with the caps of the study's budget; ``--max-cost`` goes before its total.
+
+        Raises UsageError where a split does not suit the models.
+        """
+        budget = self.study.file.budget
+        total_usd = budget.total_usd if options.max_cost_usd is None else options.max_cost_usd
+        options = replace(options, max_cost_usd=total_usd, split_usd=budget.split)
+        paid = {self.registered[n] for n, entry in self.entries.items() if entry.price != "free"}
+        left_out = {*self.study.file.models} - {*self.models}  # whose parts are for another day
+        options.caps.check(paid | (left_out & {*budget.split}))
+        return options
 
     def by_label(self) -> dict[str, Arm]:
         """The arms by the labels that their trials carry."""

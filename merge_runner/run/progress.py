@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -58,11 +58,13 @@ class Progress:
     ledger: Ledger
     stored: Counter[Cell] = field(default_factory=Counter)
     cap_usd: float | None = None
+    until: datetime | None = None
     by_cell: defaultdict[Cell, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     started: float = field(default_factory=time.monotonic)
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
+    unstored: Callable[[], str] = str  # says why trials are not stored; empty: nothing is wrong
 
     @property
     def title(self) -> str:
@@ -105,7 +107,7 @@ class Progress:
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
             ("cost", f"{self._cost_usd:.2f} USD{self._spent()}"),
             *(("calls waiting", "; ".join(texts)) for texts in [self._waiting()] if texts),
-            ("time", f"{elapsed:.0f} s{left}"),
+            ("time", f"{elapsed:.0f} s{left}{self._until()}"),
         ]
 
     def standing(self, sweep_id: str) -> Standing:
@@ -162,6 +164,9 @@ class Progress:
             return ""
         return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
 
+    def _until(self) -> str:
+        return "" if self.until is None else f", until {self.until:%a %H:%M}"
+
     def _cell(self, cell: Cell) -> CellStanding:
         playing = self.runner.playing
         ways = self.by_cell[cell]
@@ -181,6 +186,7 @@ class Progress:
         others = sum((meter.mismatches for meter in self.meters), Counter[str]())
         meters = self.runner.meters.items()
         return [
+            *(text for text in [self.unstored()] if text),
             *(f"another model answers: {pair}" for pair in sorted(others)),
             *(f"a scripted stand-in answers, not {name}" for name, m in meters if m.stand_ins),
         ]

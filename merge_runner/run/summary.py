@@ -100,7 +100,8 @@ def as_lines(outcome: Outcome, options: Options, expected: Estimate | None) -> I
             yield f"... and {len(facts.failed) - FAILURES_SHOWN} more, in the table trials"
         if facts.failed and outcome.exit_code != ReplayMiss.exit_code:
             yield "Run the same command again to play the failed trials anew."
-    yield f"database: {options.db}"
+    if outcome.sweep_id:
+        yield f"database: {options.db}"
 
 
 def _failures(facts: SweepFacts) -> Iterator[str]:

@@ -9,7 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import partial
+from functools import cached_property, partial
+from itertools import takewhile
 
 from merge_runner.audit import Audit, audit_sweep
 from merge_runner.config import ModelEntry
@@ -30,6 +31,7 @@ from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.progress_file import ProgressFile
 from merge_runner.results.provenance import git_state, versions
+from merge_runner.results.recorded_study import described
 from merge_runner.results.recording import Spilled
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
@@ -39,13 +41,14 @@ from merge_runner.run.clients import (
     sealed_clients,
     start_endpoints,
 )
-from merge_runner.run.estimate import Estimate, estimate
-from merge_runner.run.flusher import Flusher
+from merge_runner.run.estimate import Estimate, Todo, estimate
+from merge_runner.run.flusher import AGAIN, Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
 from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
+from merge_runner.run.until import GRACE_S
 from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
@@ -53,6 +56,7 @@ SHOWN = 5
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
 FROM_RECORDINGS = 16
+LOOK_AT_CLOCK_S = 1.0
 
 
 @dataclass(slots=True)
@@ -63,7 +67,8 @@ class Outcome:
     wait for money, and their replies are in the cache. ``meter`` counts the calls of this run,
     ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` what all replies in
     the cache cost when they were made. ``facts`` summarises what the database holds of the sweep,
-    and ``audit`` the checks made there; both are None where nothing is stored. ``playing_s`` is how
+    and ``audit`` the checks made there; both are None where nothing is stored, or its user
+    ``gave_up`` waiting for the database. ``playing_s`` is how
     long the trials took, ``worst_stall_s`` the longest delay of the event loop.
     """
 
@@ -78,6 +83,7 @@ class Outcome:
     cache_cost_usd: float = 0.0
     facts: SweepFacts | None = None
     audit: Audit | None = None
+    gave_up: bool = False
     playing_s: float = 0.0
     worst_stall_s: float = 0.0
 
@@ -90,21 +96,20 @@ class Outcome:
 class Sweep:
     """One run of a plan.
 
-    Making it opens the cache and the database, asks a server of one's own what its model is
-    called, and does nothing else.
+    Making it opens the cache, and the database unless it is a replay; it asks a server of one's
+    own what its model is called, and does nothing else.
     """
 
     def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
         """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
         self._options = options
         self._say = say
-        recorded = partial(Spilled, options.recording) if options.recording else None
+        recorded = partial(Spilled, options.recordings) if options.recordings else None
         self._cache = ResponseCache(options.cache, overlay=recorded)
         plan = plan.with_entries(self._named(plan.entries))
         endpoints = {name: self._endpoint(plan, name) for name in plan.entries}
         self._plan = plan = replace(plan, endpoints=endpoints)
         self._arms = plan.by_label()
-        self._store = Store(options.db)
         specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
         with unreadable_is_usage():
@@ -118,6 +123,7 @@ class Sweep:
         # Keyed by model and its number of answered calls, so that an answer starts a new count.
         self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
         self._suspended: TrialSuspended | None = None
+        self._out_of_time = False
         self._progress = Progress(
             plan=plan,
             planned=Counter(spec.cell for spec in specs.values()),
@@ -125,6 +131,7 @@ class Sweep:
             runner=LocalRunner(plan, {}, in_flight=0),  # nobody plays yet
             ledger=self._ledger,
             cap_usd=options.max_cost_usd,
+            until=options.until,
         )
 
     @property
@@ -134,6 +141,8 @@ class Sweep:
 
     async def run(self) -> Outcome:
         """Play what is missing and store it; what goes wrong is in the outcome."""
+        if self._options.replay and (misses := await self._all_missing()):
+            return self._not_recorded(misses)
         with unreadable_is_usage():
             sweep_id = self._begin()
         file = ProgressFile(self._options.db, sweep_id)
@@ -141,7 +150,38 @@ class Sweep:
             outcome = await self._run(sweep_id)
             self._progress.doing = "checking"
             file.write(self._progress.standing(sweep_id))
-            self._end(outcome)
+            if not outcome.gave_up:
+                self._end(outcome)
+        return outcome
+
+    @cached_property
+    def _store(self) -> Store:
+        return Store(self._options.db)
+
+    async def _all_missing(self) -> list[Miss]:
+        """The first calls of all trials if none is recorded; else nothing."""
+        runner = LocalRunner(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
+        misses: list[Miss] = []
+
+        def none_found() -> bool:
+            return not any(meter.calls_cached for meter in runner.meters.values())
+
+        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+            if isinstance(record, TrialRecord):
+                misses.extend(_misses(spec, record))
+
+        await runner.play(takewhile(lambda _: none_found(), self._todo), ended)
+        return misses if none_found() else []
+
+    def _not_recorded(self, misses: list[Miss]) -> Outcome:
+        """The outcome of a replay that stores nothing, since it has none of its calls."""
+        outcome = Outcome(self._plan, "", 0)
+        self._explain(misses, outcome)
+        held = described(self._options.recordings, self._cache.entries())
+        outcome.messages.append(
+            f"nothing of this replay is recorded, and nothing is stored: {held}"
+        )
+        self._cache.close()
         return outcome
 
     async def _run(self, sweep_id: str) -> Outcome:
@@ -152,6 +192,7 @@ class Sweep:
             runner = await self._runner(stack)
             self._progress.runner = runner
             flusher = Flusher(self._store, outcome.sweep_id, self._say)
+            self._progress.unstored = lambda: flusher.problem
             began = time.perf_counter()
             try:
                 async with display_progress(self._progress):
@@ -160,7 +201,7 @@ class Sweep:
                 outcome.playing_s = time.perf_counter() - began
                 outcome.worst_stall_s = self._progress.worst_stall_s
                 await self._store_rest(flusher, outcome)
-            self._explain_misses(outcome)
+            self._explain(self._misses, outcome)
             try:
                 outcome.cache_cost_usd = self._cache.cost_usd()
                 outcome.spending = self._ledger.read()
@@ -186,39 +227,47 @@ class Sweep:
     async def estimate(self) -> Estimate:
         """What a live run takes: plays from recorded replies alone, and counts what is missing."""
         plan = self._plan
-        trials = 0
-        calls = dict.fromkeys(plan.entries, 0.0)
+        trials: Counter[str] = Counter()
+        calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in self._arms.items()}
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            nonlocal trials
             if isinstance(record, TrialSuspended) or record.status != "failed":
                 return
-            trials += 1
+            trials[spec.arm] += 1
             for side, name in self._arms[spec.arm].asked.items():
-                if name in calls:
+                if name in plan.entries:
                     answered = sum(row.side == side for row in record.decisions)
-                    calls[name] += max(1.0, PROMPTS_PER_DRIVER - answered)
+                    calls[spec.arm][name] += max(1.0, PROMPTS_PER_DRIVER - answered)
 
         clients = sealed_clients(plan, self._cache)
         await LocalRunner(plan, clients, in_flight=1).play(self._todo, ended)
-        facts = {name: self._measured(name, entry) for name, entry in plan.entries.items()}
-        return estimate(plan, self._options, trials=trials, calls=calls, facts=facts)
+        todo = {label: Todo(trials[label], calls[label]) for label in self._arms}
+        return estimate(
+            plan,
+            self._options,
+            todo=todo,
+            facts=self._measured(),
+            spending=self._ledger.spending,
+        )
 
-    def _measured(self, name: str, entry: ModelEntry) -> CallTotals:
-        """What is known about answers to requests like those of this sweep."""
-        sent = FORMATS[entry.format].request(entry, "")
-        asked = manner(sent.path, canonical_json(sent.body))
-        return self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
+    def _measured(self) -> dict[str, CallTotals]:
+        """What is known about each model's answers to requests like those of this sweep."""
+        facts = {}
+        for name, entry in self._plan.entries.items():
+            sent = FORMATS[entry.format].request(entry, "")
+            asked = manner(sent.path, canonical_json(sent.body))
+            facts[name] = self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
+        return facts
 
     def close(self) -> None:
         """Close what was opened, if the sweep is not run after all."""
         self._cache.close()
 
-    def _explain_misses(self, outcome: Outcome) -> None:
-        if not self._misses:
+    def _explain(self, misses: list[Miss], outcome: Outcome) -> None:
+        if not misses:
             return
         left_out: list[str] = []
-        for line in explain(self._misses, self._cache.entries(left_out)):
+        for line in explain(misses, self._cache.entries(left_out)):
             outcome.fail(ReplayMiss.exit_code, line)
         if left_out:
             outcome.messages.append(
@@ -253,7 +302,7 @@ class Sweep:
             clients = sealed_clients(plan, self._cache)
             # Recorded replies come at once: more trials in flight would only take more memory.
             return LocalRunner(plan, clients, min(options.in_flight, FROM_RECORDINGS))
-        services = open_services(plan, options, self._cache, self._ledger, stack)
+        services = open_services(plan, options, self._cache, self._ledger, self._measured(), stack)
         urls = await start_endpoints(plan.entries, options.emulator_options, stack)
         known = frozenset(
             name
@@ -290,11 +339,7 @@ class Sweep:
                 self._suspended = record
                 return
             self._progress.by_cell[spec.cell][record.status] += 1
-            self._misses += (
-                Miss(spec.trial_id, failed.request)
-                for failed in record.failed_calls
-                if failed.missed
-            )
+            self._misses += _misses(spec, record)
             flusher.add(record)
             self._watch_for_outage(record, runner)
 
@@ -309,29 +354,66 @@ class Sweep:
             )
             work.cancel()
 
+        clock = asyncio.create_task(self._stop_in_time(runner, interrupted))
         with on_interrupt(interrupted, drain.cancel):
             await asyncio.wait([drain])
             await asyncio.wait([work])
-        if work.cancelled():
+        clock.cancel()
+        self._note_end(work, outcome)
+
+    def _note_end(self, work: asyncio.Task[None], outcome: Outcome) -> None:
+        """Note how the playing ended, if not with the last trial."""
+        left = self._progress.total - self._progress.ways.total()
+        if self._out_of_time and left and (work.cancelled() or work.exception() is None):
+            outcome.fail(
+                INTERRUPTED,
+                f"Stopped as --until says; {left} trials have not ended, and their replies are "
+                "kept. Run the same command again to go on.",
+            )
+        elif work.cancelled():
             outcome.fail(INTERRUPTED, "Interrupted. Run the same command again to go on.")
         elif isinstance(error := work.exception(), MergeRunnerError):
             outcome.fail(error.exit_code, str(error))
         elif error is not None:
             raise error
 
+    async def _stop_in_time(self, runner: TrialRunner, interrupt: Callable[[], None]) -> None:
+        """At the time of ``--until`` begin no more trials; a while later stop those under way."""
+        until = self._options.until
+        if until is None:
+            return
+        # In short steps, since a machine that slept wakes up late.
+        while time.time() < until.timestamp():
+            left_s = until.timestamp() - time.time()
+            await asyncio.sleep(max(0.0, min(left_s, LOOK_AT_CLOCK_S)))
+        self._out_of_time = True
+        runner.begin_no_more()
+        self._say(
+            f"It is {until:%H:%M}: no other trial begins, and what the {runner.running} trials "
+            f"under way do not finish in {GRACE_S:.0f} s is left to the next run."
+        )
+        await asyncio.sleep(GRACE_S)
+        interrupt()
+
     async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> None:
-        """Store what has ended and is not stored yet."""
-        try:
-            await flusher.close()
-            if flusher.differing:
-                outcome.fail(
-                    StoreError.exit_code,
-                    f"{len(flusher.differing)} trials are stored otherwise in {self._options.db}, "
-                    f"which is left as it is: {_differing(flusher.differing)}. Replay into "
-                    "another --db.",
-                )
-        except StoreError as exc:
-            outcome.fail(exc.exit_code, str(exc))
+        """Store what has ended and is not stored yet; Ctrl-C ends the waiting for that."""
+        closing = asyncio.create_task(flusher.close())
+        with on_interrupt(closing.cancel, closing.cancel):
+            await asyncio.wait([closing])
+        if closing.cancelled():
+            outcome.gave_up = True
+            outcome.fail(INTERRUPTED, f"Interrupted: {flusher.problem}. {AGAIN}")
+        elif isinstance(error := closing.exception(), StoreError):
+            outcome.fail(error.exit_code, str(error))
+        elif error is not None:
+            raise error
+        elif flusher.differing:
+            outcome.fail(
+                StoreError.exit_code,
+                f"{len(flusher.differing)} trials are stored otherwise in {self._options.db}, "
+                f"which is left as it is: {_differing(flusher.differing)}. Replay into "
+                "another --db.",
+            )
 
     def _end(self, outcome: Outcome) -> None:
         """Note how the sweep ended, read back what the database holds of it, and audit that."""
@@ -397,6 +479,11 @@ class Sweep:
                 "Set the base URL variable of its provider to the one to replay."
             )
         return recorded[0]
+
+
+def _misses(spec: TrialSpec, record: TrialRecord) -> list[Miss]:
+    """The calls of a trial for which nothing was recorded."""
+    return [Miss(spec.trial_id, call.request) for call in record.failed_calls if call.missed]
 
 
 def _differing(trials: Mapping[str, Sequence[str]]) -> str:

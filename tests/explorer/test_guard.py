@@ -161,7 +161,7 @@ def test_the_names_are_those_under_which_it_is_reached(monkeypatch, bind, addres
 
 
 def test_a_database_that_is_not_there_is_told(tmp_path):
-    with pytest.raises(UsageError, match="make sweep"):
+    with pytest.raises(UsageError, match="`merge-runner sweep baseline`"):
         Site(tmp_path / "none.duckdb").catalogue.refresh()
 
 

@@ -18,8 +18,8 @@ from analysis.explorer.child import NoAnswer
 from analysis.explorer.pages.sql import EXAMPLES
 from analysis.explorer.query_process import QueryResult
 from analysis.explorer.query_worker import Caps
-from analysis.explorer.schema import tables
 from analysis.explorer.site import Site
+from merge_runner.results.data_dictionary import tables
 from merge_runner.results.store import query
 from tests.analysis.studies import write_study, yielding
 from tests.harness import PROJECT

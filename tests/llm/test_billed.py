@@ -26,12 +26,13 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Caps, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Slot, Usage
 from tests.emulator.scenarios import SCENARIOS
 from tests.emulator.scenarios.playing import ScenarioPlan, playing
+from tests.harness import each
 from tests.llm.test_scenarios import (  # noqa: F401 # fixtures
     GEMINI,
     MODELS,
@@ -165,7 +166,7 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
         worst = cost_usd(entry, client._worst_case(client._request(PROMPT, slot(0))))
         client.first = first or client.first
         ledger = Ledger(cache, name)
-        client.budget = Budget(ledger, cap_usd=cap * worst, trial_usd=worst)
+        client.budget = Budget(ledger, Caps(cap * worst), each(worst, "my-model"))
 
         async def ask(number):
             try:

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
 # o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and none can
 # cost more than 3.4 USD (2 x 12 prompts to the timeout, 16,000 tokens of output each).
-SHORT = "[repetitions]\nbaseline = 10\n[scenario]\ntimeout_s = 12\n"
+SHORT = "[repetitions]\nbaseline = 18\n[scenario]\ntimeout_s = 12\n"
 ROOM_FOR_SOME = 3.9
 
 
@@ -58,7 +58,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
     bill = Bill()
     async with watched(bill.middle) as server:
         env = account(server)
-        sweep = (*SWEEP, "--reps", 6, "--yes", *FAST)
+        sweep = (*SWEEP, "--reps", 18, "--yes", *FAST)
         run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)
         assert run.code == 3, run.err
         assert 0 < bill.usd <= ROOM_FOR_SOME
@@ -66,12 +66,12 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         assert run.summary["trials"]["suspended"] > 0
         assert f"{bill.usd:.2f} of {ROOM_FOR_SOME} over all runs" in run.err.splitlines()[-2]
         assert "raise --max-cost and run the same command again" in run.err
-        # What is finished is balanced: no condition is two repetitions ahead of another one.
+        # What is finished is balanced: no condition is far ahead of another one.
         counts = await sql(
             merge_runner, "select condition, count(*) as n from trials group by all order by n"
         )
         assert len(counts) == 3
-        assert counts[-1]["n"] - counts[0]["n"] <= 1
+        assert counts[-1]["n"] - counts[0]["n"] <= 2
         spent = bill.usd
         # The same cap again: nothing is left to begin a trial with.
         again = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)

@@ -4,17 +4,31 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import shutil
+import signal
 import sqlite3
 import sys
 
 import pytest
 
+from merge_runner.emulator.faults import FaultPlan
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import make_plan
 from tests.harness import watched
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
+NOTEBOOK = """
+import duckdb, sys, time
+while True:
+    try:
+        held = duckdb.connect(sys.argv[1], read_only=sys.argv[2] == "read")
+        break
+    except duckdb.IOException:  # the sweep writes just now
+        time.sleep(0.01)
+print("held", flush=True)
+sys.stdin.read()
+"""
 LOCK = """
 import duckdb, sys, time
 held = duckdb.connect(sys.argv[1])
@@ -100,8 +114,43 @@ async def test_a_database_that_another_program_holds_for_a_while_is_waited_for(
         run = await merge_runner(*SWEEP, "--conditions", "N_0_0,L_4_8", **env)
         assert await other.wait() == 0
     assert run.code == 0, run.err
-    assert "for another program to close results/merge.duckdb" in run.err
+    assert f"(PID {other.pid}) to close results/merge.duckdb" in run.err
     assert run.summary["trials"]["planned"] == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["read", "write"])
+async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_replies(
+    merge_runner, tmp_path, mode
+):
+    part = ("sweep", "baseline", "--conditions", "N_0_0", "--json")
+    async with watched(faults=FaultPlan(latency_s=0.2)) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        assert (await merge_runner(*part, "--reps", 1, **env)).code == 0
+        sweep = await merge_runner.start(*part, "--reps", 3, **env)
+        while server.requests <= 22:  # of the trial before
+            await asyncio.sleep(0.1)
+        notebook = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", NOTEBOOK, tmp_path / "results/merge.duckdb", mode,
+            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        await notebook.stdout.readline()
+        said = b""
+        while b"the playing has ended" not in said:
+            said += await asyncio.wait_for(sweep.stderr.readline(), 60)
+        os.kill(sweep.pid, signal.SIGINT)
+        _, err = await sweep.communicate()
+        err = (said + err).decode()
+        assert sweep.returncode == 130, err
+        assert f"(PID {notebook.pid}): close it there" in err
+        assert "run the same command again" in err
+        again = await merge_runner.fork(*part, "--reps", 3, **env)
+        await asyncio.sleep(2)
+        notebook.stdin.close()  # what waits for it goes on
+        out, err = await again.communicate()
+        assert again.returncode == 0, err
+        assert json.loads(out)["calls"]["live"] == 0
+        assert json.loads(out)["trials"]["planned"] == 3
 
 
 async def test_a_truncated_database_is_left_alone_and_rebuilt_from_the_cache(

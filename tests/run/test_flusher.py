@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from dataclasses import replace
 
 import pytest
 
@@ -16,7 +17,13 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
-from merge_runner.run.flusher import MOST_PENDING, MOST_PENDING_BYTES, MOST_STUCK_BYTES, Flusher
+from merge_runner.run.flusher import (
+    MOST_PENDING,
+    MOST_PENDING_BYTES,
+    MOST_STUCK_BYTES,
+    SPILLED_BYTES,
+    Flusher,
+)
 
 SPEC = TrialSpec("t", "h", "llm", "m", "m", "baseline", "L_4_0", 1, 0, 0)
 MB = 2**20
@@ -60,7 +67,7 @@ class Slow:
     def write(self, sweep_id, batch, *, patience_s):
         self.go_on.wait()
         self.written.append(len(batch))
-        return []
+        return {}
 
 
 async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
@@ -81,12 +88,53 @@ async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     assert flusher._bytes == 0
 
 
-async def test_what_cannot_be_stored_fills_the_memory_up_to_a_limit():
-    flusher = Flusher(Refusing(StoreLocked("somebody reads")), "sweep", lambda line: None)
+class Held(Slow):
+    """A store that another program holds until it is told to go on."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.path = path
+
+    def write(self, sweep_id, batch, *, patience_s):
+        if not self.go_on.is_set():
+            raise StoreLocked("somebody reads")
+        self.written.extend(record.end_time_s for record in batch)
+        return {}
+
+
+def long_trials(number):
+    one = trial(SPILLED_BYTES // 4)
+    return [replace(one, end_time_s=float(place)) for place in range(number)]
+
+
+async def test_what_cannot_be_stored_is_spilled_and_stored_whole_and_in_order(tmp_path):
+    store, said = Held(tmp_path / "results.duckdb"), []
+    flusher = Flusher(store, "sweep", said.append)
+    for record in long_trials(6):
+        flusher.add(record)
+        await asyncio.wait_for(flusher.room(), 10)
+    async with asyncio.timeout(20):
+        while flusher._bytes > SPILLED_BYTES:
+            await asyncio.sleep(0.05)
+    assert flusher.left == 6
+    assert flusher.problem == "6 trials wait to be stored: somebody reads"
+    closing = asyncio.create_task(flusher.close())
+    async with asyncio.timeout(20):
+        while "Ctrl-C ends the waiting" not in said[-1]:
+            await asyncio.sleep(0.05)
+        store.go_on.set()
+        await closing
+    assert sorted(store.written) == list(map(float, range(6)))
+    assert (flusher.left, flusher._bytes, flusher.problem) == (0, 0, "")
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_what_can_neither_be_stored_nor_spilled_fills_the_memory_up_to_a_limit(tmp_path):
+    flusher = Flusher(Held(tmp_path / "no such folder/results.duckdb"), "sweep", lambda line: None)
     text = trial(MOST_STUCK_BYTES // 4)
     for _ in range(4):
         flusher.add(text)
-    await asyncio.sleep(0.01)
+    await asyncio.sleep(0.1)
     flusher._task.cancel()
     await asyncio.gather(flusher._task, return_exceptions=True)
     assert flusher._problem

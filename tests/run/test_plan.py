@@ -10,7 +10,8 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import CallTotals
-from merge_runner.run.estimate import estimate
+from merge_runner.llm.ledger import Spending
+from merge_runner.run.estimate import Todo, estimate
 from merge_runner.run.plan import PROGRAMS, Options, make_plan
 
 
@@ -144,11 +145,38 @@ def test_the_estimate_takes_the_limits_into_account(limited, minutes):
     expected = estimate(
         plan,
         Options(Path("m.duckdb"), Path("responses"), **limited),
-        trials=plan.trials,
-        calls={"o3": plan.trials * 21},
+        todo={"baseline": Todo(plan.trials, {"o3": plan.trials * 21})},
         facts={"o3": CallTotals()},
+        spending=Spending(),
     )
     assert expected.minutes == pytest.approx(minutes, rel=0.08)
     assert expected.calls == 2310
     each = 2310 * (500 * 2 + 1500 * 8) / 1e6
     assert expected.cost_usd == pytest.approx(each, rel=0.05)
+
+
+def test_the_estimate_tells_each_variant_and_what_the_cap_buys():
+    plan = make_plan("ablations", "o3", 2, variants=["baseline", "A1"])
+    todo = {
+        "baseline": Todo(10, {"o3": 210.0}),
+        "A1": Todo(30, {"o3": 630.0}),
+    }
+    options = Options(Path("m.duckdb"), Path("responses"), max_cost_usd=6.0)
+    facts = CallTotals(measured=10, input_tokens=5_000, output_tokens=15_000, latency_s=200)
+    spent = Spending(spent_usd=0.54)
+    expected = estimate(plan, options, todo=todo, facts={"o3": facts}, spending=spent)
+    each = (500 * 2 + 1500 * 8) / 1e6
+    cells = {cell.cell: cell for cell in expected.cells}
+    assert [cell.trials for cell in expected.cells] == [10, 30]
+    assert cells["A1"].cost_usd == pytest.approx(630 * each, abs=0.01)
+    assert sum(cell.calls for cell in expected.cells) == expected.calls == 840
+    # 5.46 of 10.92 USD are left: every second trial of either variant.
+    assert [cell.trials_within_cap for cell in expected.cells] == [5, 15]
+    assert expected.trials_within_cap == 20
+    split = replace(options, max_cost_usd=None, split_usd={"o3": 1.7})
+    (few, _) = estimate(plan, split, todo=todo, facts={"o3": facts}, spending=spent).cells
+    assert few.trials_within_cap == 1
+    free = estimate(
+        plan, replace(options, max_cost_usd=None), todo=todo, facts={"o3": facts}, spending=spent
+    )
+    assert free.trials_within_cap is None

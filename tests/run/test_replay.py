@@ -67,6 +67,27 @@ async def test_the_committed_recording_replays_to_its_digest(merge_runner):
     assert (await merge_runner("digest")).out == GOLDEN
 
 
+async def test_without_replies_of_its_own_a_replay_takes_the_recording_that_ships(
+    merge_runner, tmp_path
+):
+    part = ("baseline", "--reps", 1, "--conditions", "N_0_0,L_4_8")
+    for _ in range(2):  # the first one makes the cache folder, which says nothing of replies
+        run = await merge_runner("replay", *part)
+        assert run.code == 0, run.err
+        shipped = tmp_path.joinpath(run.err.split("ships with merge-runner: ")[1].split("\n")[0])
+        assert shipped.samefile(RECORDING)
+    (tmp_path / "own.toml").write_text("repetitions = { baseline = 1 }")
+    assert (await merge_runner("replay", "own.toml", "--reps", 1)).code == 4
+
+
+async def test_replies_of_ones_own_are_not_mixed_with_those_that_ship(merge_runner):
+    part = ("baseline", "--reps", 1, "--conditions")
+    assert (await merge_runner("sweep", *part, "N_0_0")).code == 0
+    replay = await merge_runner("replay", *part, "N_0_0", "--db", "other")
+    assert (replay.code, "ships with" in replay.err) == (0, False)
+    assert (await merge_runner("replay", *part, "L_4_8", "--db", "other")).code == 4
+
+
 async def test_the_recording_is_what_the_emulator_answers_today(merge_runner, tmp_path):
     part = ("--reps", 1, "--json")
     live = await merge_runner("sweep", "baseline", *part)
@@ -130,10 +151,97 @@ async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, s
     )  # fmt: skip
     out, _ = await run.communicate()
     assert run.returncode == 4
-    (told,) = json.loads(out)["messages"]
+    told, held = json.loads(out)["messages"]
+    assert "small.parquet holds 206 calls of scripted-driver" in held
     assert "recorded '- Your speed: 1" in told
     assert "wanted '- Your spead: 1" in told
     assert told.endswith("; 22 calls of 11 trials differ like this")
+
+
+async def test_a_replay_that_finds_nothing_stores_nothing_and_says_what_is_recorded(
+    merge_runner, tmp_path
+):
+    other = ("replay", "ablations", "--model", "o3", "--recording", RECORDING)
+    run = await merge_runner(*other)
+    assert run.code == 4
+    assert not (tmp_path / "results").exists()
+    assert (
+        "nothing of this replay is recorded, and nothing is stored: "
+        f"{RECORDING} holds baseline with emulator: 10 x baseline in 11 conditions"
+    ) in run.err
+    assert f"merge-runner replay baseline --model emulator --recording {RECORDING}" in run.err
+    cached = await merge_runner("replay", "baseline", "--reps", 1)
+    assert cached.code == 4
+    assert "the cache holds no call at all" in cached.err
+
+
+async def test_a_replay_plays_what_a_smaller_recording_holds_and_says_so(merge_runner, tmp_path):
+    part = ("--reps", 2, "--conditions", "N_0_0,R_-4_8")
+    assert (await merge_runner("sweep", "baseline", *part)).code == 0
+    assert (await merge_runner("recording", "export", "part.parquet")).code == 0
+    replay = ("replay", "baseline", "--recording", "part.parquet", "--cache", "none", "--json")
+    run = await merge_runner(*replay, "--db", "part.duckdb")
+    assert run.code == 0, run.err
+    assert run.summary["trials"]["planned"] == 4
+    assert "2 x baseline in 2 conditions, 4 trials; the sweep baseline has 110" in run.err
+    digest = results_digest(tmp_path / "results/merge.duckdb")
+    assert results_digest(tmp_path / "part.duckdb") == digest
+    asked = await merge_runner(*replay, "--reps", 3, "--db", "asked.duckdb")
+    assert asked.code == 4, "what is asked for is what is played"
+    assert asked.summary["trials"]["planned"] == 33
+
+
+async def test_several_sweeps_go_into_one_file_and_several_files_into_one_replay(
+    merge_runner, tmp_path
+):
+    sweeps = []
+    for name, part in (("a", ("N_0_0",)), ("b", ("R_-4_8",)), ("c", ("N_0_0,R_-4_8", "--reps", 2))):
+        run = await merge_runner("sweep", "baseline", "--reps", 1, "--json", "--conditions", *part)
+        assert run.code == 0, run.err
+        sweeps.append(run.summary["sweep_id"])
+        assert (await merge_runner("recording", "export", f"{name}.parquet")).code == 0
+    both = ("--sweep", sweeps[0], "--sweep", sweeps[1])
+    export = await merge_runner("recording", "export", "both.parquet", *both)
+    assert export.code == 0, export.err
+    assert (await merge_runner("recording", "verify", "both.parquet")).code == 0
+    audit = await merge_runner("audit", "--recording", "both.parquet")
+    assert audit.code == 0, audit.out
+    info = json.loads((await merge_runner("recording", "info", "both.parquet")).out)
+    assert [row["sweep_id"] for row in json.loads(info["provenance"]["sweeps"])] == sweeps[:2]
+    replay = ("replay", "baseline", "--cache", "none", "--json")
+    digests = []
+    for files in (("both",), ("a", "b"), ("a", "c", "b")):
+        named = [word for file in files for word in ("--recording", f"{file}.parquet")]
+        db = f"{'-'.join(files)}.duckdb"
+        run = await merge_runner(*replay, *named, "--db", db)
+        assert run.code == 0, run.err
+        digests.append(results_digest(tmp_path / db))
+    assert digests[0] == digests[1]
+    assert [trials for _, trials in digests] == [2, 2, 4]
+    unknown = await merge_runner("recording", "export", "x.parquet", "--sweep", "nobody")
+    assert unknown.code == 2
+    assert f"holds no sweep nobody; valid: {', '.join(sweeps)}" in unknown.err
+
+
+async def test_recordings_that_contradict_each_other_are_not_replayed_together(
+    merge_runner, tmp_path
+):
+    for name, faults in (("good", None), ("bad", FaultPlan(rates={"malformed": 1.0}))):
+        async with watched(faults=faults) as server:
+            env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
+            part = ("baseline", "--model", "o3", "--reps", 1, "--conditions", "L_4_0", "--yes")
+            places = ("--db", f"{name}.duckdb", "--cache", name)
+            assert (await merge_runner("sweep", *part, *FAST, *places, **env)).code == 0
+        assert (await merge_runner("recording", "export", f"{name}.parquet", *places)).code == 0
+    cache = ResponseCache(tmp_path / "one")
+    entries = list(read_recording(tmp_path / "bad.parquet"))
+    (good, *_) = read_recording(tmp_path / "good.parquet")
+    cache.put_now([type(good)(good.request, entries[0].attempts)])
+    export_recording(tmp_path / "other.parquet", cache, [good.request.key], {})
+    replay = ("replay", *part[:-1], "--recording", "good.parquet", "--recording", "other.parquet")
+    run = await merge_runner(*replay)
+    assert run.code == 1
+    assert f"other.parquet holds another reply to the call {good.request.key}" in run.err
 
 
 async def test_an_exported_sweep_goes_round_through_a_file(merge_runner, tmp_path):

@@ -117,7 +117,7 @@ async def test_a_real_model_runs_against_any_server_of_its_format_and_replays_wi
     without = await merge_runner(*sweep)
     assert without.code == 2
     assert variables[0] in without.err
-    assert "make sweep" in without.err
+    assert "`merge-runner sweep baseline` runs" in without.err
     async with watched() as server:
         env = {variables[0]: "dummy-key", variables[1]: server.url + path}
         unasked = await merge_runner(*sweep, **env)

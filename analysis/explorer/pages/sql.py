@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from analysis.explorer.child import NoAnswer
 from analysis.explorer.display_text import visible
 from analysis.explorer.query_process import DOWNLOADED_ROWS, LONGEST, QueryResult
-from analysis.explorer.schema import tables, units
 from analysis.explorer.site import Site
 from merge_runner.errors import MergeRunnerError
+from merge_runner.results.data_dictionary import tables, units
 
 UNANSWERED = (NoAnswer, MergeRunnerError)
 NUMBERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",

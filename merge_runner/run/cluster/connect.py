@@ -38,9 +38,7 @@ async def connected(where: str) -> AsyncIterator[Client]:
     try:
         import distributed
     except ModuleNotFoundError as exc:
-        raise UsageError(
-            "--dask needs the package distributed: pip install 'merge-runner[dask]'"
-        ) from exc
+        raise UsageError("--dask needs the package distributed: pip install distributed") from exc
 
     _silence()
     if workers:

@@ -92,7 +92,7 @@ class RemoteBudget:
         self._numbers = itertools.count()
 
     async def admit(self, trial: int) -> None:
-        """Wait for a trial's allowance."""
+        """Wait until a trial may begin."""
         await self._link.ask("admit", trial)
 
     def leave(self, trial: int) -> None:

@@ -13,11 +13,11 @@
 CREATE OR REPLACE VIEW geometry AS
 WITH sizes AS (
     SELECT spec_hash,
-        coalesce((spec -> 'scenario' ->> 'vehicle_length_m')::DOUBLE, usual_length_m()) AS length_m,
-        coalesce((spec -> 'scenario' ->> 'vehicle_width_m')::DOUBLE, usual_width_m()) AS width_m,
-        coalesce((spec -> 'track' ->> 'merge_point_m')::DOUBLE, merge_point_m()) AS merge_point_m,
-        coalesce((spec -> 'track' ->> 'end_m')::DOUBLE, track_end_m()) AS end_m,
-        coalesce((spec -> 'track' ->> 'start_distance_m')::DOUBLE / 2 / merge_point_m,
+        coalesce((spec->>'$.scenario.vehicle_length_m')::DOUBLE, usual_length_m()) AS length_m,
+        coalesce((spec->>'$.scenario.vehicle_width_m')::DOUBLE, usual_width_m()) AS width_m,
+        coalesce((spec->>'$.track.merge_point_m')::DOUBLE, merge_point_m()) AS merge_point_m,
+        coalesce((spec->>'$.track.end_m')::DOUBLE, track_end_m()) AS end_m,
+        coalesce((spec->>'$.track.start_distance_m')::DOUBLE / 2 / merge_point_m,
             branch_sine()) AS sin1
     FROM specs
 ), angles AS (
@@ -33,14 +33,25 @@ WITH sizes AS (
         (width_m * (1 + cos2) + length_m * sin2) / 2 / sin2 AS contact
     FROM angles
 )
-SELECT spec_hash, length_m, width_m, merge_point_m, end_m,
+SELECT
+    spec_hash,
+    -- of both vehicles
+    length_m,
+    -- of both vehicles
+    width_m,
+    -- where the branches meet, along either
+    merge_point_m,
+    -- where the track ends
+    end_m,
+    -- where a vehicle's centre is when its front reaches the merge point
     merge_point_m - length_m / 2 AS front_m,
+    -- where a vehicle's centre is when its rear has left the merge point
     merge_point_m + length_m / 2 AS rear_m,
     -- A vehicle at contact_m overlaps the other from there to contact_high_m, one at the merge point
     -- from merge_low_m to merge_high_m.
     merge_point_m - contact AS contact_m,
-    if(contact < along, merge_point_m + (along - contact) / cos1, contact_m + length_m)
-        AS contact_high_m,
+    CASE WHEN contact < along THEN merge_point_m + (along - contact) / cos1
+        ELSE contact_m + length_m END AS contact_high_m,
     merge_point_m - least(along2, contact) AS merge_low_m,
     merge_point_m + least(along, across / sin1) AS merge_high_m
 FROM reaches;
@@ -80,7 +91,8 @@ FROM pairs WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step);
 CREATE OR REPLACE VIEW merge_times AS
 SELECT *,
     least(left_s, right_s) AS first_s,
-    if(left_s IS NULL OR right_s IS NULL, NULL, greatest(left_s, right_s)) AS both_s
+    CASE WHEN left_s IS NOT NULL AND right_s IS NOT NULL THEN greatest(left_s, right_s) END
+        AS both_s
 FROM (SELECT trial_id, spec_hash,
     min(passing_s(point_m, left_before_m, left_m, time_before_s, time_s)) AS left_s,
     min(passing_s(point_m, right_before_m, right_m, time_before_s, time_s)) AS right_s,
@@ -98,13 +110,15 @@ FROM (SELECT *, coalesce(merge_point_m, merge_point_m()) AS point_m
 -- simulator gave the vehicle; a recording begins up to a step later.
 CREATE OR REPLACE VIEW speed_deviations AS
 SELECT *,
+    -- the mean of both
     (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
+    -- whether both are at least 0.5 m/s
     least(rmse_left_mps, rmse_right_mps) >= 0.5 AS joint
 FROM (SELECT trial_id, spec_hash, time_window,
-    sqrt(avg((left_mps - if(source = 'human', mean_speed_mps() + relative_velocity_mps / 2,
-        left_first_mps)) ** 2)) AS rmse_left_mps,
-    sqrt(avg((right_mps - if(source = 'human', mean_speed_mps() - relative_velocity_mps / 2,
-        right_first_mps)) ** 2)) AS rmse_right_mps
+    sqrt(avg((left_mps - CASE source WHEN 'human'
+        THEN mean_speed_mps() + relative_velocity_mps / 2 ELSE left_first_mps END) ** 2)) AS rmse_left_mps,
+    sqrt(avg((right_mps - CASE source WHEN 'human'
+        THEN mean_speed_mps() - relative_velocity_mps / 2 ELSE right_first_mps END) ** 2)) AS rmse_right_mps
 FROM vehicle_pairs
 JOIN trials USING (trial_id, spec_hash)
 JOIN merge_times USING (trial_id, spec_hash)
@@ -139,7 +153,8 @@ WITH distances AS (
 ), collision_times AS (
     SELECT trial_id, spec_hash, min((abs(left_m - right_m) - length_m) / closing_mps) AS min_ttc_s
     FROM (
-        SELECT *, if(left_m > right_m, right_mps - left_mps, left_mps - right_mps) AS closing_mps
+        SELECT *, CASE WHEN left_m > right_m THEN right_mps - left_mps
+            ELSE left_mps - right_mps END AS closing_mps
         FROM vehicle_pairs JOIN geometry USING (spec_hash)
         WHERE greatest(left_m, right_m) >= merge_point_m
     )
@@ -164,21 +179,36 @@ WITH distances AS (
 SELECT
     trials.trial_id,
     trials.spec_hash,
-    if(finished, merge_m - length_m, NULL) AS gap_m,
-    if(finished, first_sample_m - length_m, NULL) AS gap_first_sample_m,
-    if(finished, mean_at_merge_m - length_m, NULL) AS gap_mean100_m,
+    -- net gap, |s_left - s_right| less the vehicle length of the trial's spec, when the first vehicle
+    -- reaches the merge point, interpolated linearly within the step; finished trials
+    CASE WHEN finished THEN merge_m - length_m END AS gap_m,
+    -- the same at the first sample at or after that instant
+    CASE WHEN finished THEN first_sample_m - length_m END AS gap_first_sample_m,
+    -- the same at the first sample at which the mean position has reached the merge point (Siebinga et
+    -- al.; 100 m in the human experiment)
+    CASE WHEN finished THEN mean_at_merge_m - length_m END AS gap_mean100_m,
+    -- RMSE of the left vehicle's speed from its initial speed, from the start of control to the first
+    -- sample after the first merge
     rmse_left_mps,
+    -- the same of the right vehicle
     rmse_right_mps,
+    -- the mean of both
     rmse_mps,
+    -- whether both are at least 0.5 m/s
     joint,
+    -- when the first vehicle reaches the merge point
     first_s AS time_to_merge_s,
-    if(finished, abs(left_s - right_s), NULL) AS merge_interval_s,
+    -- between the two vehicles' arrivals there
+    CASE WHEN finished THEN abs(left_s - right_s) END AS merge_interval_s,
     -- from when the first vehicle's rear has left the merge point to when the second's front is there
-    if(finished, if(left_s < right_s, right_front_s - left_rear_s, left_front_s - right_rear_s), NULL)
-        AS post_encroachment_s,
+    CASE WHEN finished AND left_s < right_s THEN right_front_s - left_rear_s
+        WHEN finished THEN left_front_s - right_rear_s END AS post_encroachment_s,
+    -- smallest time to collision once a vehicle is past the merge point; NULL if they never close in
     min_ttc_s,
+    -- largest absolute acceleration of either vehicle under the drivers' control
     max_acceleration_mps2,
-    if(status = 'collided', NULL, conflict_resolution_s) AS conflict_resolution_s
+    -- when the vehicles are first off a collision course; NULL after a collision
+    CASE WHEN status <> 'collided' THEN conflict_resolution_s END AS conflict_resolution_s
 FROM (SELECT *, status = 'finished' AS finished FROM trials) AS trials
 LEFT JOIN merge_times USING (trial_id, spec_hash)
 LEFT JOIN geometry USING (spec_hash)

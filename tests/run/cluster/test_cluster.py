@@ -88,7 +88,7 @@ async def test_without_the_extra_it_says_what_to_install(merge_runner, tmp_path,
     _, err = await process.communicate()
     assert process.returncode == 2
     assert err.decode() == (
-        "error: --dask needs the package distributed: pip install 'merge-runner[dask]'\n"
+        "error: --dask needs the package distributed: pip install distributed\n"
     )
 
 

@@ -105,7 +105,7 @@ async def test_the_cost_cap_holds_over_all_workers_and_a_higher_one_goes_on(merg
 
     async with watched(middle) as server:
         env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
-        sweep = (*SWEEP, *THREE, "--reps", 3, "--model", "o3", "--yes", *FAST)
+        sweep = (*SWEEP, *THREE, "--reps", 18, "--model", "o3", "--yes", *FAST)
         run = await merge_runner(*sweep, *ON_THREE, "--max-cost", cap, **env)
         assert run.code == 3, run.err
         assert 0 < usd <= cap

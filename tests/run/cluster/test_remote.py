@@ -12,14 +12,15 @@ from distributed.comm import connect, listen
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import CachedCall, KnownCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request
-from merge_runner.llm.ledger import Asked, Ledger
+from merge_runner.llm.ledger import Asked, Caps, Ledger
 from merge_runner.records import Attempt, Slot
 from merge_runner.run.clients import LocalServices
 from merge_runner.run.cluster.link import Link, LinkLost
 from merge_runner.run.cluster.remote import RemoteBudget, RemoteCache
 from merge_runner.run.cluster.session import Session
+from tests.harness import each
 
-WORST = Asked("o3", "L_4_0 rep 1 left, decision 3", 0.5)
+WORST = Asked("o3", "L_4_0 rep 1 left, decision 3", 0.5, "o3")
 TRIAL = 1
 
 
@@ -32,7 +33,7 @@ def cache(tmp_path):
 
 @pytest.fixture
 def budget(cache):
-    return Budget(Ledger(cache, "sweep"), cap_usd=1.0, trial_usd=1.0)
+    return Budget(Ledger(cache, "sweep"), Caps(1.0), each(1.0, "o3"))
 
 
 @pytest.fixture
@@ -65,7 +66,13 @@ async def worker(cache, budget):
 def money(budget):
     """What is held in memory, set aside in the ledger, and spent."""
     spending = budget.ledger.read()
-    return budget._queued_usd, spending.reserved_usd, spending.spent_usd
+    (pot,) = budget._pots
+    return pot.queued_usd, spending.reserved_usd, spending.spent_usd
+
+
+def in_flight(budget):
+    (pot,) = budget._pots
+    return pot.in_flight
 
 
 async def test_a_worker_that_dies_before_it_sends_gives_its_money_back(worker, budget):
@@ -74,7 +81,7 @@ async def test_a_worker_that_dies_before_it_sends_gives_its_money_back(worker, b
         await worker.dies()
         with pytest.raises(LinkLost):
             await paid.begin([])
-    assert (budget._in_flight, money(budget)) == (0, (0, 0, 0))
+    assert (in_flight(budget), money(budget)) == (0, (0, 0, 0))
 
 
 async def test_what_a_dead_worker_had_in_flight_stays_set_aside(worker, budget):
@@ -84,7 +91,7 @@ async def test_what_a_dead_worker_had_in_flight_stays_set_aside(worker, budget):
         await worker.dies()
         with pytest.raises(LinkLost):
             await paid.settle([Attempt(1, "timeout")])
-    assert (budget._in_flight, money(budget)) == (0, (0, 0.5, 0))
+    assert (in_flight(budget), money(budget)) == (0, (0, 0.5, 0))
 
 
 async def test_who_gives_up_waiting_for_money_holds_none(worker, budget):
@@ -100,7 +107,7 @@ async def test_who_gives_up_waiting_for_money_holds_none(worker, budget):
         await asyncio.gather(waiting, return_exceptions=True)
         assert waiting.cancelled()
     await worker.link.ask("leave", TRIAL)  # all that was told before it has been heard
-    assert (budget._in_flight, money(budget)) == (0, (0, 0, 0))
+    assert (in_flight(budget), money(budget)) == (0, (0, 0, 0))
 
 
 async def test_who_gives_up_when_the_answer_is_under_way_holds_no_money(worker, budget):
@@ -115,7 +122,7 @@ async def test_who_gives_up_when_the_answer_is_under_way_holds_no_money(worker, 
         asking.cancel()
         await asyncio.gather(asking, return_exceptions=True)
     await worker.link.ask("leave", TRIAL)  # all that was told before it has been heard
-    assert (budget._in_flight, money(budget)) == (0, (0, 0, 0))
+    assert (in_flight(budget), money(budget)) == (0, (0, 0, 0))
 
 
 def answered(reply):

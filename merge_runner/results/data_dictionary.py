@@ -1,4 +1,8 @@
-"""Tables and views with their columns, as their definitions explain them."""
+"""Tables and views with their columns, as their definitions in SQL explain them.
+
+A comment above a table or a view explains that, one behind a column of a table or above a column of
+a view explains the column. A column without one means what the first of its name does.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,16 @@ _BEGINS = re.compile(
     r"CREATE (?:TABLE IF NOT EXISTS|(?:OR REPLACE )?VIEW(?: IF NOT EXISTS)?) (\w+)"
 )
 _COLUMN = re.compile(r" {4}(\w+) [A-Z][^-]*(?:-- (.*))?")
+_SELECTED = re.compile(r"(?:.* AS| {3}) (\w+),?")
+_UNITS = {
+    "mps2": "m/s²",
+    "mps": "m/s",
+    "m": "m",
+    "s": "s",
+    "usd": "USD",
+    "tokens": "tokens",
+    "at": "UTC",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +37,11 @@ class SchemaColumn:
     name: str
     kind: str
     comment: str
+
+    @property
+    def unit(self) -> str:
+        """As the end of its name says it; empty: it has none."""
+        return _UNITS.get(self.name.rpartition("_")[2], "") if "_" in self.name else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +59,9 @@ def tables() -> list[SchemaTable]:
     """Tables, then views, in the order of their definitions."""
     definitions = schema_sql()
     said = _comments(definitions)
+    first: dict[str, str] = {}
+    for columns in said.values():
+        first = {**columns, **first}
     with duckdb.connect() as connection:
         connection.execute(definitions)
         found = connection.execute(
@@ -53,7 +75,10 @@ def tables() -> list[SchemaTable]:
             name,
             is_view,
             said[name][""],
-            [SchemaColumn(column, kind, said[name].get(column, "")) for column, kind in columns],
+            [
+                SchemaColumn(column, kind, said[name].get(column, first.get(column, "")))
+                for column, kind in columns
+            ],
         )
         for name, is_view, columns in found
     ]
@@ -71,12 +96,16 @@ def _comments(definitions: str) -> dict[str, dict[str, str]]:
     above: list[str] = []
     columns: dict[str, str] = {}
     for line in definitions.splitlines():
-        if line.startswith("-- "):
-            above.append(line.removeprefix("-- "))
+        if line.lstrip().startswith("-- "):
+            above.append(line.strip().removeprefix("-- "))
             continue
         if begins := _BEGINS.match(line):
             columns = said[begins[1]] = {"": " ".join(above)}
         elif (column := _COLUMN.fullmatch(line)) and column[2]:
             columns[column[1]] = column[2]
+        elif above and (selected := _SELECTED.fullmatch(line)):
+            columns[selected[1]] = " ".join(above)
+        elif above and line.startswith("    "):
+            continue  # the expression of the column goes on
         above = []
     return said

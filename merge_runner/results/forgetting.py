@@ -1,0 +1,135 @@
+"""Removes named sweeps and trials from the database; their replies stay in the cache."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import duckdb
+
+from merge_runner.errors import StoreError, UsageError
+from merge_runner.results.comparison import PLACES
+from merge_runner.results.database import PATIENCE_S, open_database, read_database
+from merge_runner.results.progress_file import running
+from merge_runner.results.store import Store
+from merge_runner.text_safety import first_line
+
+GOING_SWEEPS = """
+CREATE OR REPLACE TEMP TABLE going_sweeps AS
+SELECT DISTINCT sweep_id FROM sweeps JOIN (SELECT unnest(?) AS named) ON sweep_id GLOB named
+"""
+# The named trials, and those of the going sweeps that no other sweep has.
+GOING_TRIALS = """
+CREATE OR REPLACE TEMP TABLE going_trials AS
+SELECT trial_id, spec_hash FROM trials JOIN (SELECT unnest(?) AS named) ON trial_id GLOB named
+UNION
+(SELECT trial_id, spec_hash FROM sweep_trials SEMI JOIN going_sweeps USING (sweep_id)
+EXCEPT
+SELECT trial_id, spec_hash FROM sweep_trials ANTI JOIN going_sweeps USING (sweep_id))
+"""
+# Trials that stay, although their sweep goes.
+STAYING = """
+SELECT count(DISTINCT (trial_id, spec_hash)) FROM sweep_trials SEMI JOIN going_sweeps
+USING (sweep_id) ANTI JOIN going_trials USING (trial_id, spec_hash)
+"""
+# A sweep that stays and loses trials no longer claims that all of them ended.
+LOSING = """
+UPDATE sweeps SET exit_code = 1 WHERE coalesce(exit_code, 0) = 0 AND sweep_id IN
+(SELECT sweep_id FROM sweep_trials SEMI JOIN going_trials USING (trial_id, spec_hash))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Forgotten:
+    """What goes, or went: sweeps by id, numbers of trials, and of trials that other sweeps have."""
+
+    sweeps: tuple[str, ...]
+    trials: int
+    staying: int
+
+    def __str__(self) -> str:
+        """As a part of a sentence."""
+        named = f" ({', '.join(self.sweeps)})" if self.sweeps else ""
+        also = f"; {self.staying} trials that other sweeps have, too, stay" if self.staying else ""
+        return f"{len(self.sweeps)} sweeps{named} and {self.trials} trials{also}"
+
+
+def to_forget(db: Path, sweeps: Sequence[str], trials: Sequence[str]) -> Forgotten:
+    """What ``forget`` would remove; nothing is changed.
+
+    ``sweeps`` and ``trials`` are ids in which * stands for anything. Raises UsageError where one of
+    them names nothing, or a sweep into the database is running.
+    """
+    busy = running(db)
+    if busy:
+        raise UsageError(
+            f"the sweep {busy[0].sweep_id} is running into {db}: stop it, or wait for its end"
+        )
+    with read_database(db) as connection:
+        for table, column, patterns in (
+            ("sweeps", "sweep_id", sweeps),
+            ("trials", "trial_id", trials),
+        ):
+            _require_each(connection, db, table, column, patterns)
+        return _mark(connection, sweeps, trials)
+
+
+def forget(db: Path, sweeps: Sequence[str], trials: Sequence[str]) -> Forgotten:
+    """Remove sweeps and trials, and the specs that no trial is left of; see ``to_forget``."""
+    Store(db)  # brings an older database up to date
+    with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
+        try:
+            connection.begin()
+            gone = _mark(connection, sweeps, trials)
+            connection.execute(LOSING)
+            for table in (*PLACES, "sweep_trials"):
+                connection.execute(
+                    f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM going_trials)"  # noqa: S608 # our tables
+                )
+            for table in ("sweep_trials", "sweeps"):
+                connection.execute(
+                    f"DELETE FROM {table} WHERE sweep_id IN (FROM going_sweeps)"  # noqa: S608 # our tables
+                )
+            connection.execute(
+                "DELETE FROM specs WHERE spec_hash NOT IN (SELECT spec_hash FROM trials)"
+            )
+            connection.commit()
+        except duckdb.Error as exc:
+            raise StoreError(f"{db} cannot be changed: {first_line(exc)}") from exc
+    return gone
+
+
+def _require_each(
+    connection: duckdb.DuckDBPyConnection,
+    db: Path,
+    table: str,
+    column: str,
+    patterns: Sequence[str],
+) -> None:
+    """Raise UsageError where a pattern matches nothing; the message has the valid names."""
+    for pattern in patterns:
+        found = connection.execute(
+            f"SELECT 1 FROM {table} WHERE {column} GLOB ? LIMIT 1",  # noqa: S608 # our tables
+            [pattern],
+        )
+        if not found.fetchone():
+            names = connection.execute(
+                f"SELECT DISTINCT {column} FROM {table} ORDER BY ALL LIMIT 10"  # noqa: S608 # our tables
+            ).fetchall()
+            raise UsageError(
+                f"{db} holds no {table} named {pattern}; it has, among others: "
+                f"{', '.join(name for (name,) in names) or 'none'}. * stands for anything"
+            )
+
+
+def _mark(
+    connection: duckdb.DuckDBPyConnection, sweeps: Sequence[str], trials: Sequence[str]
+) -> Forgotten:
+    """Make the tables of what goes, and count that."""
+    connection.execute(GOING_SWEEPS, [list(sweeps)])
+    connection.execute(GOING_TRIALS, [list(trials)])
+    named = connection.execute("FROM going_sweeps ORDER BY ALL").fetchall()
+    ((going,),) = connection.execute("SELECT count(*) FROM going_trials").fetchall()
+    ((staying,),) = connection.execute(STAYING).fetchall()
+    return Forgotten(tuple(name for (name,) in named), going, staying)

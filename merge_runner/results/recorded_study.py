@@ -1,0 +1,133 @@
+"""Which study recordings hold: their sweeps, as they say themselves, and what is there of these."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from merge_runner.llm.cache import CachedCall
+from merge_runner.results.recording import opened, read_provenance, readable, sweeps_of
+from merge_runner.text_safety import one_line
+
+
+class _Config(BaseModel):
+    """What is read of a sweep's configuration."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    model: str
+    repetitions: dict[str, int]
+    conditions: tuple[str, ...]
+    sample_set: int
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedSweep:
+    """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition."""
+
+    name: str
+    model: str
+    repetitions: dict[str, int]
+    conditions: tuple[str, ...]
+    sample_set: int
+
+    def __str__(self) -> str:
+        """As a part of a sentence."""
+        variants = ", ".join(f"{n} x {variant}" for variant, n in self.repetitions.items())
+        return one_line(
+            f"{self.name} with {self.model}: {variants} in {len(self.conditions)} conditions "
+            f"({', '.join(self.conditions)}), sample set {self.sample_set}"
+        )
+
+    def command(self, files: Sequence[Path]) -> str:
+        """What replays it; its names may be anybody's, and are quoted for a shell."""
+        words = ["merge-runner", "replay", self.name, "--model", self.model]
+        words += ["--sample-set", str(self.sample_set)] * bool(self.sample_set)
+        words += [word for file in files for word in ("--recording", str(file))]
+        return one_line(shlex.join(words))
+
+
+def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
+    """The sweeps in recordings, less the repetitions and conditions of which no call is there.
+
+    A recording that does not say of what sweep it is has none. Raises RecordingError.
+    """
+    found = []
+    for file in files:
+        there = _conditions_and_repetitions(file)
+        for row in sweeps_of(read_provenance(file)):
+            try:
+                config = _Config.model_validate_json(row.get("config", ""))
+            except ValidationError:
+                continue
+            conditions = [one for one in config.conditions if one in there]
+            most = max((there[one] for one in conditions), default=0)
+            found.append(
+                RecordedSweep(
+                    name=row.get("name", ""),
+                    model=config.model,
+                    repetitions={v: min(n, most) for v, n in config.repetitions.items()},
+                    conditions=tuple(conditions),
+                    sample_set=config.sample_set,
+                )
+            )
+    return found
+
+
+def recorded_part(
+    files: Iterable[Path], name: str, model: str, sample_set: int
+) -> RecordedSweep | None:
+    """What recordings hold of one sweep: all that several of them, or several runs, hold of it."""
+    whole: RecordedSweep | None = None
+    for one in recorded_sweeps(files):
+        if (one.name, one.model, one.sample_set) == (name, model, sample_set):
+            whole = one if whole is None else _joined(whole, one)
+    return whole
+
+
+def _joined(one: RecordedSweep, other: RecordedSweep) -> RecordedSweep:
+    variants = dict.fromkeys([*one.repetitions, *other.repetitions])
+    repetitions = {v: max(one.repetitions.get(v, 0), other.repetitions.get(v, 0)) for v in variants}
+    conditions = tuple(dict.fromkeys([*one.conditions, *other.conditions]))
+    return replace(one, repetitions=repetitions, conditions=conditions)
+
+
+def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
+    """What recordings hold, and what to type to replay it; without files, what a cache holds.
+
+    ``entries`` are all their calls, from which it is told what no recording says.
+    """
+    named = ", ".join(map(str, files))
+    if sweeps := recorded_sweeps(files):
+        said = "; ".join(map(str, sweeps))
+        return f"{named} holds {said}. To replay it: {sweeps[0].command(files)}"
+    models: dict[str, list[CachedCall]] = {}
+    for entry in entries:
+        models.setdefault(entry.request.model, []).append(entry)
+    held = "; ".join(_counted(model, calls) for model, calls in sorted(models.items()))
+    return f"{named or 'the cache'} holds {held or 'no call at all'}"
+
+
+def _counted(model: str, calls: Sequence[CachedCall]) -> str:
+    slots = [call.request.slot for call in calls]
+    sets = sorted({slot.sample_set for slot in slots})
+    conditions = list(dict.fromkeys(slot.condition for slot in slots))
+    return one_line(
+        f"{len(calls)} calls of {model}: up to {max(slot.repetition for slot in slots)} "
+        f"repetitions in {len(conditions)} conditions ({', '.join(conditions)}), "
+        f"sample set {', '.join(map(str, sets))}"
+    )
+
+
+def _conditions_and_repetitions(file: Path) -> dict[str, int]:
+    """Each condition of which a call is recorded, and its highest repetition."""
+    with opened(file) as connection, readable(file):
+        return dict(
+            connection.execute(
+                "SELECT condition, max(repetition) FROM recording GROUP BY ALL"
+            ).fetchall()
+        )

@@ -1,0 +1,94 @@
+"""A database opens in the oldest DuckDB that is promised, with every table and view."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import duckdb
+import pytest
+
+from merge_runner.results.database import SETTINGS
+from merge_runner.results.store import query
+
+OLDEST = "1.2.2"
+READ = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+import duckdb
+connection = duckdb.connect(sys.argv[2], read_only=True)
+names = connection.execute(
+    "SELECT table_name FROM duckdb_tables() UNION ALL "
+    "SELECT view_name FROM duckdb_views() WHERE NOT internal"
+).fetchall()
+read = {name: len(connection.execute(f"FROM {name}").fetchall()) for (name,) in names}
+measured = connection.execute(sys.argv[3]).fetchall()
+print(json.dumps([duckdb.__version__, read, measured]))
+"""
+MEASURED = (
+    "SELECT driver, trial_metrics.* FROM trial_drivers JOIN trial_metrics "
+    "USING (trial_id, spec_hash) ORDER BY trial_id"
+)
+
+
+@pytest.fixture(scope="module")
+def old_client(tmp_path_factory) -> Path:
+    """A folder with the old DuckDB."""
+    folder = tmp_path_factory.mktemp("old-duckdb")
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--only-binary=:all:"]
+    done = subprocess.run(
+        [*pip, "--target", folder, f"duckdb=={OLDEST}"],
+        capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    if done.returncode:
+        pytest.skip(f"DuckDB {OLDEST} cannot be installed here: {done.stderr.strip()[-200:]}")
+    return folder
+
+
+def read_by(client: Path, db: Path) -> dict[str, int]:
+    """How many rows the old client finds in each table and view; it measures what we do."""
+    done = subprocess.run(
+        [sys.executable, "-c", READ, client, db, MEASURED],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    version, rows, measured = json.loads(done.stdout)
+    assert version == OLDEST
+    ours = [list(row) for row in query(db, MEASURED)[1]]
+    assert [row[0] for row in measured] == [row[0] for row in ours]
+    for theirs, own in zip(measured, ours, strict=True):
+        assert theirs == pytest.approx(own, nan_ok=True)
+    return rows
+
+
+@pytest.mark.slow
+async def test_an_old_duckdb_reads_every_table_and_view(merge_runner, tmp_path, old_client):
+    played = await merge_runner("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
+    assert played.code == 0, played.err
+    kept = await merge_runner("tables", "gap")  # the analysis keeps what it computes there, too
+    assert kept.code == 0, kept.err
+    rows = read_by(old_client, tmp_path / "results/merge.duckdb")
+    assert rows["trial_metrics"] == rows["trials"] == 1
+    assert min(rows[name] for name in ("states", "attempts", "finished", "geometry")) > 0
+
+
+@pytest.mark.slow
+async def test_a_database_of_a_newer_storage_version_is_brought_to_the_old_one(
+    merge_runner, tmp_path, old_client
+):
+    part = ("replay", "baseline", "--model", "constant", "--reps", 1)
+    assert (await merge_runner(*part, "--db", "new.duckdb")).code == 0
+    with duckdb.connect() as made:  # as an earlier version of the program made it
+        made.execute(f"ATTACH '{tmp_path}/new.duckdb' AS new (READ_ONLY)")
+        made.execute(f"ATTACH '{tmp_path}/old.duckdb' AS old (STORAGE_VERSION 'latest')")
+        made.execute("COPY FROM DATABASE new TO old; UPDATE old.meta SET schema_version = 4")
+    run = await merge_runner(*part, "--db", "old.duckdb")
+    assert "was brought from schema 4 to 5" in run.err
+    rows = read_by(old_client, tmp_path / "old.duckdb")
+    assert rows["trials"] == 11
+
+
+def test_the_promised_version_is_the_one_that_is_tested():
+    assert SETTINGS["storage_compatibility_version"] == f"v{OLDEST.rsplit('.', 1)[0]}.0"

@@ -1,0 +1,78 @@
+"""The exported folder: every table and view, explained, and nothing of anybody else's replaced."""
+
+from __future__ import annotations
+
+import csv
+
+import duckdb
+
+from merge_runner.results.data_dictionary import tables
+from merge_runner.results.recording import COLUMNS, MEANINGS
+from tests.harness import PROJECT
+
+
+def rows(path):
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+async def test_every_table_and_view_is_written_as_parquet_and_csv(merge_runner, tmp_path):
+    part = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
+    assert (await merge_runner(*part)).code == 0
+    for _ in range(2):  # an earlier export is replaced
+        run = await merge_runner("export", "out")
+        assert run.code == 0, run.err
+    folder, db = tmp_path / "out", str(tmp_path / "results/merge.duckdb")
+    dictionary = rows(folder / "dictionary.csv")
+    with duckdb.connect(db, read_only=True) as connection:
+        for table in tables():
+            ((there,),) = connection.execute(f"SELECT count(*) FROM {table.name}").fetchall()
+            parquet = duckdb.read_parquet(str(folder / f"{table.name}.parquet"))
+            assert parquet.shape == (there, len(table.columns))
+            assert len(rows(folder / f"{table.name}.csv")) == there
+            told = [row["column"] for row in dictionary if row["table"] == table.name]
+            assert told == parquet.columns
+            assert f"| `{table.name}`" in (folder / "README.md").read_text()
+    (gap,) = [
+        row for row in dictionary if (row["table"], row["column"]) == ("trial_metrics", "gap_m")
+    ]
+    assert (gap["type"], gap["unit"]) == ("DOUBLE", "m")
+    assert gap["meaning"].startswith("net gap, ")
+
+
+async def test_a_folder_with_anything_else_is_left_as_it_is(merge_runner, tmp_path):
+    part = ("sweep", "baseline", "--model", "constant", "--reps", 1, "--conditions", "N_0_0")
+    assert (await merge_runner(*part)).code == 0
+    for name, content in (("notes.txt", "mine"), ("README.md", "# mine"), ("trials.csv", "mine")):
+        folder = tmp_path / name.partition(".")[0]
+        folder.mkdir()
+        (folder / name).write_text(content)
+        run = await merge_runner("export", folder)
+        assert run.code == 2
+        assert f"holds {name}, which is no export's: name another folder" in run.err
+        assert [path.read_text() for path in folder.iterdir()] == [content]
+
+
+def test_every_column_of_a_table_and_of_the_metrics_has_a_meaning():
+    for table in tables():
+        assert table.comment, table.name
+        if not table.is_view or table.name == "trial_metrics":
+            assert [column.name for column in table.columns if not column.comment] == []
+
+
+def test_the_documented_columns_are_those_of_the_code():
+    described = (PROJECT / "docs/reference/tables.md").read_text()
+    (metrics,) = [table for table in tables() if table.name == "trial_metrics"]
+    for column in metrics.columns[2:]:
+        assert f"| `{column.name}` | {column.comment.replace('|', chr(92) + '|')} |" in described
+    recording = (PROJECT / "docs/reference/recordings.md").read_text()
+    assert MEANINGS.keys() == COLUMNS.keys()
+    for name, kind in COLUMNS.items():
+        assert f"| `{name}` | {kind} | {MEANINGS[name]} |" in recording
+
+
+async def test_an_export_of_no_database_writes_nothing(merge_runner, tmp_path):
+    run = await merge_runner("export", "out")
+    assert run.code == 2
+    assert "there is no database" in run.err
+    assert list(tmp_path.iterdir()) == []
