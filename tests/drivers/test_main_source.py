@@ -34,9 +34,17 @@ _ = ARRAY
 print(Program(Mine, "brakes").source)
 """
 
+PLANNED = """
+from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.run.plan import make_plan
+
+PROGRAMS.register("mine", Program(Mine, "brakes"))
+print(make_plan("baseline", "mine+constant").config()["main"]["mine"]["braking"])
+"""
+
 
 def source(folder, *changes: tuple[str, str]):
-    text = SCRIPT
+    text = SCRIPT + PLANNED
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
@@ -53,7 +61,12 @@ def source(folder, *changes: tuple[str, str]):
 
 def test_an_edit_of_the_class_or_of_what_it_uses_is_another_driver_and_no_other_edit_is(tmp_path):
     first = source(tmp_path).stdout
-    assert len(first.strip()) == 64
+    digest, *braking = first.splitlines()
+    assert len(digest) == 64
+    assert braking[:2] == [
+        "def braking(distance_m):",
+        '    return -GAIN["near"] * math.exp(-distance_m)',
+    ]
     assert source(tmp_path, ('"brakes"', '"brakes a bit"'), ("_ = ARRAY", "_ = 1")).stdout == first
     others = {
         source(tmp_path, ('"near": 0.1', '"near": 0.2')).stdout,
