@@ -20,9 +20,9 @@ NAMED = ("LOAD_NAME", "LOAD_GLOBAL", "LOAD_FROM_DICT_OR_GLOBALS")
 def main_source(made: type) -> dict[str, str]:
     """The source of a class of ``__main__`` by its name, and of all there that it rests on.
 
-    That are the classes and functions of other cells and, as they are written in Python, the values
-    of constants. What is imported counts by its name alone. Raises UsageError for anything else,
-    such as an array: an edit of it could not be told.
+    These are the classes and functions of other cells, and the values of constants. What is
+    imported counts by its name alone. Raises UsageError for anything else, such as an array, whose
+    changes cannot be told.
     """
     there = vars(sys.modules[MAIN])
     sources: dict[str, str] = {}
@@ -47,8 +47,8 @@ def _named(made: type, name: str, thing: object) -> str:
     """What stands for something that is no code of ``__main__``."""
     if isinstance(thing, ModuleType):
         return thing.__name__
-    if callable(thing) and hasattr(thing, "__qualname__"):
-        return f"{thing.__module__}.{thing.__qualname__}"
+    if callable(thing) and hasattr(thing, "__name__"):
+        return f"{getattr(thing, '__module__', '')}.{thing.__name__}"
     try:
         if ast.literal_eval(repr(thing)) == thing:
             return repr(thing)

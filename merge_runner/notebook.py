@@ -203,8 +203,8 @@ class Study:
             plan = self.plan()
             options = self._options(plan)
             options = replace(options, replay=True, recordings=tuple(map(Path, recordings)))
-            part = any(self._wanted[each] is not None for each in PARTS)
-            plan, options, notes = replayed(plan, options, whole=part)
+            whole = any(self._wanted[each] is not None for each in PARTS)
+            plan, options, notes = replayed(plan, options, whole=whole)
             for note in notes:
                 _say(note)
             return await _played(Sweep(plan, options, say=_say), options)

@@ -11,6 +11,7 @@ SCRIPT = """
 from dataclasses import dataclass
 import math
 import numpy as np
+from numpy import exp
 from merge_runner.drivers.base import Seat
 from merge_runner.drivers.registry import Program
 
@@ -19,7 +20,7 @@ ARRAY = np.zeros(2)
 seat = ARRAY  # the name of an attribute alone
 
 def braking(distance_m):
-    return -GAIN["near"] * math.exp(-distance_m)
+    return -GAIN["near"] * exp(-distance_m) * math.pi
 
 @dataclass
 class Mine:
@@ -65,12 +66,12 @@ def test_an_edit_of_the_class_or_of_what_it_uses_is_another_driver_and_no_other_
     assert len(digest) == 64
     assert braking[:2] == [
         "def braking(distance_m):",
-        '    return -GAIN["near"] * math.exp(-distance_m)',
+        '    return -GAIN["near"] * exp(-distance_m) * math.pi',
     ]
     assert source(tmp_path, ('"brakes"', '"brakes a bit"'), ("_ = ARRAY", "_ = 1")).stdout == first
     others = {
         source(tmp_path, ('"near": 0.1', '"near": 0.2')).stdout,
-        source(tmp_path, ("math.exp(-", "math.exp(+")).stdout,
+        source(tmp_path, (" exp(-", " exp(+")).stdout,
         source(tmp_path, ("range(2)", "range(3)")).stdout,
         source(tmp_path, ("@dataclass", "@dataclass(slots=True)")).stdout,
     }
