@@ -1,13 +1,21 @@
 """Analyses of what lies in the results database, for a notebook as for the command line.
 
->>> from analysis import Study, table
->>> study = Study("results/merge.duckdb")
->>> table(study, "gap")
+>>> from analysis import table
+>>> table("results/merge.duckdb", "gap")
+
+``Study`` holds what such a database has of its trials, to make several tables of it; a study that
+can be run is ``merge_runner.Study``.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from analysis.data.load import load, load_trials
+    from analysis.data.study import Study
+    from analysis.tables import TABLES, table
 
 # Names are loaded when they are used: the command line must not wait for pandas.
 _PLACES = {

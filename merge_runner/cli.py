@@ -6,11 +6,11 @@ import errno
 import gc
 import json
 import math
+import shlex
 import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from enum import StrEnum
 from itertools import chain
@@ -180,6 +180,18 @@ def common(
 
 
 @app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
+) -> None:
+    """Write a folder with a study that runs as it is, to be changed into your own."""
+    from merge_runner.study.folder import write_folder
+
+    for path in write_folder(folder):
+        say(f"wrote {path}")
+    print_out(f"go on: cd {shlex.quote(str(folder))} && merge-runner sweep study.toml")
+
+
+@app.command()
 def sweep(
     name: NameArgument,
     model: ModelOption = None,
@@ -230,7 +242,10 @@ def sweep(
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
+    import asyncio
+
     from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.unsent import unsent
     from merge_runner.run.until import deadline
 
     if max_cost is not None and not math.isfinite(max_cost):
@@ -274,7 +289,7 @@ def sweep(
         for note in notes:
             say(note)
     if dry_run:
-        _print_estimate(_dry_run(plan, options), as_json=as_json)
+        _print_estimate(asyncio.run(unsent(plan, options, say=say)), as_json=as_json)
     else:
         _run(plan, options, yes=yes, as_json=as_json)
 
@@ -645,23 +660,6 @@ def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> None:
     for message in outcome.messages:
         say(f"error: {message}")
     sys.exit(outcome.exit_code)
-
-
-def _dry_run(plan: Plan, options: Options) -> Estimate:
-    """What is neither stored nor recorded yet; makes no database or cache that is not there."""
-    import asyncio
-
-    from merge_runner.results.database import readable
-    from merge_runner.run.sweep import Sweep
-
-    with tempfile.TemporaryDirectory() as folder:
-        db = readable(options.db) if options.db.is_file() else Path(folder) / "none.duckdb"
-        recorded = (options.cache / "cache.db").is_file()
-        cache = options.cache if recorded else Path(folder) / "responses"
-        prepared = Sweep(plan, replace(options, db=db, cache=cache, dry_run=True), say=say)
-        expected = asyncio.run(prepared.estimate())
-        prepared.close()
-    return expected
 
 
 def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:

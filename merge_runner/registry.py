@@ -82,6 +82,11 @@ class Registry(Mapping[str, T]):
         self._owners[name] = _owner[-1]
         return thing
 
+    def replace(self, name: str, thing: T) -> T:
+        """Like ``register``, but in place of what was registered here by ``replace`` before."""
+        with registering(f"{self.kind} {name}"):
+            return self.register(name, thing)
+
     def drop(self, owner: str) -> None:
         """Take out what an owner has registered."""
         for name in [name for name, theirs in self._owners.items() if theirs == owner]:

@@ -16,6 +16,7 @@ from analysis.commands import app
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
     *("tables", "figures", "report", "explain", "human", "ledger", "view"),
+    *("init", "export", "forget"),
 }
 # The promised options; more may be there.
 SWEEP_OPTIONS = {
@@ -31,7 +32,7 @@ def test_the_menu_is_what_was_promised():
     options = {o for p in command.commands["sweep"].params for o in p.opts}
     assert options >= SWEEP_OPTIONS
     assert set(command.commands["recording"].commands) == {"export", "import", "verify", "info"}
-    assert package.__all__ == ["__version__"]
+    assert package.__all__ == ["Study", "StudyOutcome", "__version__"]
     assert [e.value for e in entry_points(name="merge-runner")] == ["merge_runner.__main__:main"]
 
 

@@ -11,16 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import duckdb
-import numpy as np
 import pandas as pd
 from pydantic import BaseModel, JsonValue, ValidationError
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
+from merge_runner.results import frames
 from merge_runner.results.database import read_database
-from merge_runner.results.store import answer
 from merge_runner.scenarios.merge.geometry import TRACK, Track
 from merge_runner.served_model import ALIASES, PAIRS, Pair, others_among
 
@@ -87,15 +85,6 @@ SELECT one.spec_hash, base.spec_hash AS baseline, calls, count(*) AS shared
 FROM used AS one JOIN used AS base USING (call_key) JOIN totals ON totals.spec_hash = one.spec_hash
 WHERE one.variant <> 'baseline' AND base.variant = 'baseline' GROUP BY ALL ORDER BY ALL
 """
-WHOLE_NUMBERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT")
-TEXT = pd.StringDtype(na_value=np.nan)  # what pandas calls str since its version 3
-DTYPES = {
-    "VARCHAR": TEXT,
-    "JSON": TEXT,
-    "DOUBLE": "float64",
-    "FLOAT": "float64",
-    "TIMESTAMP": "datetime64[us]",
-}
 # One row a trial and window: RMSE of the speeds from the initial ones, and joint.
 DEVIATIONS = "SELECT * FROM speed_deviations ORDER BY ALL"
 # Fates of the attempts that were answered, also without a plan.
@@ -134,8 +123,7 @@ class _Spec(BaseModel):
 
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     """The rows of one read-only query; raises UsageError."""
-    with answer(Path(db), sql) as result:
-        return _frame(result)
+    return frames.load(Path(db), sql)
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
@@ -146,31 +134,7 @@ def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
 def load_each(queries: Mapping[str, str], db: Path | str = DEFAULT_DB) -> dict[str, pd.DataFrame]:
     """The rows of our own queries, by name; opening a database takes longer than most of them."""
     with read_database(Path(db)) as connection:
-        return {name: _frame(connection.execute(sql)) for name, sql in queries.items()}
-
-
-def _frame(result: duckdb.DuckDBPyConnection) -> pd.DataFrame:
-    """All rows of a result; the columns have their types also where there is no value.
-
-    Where a value is missing, truth values are ``boolean`` and whole numbers ``Int64``, which know
-    missing values; a text is ``str``, and a list or a decimal number an object.
-    """
-    columns = [(name, str(kind)) for name, kind, *_ in result.description or ()]
-    # By place, since two columns may have one name.
-    frame = pd.DataFrame(result.fetchall(), columns=range(len(columns)))
-    types = {place: _dtype(kind, frame[place]) for place, (_, kind) in enumerate(columns)}
-    frame = frame.astype({place: dtype for place, dtype in types.items() if dtype is not None})
-    frame.columns = pd.Index([name for name, _ in columns])
-    return frame
-
-
-def _dtype(kind: str, values: pd.Series) -> Any:  # noqa: ANN401 # pandas knows many
-    """The dtype of a column of this SQL type; None: as pandas finds it."""
-    if kind == "BOOLEAN":
-        return "boolean" if values.hasnans else bool
-    if kind in WHOLE_NUMBERS:
-        return "Int64" if values.hasnans else "int64"
-    return DTYPES.get(kind)
+        return {name: frames.frame(connection.execute(sql)) for name, sql in queries.items()}
 
 
 def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:

@@ -12,10 +12,11 @@ from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 from analysis.explorer.catalogue import FACTOR, Catalogue
 from analysis.explorer.reading import Row
 from merge_runner.audit.expected import ArmFacts, ModelFacts
-from merge_runner.config import both_sides, find_experiments, pair_name
+from merge_runner.config import both_sides, pair_name
 from merge_runner.drivers.registry import stand_in
 from merge_runner.results.progress_file import Standing, read_standing
 from merge_runner.study.crossing import MODEL, OPPONENT, PROMPT, SELF
+from merge_runner.study.file import study_files
 
 OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"
 SWEEPS = """
@@ -454,8 +455,7 @@ def _again(entry: ListedSweep) -> str:
 def _study_of(entry: ListedSweep) -> str:
     """The name of a sweep's study, or the file that it was read from, wherever that lies."""
     name = str(entry.row["name"])
-    known = {path.stem for path in find_experiments().glob("*.toml")}
-    return name if name in known or not entry.config.study else f"{name}.toml"
+    return name if name in study_files() or not entry.config.study else f"{name}.toml"
 
 
 def _later(entry: ListedSweep, newer: list[ListedSweep]) -> str:

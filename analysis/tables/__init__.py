@@ -78,11 +78,17 @@ def finished_tables(
     return [found[name] for name in wanted]
 
 
-def table(study: Study, name: str) -> pd.DataFrame:
-    """A table as a data frame at full precision, with the rows of its CSV; raises UsageError."""
+def table(study: Study | Path | str, name: str) -> pd.DataFrame:
+    """A table of a study, or of a database, as a data frame at full precision.
+
+    It has the rows of the table's CSV. Raises UsageError.
+    """
     import pandas as pd
 
-    (made,) = make_tables(study, [name])
+    from analysis.data.study import Study
+
+    read = study if isinstance(study, Study) else Study(study)
+    (made,) = make_tables(read, [name])
     return pd.DataFrame(value_rows(made)).set_index("row")
 
 

@@ -52,7 +52,7 @@ class ArmFacts(_Facts):
         """The part of its trials' ids that is for its factors, spelled as the plan spells it."""
         return "".join(
             f"/{name}={in_a_name(level)}"
-            for name, level in self.factors.items()
+            for name, level in sorted(self.factors.items())
             if name not in ("prompt", "opponent")
         )
 

@@ -91,7 +91,9 @@ def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
     """A new database in memory."""
     connection = duckdb.connect(config=settings)
     # DuckDB takes `python -c` for an interactive prompt: a slow query would draw into our output.
-    connection.execute("SET enable_progress_bar = false")
+    # In a notebook without ipywidgets it can draw nothing, and refuses to be told so.
+    with contextlib.suppress(duckdb.InvalidInputException):
+        connection.execute("SET enable_progress_bar = false")
     return connection
 
 

@@ -31,8 +31,8 @@ from merge_runner.study.file import (
     EVERY_CONDITION,
     EVERY_PROMPT,
     BudgetTerms,
-    Study,
     StudyFile,
+    StudySource,
     read_study,
 )
 from merge_runner.study.parts import adopt
@@ -93,7 +93,7 @@ class Plan:
     """
 
     name: str
-    study: Study
+    study: StudySource
     models: tuple[str, ...]
     arms: tuple[Arm, ...]
     entries: dict[str, ModelEntry]
@@ -292,6 +292,10 @@ class Plan:
             ]
         if self.study.is_own:
             config["study"] = {"text": self.study.text, "plugins": self.study.plugins}
+        drivers = {name for arm in self.arms for name in arm.sides.values()} & {*PROGRAMS}
+        sources = {name: PROGRAMS[name].main_source for name in sorted(drivers)}
+        if any(sources.values()):
+            config["main"] = {name: source for name, source in sources.items() if source}
         return config
 
     def _trial_id(self, arm: Arm, condition: str, repetition: int) -> str:
@@ -299,7 +303,7 @@ class Plan:
         # The prompt and the opponent stand in it already.
         levels = "".join(
             f"/{name}={in_a_name(level)}"
-            for name, level in arm.factors.items()
+            for name, level in sorted(arm.factors.items())
             if name not in (PROMPT, OPPONENT)
         )
         return f"{arm.model}/{arm.variant}/{condition}/rep{repetition:02d}{set_}{levels}"
@@ -387,7 +391,7 @@ def _conditions(
 
 
 def _repetitions(
-    study: Study, variants: Sequence[str] | None, chosen: int | None
+    study: StudySource, variants: Sequence[str] | None, chosen: int | None
 ) -> dict[str, int]:
     """The wanted prompts with their repetitions per condition; raises UsageError."""
     if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:

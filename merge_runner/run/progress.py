@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from importlib import import_module
 from typing import TYPE_CHECKING, Literal
 
 from merge_runner.llm.call import Wait
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
+CELL_EVERY_S = 0.5
 PULSE_S = 0.05
 NOTES_SHOWN = 10
 REASONS_SHOWN = 3
@@ -233,8 +235,8 @@ async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncItera
 
 @asynccontextmanager
 async def display_progress(progress: Progress) -> AsyncIterator[None]:
-    """Show the progress on stderr while the body runs, and once more at its end."""
-    show = _show_live if sys.stderr.isatty() else _show_plain
+    """Show the progress on stderr or in a notebook while the body runs, and at its end."""
+    show = _show_live if sys.stderr.isatty() else _show_in_cell if in_cell() else _show_plain
     stop = asyncio.Event()
     display = asyncio.create_task(show(progress, stop))
     pulse = asyncio.create_task(_feel_pulse(progress))
@@ -275,6 +277,24 @@ async def _show_live(progress: Progress, stop: asyncio.Event) -> None:
         for note in _notes(progress):
             console.print(Text(note))
         live.update(_table(progress), refresh=True)
+
+
+def in_cell() -> bool:
+    """Whether a notebook's cell is running."""
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
+
+
+async def _show_in_cell(progress: Progress, stop: asyncio.Event) -> None:
+    """One line below the cell, which is replaced by the next one also in a notebook's file."""
+    display = import_module("IPython.display").display
+    shown = display({"text/plain": ""}, raw=True, display_id=True)
+    ended = False
+    while not ended:
+        ended = await _stopped(stop, CELL_EVERY_S)
+        for note in _notes(progress):
+            _say(note)
+        shown.update({"text/plain": printable(_line(progress))}, raw=True)
 
 
 async def _show_plain(progress: Progress, stop: asyncio.Event) -> None:

@@ -156,7 +156,7 @@ class StudyFile(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
-class Study:
+class StudySource:
     """A study's file as it was read, with the source of its plug-ins by file name."""
 
     name: str
@@ -173,22 +173,27 @@ class Study:
         return bool(file.factors or file.prompts or file.plugins.files or own_conditions)
 
 
-def read_study(name: str) -> Study:
+def study_files() -> dict[str, Path]:
+    """The studies that a name stands for: those of the working directory, and those that ship."""
+    return {
+        file.stem: file
+        for folder in reversed(experiments())
+        for file in folder.glob("*.toml")
+        if file.stem != "models"
+    }
+
+
+def read_study(name: str) -> StudySource:
     """The study ``experiments/NAME.toml``, or that of a path; raises UsageError."""
     path = Path(name)
     if path.suffix != ".toml":
-        files = {
-            file.stem: file
-            for folder in reversed(experiments())
-            for file in folder.glob("*.toml")
-            if file.stem != "models"
-        }
+        files = study_files()
         if name not in files:
             known = ", ".join(sorted(files))
             raise UsageError(f"there is no sweep {name!r}; valid: {known}, or a path")
         path = files[name]
     file = validated(StudyFile, read_toml(path), str(path))
-    return Study(
+    return StudySource(
         name=path.stem,
         file=file,
         text=path.read_text(encoding="utf-8"),

@@ -26,16 +26,16 @@ from merge_runner.registry import (
     unregister,
 )
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
-from merge_runner.study.file import AddedText, Study, StudyCondition, StudyFile, StudyPrompt
+from merge_runner.study.file import AddedText, StudyCondition, StudyFile, StudyPrompt, StudySource
 
 LAST = "the end"
 PACKAGE = "study_plugins"
 """The package of a study's plug-ins: one imports from another by ``from .other import thing``."""
 _lock = threading.RLock()
-_adopted: list[tuple[Study, int]] = []
+_adopted: list[tuple[StudySource, int]] = []
 
 
-def adopt(study: Study) -> None:
+def adopt(study: StudySource) -> None:
     """Register what a study adds, in place of what the study before it added.
 
     Raises UsageError.
@@ -51,7 +51,7 @@ def adopt(study: Study) -> None:
         _adopted.append((study, changes()))
 
 
-def adopted() -> Study | None:
+def adopted() -> StudySource | None:
     """The study whose parts are registered now, if any."""
     return _adopted[-1][0] if _adopted else None
 

@@ -44,7 +44,7 @@ def test_models_factors_and_prompts_are_crossed_and_named_by_what_varies(plan_of
     specs = plan.trial_specs()
     assert plan.trials == len(specs) == len({spec.trial_id for spec in specs}) == 16
     named = {spec.trial_id: dict(spec.factors) for spec in specs}
-    assert named["emulator/A2/N_0_0/rep01/temperature=0.2/seed=7"] == {
+    assert named["emulator/A2/N_0_0/rep01/seed=7/temperature=0.2"] == {
         "prompt": "A2",
         "temperature": "0.2",
         "seed": "7",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pkgutil import iter_modules
 
 import numpy as np
 import pandas as pd
@@ -24,12 +25,15 @@ def test_a_notebook_gets_one_row_a_trial_with_its_metrics(in_process, tmp_path):
 def test_a_notebook_gets_the_tables_at_full_precision(study):
     frame = table(Study(study.db), "ablation-quantitative")
     assert list(frame.index) == ["human", "o3/baseline", "o3/A1", "o3/A2", "other/baseline"]
+    assert frame.equals(table(study.db, "ablation-quantitative"))
     assert frame.loc["o3/A1", "gap_m_ci_low"] < frame.loc["o3/A1", "gap_m"]
 
 
 def test_the_menu_is_small_and_loads_nothing_before_it_is_used():
     assert analysis.__all__ == ["TABLES", "Study", "load", "load_trials", "table"]
     assert all(hasattr(analysis, name) for name in analysis.__all__)
+    modules = {module.name for module in iter_modules(analysis.__path__)}
+    assert not modules & {*analysis.__all__}, "an import of the module would hide the name"
     code = "import sys, analysis.commands; print('pandas' in sys.modules or 'scipy' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
 

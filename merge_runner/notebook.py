@@ -1,0 +1,268 @@
+"""A study run from Python, as in a notebook: ``Study("study.toml").run()``, and its results.
+
+>>> from merge_runner import Study
+>>> outcome = await Study("study.toml").arun()
+>>> outcome.trials().groupby("temperature")["gap_m"].mean()
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import threading
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
+
+from merge_runner.config import resolve_endpoint
+from merge_runner.drivers.base import Driver, Seat
+from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+from merge_runner.registry import Registry
+from merge_runner.run import summary
+from merge_runner.run.estimate import Estimate
+from merge_runner.run.plan import Options, Plan, make_plan
+from merge_runner.run.recorded_plan import replayed
+from merge_runner.run.sweep import Sweep
+from merge_runner.run.unsent import unsent
+from merge_runner.study.crossing import level_text
+from merge_runner.text_safety import printable
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from pydantic import JsonValue
+
+T = TypeVar("T")
+PARTS = ("repetitions", "conditions", "variants")
+_playing = threading.Lock()
+
+
+class RunOptions(TypedDict, total=False):
+    """How a run goes on, without a change of its results: the options of ``merge-runner sweep``."""
+
+    in_flight: int
+    rpm: int | None
+    tpm: int | None
+    max_cost_usd: float | None
+    strict_model: bool
+
+
+@dataclass(frozen=True, repr=False)
+class StudyOutcome:
+    """What a run did, and its trials as data frames, those that were stored before among them.
+
+    ``exit_code`` is that of the command line: 0 where all trials ended; ``messages`` say what went
+    wrong. ``facts`` is the summary that ``merge-runner sweep --json`` prints.
+    """
+
+    exit_code: int
+    messages: list[str]
+    facts: dict[str, Any]
+    db: Path
+    sweep_id: str
+    text: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether all trials ended, and nothing went wrong."""
+        return self.exit_code == 0
+
+    def __repr__(self) -> str:
+        """The summary, and what went wrong, for a reader."""
+        return "\n".join([self.text, *(f"error: {message}" for message in self.messages)])
+
+    def trials(self) -> pd.DataFrame:
+        """One row a trial, with its measures in SI units and a column for each factor.
+
+        A factor is of numbers where all its levels are numbers, of truth values likewise.
+        """
+        from merge_runner.results.frames import with_factors
+
+        return with_factors(self._rows("trials"), self._rows("trial_factors"))
+
+    def decisions(self) -> pd.DataFrame:
+        """One row a decision."""
+        return self._rows("decisions")
+
+    def calls(self) -> pd.DataFrame:
+        """One row an attempt at a call."""
+        return self._rows("calls")
+
+    def states(self) -> pd.DataFrame:
+        """One row a vehicle and step."""
+        return self._rows("states")
+
+    def sql(self, query: str) -> pd.DataFrame:
+        """The rows of one read-only query over the whole database; raises UsageError."""
+        from merge_runner.results.frames import load
+
+        return load(self.db, query)
+
+    def _rows(self, table: str) -> pd.DataFrame:
+        from merge_runner.results.frames import load_of_sweep
+
+        return load_of_sweep(self.db, self.sweep_id, table)
+
+
+class Study:
+    """A study that can be run: a sweep of ``experiments``, or a file, and what of it is wanted.
+
+    ``models``, ``repetitions``, ``conditions`` and ``prompts`` take the place of what the file
+    says; ``only`` names a level, or a list of levels, by factor. ``arun``, ``areplay`` and
+    ``adry_run`` are awaited, as in a notebook; ``run``, ``replay`` and ``dry_run`` are for scripts.
+
+    All of them raise UsageError for what cannot be run as it is asked for. What goes wrong on the
+    way is in the outcome, beside the trials that ended: the same call goes on from there.
+    """
+
+    def __init__(
+        self,
+        file: Path | str,
+        *,
+        db: Path | str = DEFAULT_DB,
+        cache: Path | str = DEFAULT_CACHE,
+        models: Sequence[str] | str = (),
+        only: Mapping[str, JsonValue] | None = None,
+        repetitions: int | None = None,
+        conditions: Sequence[str] | None = None,
+        prompts: Sequence[str] | None = None,
+        sample_set: int = 0,
+    ) -> None:
+        self.file = str(file)
+        self.db, self.cache = Path(db), Path(cache)
+        self._wanted: dict[str, Any] = {
+            "models": models,
+            "repetitions": repetitions,
+            "conditions": conditions,
+            "variants": prompts,
+            "sample_set": sample_set,
+            "only": {name: _texts(levels) for name, levels in (only or {}).items()},
+        }
+
+    def register(self, registry: Registry[T], name: str, thing: T) -> T:
+        """Add a prompt, a condition, a metric, ... to its registry, and return it.
+
+        It takes the place of what was so added by this name, so that a cell can be run again.
+        Raises UsageError where the name is that of something else.
+        """
+        return registry.replace(name, thing)
+
+    def register_driver(
+        self,
+        name: str,
+        driver: Callable[[Seat], Driver],
+        meaning: str,
+        parameters: Mapping[str, float] | None = None,
+        rate_hz: float | None = None,
+    ) -> None:
+        """Add a driver; see ``Program``. Where its source is edited, it is another driver."""
+        program = Program(driver, meaning, parameters or {}, rate_hz)
+        self.register(PROGRAMS, name, program)
+
+    def plan(self) -> Plan:
+        """What would be played; raises UsageError."""
+        return make_plan(self.file, **self._wanted)
+
+    def dry_run(self, max_cost_usd: float | None = None) -> Estimate:
+        """The trials, calls, tokens, cost and time of a run; nothing is sent."""
+        return _now(self.adry_run(max_cost_usd), "adry_run")
+
+    async def adry_run(self, max_cost_usd: float | None = None) -> Estimate:
+        """See ``dry_run``."""
+        plan = self.plan()
+        return await unsent(plan, self._options(plan, max_cost_usd=max_cost_usd), say=_say)
+
+    def run(self, *, yes: bool = False, **how: Unpack[RunOptions]) -> StudyOutcome:
+        """Play all trials that are not stored yet; ``yes`` lets it spend money."""
+        return _now(self.arun(yes=yes, **how), "arun")
+
+    async def arun(self, *, yes: bool = False, **how: Unpack[RunOptions]) -> StudyOutcome:
+        """See ``run``."""
+        with _alone():
+            plan = self.plan()
+            options = self._options(plan, **how)
+            prepared = Sweep(plan, options, say=_say)
+            if prepared.trials_to_play:
+                try:
+                    await _check(plan, prepared, may_spend=yes)
+                except MergeRunnerError:
+                    prepared.close()
+                    raise
+            return await _played(prepared, options)
+
+    def replay(self, *recordings: Path | str) -> StudyOutcome:
+        """Play all trials from recorded replies alone, those of the files first; sends nothing."""
+        return _now(self.areplay(*recordings), "areplay")
+
+    async def areplay(self, *recordings: Path | str) -> StudyOutcome:
+        """See ``replay``."""
+        with _alone():
+            plan = self.plan()
+            options = self._options(plan)
+            options = replace(options, replay=True, recordings=tuple(map(Path, recordings)))
+            whole = any(self._wanted[each] is not None for each in PARTS)
+            plan, options, notes = replayed(plan, options, whole=whole)
+            for note in notes:
+                _say(note)
+            return await _played(Sweep(plan, options, say=_say), options)
+
+    def _options(self, plan: Plan, **how: Unpack[RunOptions]) -> Options:
+        return plan.within_budget(Options(self.db, self.cache, **how))
+
+
+def _texts(levels: JsonValue) -> list[str]:
+    return [level_text(level) for level in (levels if isinstance(levels, list) else [levels])]
+
+
+@contextmanager
+def _alone() -> Iterator[None]:
+    """What a study adds is registered for the whole process, so one is played at a time."""
+    if not _playing.acquire(blocking=False):
+        raise UsageError("another study is running in this process: wait for its end")
+    try:
+        yield
+    finally:
+        _playing.release()
+
+
+async def _check(plan: Plan, prepared: Sweep, *, may_spend: bool) -> None:
+    """Raise UsageError where a key is missing, or where money is spent without leave."""
+    for name, entry in plan.entries.items():
+        resolve_endpoint(name, entry)
+    if may_spend or all(entry.price == "free" for entry in plan.entries.values()):
+        return
+    expected = await prepared.estimate()
+    cost = "an unknown sum" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
+    raise UsageError(
+        f"this run spends {cost} for {expected.trials} trials: yes=True goes ahead, dry_run() "
+        "tells more"
+    )
+
+
+async def _played(prepared: Sweep, options: Options) -> StudyOutcome:
+    outcome = await prepared.run()
+    return StudyOutcome(
+        exit_code=outcome.exit_code,
+        messages=outcome.messages,
+        facts=summary.as_dict(outcome, options, None),
+        db=options.db,
+        sweep_id=outcome.sweep_id,
+        text="\n".join(summary.as_lines(outcome, options, None)),
+    )
+
+
+def _now(work: Coroutine[Any, Any, T], awaited: str) -> T:
+    """The result of a coroutine where no event loop is running."""
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return asyncio.run(work)
+    work.close()
+    raise UsageError(f"an event loop is running, as in a notebook: await study.{awaited}(...)")
+
+
+def _say(text: str) -> None:
+    print(printable(text), file=sys.stderr, flush=True)  # noqa: T201 # messages beside the results

@@ -1,0 +1,25 @@
+"""What a run would still send, found out without it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from merge_runner.results.database import readable
+from merge_runner.run.estimate import Estimate
+from merge_runner.run.plan import Options, Plan
+from merge_runner.run.sweep import Sweep
+
+
+async def unsent(plan: Plan, options: Options, *, say: Callable[[str], None]) -> Estimate:
+    """What is neither stored nor recorded yet; makes no database or cache that is not there."""
+    with tempfile.TemporaryDirectory() as folder:
+        db = readable(options.db) if options.db.is_file() else Path(folder) / "none.duckdb"
+        recorded = (options.cache / "cache.db").is_file()
+        cache = options.cache if recorded else Path(folder) / "responses"
+        prepared = Sweep(plan, replace(options, db=db, cache=cache, dry_run=True), say=say)
+        expected = await prepared.estimate()
+        prepared.close()
+    return expected

@@ -1,0 +1,31 @@
+"""What this study adds. An edited driver is another one: its trials are played anew."""
+
+from analysis.metrics import Metric, register
+from merge_runner.drivers.base import Seat
+from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.records import Decision, Observation
+
+
+class HesitantDriver:
+    """Brakes a little before the merge point, and keeps its speed behind it."""
+
+    def __init__(self, seat: Seat) -> None:
+        self.seat = seat
+
+    async def decide(self, observation: Observation, number: int) -> Decision:
+        """Hold an acceleration, from -1 to 1, until the next decision."""
+        return self.seat.held(0.0 if observation.distance_to_merge_m is None else -0.1)
+
+
+PROGRAMS.register("hesitant", Program(HesitantDriver, "brakes a little before the merge point"))
+register(
+    Metric(
+        name="lowest_speed_mps",
+        label="lowest speed",
+        unit="m/s",
+        meaning="the lowest speed of either vehicle",
+        phrase="the lowest speed",
+        value="""(SELECT min(velocity_mps) FROM states WHERE states.trial_id = trials.trial_id
+            AND states.spec_hash = trials.spec_hash AND time_s >= 0)""",
+    )
+)

@@ -1,0 +1,79 @@
+"""The page about a study's file: every key is there, and every example can be played."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+import pytest
+from pydantic import BaseModel
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.prompts.blocks import BLOCKS, Fields
+from merge_runner.run.plan import Options, make_plan
+from merge_runner.study.file import StudyFile
+from tests.harness import PROJECT
+
+PAGE = (PROJECT / "docs/how-to/run-a-study.md").read_text()
+EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n+```toml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
+
+
+def keys(model: type[BaseModel]):
+    """The keys of a table of the file, and of those within it but the scenario's."""
+    yield from model.model_fields
+    for inner in getattr(model, "nested", {}).values():
+        if inner is not ScenarioConfig:
+            yield from keys(inner)
+
+
+def plan_of(folder, example, **asked):
+    (folder / "study.toml").write_text(EXAMPLES[example])
+    (folder / "plugin.py").touch()
+    return make_plan(str(folder / "study.toml"), **asked)
+
+
+@pytest.mark.parametrize(
+    ("example", "arms"),
+    [
+        ("Who, how often, where", 2),
+        ("What varies", 12 + 6),
+        ("Prompts", 4),
+        ("The driving task", 1),
+        ("Money and plug-ins", 2),
+    ],
+)
+def test_every_example_can_be_played(example, arms, tmp_path):
+    plan = plan_of(tmp_path, example)
+    assert len(plan.arms) == arms
+    assert len(plan.trial_specs()) == plan.trials
+    plan.within_budget(Options(tmp_path / "db", tmp_path / "cache"))
+
+
+def test_no_example_is_left_out():
+    assert len(EXAMPLES) == PAGE.count("```toml\n") == 5
+
+
+def test_every_key_is_explained_and_shown_in_an_example():
+    explained = re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL)
+    shown = "\n".join(EXAMPLES.values())
+    for key in keys(StudyFile):
+        if key != "name":  # of a condition, and of the scenario
+            assert f"`{key}" in explained, key
+        assert re.search(rf"\b{key}\b", shown) or key == "text", key
+    for text in EXAMPLES.values():
+        StudyFile.model_validate(tomllib.loads(text))
+
+
+def test_all_fields_and_blocks_of_a_prompt_are_named():
+    (fields,) = re.findall(r"<!-- fields -->(.*?)<!-- end -->", PAGE, re.DOTALL)
+    assert re.findall(r"`(\w+)`", fields) == list(Fields.__annotations__)
+    for block in BLOCKS:
+        assert f"`{block}`" in PAGE
+
+
+def test_combinations_that_skip_names_are_left_out(tmp_path):
+    plan = plan_of(tmp_path, "What varies")
+    found = [(arm.sides["left"], *arm.factors.values()) for arm in plan.arms]
+    assert not [arm for arm in found if arm[0] == "o3" and "0.2" in arm]
+    assert not [arm for arm in found if {"A2", "projected-order"} <= {*arm}]
+    assert len(found) == len({*found})
