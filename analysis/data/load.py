@@ -51,7 +51,8 @@ SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
     list(velocity_mps ORDER BY step) AS velocity_mps,
     any_value(resisted) AS resisted
 FROM states JOIN (
-    SELECT spec_hash, coalesce(spec->>'$.source', spec->>'$.scenario.resistance') = 'human'
+    SELECT spec_hash,
+        coalesce(spec->>'$.source', spec->>'$.scenario.resistance', '') = 'human'
         AS resisted FROM specs
 ) USING (spec_hash) WHERE time_s >= 0 GROUP BY ALL ORDER BY ALL
 """

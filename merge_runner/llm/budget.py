@@ -239,8 +239,8 @@ class Budget:
             beside_usd = self._needed_usd(pot, begun) + self._before_usd(pot, trial)
             left_usd = pot.left_usd(spending) - pot.part(needed) + TOLERANCE_USD
             if left_usd < 0 and not begun and not pot.in_flight:
-                if not self.costs.is_measured(trial):
-                    continue  # it shows what a trial costs; each attempt must still fit
+                if not any(map(spending.committed_for, needed)):
+                    continue  # the first one shows what a trial costs; each attempt must still fit
                 raise self._suspended(
                     f"a whole trial may cost {pot.part(needed):.2f} USD", pot, spending
                 )

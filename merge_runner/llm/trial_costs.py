@@ -73,10 +73,6 @@ class TrialCosts:
             self._expected[cell] = {model: self._usd(cell, model) for model in calls}
         return self._expected[cell]
 
-    def is_measured(self, trial: int) -> bool:
-        """Whether any answer of each of the trial's models is measured."""
-        return all(self._by_model[model].number for model in self.of(trial))
-
     def learn(self, trial: int, model: str, usd: float) -> None:
         """An answer to a call of this trial cost so much."""
         self._by_model[model].add(usd)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from merge_runner.errors import UsageError
+from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.results.recorded_study import recorded_part
@@ -39,16 +39,20 @@ def _shipped(plan: Plan, folder: Path) -> Path | None:
 
 
 def _has_replies(folder: Path, plan: Plan) -> bool:
+    """Whether a cache holds replies of the plan's models, or is one that cannot be read here."""
     if not (folder / "cache.db").is_file():
         return False
+    ids = {entry.id for entry in plan.entries.values()}
+    unreadable: list[str] = []
     try:
         cache = ResponseCache(folder, read_only=True)
-    except UsageError:
-        return True  # of another version, which says so when the replay opens it
-    try:
-        return any(cache.stats(entry.id).totals for entry in plan.entries.values())
-    finally:
-        cache.close()
+        try:
+            found = any(entry.request.model in ids for entry in cache.entries(unreadable))
+        finally:
+            cache.close()
+    except MergeRunnerError:
+        return True  # it says so when the replay opens it
+    return found or bool(unreadable)
 
 
 def as_recorded(plan: Plan, recordings: Sequence[Path]) -> tuple[Plan, str]:

@@ -307,10 +307,15 @@ async def test_trials_begin_in_their_order_and_the_first_is_never_overtaken(ledg
     assert begun == [1, 2, 3, 4]
 
 
-async def test_without_money_for_a_whole_trial_none_begins(ledger):
+async def test_without_money_for_a_whole_trial_the_first_one_alone_begins(ledger):
     budget = Budget(ledger, Caps(3.0), each(4.0))
+    await budget.admit(1)  # or it would never be known that a trial costs less
+    other = await soon(budget.admit(2))
+    assert not other.done()
+    await attempt(budget, 1, 1.0, 1.0)
+    budget.leave(1)
     with pytest.raises(TrialSuspended, match=r"a whole trial may cost 4\.00 USD"):
-        await budget.admit(1)
+        await other
 
 
 async def test_a_begun_trial_is_paid_before_another_begins(ledger):

@@ -170,7 +170,7 @@ async def test_a_replay_that_finds_nothing_stores_nothing_and_says_what_is_recor
         f"{RECORDING} holds baseline with emulator: 10 x baseline in 11 conditions"
     ) in run.err
     assert f"merge-runner replay baseline --model emulator --recording {RECORDING}" in run.err
-    cached = await merge_runner("replay", "baseline", "--reps", 1)
+    cached = await merge_runner("replay", "ablations", "--reps", 1)
     assert cached.code == 4
     assert "the cache holds no call at all" in cached.err
 
@@ -308,7 +308,7 @@ async def test_a_recording_that_was_tampered_with_is_refused_whole(
         assert says in run.err
         assert "Traceback" not in run.err
     left = await merge_runner("replay", "baseline", "--reps", 1, "--conditions", "N_0_0")
-    assert left.code == 4, "nothing of it entered the cache"
+    assert "ships with merge-runner" in left.err, "nothing of it entered the cache"
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from itertools import pairwise
 from math import sqrt
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from analysis.data.load import load, load_trials
@@ -156,7 +157,7 @@ def test_every_measure_of_random_trials_equals_its_definition(drives, scenario, 
         if record.status != "finished":
             for name in ("gap_m", "gap_first_sample_m", "gap_mean100_m", "rmse_mps", "joint",
                          "post_encroachment_s", "merge_interval_s"):  # fmt: skip
-                assert row[name] is None or np.isnan(row[name]), name
+                assert pd.isna(row[name]), name
             continue
         positions = at(trace, first)
         assert row["gap_m"] == pytest.approx(abs(positions[0] - positions[1]) - length_m)
