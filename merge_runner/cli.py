@@ -279,6 +279,8 @@ def sweep(
         order_seed=order_seed,
         only=levels(only or (), "--only"),
     )
+    for note in plan.notes():
+        say(note)
     if not replay:
         options = plan.within_budget(options)
     else:

@@ -175,6 +175,13 @@ class Plan:
         Caps(budget.total_usd, budget.split).check(paid, sides | {*self.registered.values()})
         return replace(options, max_cost_usd=total_usd, split_usd=budget.split)
 
+    def notes(self) -> Iterator[str]:
+        """What a user may have meant otherwise."""
+        prompts = self.study.file.prompts
+        used = {*self.repetitions, *(prompt.based_on for prompt in prompts.values())}
+        if unused := [name for name in prompts if name not in used]:
+            yield f"note: not played, though {self.study.path} has them: {', '.join(unused)}"
+
     @property
     def capped_by(self) -> str:
         """Where a user raises what may be spent."""
@@ -402,12 +409,11 @@ def _repetitions(
     listed = levels or [*given] or ["baseline"] * (for_all is not None)
     for variant in (*given, *listed, *(variants or ())):
         blocks_of(variant)
-    bases = {prompt.based_on for prompt in study.file.prompts.values()}
-    for name in [*study.file.prompts, *given]:
-        if name not in {*listed, *bases, *(variants or ())}:
+    for name in given:
+        if name not in {*listed, *(variants or ())}:
             raise UsageError(
-                f"the prompt {name} is in {study.path} and never played: name it in the factor "
-                f"{PROMPT}, which has {', '.join(listed) or 'none'}"
+                f"{study.path} has repetitions for {name}, which is never played: name it in the "
+                f"factor {PROMPT}, which has {', '.join(listed)}"
             )
     wanted: dict[str, int] = {}
     for variant in listed if variants is None else variants:

@@ -158,6 +158,13 @@ def test_a_split_budget_suits_a_part_of_the_study(plan_of, tmp_path):
         assert (caps.total_usd, caps.by_model["o3"]) == (5, 3)
 
 
+def test_a_prompt_that_is_not_played_is_noted(plan_of):
+    text = '[prompts.x]\nremove = ["C2"]\n[prompts.y]\nbased_on = "x"\n'
+    (note,) = plan_of(text).notes()
+    assert note.endswith("has them: y")
+    assert not list(plan_of(text, variants=["y"], repetitions=1).notes())
+
+
 def test_plain_sweeps_have_one_arm_for_each_prompt():
     plan = make_plan("ablations", "emulator")
     assert [arm.label for arm in plan.arms] == ["baseline", *(f"A{i}" for i in range(1, 8))]
@@ -182,7 +189,6 @@ def test_plain_sweeps_have_one_arm_for_each_prompt():
         ("[factors]\ntemperature = [3]\n", [], "temperature = 3 is no number from 0 to 2"),
         ("[factors]\nskip = [1]\n", [], "skip is no factor: write it above [factors]"),
         ('[factors]\nopponent = ["self", "emulator"]\n', [], "are the same trials: leave one out"),
-        ('[prompts.x]\nremove = ["C2"]\n', [], "the prompt x is in"),
         ("[factors]\ntemperature = [0.2]\n", ["o3"], "no parameter temperature but its default"),
         ("[factors]\ntemperature = [0.2]\n", ["o3"], 'skip = [{ model = "o3", temperature = 0.2'),
         ("[factors]\ntemperature = [0.2]\n", ["constant"], "is a program and takes no temperature"),

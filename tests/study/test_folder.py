@@ -75,9 +75,9 @@ async def test_the_commands_of_its_readme_and_its_makefile_work(merge_runner, st
     assert targets.stdout.splitlines() == [
         "merge-runner sweep study.toml --db x",
         "merge-runner replay study.toml --db x",
-        "merge-runner tables --db x",
-        "merge-runner report --db x",
-        "merge-runner view --db x",
+        "merge-runner tables --study study.toml --db x",
+        "merge-runner report --study study.toml --db x",
+        "merge-runner view --study study.toml --db x",
     ]
 
 
