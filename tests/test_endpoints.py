@@ -3,7 +3,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.config import (
-    PROJECT,
     PROVIDERS,
     ModelEntry,
     Price,
@@ -17,6 +16,7 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import read_models
 from merge_runner.study.file import read_study
+from tests.harness import PROJECT
 
 REGISTRY = PROJECT / "experiments/models.toml"
 KEYS = {f"{name}_API_KEY": "k" for name in ("OPENAI", "GEMINI", "ANTHROPIC", "OPENROUTER")}

@@ -32,7 +32,7 @@ THREADS = 2
 BATCH = 64  # rows fetched at once: each may be large
 COLUMNS = 1000
 NAME = 200
-PLAN_TEXT = 200_000  # characters: a part of a plan of execution says little
+PLAN_TEXT = 400_000
 CELL_COSTS = 30  # bytes of a cell of the page, beside its text
 LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
 # What Python gets for infinite timestamps.

@@ -498,7 +498,7 @@ def _copy_table(connection: duckdb.DuckDBPyConnection, table: str) -> None:
     """Copy a table, some rows at a time: all rows of a transaction are in memory at once."""
     row = connection.execute(f"SELECT coalesce(max(rowid), -1) FROM {table}").fetchone()  # noqa: S608 # our tables
     assert row is not None
-    size = COPIED_AT_ONCE if table in ("calls", "decisions") else row[0] + 1
+    size = COPIED_AT_ONCE if table in ("calls", "decisions") else max(1, row[0] + 1)
     for first in range(0, row[0] + 1, size):
         connection.execute(
             f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # our tables

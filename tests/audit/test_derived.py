@@ -26,6 +26,7 @@ conditions = ["L_4_0"]
 factors = { opponent = ["constant"] }
 """
 MIXED = ("sweep", "study.toml")
+PART = ("--reps", 1, "--conditions", "L_4_0")
 # Of which row a value is changed, and to what, where another row or value tells more.
 ROWS = {
     "states": "step = 9 AND side = 'left'",
@@ -212,7 +213,7 @@ async def test_each_format_is_read_anew_as_it_was_read(merge_runner, tmp_path, m
     keys = dict.fromkeys(("OPENAI_API_KEY", "GEMINI_API_KEY", "ANTHROPIC_API_KEY"), "x")
     async with watched(as_a_model, honest=False) as server:
         run = await merge_runner(
-            "sweep", "baseline", "--model", model, *MIXED[4:], "--yes", "--rpm", 10**6,
+            "sweep", "baseline", "--model", model, *PART, "--yes", "--rpm", 10**6,
             "--tpm", 10**9, **keys, **{variable: server.url + path},
         )  # fmt: skip
     assert run.code == 0, run.err
@@ -248,6 +249,8 @@ async def test_answers_that_were_exchanged_before_they_were_kept_are_found(
     (finding, *_) = audit_recording(tmp_path / "swapped.parquet").findings
     assert (finding.kind, finding.decision) == ("derived", 2)
     # The trial goes another way after the first of them, so that it ends for want of a reply.
-    await merge_runner("replay", *MIXED[1:], "--cache", "swapped")
+    await merge_runner(
+        "replay", "baseline", "--model", "emulator+constant", *PART, "--cache", "swapped"
+    )
     texts = {f.decision: f.text for f in findings(tmp_path / "results/merge.duckdb")}
     assert "the answer to another request" in texts[2]

@@ -278,7 +278,7 @@ async def test_a_slot_that_is_no_slot_gives_400(emulator, driving_prompt, slot):
     "changes",
     [
         {"weather": "rain"},
-        {"condition": "X_1_1"},
+        {"condition": None},
         {"condition": ["N_0_0"]},
         {"repetition": "first"},
         {"repetition": None},

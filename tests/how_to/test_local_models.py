@@ -64,7 +64,7 @@ def registry(tmp_path):
     ],
 )
 async def test_an_entry_of_the_page_sends_what_the_page_says(merge_runner, registry, name, sent):
-    entry = read_models(registry)[name]
+    entry = read_models(registry / "models.toml")[name]
     body = FORMATS[entry.format].request(entry, "prompt").body
     assert sent.items() <= body.items()
     if entry.base_url is not None:

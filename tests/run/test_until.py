@@ -86,7 +86,7 @@ async def test_at_its_time_a_sweep_begins_no_trial_and_the_same_command_goes_on(
 
 async def test_what_does_not_end_in_a_while_is_stopped_as_by_ctrl_c(tmp_path, monkeypatch):
     async def middle(request, handler):
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0.5)  # so that no trial can end in time
         return await handler(request)
 
     monkeypatch.setattr("merge_runner.run.sweep.GRACE_S", 0.3)
@@ -94,7 +94,7 @@ async def test_what_does_not_end_in_a_while_is_stopped_as_by_ctrl_c(tmp_path, mo
     async with watched(middle) as server:
         monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
         plan = make_plan("baseline", "emulator", repetitions=1, conditions=["N_0_0", "L_4_0"])
-        until = datetime.now().astimezone() + timedelta(seconds=0.5)
+        until = datetime.now().astimezone() + timedelta(seconds=2)
         options = Options(tmp_path / "m.duckdb", tmp_path / "c", until=until)
         outcome = await Sweep(plan, options, say=said.append).run()
         assert outcome.exit_code == INTERRUPTED

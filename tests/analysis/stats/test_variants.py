@@ -145,7 +145,7 @@ def test_every_group_has_a_row_a_term_and_only_variants_a_difference(study, tabl
     assert [row.id for row in table.rows] == [f"{g.id}/{t}" for t in terms for g in study.groups]
     for row in table.rows:
         assert (row.values.get("difference") is not None) == ("/A" in row.id)
-        assert row.reference == ("o3/baseline" if "/A" in row.id else "")
+        assert row.references == (("o3/baseline",) if "/A" in row.id else ())
 
 
 @pytest.mark.parametrize(("name", "paper"), [*zip(NAMES, ("who-first", "gap"), strict=True)])
