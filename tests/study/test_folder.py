@@ -66,7 +66,17 @@ async def test_the_commands_of_its_readme_and_its_makefile_work(merge_runner, st
         done = await merge_runner(*words, cwd=study)
         assert done.code == 0, (words, done.err)
     targets = subprocess.run(
-        ["make", "-n", "sweep", "replay", "tables", "report", "view", "ARGS=--db x"],
+        [
+            "make",
+            "--no-print-directory",
+            "-n",
+            "sweep",
+            "replay",
+            "tables",
+            "report",
+            "view",
+            "ARGS=--db x",
+        ],
         cwd=study,
         capture_output=True,
         text=True,
