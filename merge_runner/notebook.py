@@ -12,7 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
 
@@ -201,8 +201,8 @@ class Study:
         """See ``replay``."""
         with _alone():
             plan = self.plan()
-            options = self._options(plan)
-            options = replace(options, replay=True, recordings=tuple(map(Path, recordings)))
+            files = tuple(map(Path, recordings))
+            options = Options(self.db, self.cache, replay=True, recordings=files)
             whole = any(self._wanted[each] is not None for each in PARTS)
             plan, options, notes = replayed(plan, options, whole=whole)
             for note in notes:

@@ -192,12 +192,6 @@ class Plan:
         """The arms by the labels that their trials carry."""
         return {arm.label: arm for arm in self.arms}
 
-    def parts(self) -> Iterator[tuple[str, Plan]]:
-        """Each arm with its label, as a plan of its own."""
-        for arm in self.arms:
-            endpoints = {name: self.endpoints[name] for name in arm.entries}
-            yield arm.label, replace(self, arms=(arm,), entries=arm.entries, endpoints=endpoints)
-
     def with_entries(self, entries: dict[str, ModelEntry]) -> Plan:
         """The same with other entries for the same names, in its arms too."""
         arms = (
