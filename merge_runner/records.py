@@ -59,7 +59,9 @@ class Observation:
     ``relative_distance_m`` is the other's travelled distance minus the own one, so that it is
     positive while the other is ahead. ``distance_to_merge_m`` is None on the straight road.
     The histories are oldest first, one value per simulation step: the accelerations that the own
-    vehicle executed, and the speeds at which the other was seen before now.
+    vehicle executed, and the speeds at which the other was seen before now. ``own_position_m`` is
+    travelled along the own branch; ``other_acceleration_mps2`` is what the other executed over the
+    last step, 0 before the first. Programs see these two; no prompt tells them.
     """
 
     road: Road
@@ -69,6 +71,8 @@ class Observation:
     distance_to_merge_m: float | None
     own_accelerations_mps2: tuple[float, ...]
     other_speeds_mps: tuple[float, ...]
+    own_position_m: float
+    other_acceleration_mps2: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ OTHER_PLAN = tuple(-a for a in PLAN)
 ZEROS = (0.0,) * 5
 INVALID = "I would rather not say."
 
-SEEN = Observation("merge", 10.0, 10.0, 0.0, 50.0, (0.0,) * 10, (10.0,) * 10)
+SEEN = Observation("merge", 10.0, 10.0, 0.0, 50.0, (0.0,) * 10, (10.0,) * 10, 50.0, 0.0)
 REQUEST = ChatRequest(
     key="key",
     provider="test",

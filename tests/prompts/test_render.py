@@ -32,6 +32,8 @@ FIRST = Observation(
     distance_to_merge_m=42.46153846153847,
     own_accelerations_mps2=(0.0,) * 10,
     other_speeds_mps=(10.4,) * 10,
+    own_position_m=57.53846153846153,
+    other_acceleration_mps2=0.0,
 )
 MID_RUN = Observation(
     road="merge",
@@ -41,8 +43,16 @@ MID_RUN = Observation(
     distance_to_merge_m=12.3456,
     own_accelerations_mps2=(0.0,) * 5 + (0.5, 0.75, 1.0, 1.25, 2.5),
     other_speeds_mps=(10.4, 10.3, 10.1, 9.9, 9.75, 9.6, 9.45, 9.3, 9.2, 9.1),
+    own_position_m=87.6544,
+    other_acceleration_mps2=-0.4375,
 )
-STRAIGHT = replace(MID_RUN, road="straight", relative_distance_m=8.375, distance_to_merge_m=None)
+STRAIGHT = replace(
+    MID_RUN,
+    road="straight",
+    relative_distance_m=8.375,
+    distance_to_merge_m=None,
+    own_position_m=102.5,
+)
 REST_OF_PLAN = (0.3, 0.25, 0.2, 0.15, 0.1, 0.05, 0.0, 0.0, -0.05, -0.1, -1.0, -0.5, 0.0, 1.0, 0.5)
 
 FORMS = {
@@ -129,7 +139,9 @@ def test_no_prompt_tells_left_from_right(form):
 
 @pytest.mark.parametrize("value", [-0.0, -0.001, -0.00499])
 def test_a_value_that_rounds_to_zero_has_no_sign(value):
-    seen = Observation("merge", value, value, value, value, (value,) * 10, (value,) * 10)
+    seen = Observation(
+        "merge", value, value, value, value, (value,) * 10, (value,) * 10, value, value
+    )
     prompt = render_prompt(seen, (value,) * 15, variant="baseline", scenario=ScenarioConfig())
     assert "-0.00" not in prompt
     # Three speeds and distances, one to the merge point, two histories and the plan.

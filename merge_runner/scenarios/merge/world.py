@@ -93,6 +93,8 @@ class World:
             other_speeds_mps=self._history(
                 self._velocities[other][:-1], self._velocities[other][0]
             ),
+            own_position_m=position,
+            other_acceleration_mps2=self._accelerations[other][-1],
         )
 
     def states(self) -> tuple[StateRow, ...]:

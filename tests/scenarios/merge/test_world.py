@@ -217,6 +217,18 @@ def test_histories_hold_the_last_ten_steps(history_start):
     assert left.other_speed_mps == right_speeds[12]
 
 
+def test_an_observation_holds_the_own_position_and_what_the_other_did_in_the_last_step():
+    world = start()
+    assert world.observe("left").other_acceleration_mps2 == 0
+    world.advance({"left": 0.2, "right": -0.1})
+    left, right = world.observe("left"), world.observe("right")
+    assert left.other_acceleration_mps2 == pytest.approx(-0.1 * A_MAX_MPS2)
+    assert right.other_acceleration_mps2 == pytest.approx(0.2 * A_MAX_MPS2)
+    positions = {row.side: row.position_m for row in world.states() if row.step == 1}
+    assert left.own_position_m == positions["left"]
+    assert right.own_position_m == positions["right"]
+
+
 def test_an_observation_is_told_from_the_own_seat():
     world = start("L_4_-8")
     left, right = world.observe("left"), world.observe("right")
