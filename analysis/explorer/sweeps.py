@@ -13,7 +13,7 @@ from analysis.explorer.catalogue import FACTOR, Catalogue
 from analysis.explorer.reading import Row
 from merge_runner.audit.expected import ArmFacts, ModelFacts
 from merge_runner.config import both_sides, pair_name
-from merge_runner.drivers.registry import stand_in
+from merge_runner.drivers.registry import EMULATOR, stand_in
 from merge_runner.results.progress_file import Standing, read_standing
 from merge_runner.study.crossing import MODEL, OPPONENT, PROMPT, SELF
 from merge_runner.study.file import study_files
@@ -139,9 +139,15 @@ class ListedSweep:
             part = f", in {scripted} of {trials} trials" if scripted < trials else ""
             return f"{self.row['stand_ins']}{part}"
         asked = {model.provider for model in self.config.models.values()}
-        if "emulator" not in asked or trials:
+        if EMULATOR not in asked or trials:
             return ""
         return "; ".join(stand_in(both_sides(name)) for name in self.config.drivers)
+
+    @property
+    def notes(self) -> list[str]:
+        """What the registry says of its language models."""
+        models = self.config.models.items()
+        return [f"{n}: {m.note}" for n, m in models if m.note and m.provider != EMULATOR]
 
     @property
     def state(self) -> str:

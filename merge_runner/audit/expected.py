@@ -34,6 +34,7 @@ class ModelFacts(_Facts):
     aliases: tuple[str, ...] = ()
     parameters: dict[str, JsonValue] = {}
     path: str | None = None
+    note: str = ""
 
 
 class ArmFacts(_Facts):

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import Any, get_args
 
 from merge_runner.config import both_sides
+from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.records import Status
 from merge_runner.results.store import SweepFacts
@@ -93,6 +94,9 @@ def as_lines(outcome: Outcome, options: Options, expected: Estimate | None) -> I
         yield from (_stand_in(*found) for found in facts.stand_ins)
         if outcome.meter.cost_usd and facts.stand_ins:
             yield PRICED_ALIKE
+        for name, entry in outcome.plan.entries.items():
+            if entry.note and entry.provider != EMULATOR:
+                yield f"{name}: {entry.note}"
         audit = outcome.audit
         if audit is not None:
             checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)

@@ -30,7 +30,7 @@ from tests.run.standings import progress, runner
 URL = "/sweeps/sweep-1"
 CONFIG = {
     "model": "o3",
-    "models": {"o3": {"id": "o3", "provider": "openai", "aliases": ["o3-alias"]}},
+    "models": {"o3": {"id": "o3", "provider": "openai", "aliases": ["o3-alias"], "note": "retires soon"}},
     "repetitions": {"baseline": 3},
     "conditions": list(CONDITIONS),
     "max_cost_usd": 9.0,
@@ -89,6 +89,10 @@ def running(db, **changes):
     file = ProgressFile(db, "sweep-1")
     file.write(standing)
     return file
+
+
+def test_a_sweep_says_what_the_registry_says_of_its_model(written):
+    assert "o3: retires soon." in text_of(browser(written))
 
 
 def test_the_page_has_the_numbers_of_the_database(written):

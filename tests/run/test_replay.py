@@ -29,8 +29,11 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.text_safety import quoted
 from tests.harness import FAST, PROJECT, RECORDING, environment, watched
 
-# The digest of the committed recording: results, and so this text, never change by themselves.
-GOLDEN = (PROJECT / "tests/golden/emulator-baseline.digest").read_text()
+# The digests of the committed recordings: results, and so these texts, never change by themselves.
+GOLDEN = {
+    model: (PROJECT / f"tests/golden/{model}-baseline.digest").read_text()
+    for model in ("emulator", "smollm2", "smollm2-free")
+}
 SEALED = """
 import socket, sys
 real = socket.socket
@@ -64,7 +67,23 @@ async def test_the_committed_recording_replays_to_its_digest(merge_runner):
     assert run.code == 0, run.err
     assert run.summary["calls"]["live"] == 0
     assert 1 <= run.summary["trials"]["collided"] <= 6
-    assert (await merge_runner("digest")).out == GOLDEN
+    assert (await merge_runner("digest")).out == GOLDEN["emulator"]
+
+
+@pytest.mark.parametrize("model", ["smollm2", "smollm2-free"])
+async def test_the_recordings_of_a_real_small_model_replay_to_what_their_page_says(
+    merge_runner, model
+):
+    run = await merge_runner("replay", "baseline", "--model", model, "--json")
+    assert run.code == 0, run.err
+    trials, decisions = run.summary["trials"], run.summary["decisions"]
+    assert run.summary["calls"]["live"] == 0
+    figures = [trials["planned"], trials["collided"], decisions, run.summary["invalid_decisions"]]
+    row = " | ".join([f"| `{model}`", *map(str, figures)])
+    assert f"{row} |" in (PROJECT / "docs/reference/smollm2.md").read_text()
+    assert (await merge_runner("digest")).out == GOLDEN[model]
+    said = await merge_runner("replay", "baseline", "--model", model)
+    assert f"\n{model}: 135 million parameters, " in said.out
 
 
 async def test_the_first_screen_of_the_readme_shows_what_is_printed(merge_runner):
