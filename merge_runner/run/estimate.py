@@ -121,12 +121,19 @@ def estimate(
     arms = plan.by_label()
     calls = {label: _calls(plan, arms[label], cell.calls, facts) for label, cell in todo.items()}
     whole = [made for cell in calls.values() for made in cell]
-    cells = []
-    for label, cell in todo.items():
-        sums = _sums(calls[label])
-        minutes = _minutes(options, cell.trials, calls[label])
-        within = _within(cell.trials, _share_within(options.caps, spending, calls[label], whole))
-        cells.append(CellEstimate(label, cell.trials, *sums, minutes, within))
+    shares = {
+        label: _share_within(options.caps, spending, cell, whole) for label, cell in calls.items()
+    }
+    cells = tuple(
+        CellEstimate(
+            label,
+            cell.trials,
+            *_sums(calls[label]),
+            minutes=_minutes(options, cell.trials, calls[label]),
+            trials_within_cap=_within({label: shares[label]}, todo),
+        )
+        for label, cell in todo.items()
+    )
     trials = sum(cell.trials for cell in todo.values())
     return Estimate(
         plan.driver,
@@ -137,8 +144,8 @@ def estimate(
         measured=tuple(
             driver_name(name, plan.endpoints[name]) for name in plan.entries if facts[name].measured
         ),
-        trials_within_cap=_sum_within(cells),
-        cells=tuple(cells),
+        trials_within_cap=_within(shares, todo),
+        cells=cells,
     )
 
 
@@ -190,14 +197,10 @@ def _usd(calls: Sequence[_Calls], model: str | None) -> float:
     return sum(each.cost_usd or 0.0 for each in calls if model in (None, each.model))
 
 
-def _sum_within(cells: Sequence[CellEstimate]) -> int | None:
-    within = [cell.trials_within_cap for cell in cells]
-    known = [trials for trials in within if trials is not None]
-    return sum(known) if known and len(known) == len(within) else None
-
-
-def _within(trials: int, share: float | None) -> int | None:
-    return None if share is None else int(trials * share)
+def _within(shares: Mapping[str, float | None], todo: Mapping[str, Todo]) -> int | None:
+    """How many trials of cells the money left buys, each cell by its part."""
+    known = [todo[label].trials * share for label, share in shares.items() if share is not None]
+    return int(sum(known)) if known and len(known) == len(shares) else None
 
 
 def _minutes(options: Options, trials: int, calls: Sequence[_Calls]) -> float:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any, get_args
 
+from merge_runner.audit.findings import Audit, Sharing
 from merge_runner.config import both_sides
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
@@ -23,6 +24,7 @@ Groups = defaultdict[tuple[object, ...], Counter[str]]
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
 LEDGER = ("model", "variant", "fate", "outcome", "attempts")
 FAILURES_SHOWN = NOTES_SHOWN = 10
+SHARINGS_SHOWN = 3
 PRICED_ALIKE = "replies of stand-ins are priced as the model's; nobody charges for them"
 
 
@@ -91,26 +93,10 @@ def as_lines(outcome: Outcome, options: Options, expected: Estimate | None) -> I
     for pair, answers in _mismatches(facts).items():
         yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
     if facts is not None:
-        yield from (_stand_in(*found) for found in facts.stand_ins)
-        if outcome.meter.cost_usd and facts.stand_ins:
-            yield PRICED_ALIKE
-        for name, entry in outcome.plan.entries.items():
-            if entry.note and entry.provider != EMULATOR:
-                yield f"{name}: {entry.note}"
-        audit = outcome.audit
-        if audit is not None:
-            checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
-            yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
-            told = [*audit.notes, *map(str, audit.sharings)]
-            yield from (f"note: {text}" for text in told[:NOTES_SHOWN])
-            if len(told) > NOTES_SHOWN:
-                yield f"... and {len(told) - NOTES_SHOWN} more notes: `merge-runner audit`"
-        for trial_id, error in facts.failed[:FAILURES_SHOWN]:
-            yield f"failed: {trial_id}: {error}"
-        if len(facts.failed) > FAILURES_SHOWN:
-            yield f"... and {len(facts.failed) - FAILURES_SHOWN} more, in the table trials"
-        if facts.failed and outcome.exit_code != ReplayMiss.exit_code:
-            yield "Run the same command again to play the failed trials anew."
+        yield from _who_answered(outcome, facts)
+        if outcome.audit is not None:
+            yield from _audited(outcome.audit)
+        yield from _failed(outcome, facts)
     if outcome.sweep_id:
         yield f"database: {options.db}"
 
@@ -207,6 +193,48 @@ def _varying(plan: Plan) -> dict[str, list[str]]:
             found.setdefault(factor, []).append(level)
     levels = {name: list(dict.fromkeys(each)) for name, each in found.items() if name != PROMPT}
     return {name: each for name, each in levels.items() if len(each) > 1}
+
+
+def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
+    """Stand-ins, and what the registry notes of models."""
+    yield from (_stand_in(*found) for found in facts.stand_ins)
+    if outcome.meter.cost_usd and facts.stand_ins:
+        yield PRICED_ALIKE
+    for name, entry in outcome.plan.entries.items():
+        if entry.note and entry.provider != EMULATOR:
+            yield f"{name}: {entry.note}"
+
+
+def _audited(audit: Audit) -> Iterator[str]:
+    checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
+    yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
+    told = [*audit.notes, *_shared(audit.sharings)]
+    yield from (f"note: {text}" for text in told[:NOTES_SHOWN])
+    if len(told) > NOTES_SHOWN:
+        yield f"... and {len(told) - NOTES_SHOWN} more notes: `merge-runner audit`"
+
+
+def _shared(sharings: Sequence[Sharing]) -> Iterator[str]:
+    """What is shared, in one line where many arms ask the same in the same slots."""
+    calls = [each for each in sharings if each.what == "calls"]
+    for each in sharings:
+        if each not in calls or len(calls) <= SHARINGS_SHOWN:
+            yield str(each)
+    if len(calls) > SHARINGS_SHOWN:
+        total = sum(each.count for each in calls)
+        yield (
+            f"{len(calls)} pairs of arms share {total} calls, where they asked the same in the "
+            "same slots: `merge-runner audit` names them"
+        )
+
+
+def _failed(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
+    for trial_id, error in facts.failed[:FAILURES_SHOWN]:
+        yield f"failed: {trial_id}: {error}"
+    if len(facts.failed) > FAILURES_SHOWN:
+        yield f"... and {len(facts.failed) - FAILURES_SHOWN} more, in the table trials"
+    if facts.failed and outcome.exit_code != ReplayMiss.exit_code:
+        yield "Run the same command again to play the failed trials anew."
 
 
 def _stand_in(driver: str, model: str, provider: str, scripted: int, answers: int) -> str:

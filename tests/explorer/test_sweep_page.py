@@ -30,7 +30,9 @@ from tests.run.standings import progress, runner
 URL = "/sweeps/sweep-1"
 CONFIG = {
     "model": "o3",
-    "models": {"o3": {"id": "o3", "provider": "openai", "aliases": ["o3-alias"], "note": "retires soon"}},
+    "models": {
+        "o3": {"id": "o3", "provider": "openai", "aliases": ["o3-alias"], "note": "retires soon"}
+    },
     "repetitions": {"baseline": 3},
     "conditions": list(CONDITIONS),
     "max_cost_usd": 9.0,
