@@ -181,6 +181,14 @@ class Plan:
         used = {*self.repetitions, *(prompt.based_on for prompt in prompts.values())}
         if unused := [name for name in prompts if name not in used]:
             yield f"note: not played, though {self.study.path} has them: {', '.join(unused)}"
+        yield from dict.fromkeys(filter(None, map(self._finer_world, self.arms)))
+
+    def _finer_world(self, arm: Arm) -> str:
+        """A note where the drivers of an arm need a finer world than the study's own."""
+        step_s = arm.scenario.step_s
+        if step_s == self.study.file.scenario.step_s or "step_s" in arm.factors:
+            return ""
+        return f"note: {arm.model} is driven in steps of {step_s:g} s, as its drivers need"
 
     @property
     def capped_by(self) -> str:
@@ -266,18 +274,20 @@ class Plan:
         """The sweep's configuration for its row in the database."""
         entries = {name: entry.model_dump(mode="json") for name, entry in self.entries.items()}
         prompt_blocks = {variant: block_digests(variant) for variant in self.repetitions}
+        file = self.study.file
+        many = bool(file.factors) or len(self.models) > 1
         config: dict[str, object] = {
             "model": self.model,
             "models": entries,
             "endpoints": self.endpoints,
-            "scenario": self.study.file.scenario.model_dump(),
+            "scenario": (file.scenario if many else self.scenario).model_dump(),
             "repetitions": self.repetitions,
             "conditions": list(self.conditions),
             "sample_set": self.sample_set,
             "order_seed": self.order_seed,
             "prompt_blocks": prompt_blocks,
         }
-        if self.study.file.factors or len(self.models) > 1:
+        if many:
             config["arms"] = [
                 {
                     "label": arm.label,

@@ -93,8 +93,9 @@ def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
     assert "constant, projected-order" in asked.err
 
 
-def test_a_world_that_is_too_coarse_is_refused_with_what_to_type(study, installed):
-    done = study.run("sweep", "baseline", "--model", "constant+impulsive", **installed)
+def test_a_world_that_is_set_too_coarse_is_refused_with_what_to_type(study, installed):
+    (study.folder / "coarse.toml").write_text(FINE.replace("0.05", "0.2"))
+    done = study.run("sweep", "coarse.toml", "--model", "constant+impulsive", **installed)
     assert (done.code, done.out) == (2, "")
     assert done.err == (
         "error: the driver impulsive cannot decide 20.0 times a second: the time between two "
