@@ -278,7 +278,10 @@ def sweep(
         sample_set=sample_set,
         order_seed=order_seed,
         only=levels(only or (), "--only"),
+        db=db,
     )
+    if dask is not None and plan.replays_humans:
+        raise UsageError("human-replay is played in this process: leave --dask out")
     for note in plan.notes():
         say(note)
     if not replay:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
+from merge_runner.drivers.human_replay import HumanReplayDriver
 from merge_runner.errors import CallFailed, ReplayMiss, UsageError
 from merge_runner.records import (
     SIDES,
@@ -20,6 +21,7 @@ from merge_runner.records import (
     TrialSpec,
 )
 from merge_runner.scenarios.base import World
+from merge_runner.scenarios.merge.world import Starts
 from merge_runner.scenarios.registry import new_world
 
 
@@ -27,7 +29,7 @@ async def play_trial(
     spec: TrialSpec, scenario: ScenarioConfig, drivers: Mapping[Side, Driver]
 ) -> TrialRecord:
     """Play a trial to its end, or until a call fails."""
-    world = new_world(scenario, spec.condition)
+    world = new_world(scenario, spec.condition, _starts(drivers))
     seats = {side: _Seated(drivers[side]) for side in SIDES}
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}
@@ -61,6 +63,15 @@ async def play_trial(
             for side, exc in failures.items()
         ),
     )
+
+
+def _starts(drivers: Mapping[Side, Driver]) -> Starts | None:
+    """Where the vehicles start beside a human who is replayed: where they did in that trial."""
+    humans = {s: d for s, d in drivers.items() if isinstance(d, HumanReplayDriver)}
+    if not humans:
+        return None
+    (some, *_) = humans.values()
+    return {side: humans.get(side, some).trial.starts[side] for side in SIDES}
 
 
 @dataclass(slots=True)

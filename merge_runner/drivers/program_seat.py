@@ -18,13 +18,14 @@ class ProgramSeat(Seat):
 
     ``condition`` and ``repetition`` (from 1) are those of the trial. ``other_seed`` is the ``seed``
     of the other side: whatever both sides draw from both seeds, they agree on. ``parameters`` are
-    those of the program, as a study may have set them.
+    those of the program, as a study may have set them, and ``data`` is what else it drives by.
     """
 
     condition: str
     repetition: int
     other_seed: int
     parameters: Mapping[str, Parameter]
+    data: object = None
 
     @property
     def interval_s(self) -> float:

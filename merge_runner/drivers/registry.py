@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from math import inf, isfinite
 from pkgutil import iter_modules
+from typing import Protocol
 
 from merge_runner import drivers
 from merge_runner.config import ScenarioConfig
@@ -25,6 +26,15 @@ SET = "set"  # the parameter that names a set of others
 RESERVED = ("program", "clock")  # what a study says of a driver beside its parameters
 
 
+class Data(Protocol):
+    """What a program drives by beside its source and its parameters."""
+
+    @property
+    def digest(self) -> str:
+        """Its hash."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Program:
     """A class whose instances drive, made with a ProgramSeat.
@@ -33,8 +43,8 @@ class Program:
     decides ``rate_hz`` times a second; None: at the prompt rate of the scenario. A ``settable``
     program reads its parameters from its seat, so that a study can set them. ``sets`` are named
     sets of further parameters, of which the parameter ``set`` chooses one. ``check`` raises
-    UsageError for parameters that cannot be. ``based_on`` names the program that a study has
-    given other parameters or another clock.
+    UsageError for parameters that cannot be. ``data`` is what else it drives by. ``based_on``
+    names the program that a study has given other parameters or another clock.
     """
 
     driver: Callable[[ProgramSeat], Driver]
@@ -44,6 +54,7 @@ class Program:
     settable: bool = False
     sets: Mapping[str, Mapping[str, Parameter]] = field(default_factory=dict)
     check: Callable[[Mapping[str, Parameter]], None] | None = None
+    data: Data | None = None
     based_on: str = ""
 
     def __post_init__(self) -> None:
@@ -125,6 +136,7 @@ class Program:
             repetition=spec.repetition,
             other_seed=seeds[other],
             parameters=self.values,
+            data=self.data,
         )
 
     def in_spec(self, name: str) -> dict[str, object]:
@@ -134,6 +146,7 @@ class Program:
             "parameters": self.values,
             "source": self.source,
             **({} if self.rate_hz is None else {"rate_hz": self.rate_hz}),
+            **({} if self.data is None else {"data": self.data.digest}),
             **({"based_on": self.based_on} if self.based_on else {}),
         }
 
