@@ -536,8 +536,7 @@ def models() -> None:
             )
         )
     for name, program in PROGRAMS.items():
-        rate = f" ({program.rate_hz:g} times a second)" if program.rate_hz is not None else ""
-        rows.append((name, "program", "", "not needed", "0", "0", "", "", program.meaning + rate))
+        rows.append((name, "program", "", "not needed", "0", "0", "", "", program.described))
     headings = ["name", "provider", "id", "key", "USD/M in", "USD/M out", "prices", "shutdown"]
     write_table([*headings, "note"], rows, sys.stdout)
 

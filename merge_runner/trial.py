@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
-from merge_runner.drivers.human_replay import HumanReplayDriver
+from merge_runner.drivers.program_seat import StartsElsewhere
 from merge_runner.errors import CallFailed, ReplayMiss, UsageError
 from merge_runner.records import (
     SIDES,
@@ -66,12 +66,14 @@ async def play_trial(
 
 
 def _starts(drivers: Mapping[Side, Driver]) -> Starts | None:
-    """Where the vehicles start beside a human who is replayed: where they did in that trial."""
-    humans = {s: d for s, d in drivers.items() if isinstance(d, HumanReplayDriver)}
-    if not humans:
+    """Where the vehicles start, unless as the condition says; each driver knows best of its own."""
+    known = {
+        side: driver for side, driver in drivers.items() if isinstance(driver, StartsElsewhere)
+    }
+    if not known:
         return None
-    (some, *_) = humans.values()
-    return {side: humans.get(side, some).trial.starts[side] for side in SIDES}
+    (some, *_) = known.values()
+    return {side: known.get(side, some).starts[side] for side in SIDES}
 
 
 @dataclass(slots=True)

@@ -136,6 +136,11 @@ class HumanReplayDriver:
         self.trial = usable[seat.repetition - 1]
         self._net_mps2 = self.trial.net_mps2(seat.side)
 
+    @property
+    def starts(self) -> Mapping[Side, tuple[float, float]]:
+        """Where both sides started in the human trial."""
+        return self.trial.starts
+
     async def decide(self, observation: Observation, number: int) -> Decision:
         """What the human did from this sample to the next."""
         net_mps2 = self._net_mps2[number] if number < len(self._net_mps2) else 0.0

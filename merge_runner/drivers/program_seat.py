@@ -4,12 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from merge_runner.drivers.base import Seat
-from merge_runner.records import Decision
+from merge_runner.records import Decision, Side
 from merge_runner.scenarios.merge.vehicle import net_acceleration
 
 Parameter = float | str
+
+
+@runtime_checkable
+class StartsElsewhere(Protocol):
+    """A driver whose trial starts elsewhere than its condition says."""
+
+    @property
+    def starts(self) -> Mapping[Side, tuple[float, float]]:
+        """Travelled distance in m and speed in m/s of both sides."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

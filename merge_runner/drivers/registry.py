@@ -77,7 +77,19 @@ class Program:
     def values(self) -> dict[str, Parameter]:
         """All parameters: those of the set that is chosen, and over them those that are given."""
         chosen = self.sets[str(self.parameters[SET])] if self.sets else {}
-        return {**chosen, **self.parameters}
+        return {**self.parameters, **chosen, **self.parameters}
+
+    @property
+    def described(self) -> str:
+        """What it does, how often it decides, and its parameters with what they may be."""
+        often = "once" if self.rate_hz == 1 else f"{self.rate_hz or 0:g} times"
+        rate = "" if self.rate_hz is None else f" ({often} a second)"
+        choices = {SET: " | ".join(self.sets)} if self.sets else {}
+        parameters = ", ".join(
+            f"{name} = {choices.get(name, value)}" for name, value in self.values.items()
+        )
+        kind = "parameters" if self.settable else "fixed"
+        return self.meaning + rate + (f"; {kind}: {parameters}" if parameters else "")
 
     def with_changes(
         self, name: str, changes: Mapping[str, object], clock_s: float | None

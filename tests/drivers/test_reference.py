@@ -155,10 +155,7 @@ def test_the_human_odds_and_gaps_are_the_published_ones():
 async def test_the_human_odds_are_drawn_and_both_sides_agree():
     wins, trials, certain = 0, 400, changed("human-odds", gap_sd_m=0.0)
     for repetition in range(1, trials + 1):
-        sides = {
-            side: certain.make(FINE, spec_of("L_2_-8", repetition), side)
-            for side in SIDES
-        }
+        sides = {side: certain.make(FINE, spec_of("L_2_-8", repetition), side) for side in SIDES}
         # Left is 2 m ahead at the merge point, and 0.8 m/s slower.
         left = await accelerates(sides["left"], seen(9.6, 10.4, 48.0, -6.0))
         right = await accelerates(sides["right"], seen(10.4, 9.6, 54.0, 6.0))
