@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.program_seat import ProgramSeat
@@ -106,6 +107,19 @@ def require_trials(
             f"{HUMAN_REPLAY} has {there} trials of {condition} to replay, and {repetitions} "
             "repetitions are asked for: choose fewer by --reps, or other --conditions"
         )
+
+
+def unresponsive(spec: Mapping[str, Any]) -> str:
+    """What is to be said wherever trials of a spec are shown; empty where no human is replayed."""
+    told = {side: spec.get(side) or {} for side in SIDES}
+    sides = [
+        side
+        for side, driver in told.items()
+        if HUMAN_REPLAY in (driver.get("program"), driver.get("based_on"))
+    ]
+    if len(sides) == len(SIDES):
+        return "both humans are replayed and do not react"
+    return f"the human on the {sides[0]} is replayed and does not react" if sides else ""
 
 
 def _can_be_driven(config: ScenarioConfig, trial: HumanTrial) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from analysis.explorer.details import read_trial
 from analysis.human.load import import_trials, sort_files
 from merge_runner.audit.sweeps import audit_database
 from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials
@@ -154,6 +155,11 @@ async def test_a_sweep_of_them_is_stored_audited_and_played_again_alike(merge_ru
     (first, *_) = audit_database(db)
     assert not first.findings
     assert not [note for note in first.notes if "derived" in note]
+    tables = await merge_runner("tables", "ablation-quantitative", "--format", "csv")
+    assert "(the human on the left is replayed and does not react)" in tables.out
+    ((spec_hash,),) = query(db, "SELECT spec_hash FROM trials WHERE source = 'driver'")[1]
+    shown = read_trial(db, "human-replay+idm/baseline/L_4_0/rep01", spec_hash)
+    assert shown.caution == "the human on the left is replayed and does not react"
     again = await merge_runner("replay", *command)
     assert again.summary["trials"] == {**again.summary["trials"], "failed": 0}
     elsewhere = await merge_runner("replay", *command, "--db", "none.duckdb")
