@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
 
 from merge_runner.config import resolve_endpoint
-from merge_runner.drivers.base import Driver, Seat
+from merge_runner.drivers.base import Driver
+from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
@@ -153,9 +154,9 @@ class Study:
     def register_driver(
         self,
         name: str,
-        driver: Callable[[Seat], Driver],
+        driver: Callable[[ProgramSeat], Driver],
         meaning: str,
-        parameters: Mapping[str, float] | None = None,
+        parameters: Mapping[str, Parameter] | None = None,
         rate_hz: float | None = None,
     ) -> None:
         """Add a driver; see ``Program``. Where its source is edited, it is another driver."""
@@ -164,7 +165,7 @@ class Study:
 
     def plan(self) -> Plan:
         """What would be played; raises UsageError."""
-        return make_plan(self.file, **self._wanted)
+        return make_plan(self.file, db=self.db, **self._wanted)
 
     def dry_run(self, max_cost_usd: float | None = None) -> Estimate:
         """The trials, calls, tokens, cost and time of a run; nothing is sent."""

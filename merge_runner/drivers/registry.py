@@ -4,47 +4,114 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from math import inf, isfinite
 from pkgutil import iter_modules
+from typing import Protocol
 
 from merge_runner import drivers
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.base import Driver, Seat, take_seat
+from merge_runner.drivers.base import Driver, take_seat
 from merge_runner.drivers.pace import program_pace
+from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.errors import UsageError
 from merge_runner.main_source import MAIN, main_source
 from merge_runner.records import SIDES, Side, TrialSpec
-from merge_runner.registry import Registry
+from merge_runner.registry import Registry, require
 from merge_runner.source import source_digest
 
 EMULATOR = "emulator"  # the model that a scripted stand-in of ours answers for
+SET = "set"  # the parameter that names a set of others
+RESERVED = ("program", "clock")  # what a study says of a driver beside its parameters
+
+
+class Data(Protocol):
+    """What a program drives by beside its source and its parameters."""
+
+    @property
+    def digest(self) -> str:
+        """Its hash."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A class whose instances drive, made with a Seat.
+    """A class whose instances drive, made with a ProgramSeat.
 
     ``meaning`` says in a few words what it does, and ``parameters`` are those of its rule. It
-    decides ``rate_hz`` times a second; None: at the prompt rate of the scenario.
+    decides ``rate_hz`` times a second; None: at the prompt rate of the scenario. A ``settable``
+    program reads its parameters from its seat, so that a study can set them. ``sets`` are named
+    sets of further parameters, of which the parameter ``set`` chooses one. ``check`` raises
+    UsageError for parameters that cannot be. ``data`` is what else it drives by. ``based_on``
+    names the program that a study has given other parameters or another clock.
     """
 
-    driver: Callable[[Seat], Driver]
+    driver: Callable[[ProgramSeat], Driver]
     meaning: str
-    parameters: Mapping[str, float] = field(default_factory=dict)
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
     rate_hz: float | None = None
+    settable: bool = False
+    sets: Mapping[str, Mapping[str, Parameter]] = field(default_factory=dict)
+    check: Callable[[Mapping[str, Parameter]], None] | None = None
+    data: Data | None = None
+    based_on: str = ""
 
     def __post_init__(self) -> None:
         """Raises UsageError for what can be no driver, or could not be told apart from another."""
         if not isinstance(self.driver, type):
             raise UsageError(f"the driver {self.driver!r} is no class: its source is not known")
+        name = self.driver.__qualname__
         if self.rate_hz is not None and not 0 < self.rate_hz < inf:
-            raise UsageError(f"the driver {self.driver.__qualname__} needs a rate_hz above 0")
-        if not all(isinstance(n, int | float) and isfinite(n) for n in self.parameters.values()):
+            raise UsageError(f"the driver {name} needs a rate_hz above 0")
+        if self.sets:
+            require(self.sets, f"{SET} of the driver {name}", str(self.parameters.get(SET)))
+        if not all(map(_can_be, self.values.values())):
+            raise UsageError(f"the parameters of the driver {name} must be finite numbers or texts")
+        if taken := {*RESERVED} & {*self.values}:
+            raise UsageError(f"the driver {name} needs another name for its parameter {min(taken)}")
+        if self.check is not None:
+            self.check(self.values)
+
+    @property
+    def values(self) -> dict[str, Parameter]:
+        """All parameters: those of the set that is chosen, and over them those that are given."""
+        chosen = self.sets[str(self.parameters[SET])] if self.sets else {}
+        return {**self.parameters, **chosen, **self.parameters}
+
+    @property
+    def described(self) -> str:
+        """What it does, how often it decides, and its parameters with what they may be."""
+        often = "once" if self.rate_hz == 1 else f"{self.rate_hz or 0:g} times"
+        rate = "" if self.rate_hz is None else f" ({often} a second)"
+        choices = {SET: " | ".join(self.sets)} if self.sets else {}
+        parameters = ", ".join(
+            f"{name} = {choices.get(name, value)}" for name, value in self.values.items()
+        )
+        kind = "parameters" if self.settable else "fixed"
+        return self.meaning + rate + (f"; {kind}: {parameters}" if parameters else "")
+
+    def with_changes(
+        self, name: str, changes: Mapping[str, object], clock_s: float | None
+    ) -> Program:
+        """The same with other parameters, and holding each action for a clock; raises UsageError.
+
+        ``name`` is that of this program.
+        """
+        if changes and not self.settable:
+            raise UsageError(f"the parameters of {name} stand in its source and cannot be set")
+        if clock_s is not None and self.rate_hz is not None and clock_s < 1 / self.rate_hz:
             raise UsageError(
-                f"the parameters of the driver {self.driver.__qualname__} must be finite numbers"
+                f"clock = {clock_s:g} is too fast: {name} decides every {1 / self.rate_hz:g} s, "
+                "and a clock can only slow it down"
             )
+        given = {each: _like(self.values, name, each, value) for each, value in changes.items()}
+        return replace(
+            self,
+            parameters={**self.parameters, **given},
+            rate_hz=self.rate_hz if clock_s is None else 1 / clock_s,
+            based_on=self.based_on or name,
+        )
 
     @property
     def source(self) -> str:
@@ -65,18 +132,52 @@ class Program:
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """See MakeDriver."""
+        return self.driver(self.seat(scenario, spec, side))
+
+    def seat(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> ProgramSeat:
+        """The seat of a side of a trial."""
         pace = program_pace(scenario, self.rate_hz)
-        return self.driver(take_seat(scenario, spec, side, pace))
+        seeds = {each: take_seat(scenario, spec, each, pace).seed for each in SIDES}
+        other: Side = "right" if side == "left" else "left"
+        return ProgramSeat(
+            scenario,
+            side,
+            pace,
+            seeds[side],
+            condition=spec.condition,
+            repetition=spec.repetition,
+            other_seed=seeds[other],
+            parameters=self.values,
+            data=self.data,
+        )
 
     def in_spec(self, name: str) -> dict[str, object]:
         """What the spec of its trials says of it."""
-        own_rate = {} if self.rate_hz is None else {"rate_hz": self.rate_hz}
         return {
             "program": name,
-            "parameters": dict(self.parameters),
+            "parameters": self.values,
             "source": self.source,
-            **own_rate,
+            **({} if self.rate_hz is None else {"rate_hz": self.rate_hz}),
+            **({} if self.data is None else {"data": self.data.digest}),
+            **({"based_on": self.based_on} if self.based_on else {}),
         }
+
+
+def _can_be(value: object) -> bool:
+    return isinstance(value, str) or (isinstance(value, int | float) and isfinite(value))
+
+
+def _like(values: Mapping[str, Parameter], program: str, name: str, value: object) -> Parameter:
+    """A parameter as it is set; raises UsageError where it is unknown or of another type."""
+    default = require(values, f"parameter of {program}", name)
+    if isinstance(default, str) and isinstance(value, str):
+        return value
+    number = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+    if isinstance(default, str) or not number:
+        wanted = "a text" if isinstance(default, str) else "a finite number"
+        raise UsageError(f"{name} of {program} is {wanted}, as {default!r}, not {value!r}")
+    assert isinstance(value, int | float)
+    return float(value)
 
 
 PROGRAMS = Registry[Program]("driver")

@@ -16,7 +16,8 @@ from merge_runner.config import (
     endpoint_identity,
     pair_name,
 )
-from merge_runner.drivers.registry import EMULATOR, PROGRAMS
+from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials, require_trials
+from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
@@ -24,6 +25,7 @@ from merge_runner.llm.ledger import Caps
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import SIDES, Side, TrialSpec
+from merge_runner.results.human_trials import human_trials
 from merge_runner.scenarios.merge.conditions import CONDITIONS, MEAN_SPEED_MPS
 from merge_runner.scenarios.registry import SCENARIOS, new_world, task_of
 from merge_runner.study.crossing import OPPONENT, PROMPT, Arm, cross, level_text
@@ -35,7 +37,7 @@ from merge_runner.study.file import (
     StudySource,
     read_study,
 )
-from merge_runner.study.parts import adopt
+from merge_runner.study.parts import adopt, adopt_humans
 from merge_runner.text_safety import in_a_name
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
@@ -154,6 +156,11 @@ class Plan:
         return any(map(_is_scripted, self.arms))
 
     @property
+    def replays_humans(self) -> bool:
+        """Whether imported human trials are replayed, which only this process has read."""
+        return any(map(_replaying, self.arms))
+
+    @property
     def driver(self) -> str:
         """The drivers with their endpoints; see ``pair_name``."""
         pairs = (pair_name(arm.asked.values(), self.endpoints) for arm in self.arms)
@@ -181,6 +188,14 @@ class Plan:
         used = {*self.repetitions, *(prompt.based_on for prompt in prompts.values())}
         if unused := [name for name in prompts if name not in used]:
             yield f"note: not played, though {self.study.path} has them: {', '.join(unused)}"
+        yield from dict.fromkeys(filter(None, map(self._finer_world, self.arms)))
+
+    def _finer_world(self, arm: Arm) -> str:
+        """A note where the drivers of an arm need a finer world than the study's own."""
+        step_s = arm.scenario.step_s
+        if step_s == self.study.file.scenario.step_s or "step_s" in arm.factors:
+            return ""
+        return f"note: {arm.model} is driven in steps of {step_s:g} s, as its drivers need"
 
     @property
     def capped_by(self) -> str:
@@ -266,18 +281,20 @@ class Plan:
         """The sweep's configuration for its row in the database."""
         entries = {name: entry.model_dump(mode="json") for name, entry in self.entries.items()}
         prompt_blocks = {variant: block_digests(variant) for variant in self.repetitions}
+        file = self.study.file
+        many = bool(file.factors) or len(self.models) > 1
         config: dict[str, object] = {
             "model": self.model,
             "models": entries,
             "endpoints": self.endpoints,
-            "scenario": self.study.file.scenario.model_dump(),
+            "scenario": (file.scenario if many else self.scenario).model_dump(),
             "repetitions": self.repetitions,
             "conditions": list(self.conditions),
             "sample_set": self.sample_set,
             "order_seed": self.order_seed,
             "prompt_blocks": prompt_blocks,
         }
-        if self.study.file.factors or len(self.models) > 1:
+        if many:
             config["arms"] = [
                 {
                     "label": arm.label,
@@ -342,10 +359,12 @@ def make_plan(
     sample_set: int = 0,
     order_seed: int = 0,
     only: Mapping[str, Sequence[str]] | None = None,
+    db: Path | None = None,
 ) -> Plan:
     """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
-    Registers what the study adds (``study.parts.adopt``). Raises UsageError.
+    Registers what the study adds (``study.parts.adopt``), and the human trials of ``db`` where
+    they are to be replayed. Raises UsageError.
     """
     study = read_study(sweep)
     registry = load_models(study.path.parent)
@@ -354,6 +373,8 @@ def make_plan(
         raise UsageError("--sample-set is a whole number from 0")
     asked = (models,) if isinstance(models, str) else tuple(models)
     drivers = tuple(dict.fromkeys(asked or study.file.models or (EMULATOR,)))
+    if db is not None and _replays_humans(study.file, drivers):
+        adopt_humans(human_trials(db))
     wanted = _repetitions(study, variants, repetitions)
     arms = cross(study.file, drivers, wanted, registry, only or {})
     entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
@@ -368,6 +389,19 @@ def make_plan(
         sample_set=sample_set,
         order_seed=order_seed,
     )
+
+
+def _replays_humans(file: StudyFile, drivers: Sequence[str]) -> bool:
+    """Whether a driver of a study may replay imported human trials."""
+    pairs = [*drivers, *map(level_text, file.factors.get(OPPONENT, ()))]
+    sides = {name for pair in pairs for name in both_sides(pair).values()}
+    return HUMAN_REPLAY in {*sides, *(driver.program for driver in file.drivers.values())}
+
+
+def _replaying(arm: Arm) -> list[Program]:
+    """The programs of an arm that replay humans."""
+    programs = [PROGRAMS[name] for name in {*arm.asked.values()} - {*arm.entries}]
+    return [program for program in programs if isinstance(program.data, HumanTrials)]
 
 
 def _conditions(
@@ -388,6 +422,8 @@ def _conditions(
     for name in conditions:
         for arm in arms:
             new_world(arm.scenario, name)  # raises where the condition cannot be played
+            for program in _replaying(arm):
+                require_trials(program, arm.scenario, name, arm.repetitions)
     return conditions
 
 

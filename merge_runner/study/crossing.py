@@ -20,6 +20,7 @@ from merge_runner.records import SIDES, Side
 from merge_runner.registry import require
 from merge_runner.scenarios.registry import SCENARIOS
 from merge_runner.study.file import StudyFile
+from merge_runner.study.world_step import with_world_step
 
 MODEL, PROMPT, OPPONENT, SELF, DEFAULT = "model", "prompt", "opponent", "self", "default"
 Levels = Mapping[str, JsonValue]
@@ -120,8 +121,10 @@ def _arm(
     sides = _sides(str(levels[MODEL]), str(levels.get(OPPONENT, SELF)))
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
-    for name in {*sides.values()} - {*registry}:
-        pace_of(scenario, PROGRAMS[name].in_spec(name))
+    programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
+    scenario = with_world_step(scenario, programs)
+    for name, program in programs.items():
+        pace_of(scenario, program.in_spec(name))
     parameters = {name: level for name, level in levels.items() if _is_parameter(name)}
     changed = set(both_sides(str(levels[MODEL])).values())
     if not changed & {*registry}:
@@ -170,6 +173,8 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
         raise UsageError("models are no factor: write models = [...] above the factors")
     if "skip" in file.factors:
         raise UsageError("skip is no factor: write it above [factors]")
+    if taken := [name for name in file.drivers if name in registry]:
+        raise UsageError(f"[drivers.{taken[0]}] needs another name: there is a model {taken[0]}")
     known = known_parameters(registry.values())
     for name in filter(_is_parameter, file.factors):
         if name not in known:

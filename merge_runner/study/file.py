@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from pydantic import BaseModel, BeforeValidator, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from merge_runner.config import (
     MOST_REPETITIONS,
@@ -120,6 +120,23 @@ class BudgetTerms(Frozen):
     split: dict[str, NotNegative] = Field(default_factory=dict)
 
 
+class StudyDriver(Frozen):
+    """A driver that a study makes of a ``program``: with other parameters, or with a slower clock.
+
+    It holds each action for ``clock`` seconds. Every other key is a parameter of the program.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    program: str
+    clock: Positive | None = None
+
+    @property
+    def parameters(self) -> dict[str, object]:
+        """The parameters that it sets."""
+        return dict(self.model_extra or {})
+
+
 class Plugins(Frozen):
     """Python files that register drivers, prompt blocks, metrics and so on, beside the study."""
 
@@ -137,6 +154,7 @@ class StudyFile(Frozen):
         "conditions": StudyCondition,
         "scenario": ScenarioConfig,
         "prompts": StudyPrompt,
+        "drivers": StudyDriver,
         "budget": BudgetTerms,
         "plugins": Plugins,
     }
@@ -151,6 +169,7 @@ class StudyFile(Frozen):
     factors: dict[str, tuple[Json, ...]] = Field(default_factory=dict)
     skip: tuple[dict[str, Json], ...] = ()
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
+    drivers: dict[str, StudyDriver] = Field(default_factory=dict)
     budget: BudgetTerms = BudgetTerms()
     plugins: Plugins = Plugins()
 
@@ -170,7 +189,8 @@ class StudySource:
         """Whether it holds more than names of what there is."""
         file = self.file
         own_conditions = any(condition.is_own for condition in file.conditions or ())
-        return bool(file.factors or file.prompts or file.plugins.files or own_conditions)
+        own_parts = file.prompts or file.drivers or file.plugins.files or own_conditions
+        return bool(file.factors or own_parts)
 
 
 def study_files() -> dict[str, Path]:

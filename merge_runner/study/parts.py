@@ -1,4 +1,4 @@
-"""What a study adds to the registries: its plug-ins, its prompts and its conditions."""
+"""What a study adds to the registries: its plug-ins, drivers, prompts and conditions."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from traceback import extract_tb
 from types import CodeType, ModuleType
 
 from merge_runner.config import validated
+from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials
+from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of
 from merge_runner.registry import (
@@ -26,7 +28,14 @@ from merge_runner.registry import (
     unregister,
 )
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
-from merge_runner.study.file import AddedText, StudyCondition, StudyFile, StudyPrompt, StudySource
+from merge_runner.study.file import (
+    AddedText,
+    StudyCondition,
+    StudyDriver,
+    StudyFile,
+    StudyPrompt,
+    StudySource,
+)
 
 LAST = "the end"
 PACKAGE = "study_plugins"
@@ -51,21 +60,32 @@ def adopt(study: StudySource) -> None:
         _adopted.append((study, changes()))
 
 
+def adopt_humans(trials: HumanTrials) -> None:
+    """Have these trials replayed by human-replay, and by what the study adopted makes of it."""
+    program = PROGRAMS[HUMAN_REPLAY]
+    if program.data != trials:
+        PROGRAMS.replace(HUMAN_REPLAY, replace(program, data=trials))
+        if (study := adopted()) is not None:
+            adopt(study)
+
+
 def adopted() -> StudySource | None:
     """The study whose parts are registered now, if any."""
     return _adopted[-1][0] if _adopted else None
 
 
 def adopt_declared(text: str) -> None:
-    """Register the prompts and conditions of a study's file, but run none of its plug-ins.
+    """Register the drivers, prompts and conditions of a study's file, but run none of its plug-ins.
 
-    Raises UsageError.
+    Drivers of a program that is not here are left out. Raises UsageError.
     """
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as exc:
         raise UsageError(f"the stored study cannot be read: {exc}") from exc
-    _register(validated(StudyFile, content, "the stored study"))
+    file = validated(StudyFile, content, "the stored study")
+    here = {name: driver for name, driver in file.drivers.items() if driver.program in PROGRAMS}
+    _register(file.model_copy(update={"drivers": here}))
 
 
 def _register(file: StudyFile) -> None:
@@ -75,6 +95,8 @@ def _register(file: StudyFile) -> None:
                 CONDITIONS.register(condition.name, _condition(condition))
         for name, prompt in _by_dependence(file.prompts):
             VARIANTS.register(name, _variant(name, prompt))
+        for name, driver in file.drivers.items():
+            PROGRAMS.register(name, _program(name, driver))
 
 
 def load_plugin_files(sources: Mapping[str, str]) -> None:
@@ -150,6 +172,15 @@ def _run(name: str, loader: _Source) -> None:
         where = f"{loader.file}, line {line}" if line else loader.file
         said = str(exc) if isinstance(exc, UsageError) else f"{type(exc).__name__}: {exc}"
         raise UsageError(f"the plug-in {where}, fails: {said}") from exc
+
+
+def _program(name: str, driver: StudyDriver) -> Program:
+    """The program that a driver of a study is; raises UsageError."""
+    try:
+        program = PROGRAMS.require(driver.program)
+        return program.with_changes(driver.program, driver.parameters, driver.clock)
+    except UsageError as exc:
+        raise UsageError(f"[drivers.{name}]: {exc}") from exc
 
 
 def _condition(condition: StudyCondition) -> Condition:

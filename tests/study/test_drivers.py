@@ -1,0 +1,181 @@
+"""Drivers that a study makes of programs, and the world that they are driven in."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.errors import UsageError
+from merge_runner.prompts.render import render_prompt
+from merge_runner.records import SIDES
+from merge_runner.run.plan import make_plan
+from merge_runner.scenarios.registry import new_world
+from merge_runner.study.parts import adopt_declared
+from merge_runner.trial import play_trial
+
+PLUGIN = """
+from merge_runner.drivers.registry import PROGRAMS, Program
+
+class Braking:
+    def __init__(self, seat):
+        self.seat = seat
+
+    async def decide(self, observation, number):
+        return self.seat.held(-self.seat.number("strength"))
+
+def check(parameters):
+    from merge_runner.errors import UsageError
+    if parameters["strength"] > 1:
+        raise UsageError("strength is at most 1")
+
+SETS = {"mild": {"strength": 0.1, "unused": 1.0}, "hard": {"strength": 0.9, "unused": 2.0}}
+PROGRAMS.register(
+    "braking",
+    Program(Braking, "brakes", {"set": "mild"}, 20.0, settable=True, sets=SETS, check=check),
+)
+"""
+
+
+@pytest.fixture
+def plan_of(tmp_path):
+    """Makes the plan of a study's text beside a plug-in with a program of 20 Hz."""
+    (tmp_path / "mine.py").write_text(PLUGIN)
+
+    def plan(text, models=(), scenario=""):
+        file = tmp_path / "mine.toml"
+        head = f'repetitions = 1\nconditions = ["N_0_0"]\n{text}\n{scenario}\n'
+        file.write_text(f'{head}[plugins]\nfiles = ["mine.py"]\n')
+        return make_plan(str(file), models)
+
+    yield plan
+    make_plan("baseline", "constant")  # what the study added is taken out again
+
+
+async def played(plan):
+    """The first trial of a plan whose drivers are programs."""
+    (spec, *_), (arm, *_) = plan.trial_specs(), plan.arms
+    drivers = {side: PROGRAMS[arm.sides[side]].make(arm.scenario, spec, side) for side in SIDES}
+    return await play_trial(spec, arm.scenario, drivers)
+
+
+def specs(plan):
+    """What the spec of each arm says."""
+    return [json.loads(plan.spec(arm, "N_0_0")) for arm in plan.arms]
+
+
+def hashes(plan):
+    return {spec.spec_hash for spec in plan.trial_specs()}
+
+
+MINE = '[drivers.mine]\nprogram = "braking"\n'
+
+
+async def test_a_driver_of_a_study_drives_by_its_parameters(plan_of):
+    trial = await played(plan_of(MINE + "strength = 0.5\n", "mine"))
+    assert {row.decision.applied for row in trial.decisions} == {(-0.5,)}
+
+
+def test_its_parameters_are_in_its_spec_and_another_value_is_another_spec(plan_of):
+    plan = plan_of(MINE + "strength = 0.5\n", "mine")
+    (spec,) = specs(plan)
+    assert spec["left"]["parameters"] == {"set": "mild", "strength": 0.5, "unused": 1.0}
+    assert (spec["left"]["program"], spec["left"]["based_on"]) == ("mine", "braking")
+    before = hashes(plan)
+    assert not before & hashes(plan_of(MINE + "strength = 0.6\n", "mine"))
+
+
+async def test_a_set_brings_its_parameters_and_single_ones_go_before_it(plan_of):
+    plan = plan_of(MINE + 'set = "hard"\nunused = 3\n', "mine")
+    assert specs(plan)[0]["left"]["parameters"] == {"set": "hard", "strength": 0.9, "unused": 3.0}
+    assert {row.decision.applied for row in (await played(plan)).decisions} == {(-0.9,)}
+
+
+def test_it_stands_in_pairs_and_in_the_sweep_with_its_study(plan_of):
+    plan = plan_of(MINE, ["mine+emulator", "constant+mine"])
+    assert [arm.sides["left"] for arm in plan.arms] == ["mine", "constant"]
+    assert "[drivers.mine]" in plan.config()["study"]["text"]
+
+
+async def test_a_clock_holds_each_action(plan_of):
+    plan = plan_of(MINE + "clock = 1.0\n", "mine")
+    trial = await played(plan)
+    left = [row for row in trial.decisions if row.side == "left"]
+    assert [row.time_s for row in left] == [float(n) for n in range(len(left))]
+    assert specs(plan)[0]["left"]["rate_hz"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (MINE + "force = 1\n", r"\[drivers\.mine\]: unknown parameter of braking 'force'; valid: "),
+        (MINE + 'strength = "1"\n', "strength of braking is a finite number, as 0.1, not '1'"),
+        (MINE + "strength = true\n", "strength of braking is a finite number"),
+        (MINE + "strength = nan\n", "strength of braking is a finite number"),
+        (MINE + "set = 1\n", "set of braking is a text, as 'mild'"),
+        (MINE + 'set = "soft"\n', "unknown set of the driver Braking 'soft'; valid: mild, hard"),
+        (MINE + "strength = 2\n", r"\[drivers\.mine\]: strength is at most 1"),
+        (MINE + "clock = 0.01\n", "braking decides every 0.05 s, and a clock can only slow it"),
+        (MINE + "clock = 0\n", "clock: Input should be greater than 0"),
+        ('[drivers.mine]\nprogram = "brake"\n', "unknown driver 'brake'; valid: constant, "),
+        ('[drivers.braking]\nprogram = "constant"\n', "there is a driver 'braking' already"),
+        ('[drivers.o3]\nprogram = "constant"\n', "needs another name: there is a model o3"),
+        (
+            '[drivers.mine]\nprogram = "projected-order"\ntarget_gap_m = 5\n',
+            "the parameters of projected-order stand in its source and cannot be set",
+        ),
+    ],
+)
+def test_what_cannot_be_a_driver_is_refused_with_the_valid_choices(plan_of, text, said):
+    with pytest.raises(UsageError, match=said):
+        plan_of(text, "constant")
+
+
+def test_a_stored_study_registers_its_drivers_without_running_its_plugins(plan_of):
+    text = plan_of(MINE + '[drivers.slow]\nprogram = "constant"\nclock = 2.0\n', "mine").study.text
+    plan_of("", "constant")
+    adopt_declared(text.replace("braking", "not-installed"))
+    assert PROGRAMS["slow"].rate_hz == 0.5
+    assert "mine" not in PROGRAMS
+
+
+def steps(plan):
+    return {arm.model: (arm.scenario.step_s, arm.scenario.plan_step_s) for arm in plan.arms}
+
+
+def test_a_world_is_as_fine_as_its_drivers_need_and_otherwise_as_it_was(plan_of):
+    slow = '[drivers.slow]\nprogram = "braking"\nclock = 1.0\n'
+    odd = '[drivers.odd]\nprogram = "braking"\nclock = 0.3\n'
+    plan = plan_of(slow + odd, ["braking", "emulator+braking", "constant", "slow", "odd"])
+    assert steps(plan) == {
+        "braking": (0.05, 0.2),
+        "emulator+braking": (0.05, 0.2),
+        "constant": (0.2, None),
+        "slow": (0.2, None),
+        "odd": (0.1, 0.2),
+    }
+    note = "note: braking is driven in steps of 0.05 s, as its drivers need"
+    assert next(plan.notes()) == note
+    assert make_plan("baseline", "constant").trial_specs()[0].spec_hash == "16d39b26a2c1fa23"
+
+
+def test_what_a_sweep_stores_of_its_world_is_what_its_trials_are_played_in(plan_of):
+    plan = plan_of("", "braking")
+    assert plan.config()["scenario"] == specs(plan)[0]["scenario"]
+
+
+def test_a_step_that_is_given_and_does_not_fit_is_refused(plan_of):
+    for text, scenario in (("", "[scenario]\nstep_s = 0.2\n"), ("[factors]\nstep_s = [0.2]\n", "")):
+        with pytest.raises(UsageError, match=r"cannot decide 20\.0 times a second"):
+            plan_of(text, "braking", scenario)
+
+
+def test_a_model_is_told_the_same_in_the_finer_world(plan_of):
+    plan = plan_of("", "emulator+braking")
+    prompts = set()
+    for scenario in (plan.arms[0].scenario, ScenarioConfig()):
+        seen = new_world(scenario, "N_0_0").observe("left")
+        prompts.add(render_prompt(seen, None, variant="baseline", scenario=scenario))
+    assert len(prompts) == 1
