@@ -26,7 +26,15 @@ from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import SIDES, Side, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS, MEAN_SPEED_MPS
 from merge_runner.scenarios.registry import SCENARIOS, new_world, task_of
-from merge_runner.study.crossing import OPPONENT, PROMPT, Arm, cross, level_text
+from merge_runner.study.crossing import (
+    OPPONENT,
+    PERCEPTION,
+    PROMPT,
+    SET_BY,
+    Arm,
+    cross,
+    level_text,
+)
 from merge_runner.study.file import (
     EVERY_CONDITION,
     EVERY_PROMPT,
@@ -181,6 +189,12 @@ class Plan:
         used = {*self.repetitions, *(prompt.based_on for prompt in prompts.values())}
         if unused := [name for name in prompts if name not in used]:
             yield f"note: not played, though {self.study.path} has them: {', '.join(unused)}"
+        levels = {str(each) for name in SET_BY for each in self.study.file.factors.get(name, ())}
+        if unused := [name for name in self.study.file.perception if name not in levels]:
+            yield (
+                f"note: no level of the factor {PERCEPTION}, though {self.study.path} has them: "
+                + ", ".join(unused)
+            )
 
     @property
     def capped_by(self) -> str:
