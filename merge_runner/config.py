@@ -28,7 +28,7 @@ from pydantic import (
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import SHIPPED_EXPERIMENTS
-from merge_runner.records import Side
+from merge_runner.records import SIDES, Side
 from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
 
@@ -79,6 +79,43 @@ def whole_steps(name: str, seconds: float, step_s: float) -> int:
     return round(steps)
 
 
+class Perception(Frozen):
+    """How the driver of one side perceives the other vehicle; by default exactly, at once, always.
+
+    ``position_sd_m`` and ``speed_sd_mps`` are the standard deviations of the errors of how far the
+    other is ahead, and of its speed. An error stays for about ``autocorrelation_s``: after t
+    seconds it is correlated by exp(-t / autocorrelation_s) with itself (Uhlenbeck and Ornstein,
+    Phys. Rev. 36, 823, 1930); 0: each instant has an error of its own. What is seen is the other
+    as it was ``delay_s`` ago. A decision receives nothing with the probability ``dropout``, and
+    shows what was received last. The other is seen up to a relative distance of ``range_m``, and
+    once the own car is within ``view_from_m`` of the merge point, or past it. ``own`` gives the own
+    position and speed errors of the same sizes.
+    """
+
+    position_sd_m: NotNegative = 0.0
+    speed_sd_mps: NotNegative = 0.0
+    autocorrelation_s: NotNegative = 0.0
+    delay_s: NotNegative = 0.0
+    dropout: Annotated[NotNegative, Field(le=1)] = 0.0
+    range_m: Positive | None = None
+    view_from_m: Positive | None = None
+    own: Annotated[bool, Field(strict=True)] = False
+
+    @cached_property
+    def is_perfect(self) -> bool:
+        """Whether a driver is told the truth."""
+        changing = self.position_sd_m, self.speed_sd_mps, self.delay_s, self.dropout
+        # A length is above 0 where it is given.
+        return not any((*changing, self.range_m, self.view_from_m))
+
+
+PERFECT = Perception()
+
+
+def _is_default(perception: Perception) -> bool:
+    return perception == PERFECT
+
+
 class ScenarioConfig(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
@@ -98,7 +135,12 @@ class ScenarioConfig(Frozen):
     ``step_s`` is the world's step. ``plan_step_s`` is how long an action of a language model's plan
     lasts and how far apart the samples of its histories are, ``step_s`` where it is not given.
     ``prompt_rate_hz`` is a language model's, and that of a program without a rate of its own.
+    ``perception_left`` and ``perception_right`` say what the driver of each side perceives.
     """
+
+    nested: ClassVar[Mapping[str, type[BaseModel]]] = {
+        f"perception_{side}": Perception for side in SIDES
+    }
 
     name: str = Field(default=USUAL_SCENARIO, exclude_if=lambda name: name == USUAL_SCENARIO)
     horizon_s: Positive = 4.0
@@ -117,6 +159,13 @@ class ScenarioConfig(Frozen):
     history_start: Literal["cruise", "empty"] = "cruise"
     fallback: Literal["continue", "restart"] = "continue"
     straight_after: Literal["own", "both"] = "own"
+    # Left out where they are perfect, for the same reason.
+    perception_left: Perception = Field(default=PERFECT, exclude_if=_is_default)
+    perception_right: Perception = Field(default=PERFECT, exclude_if=_is_default)
+
+    def perception(self, side: Side) -> Perception:
+        """What the driver of a side perceives."""
+        return self.perception_left if side == "left" else self.perception_right
 
     @cached_property
     def action_s(self) -> float:
@@ -158,6 +207,9 @@ class ScenarioConfig(Frozen):
             ("1 / prompt_rate_hz", 1 / self.prompt_rate_hz, self.action_s),
         ):
             whole_steps(name, seconds, step_s)
+        for side in SIDES:
+            if delay_s := self.perception(side).delay_s:
+                whole_steps(f"perception_{side}.delay_s", delay_s, self.step_s)
         if self.executed_actions > self.plan_actions:
             raise ValueError("the horizon is shorter than the time between two prompts")
         return self

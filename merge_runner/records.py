@@ -27,6 +27,9 @@ SCRIPTED_FIELD = "merge_runner_scripted"
 # request's body, and the slot if the request named one.
 ANSWERED_FIELD = "merge_runner_request"
 
+FAR_BEHIND_M = 1000.0
+"""Where the other vehicle is put while it is not seen; see Observation."""
+
 
 @dataclass(frozen=True, slots=True)
 class Slot:
@@ -62,6 +65,9 @@ class Observation:
     vehicle executed, and the speeds at which the other was seen before now. ``own_position_m`` is
     travelled along the own branch; ``other_acceleration_mps2`` is what the other executed over the
     last step, 0 before the first. Programs see these two; no prompt tells them.
+    ``other_seen`` is false while the other is out of sight: prompts say so, its history is empty,
+    and a program that does not ask finds a car that cannot matter, FAR_BEHIND_M behind it and as
+    fast as itself.
     """
 
     road: Road
@@ -73,6 +79,7 @@ class Observation:
     other_speeds_mps: tuple[float, ...]
     own_position_m: float
     other_acceleration_mps2: float
+    other_seen: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,12 +228,16 @@ class StateRow:
 
 @dataclass(frozen=True, slots=True)
 class DecisionRow:
-    """One decision of one driver, at its number and time in the trial."""
+    """One decision of one driver, at its number and time in the trial.
+
+    ``told`` is what the driver was told where its perception is imperfect, None: the truth.
+    """
 
     number: int
     time_s: float
     side: Side
     decision: Decision
+    told: Observation | None = None
 
 
 @dataclass(frozen=True, slots=True)

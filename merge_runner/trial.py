@@ -10,6 +10,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.program_seat import StartsElsewhere
 from merge_runner.errors import CallFailed, ReplayMiss, UsageError
+from merge_runner.perception import Eyes
 from merge_runner.records import (
     SIDES,
     Decision,
@@ -30,7 +31,7 @@ async def play_trial(
 ) -> TrialRecord:
     """Play a trial to its end, or until a call fails."""
     world = new_world(scenario, spec.condition, _starts(drivers))
-    seats = {side: _Seated(drivers[side]) for side in SIDES}
+    seats = {side: _seated(drivers[side], world) for side in SIDES}
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}
     while world.status is None:
@@ -39,10 +40,14 @@ async def play_trial(
         for side, answer in answers.items():
             if isinstance(answer, Decision):
                 number = seats[side].take(answer, world.step)
-                decisions.append(DecisionRow(number, world.time_s, side, answer))
+                told = seats[side].told
+                decisions.append(DecisionRow(number, world.time_s, side, answer, told))
         if failures:
             break
         world.advance({side: seats[side].action(world.step) for side in SIDES})
+        for side, seated in seats.items():
+            if seated.eyes:
+                seated.eyes.look(world.observe(side))
     return TrialRecord(
         spec=spec,
         status=world.status or "failed",
@@ -78,9 +83,14 @@ def _starts(drivers: Mapping[Side, Driver]) -> Starts | None:
 
 @dataclass(slots=True)
 class _Seated:
-    """A driver in its trial: what it decided last, and at which step of the world."""
+    """A driver in its trial: what it decided last, and at which step of the world.
+
+    It has ``eyes`` where its perception is imperfect, and was ``told`` what they saw.
+    """
 
     driver: Driver
+    eyes: Eyes | None = None
+    told: Observation | None = None
     decision: Decision | None = None
     decided_at: int = 0
 
@@ -91,6 +101,13 @@ class _Seated:
     def number(self, step: int) -> int:
         """The number of its decision at a step, or of the last one before."""
         return step // self.driver.seat.pace.interval_steps
+
+    def observe(self, world: World) -> Observation:
+        """What the driver is told of the world as it is now."""
+        if self.eyes is None:
+            return world.observe(self.driver.seat.side)
+        self.told = self.eyes.told()
+        return self.told
 
     def take(self, decision: Decision, step: int) -> int:
         """Drive by a decision from now on; returns its number. Raises UsageError for an odd one."""
@@ -113,6 +130,15 @@ class _Seated:
         return self.decision.applied[driven]
 
 
+def _seated(driver: Driver, world: World) -> _Seated:
+    seat = driver.seat
+    perception = seat.scenario.perception(seat.side)
+    if perception.is_perfect:
+        return _Seated(driver)
+    start = world.observe(seat.side)
+    return _Seated(driver, Eyes(perception, seat.seed, seat.scenario.step_s, start))
+
+
 async def _decide(world: World, seats: Mapping[Side, _Seated]) -> dict[Side, Decision | CallFailed]:
     """Ask at once all who are due; where one call fails, the other's answer is still awaited."""
     asked = {
@@ -130,6 +156,6 @@ async def _decide(world: World, seats: Mapping[Side, _Seated]) -> dict[Side, Dec
             return failure
 
     answers = await asyncio.gather(
-        *(answer(seated, world.observe(side)) for side, seated in asked.items())
+        *(answer(seated, seated.observe(world)) for seated in asked.values())
     )
     return dict(zip(asked, answers, strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from typing import Literal
@@ -45,8 +46,9 @@ def _blocks(prompt: str) -> list[tuple[str, str]]:
     """Name and text of each block; what belongs to none that is known here has no name."""
     found: list[tuple[str, str]] = []
     paragraphs_to_come = 0
-    for paragraph in prompt.rstrip("\n").split("\n\n"):
-        begun = _begun(paragraph)
+    paragraphs = prompt.rstrip("\n").split("\n\n")
+    for place, paragraph in enumerate(paragraphs):
+        begun = _begun(paragraphs[place:])
         if begun is not None:
             name, paragraphs_to_come = begun
             found.append((name, paragraph))
@@ -58,18 +60,21 @@ def _blocks(prompt: str) -> list[tuple[str, str]]:
     return found
 
 
-def _begun(paragraph: str) -> tuple[str, int] | None:
-    """The block that begins like this paragraph, up to its first value, and how many follow."""
-    beginnings = [
-        (beginning, name, template.count("\n\n"))
-        for name, block in BLOCKS.items()
-        for template in (block.merge, block.straight)
-        if template is not None
-        and (beginning := template.partition("{")[0].partition("\n\n")[0])
-        and paragraph.startswith(beginning)
-    ]
-    # One may begin with another one's words.
-    return max(beginnings)[1:] if beginnings else None
+def _begun(paragraphs: Sequence[str]) -> tuple[str, int] | None:
+    """The block whose first paragraph begins like this one, and how many of its own follow.
+
+    A paragraph is known by its text up to its first value. One block may begin with another one's
+    words: the one that agrees farthest, and in the most of its paragraphs, is meant.
+    """
+    agreeing = []
+    for name, block in BLOCKS.items():
+        for template in filter(None, (block.merge, block.straight)):
+            beginnings = [part.partition("{")[0] for part in template.split("\n\n")]
+            pairs = zip(beginnings, paragraphs, strict=False)
+            agrees = [paragraph.startswith(beginning) for beginning, paragraph in pairs]
+            if beginnings[0] and agrees[0]:
+                agreeing.append((len(beginnings[0]), sum(agrees), name, len(beginnings) - 1))
+    return max(agreeing)[2:] if agreeing else None
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:

@@ -297,6 +297,28 @@ def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
     }
 
 
+def perceived(trial: Trial, decision: Decision) -> list[tuple[str, float, float | None]]:
+    """What was so and what was told, with what it is of; None where it was not seen.
+
+    Empty where the driver was told the truth.
+    """
+    row = decision.row
+    own, other = (
+        trial.states.get(side) for side in sorted(SIDES, key=lambda side: side != row["side"])
+    )
+    imperfect = row.get("other_seen") is not None
+    if not (imperfect and own and other and row["time_s"] in own["time_s"]):
+        return []
+    now = own["time_s"].index(row["time_s"])
+    distance_m = other["position_m"][now] - own["position_m"][now]
+    return [
+        ("how far ahead the other is (m)", distance_m, row["told_distance_m"]),
+        ("the other's speed (m/s)", other["velocity_mps"][now], row["told_other_speed_mps"]),
+        ("its own position (m)", own["position_m"][now], row["told_own_position_m"]),
+        ("its own speed (m/s)", own["velocity_mps"][now], row["told_own_speed_mps"]),
+    ]
+
+
 def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:
     """Both vehicles where a decision was made and where the next one was, or at the end."""
     if decision.row["lost"]:

@@ -12,8 +12,9 @@ import math
 import re
 from dataclasses import dataclass
 
-from merge_runner.emulator.chance import draw, draw_between, draw_index
-from merge_runner.records import Slot
+from merge_runner.chance import draw, draw_between, draw_index
+from merge_runner.prompts.state_lines import NOT_SEEN
+from merge_runner.records import FAR_BEHIND_M, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 
@@ -38,6 +39,7 @@ class Seen:
     """From the last two seen speeds of the other; 0 where the prompt has no history."""
     previous: float | None
     """The next action of the previous plan, normalised."""
+    other_seen: bool = True
 
     @property
     def other_distance_to_merge(self) -> float:
@@ -64,7 +66,9 @@ def answer(prompt: str, slot: Slot | None) -> str:
     if seen is None:
         return "I am a scripted stand-in for a language model and can only answer driving prompts."
     temper = temper_for(seen, slot, prompt)
-    if seen.distance_to_merge is None:
+    if not seen.other_seen:
+        action, why = 0.0, "I do not see the other car, and keep my speed."
+    elif seen.distance_to_merge is None:
         action, why = _on_straight(seen)
     elif temper.goes_first:
         action, why = _go_first(seen, temper, slot)
@@ -78,22 +82,26 @@ def answer(prompt: str, slot: Slot | None) -> str:
 
 def read_prompt(prompt: str) -> Seen | None:
     """The situation that a prompt describes; None if it is about something else."""
-    own = _number(r"Your speed: (\S+) m/s", prompt)
-    other = _number(r"Speed of the other car: (\S+) m/s", prompt)
-    relative = _number(r"Relative distance .*?: (\S+) m$", prompt)
+    own = _quantity("Your speed", "m/s", prompt)
+    other = _quantity("Speed of the other car", "m/s", prompt)
+    relative = _quantity("Relative distance .*?", "m", prompt)
     actions = _number(r"exactly (\d+) numbers", prompt)
+    other_seen = not re.search(rf"Speed of the other car(?:: | \| ){NOT_SEEN}", prompt)
+    if not other_seen:
+        other, relative = own, -FAR_BEHIND_M
     if own is None or other is None or relative is None or actions is None:
         return None
     return Seen(
         own_speed=own,
         other_speed=other,
         relative_distance=relative,
-        distance_to_merge=_number(r"distance to the merge point: (\S+) m$", prompt),
+        distance_to_merge=_quantity("Your distance to the merge point", "m", prompt),
         asks_tactical="merge first (M) or yield" in prompt,
         plan_actions=int(actions),
-        vehicle_length=_number(r"Length of each car: (\S+) m", prompt) or VEHICLE_LENGTH_M,
+        vehicle_length=_quantity("Length of each car", "m", prompt) or VEHICLE_LENGTH_M,
         other_acceleration=_other_acceleration(prompt, other),
         previous=_number(r"not been executed yet\): \[([^,\]]+)", prompt),
+        other_seen=other_seen,
     )
 
 
@@ -226,6 +234,11 @@ def _other_acceleration(prompt: str, speed_now: float) -> float:
     before = _number(r"Observed speeds of the other car .*[\[ ]([^, \]]+)\]$", prompt)
     step = _number(r"one value every (\S+) s", prompt)
     return (speed_now - before) / step if before is not None and step else 0.0
+
+
+def _quantity(name: str, unit: str, prompt: str) -> float | None:
+    """A quantity in the list of the situation, or in its table."""
+    return _number(rf"{name}(?:: | \| )(\S+) (?:\| )?{unit}(?![\w/])", prompt)
 
 
 def _number(pattern: str, prompt: str) -> float | None:

@@ -13,8 +13,8 @@ from pydantic import (
     model_validator,
 )
 
+from merge_runner.chance import draw, draw_between
 from merge_runner.config import read_toml
-from merge_runner.emulator.chance import draw, draw_between
 from merge_runner.errors import UsageError
 
 Fault = Literal[

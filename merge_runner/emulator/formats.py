@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from merge_runner.emulator.chance import draw_index
+from merge_runner.chance import draw_index
 
 CREATED = 1_760_000_000
 Turn = Any

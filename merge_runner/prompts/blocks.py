@@ -24,7 +24,8 @@ class Fields(TypedDict):
     """What a template may name in braces, each as it is written in the prompt.
 
     Numbers have two decimals, in m, s, m/s and m/s^2, or in the unit of their name; lists are
-    those of Python.
+    those of Python. What is about the other car is "not seen" while that is so, and without the
+    unit that a template has behind it.
     """
 
     vehicle_length: str
@@ -37,6 +38,12 @@ class Fields(TypedDict):
     relative_speed: str  # own minus other
     relative_distance: str  # how far the other car is ahead, negative if it is behind
     distance_to_merge: str  # before the merge point alone
+    # These have their units in them, and say in words where there is no number (state_lines).
+    projected_headway: str
+    own_time_to_merge: str
+    other_time_to_merge: str
+    time_gap: str
+    relative_speed_in_words: str
     own_accelerations: str
     other_speeds: str
     remaining_plan: str
@@ -116,34 +123,49 @@ def _named(template: str) -> list[str]:
     return [name for _, name, _, _ in parts if name is not None]
 
 
-_SITUATION_BEFORE = """\
+_APPROACHING = """\
 You drive a car towards a merge. Two roads join at a merge point and go on as a single lane. You \
 are on one of the two roads and another car is on the other one. Neither of you has the right of \
 way. You cannot steer and you cannot communicate with the other driver: you control only the \
-acceleration of your own car. You are asked for a new plan every {prompt_interval_s} s.
+acceleration of your own car. You are asked for a new plan every {prompt_interval_s} s."""
 
-Situation now:
-- Road type: merge
-- Length of each car: {vehicle_length} m
-- Your speed: {own_speed} m/s
-- Speed of the other car: {other_speed} m/s
-- Relative distance (how far the other car is ahead of you along the road; negative if it is \
-behind): {relative_distance} m
-- Your distance to the merge point: {distance_to_merge} m"""
-
-_SITUATION_AFTER = """\
+_MERGED = """\
 You drive a car on a straight road: you have passed a merge point where two roads join to a \
 single lane. Another car comes from the other road and is ahead of you or behind you. You cannot \
 steer and you cannot communicate with the other driver: you control only the acceleration of your \
-own car. You are asked for a new plan every {prompt_interval_s} s.
+own car. You are asked for a new plan every {prompt_interval_s} s."""
 
-Situation now:
-- Road type: straight
-- Length of each car: {vehicle_length} m
-- Your speed: {own_speed} m/s
-- Speed of the other car: {other_speed} m/s
-- Relative distance (how far the other car is ahead of you along the road; negative if it is \
-behind): {relative_distance} m"""
+# Quantity, value and unit.
+_STATE = (
+    ("Length of each car", "{vehicle_length}", "m"),
+    ("Your speed", "{own_speed}", "m/s"),
+    ("Speed of the other car", "{other_speed}", "m/s"),
+    (
+        "Relative distance (how far the other car is ahead of you along the road; negative if it "
+        "is behind)",
+        "{relative_distance}",
+        "m",
+    ),
+)
+_BEFORE = (
+    ("Road type", "merge", ""),
+    *_STATE,
+    ("Your distance to the merge point", "{distance_to_merge}", "m"),
+)
+_AFTER = (("Road type", "straight", ""), *_STATE)
+_Rows = tuple[tuple[str, str, str], ...]
+
+
+def _listed(introduction: str, rows: _Rows) -> str:
+    lines = "\n".join(f"- {quantity}: {value} {unit}".rstrip() for quantity, value, unit in rows)
+    return f"{introduction}\n\nSituation now:\n{lines}"
+
+
+def _tabled(introduction: str, rows: _Rows) -> str:
+    lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    head = "| quantity | value | unit |\n|---|---|---|"
+    return f"{introduction}\n\nSituation now:\n{head}\n{lines}"
+
 
 _HISTORY = """\
 History of the last {memory_s} s, one value every {step_s} s, oldest first:
@@ -175,7 +197,9 @@ Write the list in a Python code block that holds nothing but the list."""
 
 BLOCKS = Registry[Block]("prompt block")
 _of_paper = partial(Block, in_baseline=True, before=None)
-BLOCKS.register("C0", _of_paper("situation", _SITUATION_BEFORE, _SITUATION_AFTER))
+BLOCKS.register(
+    "C0", _of_paper("situation", _listed(_APPROACHING, _BEFORE), _listed(_MERGED, _AFTER))
+)
 BLOCKS.register("C1", _of_paper("history", _HISTORY, _HISTORY))
 BLOCKS.register("C2", _of_paper("previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN))
 BLOCKS.register("C3.safety", _of_paper("avoid a collision", _SAFETY, _SAFETY))
@@ -184,6 +208,27 @@ BLOCKS.register("C3.distance", _of_paper("keep a distance", _DISTANCE, _DISTANCE
 BLOCKS.register("C3.reassess", _of_paper("reassess", _REASSESS, _REASSESS))
 BLOCKS.register("C4", _of_paper("tactical decision", _TACTICAL, None))
 BLOCKS.register(OUTPUT_FORMAT, _of_paper("output format", _SCHEMA, _SCHEMA))
+
+_of_state = partial(Block, before="C1")
+_HEADWAY = """\
+Projected headway (which car is ahead when the first of you reaches the merge point at present \
+speeds): {projected_headway}"""
+_TIMES = """\
+Time to the merge point at present speeds:
+- You: {own_time_to_merge}
+- The other car: {other_time_to_merge}"""
+_GAP = "Time gap (how long the car behind takes to where the car ahead is now): {time_gap}"
+_FASTER = "Relative speed: {relative_speed_in_words}"
+_KMH = "In km/h: your speed is {own_speed_kmh}, the speed of the other car {other_speed_kmh}"
+_MPH = "In mph: your speed is {own_speed_mph}, the speed of the other car {other_speed_mph}"
+_TABLES = _tabled(_APPROACHING, _BEFORE), _tabled(_MERGED, _AFTER)
+BLOCKS.register("state.projected_headway", _of_state("projected headway", _HEADWAY, None))
+BLOCKS.register("state.time_to_merge", _of_state("times to the merge point", _TIMES, None))
+BLOCKS.register("state.time_gap", _of_state("time gap", _GAP, _GAP))
+BLOCKS.register("state.relative_speed", _of_state("relative speed in words", _FASTER, _FASTER))
+BLOCKS.register("state.kmh", _of_state("speeds in km/h", _KMH, _KMH))
+BLOCKS.register("state.mph", _of_state("speeds in mph", _MPH, _MPH))
+BLOCKS.register("state.table", _of_state("situation as a table, in place of C0", *_TABLES))
 
 VARIANTS = Registry[Variant]("variant")
 VARIANTS.register("baseline", Variant(title="Baseline"))

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from functools import cache
 from statistics import fmean
 
 from merge_runner.config import ScenarioConfig
+from merge_runner.prompts import state_lines
 from merge_runner.prompts.blocks import Fields, blocks_of
+from merge_runner.prompts.state_lines import NOT_SEEN
 from merge_runner.records import Observation, Road
 from merge_runner.registry import changes
 
 KMH_OF_MPS = 3.6
 MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
+_UNIT_OF_NOTHING = re.compile(rf"({NOT_SEEN}) (?:m/s\^2|m/s|km/h|mph|m|s)(?![\w/^])")
 
 
 def render_prompt(
@@ -27,8 +31,9 @@ def render_prompt(
     ``remaining_plan`` is the unexecuted rest of the last valid plan (normalised accelerations),
     None before the first.
     """
-    fields = _fields(observation, remaining_plan, scenario)
-    return _template(variant, observation.road, changes()).format_map(fields)
+    template = _template(variant, observation.road, changes())
+    prompt = template.format_map(fields(observation, remaining_plan, scenario))
+    return prompt if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", prompt)
 
 
 @cache
@@ -38,25 +43,39 @@ def _template(variant: str, road: Road, _: int) -> str:
     return "\n\n".join(template for template in templates if template is not None) + "\n"
 
 
-def _fields(
+def fields(
     observation: Observation, remaining_plan: Sequence[float] | None, scenario: ScenarioConfig
 ) -> Fields:
+    """What templates name, as it is written in a prompt."""
     distance = observation.distance_to_merge_m
     every = scenario.action_steps
     own, other = observation.own_speed_mps, observation.other_speed_mps
+
+    def of_other(value: float) -> str:
+        return decimal(value) if observation.other_seen else NOT_SEEN
+
     return {
         "vehicle_length": f"{scenario.vehicle_length_m:g}",
         "own_speed": decimal(own),
-        "other_speed": decimal(other),
+        "other_speed": of_other(other),
         "own_speed_kmh": decimal(own * KMH_OF_MPS),
-        "other_speed_kmh": decimal(other * KMH_OF_MPS),
+        "other_speed_kmh": of_other(other * KMH_OF_MPS),
         "own_speed_mph": decimal(own * MPH_OF_MPS),
-        "other_speed_mph": decimal(other * MPH_OF_MPS),
-        "relative_speed": decimal(own - other),
-        "relative_distance": decimal(observation.relative_distance_m),
+        "other_speed_mph": of_other(other * MPH_OF_MPS),
+        "relative_speed": of_other(own - other),
+        "relative_distance": of_other(observation.relative_distance_m),
         "distance_to_merge": "" if distance is None else decimal(distance),
+        "projected_headway": state_lines.projected_headway(observation),
+        "own_time_to_merge": state_lines.own_time_to_merge(observation),
+        "other_time_to_merge": state_lines.other_time_to_merge(observation),
+        "time_gap": state_lines.time_gap(observation),
+        "relative_speed_in_words": state_lines.relative_speed(observation),
         "own_accelerations": listing(_means(observation.own_accelerations_mps2, every)),
-        "other_speeds": listing(_firsts(observation.other_speeds_mps, every)),
+        "other_speeds": (
+            listing(_firsts(observation.other_speeds_mps, every))
+            if observation.other_seen
+            else NOT_SEEN
+        ),
         "remaining_plan": (
             "none, this is your first decision"
             if remaining_plan is None

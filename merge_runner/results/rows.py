@@ -12,6 +12,7 @@ from typing import Any
 from merge_runner.records import (
     Attempt,
     ChatRequest,
+    Observation,
     TrialRecord,
     TrialSpec,
     is_scripted,
@@ -100,7 +101,24 @@ def decision_rows(record: TrialRecord) -> Iterator[Row]:
             prompt,
             None if prompt is None else hashlib.sha256(prompt.encode()).hexdigest(),
             None if decision.reply is None else decision.reply.request.key,
+            *_told(row.told),
         )
+
+
+def _told(told: Observation | None) -> Row:
+    """What a driver was told, of the other vehicle only where it was seen; NULLs: the truth."""
+    if told is None:
+        return (None,) * 7
+    own = (told.other_seen, told.own_position_m, told.own_speed_mps)
+    if not told.other_seen:
+        return (*own, None, None, None, None)
+    return (
+        *own,
+        told.relative_distance_m,
+        told.other_speed_mps,
+        told.other_acceleration_mps2,
+        list(told.other_speeds_mps),
+    )
 
 
 def call_rows(record: TrialRecord) -> Iterator[Row]:

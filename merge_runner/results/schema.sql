@@ -89,7 +89,14 @@ CREATE TABLE IF NOT EXISTS decisions (
     fallback BOOLEAN NOT NULL,        -- applied comes from an older plan, or is 0
     prompt VARCHAR,                   -- the situation as the driver was told it
     prompt_hash VARCHAR,              -- SHA-256 of the prompt
-    call_key VARCHAR                  -- leads to the call; NULL: a program decided
+    call_key VARCHAR,                 -- leads to the call; NULL: a program decided
+    other_seen BOOLEAN,               -- whether it saw the other; NULL: it was told the truth
+    told_own_position_m DOUBLE,       -- what it was told; NULL: the truth
+    told_own_speed_mps DOUBLE,        -- what it was told; NULL: the truth
+    told_distance_m DOUBLE,           -- how far ahead the other is, it was told; NULL: not seen
+    told_other_speed_mps DOUBLE,      -- what it was told; NULL: the truth, or not seen
+    told_other_acceleration_mps2 DOUBLE, -- what programs were told; NULL as above
+    told_other_speeds_mps DOUBLE[]    -- the history that it was told; NULL as above
 );
 
 -- An attempt at a call.
@@ -123,6 +130,26 @@ CREATE TABLE IF NOT EXISTS calls (
 -- How a driver is named: by its model, and by its endpoint where that is not the provider's own.
 CREATE MACRO IF NOT EXISTS driver_name(model, endpoint) AS
     model || coalesce(' at ' || nullif(regexp_extract(endpoint, '://([^/]+)', 1), ''), '');
+
+-- What was so beside what a driver with imperfect perception was told, for each of its decisions.
+CREATE VIEW IF NOT EXISTS perceptions AS
+SELECT trial_id, spec_hash, decision, decisions.time_s, decisions.side, other_seen,
+    -- how far ahead the other was
+    other.position_m - own.position_m AS distance_m,
+    told_distance_m,
+    -- how fast the other was
+    other.velocity_mps AS other_speed_mps,
+    told_other_speed_mps,
+    -- where the own vehicle was
+    own.position_m AS own_position_m,
+    told_own_position_m,
+    -- how fast the own vehicle was
+    own.velocity_mps AS own_speed_mps,
+    told_own_speed_mps
+FROM decisions
+JOIN states AS own USING (trial_id, spec_hash, time_s, side)
+JOIN states AS other USING (trial_id, spec_hash, step)
+WHERE other_seen IS NOT NULL AND other.side <> own.side;
 
 -- Who drove: two different drivers are joined by a plus, another sample set has its number, and so
 -- has each level of a study's factors but the prompt and the opponent, which are named already.

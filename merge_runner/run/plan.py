@@ -28,7 +28,15 @@ from merge_runner.records import SIDES, Side, TrialSpec
 from merge_runner.results.human_trials import human_trials
 from merge_runner.scenarios.merge.conditions import CONDITIONS, MEAN_SPEED_MPS
 from merge_runner.scenarios.registry import SCENARIOS, new_world, task_of
-from merge_runner.study.crossing import OPPONENT, PROMPT, Arm, cross, level_text
+from merge_runner.study.crossing import (
+    OPPONENT,
+    PERCEPTION,
+    PROMPT,
+    SET_BY,
+    Arm,
+    cross,
+    level_text,
+)
 from merge_runner.study.file import (
     EVERY_CONDITION,
     EVERY_PROMPT,
@@ -189,6 +197,12 @@ class Plan:
         if unused := [name for name in prompts if name not in used]:
             yield f"note: not played, though {self.study.path} has them: {', '.join(unused)}"
         yield from dict.fromkeys(filter(None, map(self._finer_world, self.arms)))
+        levels = {str(each) for name in SET_BY for each in self.study.file.factors.get(name, ())}
+        if unused := [name for name in self.study.file.perception if name not in levels]:
+            yield (
+                f"note: no level of the factor {PERCEPTION}, though {self.study.path} has them: "
+                + ", ".join(unused)
+            )
 
     def _finer_world(self, arm: Arm) -> str:
         """A note where the drivers of an arm need a finer world than the study's own."""

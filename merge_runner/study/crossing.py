@@ -10,7 +10,7 @@ from itertools import product
 
 from pydantic import JsonValue
 
-from merge_runner.config import ModelEntry, ScenarioConfig, both_sides, validated
+from merge_runner.config import ModelEntry, Perception, ScenarioConfig, both_sides, validated
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
@@ -23,6 +23,10 @@ from merge_runner.study.file import StudyFile
 from merge_runner.study.world_step import with_world_step
 
 MODEL, PROMPT, OPPONENT, SELF, DEFAULT = "model", "prompt", "opponent", "self", "default"
+PERCEPTION, PERFECT_ONE = "perception", "perfect"
+_PERCEPTIONS = tuple(f"{PERCEPTION}_{side}" for side in SIDES)
+SET_BY = {PERCEPTION: _PERCEPTIONS, **{name: (name,) for name in _PERCEPTIONS}}
+"""The factors of perception, with the switches of the scenario that each sets."""
 Levels = Mapping[str, JsonValue]
 
 
@@ -85,7 +89,11 @@ def cross(
 def _hint(error: UsageError, levels: Levels) -> str:
     """How to leave out the crossings that cannot be: by those levels that the error names."""
     text = str(error)
-    named = [name for name in levels if name == MODEL or re.search(rf"\b{name}\b", text)]
+    named = [
+        name
+        for name in levels
+        if name == MODEL or re.search(rf"\b({'|'.join((name, *SET_BY.get(name, ())))})\b", text)
+    ]
     where = ", ".join(f"{name} = {json.dumps(levels[name])}" for name in named)
     return f"to leave such crossings out, write above [factors]: skip = [{{ {where} }}]"
 
@@ -117,7 +125,7 @@ def _arm(
     registry: Mapping[str, ModelEntry],
     varying: Sequence[str],
 ) -> Arm:
-    scenario = _scenario(file.scenario, levels)
+    scenario = _scenario(file, levels)
     sides = _sides(str(levels[MODEL]), str(levels.get(OPPONENT, SELF)))
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
@@ -164,7 +172,7 @@ def _sides(model: str, opponent: str) -> dict[Side, str]:
 
 
 def _is_parameter(name: str) -> bool:
-    return name not in (MODEL, PROMPT, OPPONENT) and name not in ScenarioConfig.model_fields
+    return name not in {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields}
 
 
 def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
@@ -175,11 +183,17 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
         raise UsageError("skip is no factor: write it above [factors]")
     if taken := [name for name in file.drivers if name in registry]:
         raise UsageError(f"[drivers.{taken[0]}] needs another name: there is a model {taken[0]}")
+    if PERCEPTION in file.factors and {*_PERCEPTIONS} & file.factors.keys():
+        raise UsageError(
+            f"the factor {PERCEPTION} is of both sides: name it, or {' and '.join(_PERCEPTIONS)}"
+        )
+    if PERFECT_ONE in file.perception:
+        raise UsageError(f"[perception.{PERFECT_ONE}] has another name: {PERFECT_ONE} is the truth")
     known = known_parameters(registry.values())
     for name in filter(_is_parameter, file.factors):
         if name not in known:
             raise UsageError(
-                f"unknown factor {name!r}; valid: {PROMPT}, {OPPONENT}, a parameter "
+                f"unknown factor {name!r}; valid: {PROMPT}, {OPPONENT}, {PERCEPTION}, a parameter "
                 f"({', '.join(sorted(known))}) or a switch of the scenario "
                 f"({', '.join(ScenarioConfig.model_fields)})"
             )
@@ -207,11 +221,14 @@ def _refuse_parameters(program: str, parameters: Levels) -> None:
             raise UsageError(f"{program} is a program and takes no {parameter}, only {DEFAULT!r}")
 
 
-def _scenario(scenario: ScenarioConfig, levels: Levels) -> ScenarioConfig:
+def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
     switches = {name: levels[name] for name in levels if name in ScenarioConfig.model_fields}
-    made = scenario
+    for factor in SET_BY.keys() & levels.keys():
+        perception = _perception(file, factor, level_text(levels[factor]))
+        switches.update(dict.fromkeys(SET_BY[factor], perception))
+    made = file.scenario
     if switches:
-        given = scenario.model_dump(exclude_unset=True)
+        given = made.model_dump(exclude_unset=True)
         made = validated(ScenarioConfig, {**given, **switches}, "factors")
     rules = SCENARIOS.require(made.name).collision_rules
     if made.collision_rule not in rules:
@@ -220,6 +237,13 @@ def _scenario(scenario: ScenarioConfig, levels: Levels) -> ScenarioConfig:
             + ", ".join(rules)
         )
     return made
+
+
+def _perception(file: StudyFile, factor: str, level: str) -> dict[str, JsonValue]:
+    """The perception that a level names; raises UsageError."""
+    known = {PERFECT_ONE: Perception(), **file.perception}
+    hint = f"define another one as [{PERCEPTION}.NAME]"
+    return require(known, f"level of the factor {factor}:", level, hint).model_dump()
 
 
 def _check_axes(

@@ -15,6 +15,7 @@ from merge_runner.config import (
     Frozen,
     Json,
     NotNegative,
+    Perception,
     Positive,
     ScenarioConfig,
     experiments,
@@ -57,17 +58,19 @@ class RoadTexts(Frozen):
 class AddedText(RoadTexts):
     """A paragraph that a prompt adds ``before`` or ``after`` a block; else it stands last.
 
-    ``text`` stands for both roads.
+    ``text`` stands for both roads. ``block`` names a registered one, which has a place of its own.
     """
 
+    block: str | None = None
     text: str | None = None
     before: str | None = None
     after: str | None = None
 
     @model_validator(mode="after")
     def _one_of_each(self) -> AddedText:
-        if (self.text is None) == (self.merge is None and self.straight is None):
-            raise ValueError("give it a text, or merge and straight")
+        of_roads = self.merge is not None or self.straight is not None
+        if (self.block is not None) + (self.text is not None) + of_roads != 1:
+            raise ValueError("give it a block, a text, or merge and straight")
         if self.before is not None and self.after is not None:
             raise ValueError("before or after, not both")
         return self
@@ -147,7 +150,8 @@ class StudyFile(Frozen):
     """One study. ``repetitions`` are per condition, for each prompt or for all of them.
 
     ``factors`` are crossed with each other, with the ``models`` and with the conditions; ``skip``
-    leaves crossings out: each row names levels, or lists of them.
+    leaves crossings out: each row names levels, or lists of them. ``perception`` holds by name what
+    the levels of the factors perception, perception_left and perception_right stand for.
     """
 
     nested: ClassVar[Mapping[str, type[BaseModel]]] = {
@@ -155,6 +159,7 @@ class StudyFile(Frozen):
         "scenario": ScenarioConfig,
         "prompts": StudyPrompt,
         "drivers": StudyDriver,
+        "perception": Perception,
         "budget": BudgetTerms,
         "plugins": Plugins,
     }
@@ -170,6 +175,7 @@ class StudyFile(Frozen):
     skip: tuple[dict[str, Json], ...] = ()
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)
+    perception: dict[str, Perception] = Field(default_factory=dict)
     budget: BudgetTerms = BudgetTerms()
     plugins: Plugins = Plugins()
 

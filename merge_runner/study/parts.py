@@ -203,7 +203,7 @@ def _variant(name: str, prompt: StudyPrompt) -> Variant:
         old = blocks[each]
         blocks[each] = Block(old.meaning, texts.merge, texts.straight, before=old.before)
     for number, added in enumerate(prompt.add, 1):
-        blocks = dict(_inserted(name, blocks, f"{name}.{number}", added))
+        blocks = dict(_inserted(name, blocks, number, added))
     if prompt.order:
         blocks = _ordered(name, blocks, prompt.order)
     changed = {each for each, block in before.items() if blocks.get(each) != block}
@@ -216,21 +216,37 @@ def _variant(name: str, prompt: StudyPrompt) -> Variant:
 
 
 def _inserted(
-    prompt: str, blocks: Mapping[str, Block], name: str, added: AddedText
+    prompt: str, blocks: Mapping[str, Block], number: int, added: AddedText
 ) -> Iterator[tuple[str, Block]]:
     """The blocks with an added one in its place."""
-    anchor = added.before or added.after
+    name, block = _added(prompt, number, added)
+    if name in blocks:
+        raise UsageError(f"the prompt {prompt} adds the block {name!r}, which it has already")
+    anchor = added.before or added.after or _own_place(block, blocks)
     if anchor is not None:
         _known(prompt, anchor, blocks)
     names = list(blocks)
     place = len(names) if anchor is None else names.index(anchor) + (added.after is not None)
     follower = names[place] if place < len(names) else LAST
+    yield from list(blocks.items())[:place]
+    yield name, replace(block, before=follower)
+    yield from list(blocks.items())[place:]
+
+
+def _added(prompt: str, number: int, added: AddedText) -> tuple[str, Block]:
+    """The name of an added block, and the block; raises UsageError."""
+    if added.block is not None:
+        return added.block, BLOCKS.require(added.block, f"the prompt {prompt} adds it")
     merge = added.merge if added.text is None else added.text
     straight = added.straight if added.text is None else added.text
-    block = Block(f"added by {prompt}", merge, straight, before=follower)
-    yield from list(blocks.items())[:place]
-    yield name, block
-    yield from list(blocks.items())[place:]
+    return f"{prompt}.{number}", Block(f"added by {prompt}", merge, straight, before=None)
+
+
+def _own_place(block: Block, blocks: Mapping[str, Block]) -> str | None:
+    """What a registered block stands before where its prompt does not say: the first there is."""
+    paper = [name for name, each in BLOCKS.items() if each.before is None]
+    later = paper[paper.index(block.before) :] if block.before in paper else []
+    return next((name for name in later if name in blocks), None)
 
 
 def _ordered(prompt: str, blocks: Mapping[str, Block], order: Iterable[str]) -> dict[str, Block]:

@@ -35,7 +35,7 @@ ROWS = {
 }
 ANOTHER = {
     "VARCHAR": "coalesce({0}, '') || 'x'", "BOOLEAN": "NOT coalesce({0}, false)",
-    "DOUBLE[]": "list_transform({0}, lambda a : a + 0.01)",
+    "DOUBLE[]": "list_transform(coalesce({0}, [0.0]), lambda a : a + 0.01)",
     "TIMESTAMP": "{0} + INTERVAL 1 SECOND", "DOUBLE": "coalesce({0}, 0) + 1e-6",
     "JSON": "replace({0}::VARCHAR, 'e', 'a')",
 }  # fmt: skip

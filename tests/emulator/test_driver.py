@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
+from merge_runner.chance import draw, draw_between, draw_index
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
-from merge_runner.emulator.chance import draw, draw_between, draw_index
-from merge_runner.emulator.driver import answer
+from merge_runner.emulator.driver import answer, read_prompt
 from merge_runner.llm.content_hashes import make_request
-from merge_runner.prompts.blocks import VARIANTS
+from merge_runner.prompts.blocks import VARIANTS, Variant
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import SIDES, ChatReply, Slot, TrialSpec
@@ -293,6 +293,25 @@ def test_who_goes_first_does_not_brake_and_who_yields_does_not_accelerate():
                     assert action >= -0.02
                 else:
                     assert action <= 0.02
+
+
+def test_a_table_is_read_as_the_list_is(monkeypatch):
+    monkeypatch.setattr(VARIANTS, "_things", dict(VARIANTS))
+    tabled = Variant(removes=frozenset({"C0"}), adds=frozenset({"state.table"}))
+    VARIANTS.register("tabled", tabled)
+    for condition in CONDITIONS:
+        listed, table = (first_prompt(condition, "left", name) for name in ("baseline", "tabled"))
+        assert read_prompt(table) == read_prompt(listed) is not None
+    assert read_prompt(straight_prompt("tabled")) == read_prompt(straight_prompt())
+
+
+def test_a_car_that_is_not_seen_is_no_reason_to_act():
+    for condition in CONDITIONS:
+        seen = World(SCENARIO, CONDITIONS[condition], TRACK).observe("left")
+        unseen = replace(seen, other_seen=False, other_speeds_mps=())
+        prompt = render_prompt(unseen, None, variant="baseline", scenario=SCENARIO)
+        assert abs(first_action(prompt, Slot(condition, 1, "left", 0, 0))) == 0
+        assert "I do not see the other car" in answer(prompt, None)
 
 
 def test_a_follower_brakes_for_a_slower_car_close_ahead_and_for_none_behind():

@@ -10,9 +10,11 @@ from pydantic import BaseModel
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import BLOCKS, Fields
+from merge_runner.prompts.render import fields
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.study.file import StudyFile
 from tests.harness import PROJECT
+from tests.prompts.test_render import FIRST
 
 PAGE = (PROJECT / "docs/how-to/run-a-study.md").read_text()
 EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n+```toml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
@@ -37,8 +39,9 @@ def plan_of(folder, example, **asked):
     [
         ("Who, how often, where", 2),
         ("What varies", 12 + 6),
-        ("Prompts", 4),
+        ("Prompts", 5),
         ("The driving task", 1),
+        ("What a driver perceives", 2),
         ("Money and plug-ins", 2),
     ],
 )
@@ -50,7 +53,7 @@ def test_every_example_can_be_played(example, arms, tmp_path):
 
 
 def test_no_example_is_left_out():
-    assert len(EXAMPLES) == PAGE.count("```toml\n") == 5
+    assert len(EXAMPLES) == PAGE.count("```toml\n") == 6
 
 
 def test_every_key_is_explained_and_shown_in_an_example():
@@ -69,6 +72,12 @@ def test_all_fields_and_blocks_of_a_prompt_are_named():
     assert re.findall(r"`(\w+)`", fields) == list(Fields.__annotations__)
     for block in BLOCKS:
         assert f"`{block}`" in PAGE
+
+
+@pytest.mark.parametrize("name", [name for name in BLOCKS if name.startswith("state.")][:-1])
+def test_what_a_ready_block_says_is_shown(name):
+    said = BLOCKS[name].merge.format_map(fields(FIRST, None, ScenarioConfig()))
+    assert f"| `{name}` | {' '.join(said.splitlines())} |" in PAGE
 
 
 def test_combinations_that_skip_names_are_left_out(tmp_path):

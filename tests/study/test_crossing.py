@@ -209,3 +209,54 @@ def test_what_cannot_be_is_refused_with_the_valid_choices(plan_of, text, models,
         plan_of(text, models)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+FOGGY = "[perception.foggy]\nspeed_sd_mps = 0.3\ndelay_s = 0.4\n"
+
+
+def test_a_perception_is_a_factor_of_both_sides_or_of_one(plan_of):
+    both = plan_of(f'[factors]\nperception = ["perfect", "foggy"]\n{FOGGY}')
+    assert [arm.scenario.perception_left.delay_s for arm in both.arms] == [0, 0.4]
+    assert [arm.scenario.perception_right.delay_s for arm in both.arms] == [0, 0.4]
+    assert {spec.trial_id.rpartition("/")[2] for spec in both.trial_specs()} == {
+        "perception=perfect",
+        "perception=foggy",
+    }
+    one = plan_of(f'[factors]\nperception_right = ["foggy"]\n{FOGGY}')
+    assert one.scenario.perception_left.is_perfect
+    assert one.scenario.perception_right.speed_sd_mps == 0.3
+
+
+def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
+    plan = plan_of(f'[factors]\nperception = ["perfect", "foggy"]\n{FOGGY}')
+    assert {spec.spec_hash for spec in plan_of("").trial_specs()} < {
+        spec.spec_hash for spec in plan.trial_specs()
+    }
+    edited = plan_of(f'[factors]\nperception = ["foggy"]\n{FOGGY}dropout = 0.1\n')
+    assert edited.trial_specs()[0].spec_hash not in {s.spec_hash for s in plan.trial_specs()}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[factors]\nperception = ["fog"]\n' + FOGGY, "'fog'; valid: perfect, foggy"),
+        (
+            '[factors]\nperception = ["foggy"]\nperception_left = ["foggy"]\n' + FOGGY,
+            "of both sides: name it, or perception_left and perception_right",
+        ),
+        ("[perception.perfect]\ndelay_s = 0.2\n", "has another name"),
+        (
+            '[factors]\nperception = ["late"]\n[perception.late]\ndelay_s = 0.3\n',
+            'no whole number of 0.2 s; .*model = "emulator", perception = "late"',
+        ),
+        ("[perception.foggy]\nspeed_sd = 1\n", "'perception.foggy.speed_sd'; valid: position_sd"),
+    ],
+)
+def test_a_perception_that_there_is_not_is_refused_with_those_that_there_are(plan_of, text, said):
+    with pytest.raises(UsageError, match=said):
+        plan_of(text)
+
+
+def test_a_perception_that_no_factor_names_is_noted(plan_of):
+    (note,) = plan_of(FOGGY).notes()
+    assert note.endswith("foggy")

@@ -164,7 +164,11 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
         (persona().replace("C3.human", "A"), None, "the prompt taxi names the block 'A'"),
         ('[prompts.baseline]\nremove = ["C2"]\n', None, "there is a variant 'baseline' already"),
         ('[prompts.x]\norder = ["C0"]\n', None, "names each of its blocks once: C0, C1"),
-        ('[prompts.x]\nadd = [{ after = "C0" }]\n', None, "give it a text, or merge and straight"),
+        (
+            '[prompts.x]\nadd = [{ after = "C0" }]\n',
+            None,
+            "give it a block, a text, or merge",
+        ),
         ("[prompts.x]\nad = []\n", None, "unknown key 'prompts.x.ad'; valid: based_on, remove"),
         ('[plugins]\nfiles = ["none.py"]\n', None, "the plug-in none.py cannot be read"),
         (

@@ -96,6 +96,7 @@ def rendered(site: Site, row: Row, trial: Trial, found: Decision) -> str:
         chart=views.plan_chart(found, trial),
         points=step_points,
         aftermath=views.aftermath(trial, found),
+        perceived=views.perceived(trial, found),
     )
 
 

@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 
 from aiohttp import web
 
-from merge_runner.emulator.chance import draw
+from merge_runner.chance import draw
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.emulator.server import HOST, Emulator
 from merge_runner.records import SCRIPTED_FIELD
