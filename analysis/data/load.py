@@ -76,6 +76,22 @@ SELECT trial_id, spec_hash, count(*) AS plans, count(*) FILTER (coarse) AS coars
     count(*) FILTER (revision > 0.1) AS large_revisions
 FROM compared GROUP BY ALL ORDER BY ALL
 """
+# One row a decision with a tactical word: the mean acceleration of the second that follows it, NULL
+# where the trial ends before.
+WORDS = """
+WITH speeds AS (
+    SELECT trial_id, spec_hash, side, round(time_s, 3)::DECIMAL(9, 3) AS time_s, velocity_mps
+    FROM states WHERE time_s >= 0
+), said AS (
+    SELECT trial_id, spec_hash, side, decision, tactical, round(time_s, 3)::DECIMAL(9, 3) AS time_s
+    FROM decisions WHERE tactical IS NOT NULL
+)
+SELECT said.* EXCLUDE (time_s), later.velocity_mps - now.velocity_mps AS driven_mps2
+FROM said JOIN speeds AS now USING (trial_id, spec_hash, side, time_s)
+LEFT JOIN speeds AS later ON later.trial_id = said.trial_id AND later.spec_hash = said.spec_hash
+    AND later.side = said.side AND later.time_s = said.time_s + 1
+ORDER BY ALL
+"""
 # How many calls of a variant's spec share their reply with a baseline's spec.
 SHARED = """
 WITH used AS (

@@ -16,6 +16,7 @@ import pandas as pd
 
 from analysis.data.collision_rules import judged
 from analysis.data.derived_cache import present_state
+from analysis.data.first_actions import FIRST_ACTIONS, HUMAN_FIRST_ACTIONS
 from analysis.data.imported_humans import Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
@@ -25,6 +26,7 @@ from analysis.data.load import (
     SHARED,
     SPEEDS,
     TRACES,
+    WORDS,
     Calls,
     load_calls,
     load_each,
@@ -255,6 +257,21 @@ class Study:
     def plans(self) -> pd.DataFrame:
         """One row a trial with valid plans: how coarse they are, how much they were revised."""
         return self._read(PLANS)
+
+    @cached_property
+    def first_actions(self) -> pd.DataFrame:
+        """One row a vehicle: its first acceleration under control, its mean over a second."""
+        return self._read(FIRST_ACTIONS)
+
+    @cached_property
+    def human_first_actions(self) -> pd.DataFrame:
+        """The imported first actions of humans, one row a vehicle."""
+        return self._read(HUMAN_FIRST_ACTIONS)
+
+    @cached_property
+    def words(self) -> pd.DataFrame:
+        """One row a decision with a tactical word: the word, and what was driven in a second."""
+        return self._read(WORDS)
 
     @cached_property
     def calls(self) -> Calls:

@@ -44,7 +44,8 @@ class Links:
 def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
     """The report as one HTML document; ``figures`` maps names to SVG in Base64."""
     links = Links(study)
-    left_out = () if levels_by_factor(study) else ("factors",)
+    left_out = [] if levels_by_factor(study) else ["factors"]
+    left_out += [table.name for table in tables if table.name == "words" and not table.rows]
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,

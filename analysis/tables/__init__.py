@@ -38,6 +38,9 @@ TABLES = {
     "robustness": "robustness",
     "attempts": "attempts",
     "fallbacks": "fallbacks",
+    "first-action": "first_action",
+    "first-action-faults": "first_action",
+    "words": "words",
 }
 
 

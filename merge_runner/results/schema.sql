@@ -127,6 +127,16 @@ CREATE TABLE IF NOT EXISTS calls (
     scripted BOOLEAN NOT NULL DEFAULT false -- a scripted stand-in answered, whoever was asked
 );
 
+-- A human's first action, decoded from the published page by its user; the pair is not known.
+CREATE TABLE IF NOT EXISTS human_first_actions (
+    trial INTEGER NOT NULL,           -- counts the trials of the page from 1
+    side VARCHAR NOT NULL,            -- left, right
+    relative_velocity_mps DOUBLE NOT NULL, -- of the trial's condition, left minus right
+    merged_first VARCHAR,             -- left, right, NULL: collided
+    first_mps2 DOUBLE NOT NULL,       -- net acceleration at the first sample under control
+    PRIMARY KEY (trial, side)
+);
+
 -- How a driver is named: by its model, and by its endpoint where that is not the provider's own.
 CREATE MACRO IF NOT EXISTS driver_name(model, endpoint) AS
     model || coalesce(' at ' || nullif(regexp_extract(endpoint, '://([^/]+)', 1), ''), '');

@@ -30,6 +30,9 @@ ABOUT = {
     "robustness": "outcomes under other collision rules",
     "attempts": "what became of the calls",
     "fallbacks": "the measures with and without trials that had a fallback",
+    "first-action": "the first action of every driver, by own relative velocity, beside humans",
+    "first-action-faults": "what in the first actions differs from the humans",
+    "words": "what follows a tactical word, and what the first word follows",
 }
 
 

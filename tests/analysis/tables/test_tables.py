@@ -118,7 +118,8 @@ def test_every_form_holds_the_same_values(tables):
         assert len(bars) == 1, "every line of a Markdown table has as many cells"
         body = latex.split(r"\midrule")[1].split(r"\bottomrule")[0].strip().splitlines()
         assert len(body) == len(table.rows)
-        assert {line.replace(r"\&", "").count("&") for line in body} == {bars.pop() - 2}
+        cells = {line.replace(r"\&", "").count("&") for line in body}
+        assert cells == ({bars.pop() - 2} if body else set())
         assert latex.count("{") == latex.count("}")
         assert len(text) >= len(table.rows) + 3
         assert "nan" not in "\n".join(text).lower()
