@@ -38,6 +38,7 @@ TABLES = {
     "robustness": "robustness",
     "attempts": "attempts",
     "fallbacks": "fallbacks",
+    "first-look-surface": "first_looks",
 }
 
 

@@ -30,6 +30,7 @@ ABOUT = {
     "robustness": "outcomes under other collision rules",
     "attempts": "what became of the calls",
     "fallbacks": "the measures with and without trials that had a fallback",
+    "first-look-surface": "first situations that were only asked, and what headway is worth",
 }
 
 
