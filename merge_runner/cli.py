@@ -88,6 +88,18 @@ SampleSetOption = Annotated[
 InFlightOption = Annotated[
     int, typer.Option("--in-flight", help="Trials at once, over all workers.", min=1)
 ]
+RpmOption = Annotated[int | None, typer.Option("--rpm", help="Requests a minute.", min=1)]
+TpmOption = Annotated[int | None, typer.Option("--tpm", help="Tokens a minute.", min=1)]
+MaxCostOption = Annotated[
+    float | None,
+    typer.Option("--max-cost", help="Never spend more USD on this, over all its runs.", min=0),
+]
+StrictModelOption = Annotated[
+    bool, typer.Option("--strict-model", help="Stop when another model answers.")
+]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only estimate.")]
+YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask before spending.")]
+ReplayOption = Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object.")]
 NameArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="experiments/NAME.toml, or a path.")
@@ -206,12 +218,9 @@ def sweep(
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
     in_flight: InFlightOption = 200,
-    rpm: Annotated[int | None, typer.Option(help="Requests a minute.", min=1)] = None,
-    tpm: Annotated[int | None, typer.Option(help="Tokens a minute.", min=1)] = None,
-    max_cost: Annotated[
-        float | None,
-        typer.Option(help="Never spend more USD on this sweep, over all its runs.", min=0),
-    ] = None,
+    rpm: RpmOption = None,
+    tpm: TpmOption = None,
+    max_cost: MaxCostOption = None,
     until: Annotated[
         str | None,
         typer.Option(
@@ -227,12 +236,10 @@ def sweep(
             help="Play on a Dask cluster: local:N, a scheduler's address, or its file.",
         ),
     ] = None,
-    strict_model: Annotated[
-        bool, typer.Option("--strict-model", help="Stop when another model answers.")
-    ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only estimate.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before spending.")] = False,
-    replay: Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")] = False,
+    strict_model: StrictModelOption = False,
+    dry_run: DryRunOption = False,
+    yes: YesOption = False,
+    replay: ReplayOption = False,
     recording: RecordingOption = None,
     fault_rate: Annotated[
         float, typer.Option(help="Emulator only: share of attempts with a transient fault.")
@@ -242,16 +249,10 @@ def sweep(
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
-    import asyncio
-
     from merge_runner.run.plan import Options, make_plan
-    from merge_runner.run.unsent import unsent
     from merge_runner.run.until import deadline
 
-    if max_cost is not None and not math.isfinite(max_cost):
-        raise UsageError("--max-cost is a number of USD")
-    if recording and not replay:
-        raise UsageError("--recording goes with a replay; to keep its replies: recording import")
+    check_money_and_replay(max_cost, recording, replay=replay)
     if dask is not None and replay:
         raise UsageError("a replay needs no cluster: leave --dask out")
     options = Options(
@@ -282,14 +283,38 @@ def sweep(
     )
     if dask is not None and plan.replays_humans:
         raise UsageError("human-replay is played in this process: leave --dask out")
+    whole = any(part is not None for part in (reps, conditions, variants))
+    play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json)
+
+
+def check_money_and_replay(
+    max_cost: float | None, recording: list[Path] | None, *, replay: bool
+) -> None:
+    """Raise UsageError for a cap that is no number, and a recording without a replay."""
+    if max_cost is not None and not math.isfinite(max_cost):
+        raise UsageError("--max-cost is a number of USD")
+    if recording and not replay:
+        raise UsageError("--recording goes with a replay; to keep its replies: recording import")
+
+
+def play(
+    plan: Plan, options: Options, *, whole: bool, dry_run: bool, yes: bool, as_json: bool
+) -> None:
+    """Play a plan, or say what that would take; a replay that is not ``whole`` plays what it can.
+
+    Ends the program with the exit code of what happened.
+    """
+    import asyncio
+
+    from merge_runner.run.unsent import unsent
+
     for note in plan.notes():
         say(note)
-    if not replay:
+    if not options.replay:
         options = plan.within_budget(options)
     else:
         from merge_runner.run.recorded_plan import replayed
 
-        whole = any(part is not None for part in (reps, conditions, variants))
         plan, options, notes = replayed(plan, options, whole=whole)
         for note in notes:
             say(note)

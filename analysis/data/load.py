@@ -22,6 +22,7 @@ from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.geometry import TRACK, Track
 from merge_runner.served_model import ALIASES, PAIRS, Pair, others_among
 
+# Those that were driven to their end: what was only asked has no outcome.
 TRIALS = (
     "SELECT trials.*, driver, coalesce(left_scripted, false) AS left_scripted, "
     "coalesce(right_scripted, false) AS right_scripted, "
@@ -30,7 +31,7 @@ TRIALS = (
     "JOIN trial_metrics USING (trial_id, spec_hash) "
     "LEFT JOIN (SELECT trial_id, spec_hash, bool_or(side = 'left') AS left_scripted, "
     "bool_or(side = 'right') AS right_scripted FROM calls WHERE scripted GROUP BY ALL) "
-    "USING (trial_id, spec_hash) ORDER BY trial_id, spec_hash"
+    "USING (trial_id, spec_hash) WHERE source <> 'seat' ORDER BY trial_id, spec_hash"
 )
 # Of each driven trial that ended a hash of its states: equal ones went the same way.
 TRACES = """
@@ -96,7 +97,8 @@ ORDER BY ALL
 SHARED = """
 WITH used AS (
     SELECT DISTINCT spec_hash, variant, call_key
-    FROM decisions JOIN trials USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
+    FROM decisions JOIN trials USING (trial_id, spec_hash)
+    WHERE call_key IS NOT NULL AND source <> 'seat'
 ), totals AS (SELECT spec_hash, count(*) AS calls FROM used GROUP BY ALL)
 SELECT one.spec_hash, base.spec_hash AS baseline, calls, count(*) AS shared
 FROM used AS one JOIN used AS base USING (call_key) JOIN totals ON totals.spec_hash = one.spec_hash
@@ -144,7 +146,10 @@ def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """One row a trial: condition, outcome and metrics in SI units (see docs/tables.md)."""
+    """One row a trial: condition, outcome and metrics in SI units (see docs/tables.md).
+
+    First situations that were only asked are left out.
+    """
     return load(TRIALS, db)
 
 

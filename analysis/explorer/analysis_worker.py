@@ -64,7 +64,9 @@ class Numbers:
             groups = [group for group in self.study.groups if group.measured]
             return {"counted": sum(len(group.trials) for group in groups)}
         with read_database(self.db) as connection:
-            (row,) = connection.execute("SELECT count(*) FROM trials").fetchall()
+            (row,) = connection.execute(
+                "SELECT count(*) FROM trials WHERE source <> 'seat'"
+            ).fetchall()
         return {"counted": row[0]}
 
     def _tables(self, names: Sequence[str]) -> dict[str, Any]:

@@ -88,12 +88,13 @@ DELETE FROM memory.levels WHERE number NOT IN (SELECT number FROM memory.listed)
 DELETE FROM memory.planned;
 INSERT INTO memory.planned SELECT DISTINCT * FROM sweep_trials;
 DELETE FROM memory.sweeps;
-INSERT INTO memory.sweeps BY NAME FROM sweeps;
+INSERT INTO memory.sweeps BY NAME FROM sweeps WHERE coalesce(config->>'$.seat', '') = '';
 """
-# The next 2,000: the file is not held for longer than that takes.
+# The next 2,000: the file is not held for longer than that takes. What was only asked is no trial
+# to look at.
 TAKE = """
 INSERT INTO memory.trials BY NAME
-    FROM trials ANTI JOIN memory.listed USING (trial_id, spec_hash)
+    FROM trials ANTI JOIN memory.listed USING (trial_id, spec_hash) WHERE source <> 'seat'
     ORDER BY trial_id, spec_hash LIMIT 2000;
 INSERT OR IGNORE INTO memory.specs
     FROM specs SEMI JOIN memory.trials USING (spec_hash);

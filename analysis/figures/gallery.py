@@ -33,6 +33,7 @@ from analysis.figures.drawing import (
     wrapped,
 )
 from analysis.figures.factor_figure import figure_of_factors
+from analysis.figures.first_look_figure import figure_of_first_looks
 from analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     Point,
@@ -213,6 +214,12 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
         figure_of_factors,
         "Each factor's levels, pooled over all other factors, by every metric: its rate, mean or "
         "median with the 95 % interval that the table of this name prints.",
+    ),
+    "first-look-surface": (
+        figure_of_first_looks,
+        "First situations asked without the loop, by the driver's own projected headway and own "
+        "relative velocity: the share of M among the answers with a word, with the line of even "
+        "odds by a logit (dashed), and the mean first action.",
     ),
 }
 

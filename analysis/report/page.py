@@ -9,6 +9,7 @@ from pathlib import Path
 import jinja2
 import pandas as pd
 
+from analysis.data.first_looks import first_looks
 from analysis.data.provenance import provenance
 from analysis.data.reference_data import published
 from analysis.data.study import Study
@@ -44,8 +45,12 @@ class Links:
 def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
     """The report as one HTML document; ``figures`` maps names to SVG in Base64."""
     links = Links(study)
-    left_out = [] if levels_by_factor(study) else ["factors"]
-    left_out += [table.name for table in tables if table.name == "words" and not table.rows]
+    empty = {
+        "factors": not levels_by_factor(study),
+        "first-look-surface": not first_looks(study),
+        **{table.name: not table.rows for table in tables if table.name == "words"},
+    }
+    left_out = {name for name, is_empty in empty.items() if is_empty}
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,

@@ -41,6 +41,7 @@ TABLES = {
     "first-action": "first_action",
     "first-action-faults": "first_action",
     "words": "words",
+    "first-look-surface": "first_looks",
 }
 
 

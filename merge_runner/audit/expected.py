@@ -78,6 +78,7 @@ class SweepConfig(_Facts):
     conditions: tuple[str, ...]
     sample_set: int
     prompt_blocks: dict[str, dict[str, str]]
+    seat: str = ""
     study: StudyFacts | None = None
     stored_arms: tuple[ArmFacts, ...] = Field(default=(), alias="arms")
 
@@ -118,17 +119,18 @@ class SweepConfig(_Facts):
                 "sample_set": self.sample_set,
                 "model_left": arm.sides["left"],
                 "model_right": arm.sides["right"],
-                "source": "llm" if self.asks(arm) else "driver",
+                "source": "seat" if self.seat else "llm" if self.asks(arm) else "driver",
             }
             for arm in self.arms
             for trial_id, condition, rep in self._slots(arm)
         }
 
     def _slots(self, arm: ArmFacts) -> Iterator[tuple[str, str, int]]:
+        prefix = "seat/" if self.seat else ""
         suffix = f"/set{self.sample_set}" if self.sample_set else ""
         for condition in self.conditions:
             for rep in range(1, arm.repetitions + 1):
-                trial_id = f"{arm.model}/{arm.variant}/{condition}/rep{rep:02d}{suffix}"
+                trial_id = f"{prefix}{arm.model}/{arm.variant}/{condition}/rep{rep:02d}{suffix}"
                 yield trial_id + arm.levels, condition, rep
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,13 +32,15 @@ class _Config(BaseModel):
     conditions: tuple[str, ...]
     sample_set: int
     arms: tuple[_Arm, ...] = ()
+    seat: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedSweep:
     """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition.
 
-    ``arms`` has the labels of the arms of a study, and is empty for a plain sweep.
+    ``arms`` has the labels of the arms of a study, and is empty for a plain sweep. ``seat`` is
+    ``first`` where only the first situations were asked.
     """
 
     name: str
@@ -47,6 +49,7 @@ class RecordedSweep:
     conditions: tuple[str, ...]
     sample_set: int
     arms: frozenset[str] = frozenset()
+    seat: str = ""
 
     def __str__(self) -> str:
         """As a part of a sentence."""
@@ -59,6 +62,10 @@ class RecordedSweep:
     def command(self, files: Sequence[Path]) -> str:
         """What replays it; its names may be anybody's, and are quoted for a shell."""
         words = ["merge-runner", "replay", self.name]
+        if self.seat:
+            study = self.name.removesuffix(f"-{self.seat}")
+            words = ["merge-runner", "seat", self.seat, study, "--replay"]
+            words += ["--conditions", ",".join(self.conditions)]
         words += [word for model in self.model.split(",") for word in ("--model", model)]
         words += ["--sample-set", str(self.sample_set)] * bool(self.sample_set)
         words += [word for file in files for word in ("--recording", str(file))]
@@ -88,18 +95,22 @@ def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
                     conditions=tuple(conditions),
                     sample_set=config.sample_set,
                     arms=frozenset(arm.label for arm in config.arms),
+                    seat=config.seat,
                 )
             )
     return found
 
 
 def recorded_part(
-    files: Iterable[Path], name: str, model: str, sample_set: int
+    files: Iterable[Path], names: Collection[str], model: str, sample_set: int
 ) -> RecordedSweep | None:
-    """What recordings hold of one sweep: all that several of them, or several runs, hold of it."""
+    """What recordings hold of one sweep: all that several of them, or several runs, hold of it.
+
+    It may have several ``names``.
+    """
     whole: RecordedSweep | None = None
     for one in recorded_sweeps(files):
-        if (one.name, one.model, one.sample_set) == (name, model, sample_set):
+        if one.name in names and (one.model, one.sample_set) == (model, sample_set):
             whole = one if whole is None else _joined(whole, one)
     return whole
 

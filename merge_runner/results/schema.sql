@@ -36,7 +36,7 @@ CREATE TABLE IF NOT EXISTS trials (
     trial_id VARCHAR NOT NULL,        -- drivers/variant/condition/repetition, and the sample set
     spec_hash VARCHAR NOT NULL,       -- of what determines the result, but condition and rep
     pair VARCHAR,                     -- human pairs only
-    source VARCHAR NOT NULL,          -- llm, driver, human
+    source VARCHAR NOT NULL,          -- llm, driver, human; seat: asked without the loop
     model_left VARCHAR,               -- who drove on the left: a model of the registry or a program
     model_right VARCHAR,              -- who drove on the right
     variant VARCHAR,                  -- of the prompt

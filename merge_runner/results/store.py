@@ -37,6 +37,7 @@ from merge_runner.results.database import (
     unreadable_is_usage,
     update_measures,
 )
+from merge_runner.results.first_looks import FIRST_LOOKS
 from merge_runner.results.levels import LEVELS
 from merge_runner.results.rows import Row, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -331,7 +332,9 @@ class SweepFacts:
     ``ledger`` (driver, variant, fate, outcome, attempts) as the view ``attempts`` names them,
     ``failed`` (trial_id, error), ``others`` (model requested, model served, answers) where another
     model answered, and ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
-    scripted stand-in answered.
+    scripted stand-in answered. Where drivers were only asked, ``first_looks`` holds (driver,
+    variant, side, own relative velocity in m/s, answers, invalid ones, those with a tactical word,
+    those with M, mean first action of valid ones in m/s^2).
     """
 
     outcomes: list[tuple[str, str, str, str | None, bool, int]]
@@ -340,6 +343,7 @@ class SweepFacts:
     failed: list[tuple[str, str]]
     others: list[tuple[str, str, int]]
     stand_ins: list[tuple[str, str, str, int, int]]
+    first_looks: list[tuple[str, str, str, float, int, int, int, int, float | None]]
     decisions: int
     invalid: int
     fallbacks: int
@@ -398,6 +402,13 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 "FROM attempts LEFT JOIN specs USING (spec_hash)",
                 "WHERE fate IN ('driven', 'fallback') GROUP BY ALL HAVING bool_or(scripted) "
                 "ORDER BY ALL",
+            ),
+            first_looks=rows(
+                "SELECT driver, variant, side, velocity_mps, count(*), "  # noqa: S608 # constants
+                "count(*) FILTER (NOT valid), count(tactical), count(*) FILTER (tactical = 'M'), "
+                f"avg(action_mps2) FILTER (valid) FROM ({FIRST_LOOKS}) "
+                "JOIN trial_drivers USING (trial_id, spec_hash)",
+                "GROUP BY ALL ORDER BY ALL",
             ),
             decisions=decisions[0],
             invalid=decisions[1],

@@ -8,14 +8,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
-from merge_runner.drivers.pace import model_pace
 from merge_runner.llm.cache import CallTotals
 from merge_runner.llm.ledger import NO_CAPS, Caps, Spending
 from merge_runner.llm.prices import cost_usd
 from merge_runner.llm.trial_costs import Answers, TrialCalls, TrialCosts
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
-from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
+from merge_runner.run.plan import Options, Plan, most_prompts, usual_prompts
 from merge_runner.scenarios.registry import new_world
 from merge_runner.study.crossing import Arm
 
@@ -235,14 +234,14 @@ def _trial_calls(plan: Plan, arm: Arm) -> dict[str, TrialCalls]:
     A model that drives on both sides with different parameters counts with the dearer ones.
     """
     sides = Counter(name for name in arm.asked.values() if name in arm.entries)
-    most = math.ceil(arm.scenario.timeout_steps / model_pace(arm.scenario).interval_steps)
+    usual, most = usual_prompts(arm), most_prompts(arm)
     # No tokeniser makes more tokens than bytes.
     read = int(len(_typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
     calls: dict[str, TrialCalls] = {}
     for name, number in sides.items():
         entry = arm.entries[name]
         worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
-        made = TrialCalls(number * PROMPTS_PER_DRIVER, number * most, cost_usd(entry, worst) or 0.0)
+        made = TrialCalls(number * usual, number * most, cost_usd(entry, worst) or 0.0)
         other = calls.get(model := plan.registered[name])
         calls[model] = made if other is None else made.and_(other)
     return calls

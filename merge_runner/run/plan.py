@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
+from typing import Literal
 
 from merge_runner.config import (
     MOST_REPETITIONS,
@@ -17,6 +19,7 @@ from merge_runner.config import (
     pair_name,
 )
 from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials, require_trials
+from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
@@ -49,7 +52,7 @@ from merge_runner.study.parts import adopt, adopt_humans
 from merge_runner.text_safety import in_a_name
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
-PROMPTS_PER_DRIVER = 10.5
+_PROMPTS_PER_DRIVER = 10.5
 DRIVERS_SHOWN = 3
 
 
@@ -99,7 +102,8 @@ class Plan:
     """A sweep before it runs: the arms of its study, each played in all conditions.
 
     ``entries`` are the language models of all arms by what an arm's ``asked`` calls them, and
-    ``endpoints`` the identities of their endpoints (see ``config.Endpoint``).
+    ``endpoints`` the identities of their endpoints (see ``config.Endpoint``). ``seat`` is ``first``
+    where only the first situations are asked (see ``run.seat``), and empty in a sweep.
     """
 
     name: str
@@ -111,6 +115,7 @@ class Plan:
     conditions: tuple[str, ...]
     sample_set: int
     order_seed: int
+    seat: Literal["", "first"] = ""
 
     @property
     def model(self) -> str:
@@ -125,9 +130,10 @@ class Plan:
         A study with a budget of its own has one ledger over all its models and samples.
         """
         if self.study.file.budget != BudgetTerms():
-            return self.name
+            return self.study.name
         models = ",".join(sorted(self.model.split(",")))
-        return f"{self.name}/{models}/set{self.sample_set}"
+        seat = f"/{self.seat}" if self.seat else ""
+        return f"{self.study.name}/{models}/set{self.sample_set}{seat}"
 
     @property
     def registered(self) -> dict[str, str]:
@@ -150,13 +156,15 @@ class Plan:
         return sum(arm.repetitions for arm in self.arms) * len(self.conditions)
 
     @property
-    def asking(self) -> float:
-        """How many of the two drivers of a trial are language models, on the average."""
-        sides = sum(
-            arm.repetitions * sum(name in arm.entries for name in arm.asked.values())
+    def calls_of_a_trial(self) -> float:
+        """How many calls a trial usually takes, on the average over the arms."""
+        calls = sum(
+            arm.repetitions
+            * usual_prompts(arm)
+            * sum(name in arm.entries for name in arm.asked.values())
             for arm in self.arms
         )
-        return sides / sum(arm.repetitions for arm in self.arms)
+        return calls / sum(arm.repetitions for arm in self.arms)
 
     @property
     def scripted(self) -> bool:
@@ -276,7 +284,7 @@ class Plan:
             TrialSpec(
                 trial_id=self._trial_id(arm, condition, repetition),
                 spec_hash=hashes[arm.label, condition],
-                source="llm" if arm.entries else "driver",
+                source="seat" if self.seat else "llm" if arm.entries else "driver",
                 model_left=arm.sides["left"],
                 model_right=arm.sides["right"],
                 variant=arm.variant,
@@ -307,6 +315,7 @@ class Plan:
             "sample_set": self.sample_set,
             "order_seed": self.order_seed,
             "prompt_blocks": prompt_blocks,
+            **({"seat": self.seat} if self.seat else {}),
         }
         if many:
             config["arms"] = [
@@ -331,6 +340,7 @@ class Plan:
         return config
 
     def _trial_id(self, arm: Arm, condition: str, repetition: int) -> str:
+        seat = "seat/" if self.seat else ""
         set_ = f"/set{self.sample_set}" if self.sample_set else ""
         # The prompt and the opponent stand in it already.
         levels = "".join(
@@ -338,7 +348,7 @@ class Plan:
             for name, level in sorted(arm.factors.items())
             if name not in (PROMPT, OPPONENT)
         )
-        return f"{arm.model}/{arm.variant}/{condition}/rep{repetition:02d}{set_}{levels}"
+        return f"{seat}{arm.model}/{arm.variant}/{condition}/rep{repetition:02d}{set_}{levels}"
 
     def _driver(self, arm: Arm, side: Side) -> dict[str, object]:
         name = arm.asked[side]
@@ -352,6 +362,16 @@ class Plan:
             "headers": sent.headers,
             "body": sent.body,
         }
+
+
+def most_prompts(arm: Arm) -> int:
+    """How many prompts a trial of an arm takes a language model at most: up to the timeout."""
+    return math.ceil(arm.scenario.timeout_steps / model_pace(arm.scenario).interval_steps)
+
+
+def usual_prompts(arm: Arm) -> float:
+    """How many prompts it usually takes a language model."""
+    return min(_PROMPTS_PER_DRIVER, most_prompts(arm))
 
 
 def _is_scripted(arm: Arm) -> bool:

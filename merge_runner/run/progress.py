@@ -26,7 +26,7 @@ from merge_runner.results.progress_file import (
     Standing,
     clear_dead,
 )
-from merge_runner.run.plan import PROMPTS_PER_DRIVER, Plan
+from merge_runner.run.plan import Plan
 from merge_runner.text_safety import printable
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class Progress:
         if ended == total:
             return None
         calls = self._calls_live + self._calls_cached
-        expected_calls = total * self.plan.asking * PROMPTS_PER_DRIVER
+        expected_calls = total * self.plan.calls_of_a_trial
         by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
         part = max(ended / total, by_calls)
         elapsed = time.monotonic() - self.started

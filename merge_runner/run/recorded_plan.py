@@ -34,7 +34,7 @@ def _shipped(plan: Plan, folder: Path) -> Path | None:
 
     A user's own replies of the same model are never mixed with those of somebody else.
     """
-    file = SHIPPED_RECORDINGS / f"{plan.model}-{plan.name}.parquet"
+    file = SHIPPED_RECORDINGS / f"{plan.model}-{plan.study.name}.parquet"
     return file if file.is_file() and not _has_replies(folder, plan) else None
 
 
@@ -58,9 +58,11 @@ def _has_replies(folder: Path, plan: Plan) -> bool:
 def as_recorded(plan: Plan, recordings: Sequence[Path]) -> tuple[Plan, str]:
     """The part of a plan that recordings of the same sweep hold, and a line that says so.
 
-    The line is empty, and the plan as it was, where they hold all of it, or say nothing of it.
+    A sweep's recording holds its first situations, too. The line is empty, and the plan as it was,
+    where they hold all of it, or say nothing of it.
     """
-    held = recorded_part(recordings, plan.name, plan.model, plan.sample_set)
+    names = {plan.study.name, plan.name}
+    held = recorded_part(recordings, names, plan.model, plan.sample_set)
     if held is None:
         return plan, ""
     arms = tuple(

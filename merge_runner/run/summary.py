@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
+from itertools import groupby
+from operator import itemgetter
 from typing import Any, get_args
 
 from merge_runner.audit.findings import Audit, Sharing
@@ -23,6 +25,7 @@ VARIANT, CONDITION, STATUS, FELL_BACK = 0, 1, 2, 4
 Groups = defaultdict[tuple[object, ...], Counter[str]]
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
 LEDGER = ("model", "variant", "fate", "outcome", "attempts")
+ASKED = ("side", "own dv", "asked", "invalid", "M", "action")
 FAILURES_SHOWN = NOTES_SHOWN = 10
 SHARINGS_SHOWN = 3
 PRICED_ALIKE = "replies of stand-ins are priced as the model's; nobody charges for them"
@@ -77,6 +80,7 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
             for (factor, level), counts in (_by_level(facts) if facts else {}).items()
         ],
         "outcomes_without_fallbacks": (_named(_counts(facts, FELL_BACK)[False,]) if facts else {}),
+        **({"first_looks": list(_first_looks(facts))} if plan.seat else {}),
     }
 
 
@@ -84,7 +88,7 @@ def as_lines(outcome: Outcome, options: Options, expected: Estimate | None) -> I
     """The summary for a reader; see ``as_dict``."""
     facts = outcome.facts
     if facts is not None:
-        yield from _table(outcome.plan, facts)
+        yield from _asked(facts) if outcome.plan.seat else _table(outcome.plan, facts)
         yield ""
         yield from _failures(facts)
     yield from _costs(outcome, options, expected)
@@ -182,6 +186,44 @@ def _table(plan: Plan, facts: SweepFacts) -> Iterator[str]:
         yield _row(factor, COLUMNS, width)
         for level in levels:
             yield _row(level, _named(by_level[factor, level]).values(), width)
+
+
+def _first_looks(facts: SweepFacts | None) -> Iterator[dict[str, Any]]:
+    """By driver, prompt, side and own relative velocity: what was done first, and with what word.
+
+    The share of M is that among answers with a tactical word.
+    """
+    for row in facts.first_looks if facts else ():
+        driver, variant, side, velocity_mps, asked, invalid, words, merging, action_mps2 = row
+        yield {
+            "driver": driver,
+            "variant": variant,
+            "side": side,
+            "relative_velocity_mps": velocity_mps,
+            "asked": asked,
+            "invalid": invalid,
+            "with_a_word": words,
+            "share_m": merging / words if words else None,
+            "first_action_mps2": action_mps2,
+        }
+
+
+def _asked(facts: SweepFacts) -> Iterator[str]:
+    """The same as a table for each driver and prompt."""
+    found = groupby(_first_looks(facts), key=itemgetter("driver", "variant"))
+    for (driver, variant), rows in found:
+        yield f"{driver}/{variant}: share of M, first action in m/s^2, by own relative velocity"
+        yield _row(ASKED[0], ASKED[1:])
+        for row in rows:
+            merging, action_mps2 = row["share_m"], row["first_action_mps2"]
+            cells = [
+                f"{row['relative_velocity_mps']:+g} m/s",
+                row["asked"],
+                row["invalid"],
+                "-" if merging is None else f"{merging:.0%}",
+                "-" if action_mps2 is None else f"{action_mps2:+.3f}",
+            ]
+            yield _row(row["side"], cells)
 
 
 def _varying(plan: Plan) -> dict[str, list[str]]:

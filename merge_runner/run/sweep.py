@@ -46,7 +46,7 @@ from merge_runner.run.estimate import Estimate, Todo, estimate
 from merge_runner.run.flusher import AGAIN, Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
-from merge_runner.run.plan import PROMPTS_PER_DRIVER, Options, Plan
+from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
 from merge_runner.run.until import GRACE_S
@@ -143,7 +143,7 @@ class Sweep:
 
         There are some where a study was run before its file had a budget, or has none any more.
         """
-        own, name = self._plan.ledger, self._plan.name
+        own, name = self._plan.ledger, self._plan.study.name
         others = [
             scope
             for scope in scopes(self._cache)
@@ -255,10 +255,11 @@ class Sweep:
             if isinstance(record, TrialSuspended) or record.status != "failed":
                 return
             trials[spec.arm] += 1
-            for side, name in self._arms[spec.arm].asked.items():
+            arm = self._arms[spec.arm]
+            for side, name in arm.asked.items():
                 if name in plan.entries:
                     answered = sum(row.side == side for row in record.decisions)
-                    calls[spec.arm][name] += max(1.0, PROMPTS_PER_DRIVER - answered)
+                    calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
 
         clients = sealed_clients(plan, self._cache)
         await LocalRunner(plan, clients, in_flight=1).play(self._todo, ended)

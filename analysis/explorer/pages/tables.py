@@ -33,6 +33,7 @@ ABOUT = {
     "first-action": "the first action of every driver, by own relative velocity, beside humans",
     "first-action-faults": "what in the first actions differs from the humans",
     "words": "what follows a tactical word, and what the first word follows",
+    "first-look-surface": "first situations that were only asked, and what headway is worth",
 }
 
 

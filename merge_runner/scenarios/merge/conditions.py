@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
 from dataclasses import dataclass
+from decimal import Decimal
 from math import isfinite
 
 from merge_runner.errors import UsageError
@@ -88,7 +91,45 @@ HUMAN_CONDITIONS: dict[str, Condition] = {
 }
 """Those of the human experiment (Siebinga et al., 4TU 19550377), which are the paper's, too."""
 
-CONDITIONS = Registry[Condition]("condition")
+NUMBER = r"-?\d{1,4}(?:\.\d{1,4})?"
+"""As a pattern: that of a headway or a velocity in the name of a condition."""
+_COMPUTED = re.compile(f"h({NUMBER})_dv({NUMBER})", re.ASCII)
+
+
+def condition_name(headway_m: float, velocity_mps: float) -> str:
+    """The name of a condition at the usual mean speed: that of the humans' where it is theirs.
+
+    Any other is called by its numbers, ``h2_dv-1.2``, and needs no registration.
+    """
+    for name, human in HUMAN_CONDITIONS.items():
+        if (human.projected_headway_m, human.relative_velocity_mps) == (headway_m, velocity_mps):
+            return name
+    return f"h{_plain(headway_m)}_dv{_plain(velocity_mps)}"
+
+
+def _plain(number: float) -> str:
+    return f"{Decimal(repr(number + 0.0)).normalize():f}"  # + 0.0: no negative zero
+
+
+class _Conditions(Registry[Condition]):
+    """Those that are registered, and any other by the name that ``condition_name`` gives it."""
+
+    def __getitem__(self, name: str) -> Condition:
+        with suppress(KeyError):
+            return super().__getitem__(name)
+        found = _COMPUTED.fullmatch(name)
+        if found is None:
+            raise KeyError(name)
+        headway_m, velocity_mps = map(float, found.groups())
+        if condition_name(headway_m, velocity_mps) != name:  # each has one name
+            raise KeyError(name)
+        try:
+            return Condition(headway_m, velocity_mps)
+        except UsageError as exc:
+            raise KeyError(name) from exc
+
+
+CONDITIONS = _Conditions("condition")
 """All that a sweep can play. A stored trial holds the numbers of its own (table ``trials``)."""
 for _name, _condition in HUMAN_CONDITIONS.items():
     CONDITIONS.register(_name, _condition)
