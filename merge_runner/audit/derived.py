@@ -78,7 +78,7 @@ CALLS = f"trial_id, spec_hash, {', '.join(COLUMNS)}, sha256(request::VARCHAR) AS
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
 NOT_INSTALLED = "anything, since their condition or their scenario is not installed"
-OTHER_HUMANS = "anything, since the human trials that they replay are not in this database"
+OTHER_DATA = "anything, since what a program drives by is not here, as human trials to replay"
 OTHER_PROGRAM = "the decisions of a program that is not as it was"
 
 
@@ -235,7 +235,7 @@ def _trials(
             left_out[NOT_INSTALLED] += 1
             continue
         if not all(map(_is_here, map(spec.driver, SIDES))):
-            left_out[OTHER_HUMANS] += 1
+            left_out[OTHER_DATA] += 1
             continue
         paces = {side: pace for side in SIDES if (pace := spec.pace(side)) is not None}
         if len(paces) < len(SIDES):

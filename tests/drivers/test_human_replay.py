@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import duckdb
 import pytest
 
 from analysis.explorer.details import read_trial
@@ -132,6 +133,18 @@ async def test_a_study_names_the_pair(db, plan_of):
             plan_of("second", text_)
 
 
+def test_a_trial_that_was_imported_in_two_ways_is_replayed_once(db, plan_of):
+    plan_of(HUMAN_REPLAY)
+    once = PROGRAMS[HUMAN_REPLAY].data
+    with duckdb.connect(str(db)) as connection:
+        for table in ("trials", "states"):
+            connection.execute(
+                f"INSERT INTO {table} SELECT * REPLACE ('another' AS spec_hash) FROM {table}"
+            )
+    plan_of(HUMAN_REPLAY)
+    assert PROGRAMS[HUMAN_REPLAY].data == once
+
+
 def test_without_an_import_it_says_what_to_type(tmp_path, plan_of):
     with pytest.raises(UsageError, match=r"holds none: merge-runner human import PATH"):
         plan_of(HUMAN_REPLAY, db=tmp_path / "other.duckdb")
@@ -148,7 +161,9 @@ def test_what_a_vehicle_cannot_do_is_not_replayed(db, plan_of):
     assert HumanTrials((other,)).digest != HumanTrials(trials.trials[:1]).digest
 
 
-async def test_a_sweep_of_them_is_stored_audited_and_played_again_alike(merge_runner, tmp_path, db):
+async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
+    merge_runner, tmp_path, db
+):
     (tmp_path / "mine.toml").write_text(HUMAN)
     command = ("mine.toml", "--model", "human-replay+idm", "--json")
     assert (await merge_runner("sweep", *command)).summary["exit_code"] == 0
@@ -160,6 +175,15 @@ async def test_a_sweep_of_them_is_stored_audited_and_played_again_alike(merge_ru
     ((spec_hash,),) = query(db, "SELECT spec_hash FROM trials WHERE source = 'driver'")[1]
     shown = read_trial(db, "human-replay+idm/baseline/L_4_0/rep01", spec_hash)
     assert shown.caution == "the human on the left is replayed and does not react"
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("DELETE FROM trials WHERE source = 'human'")
+    (first, *_) = audit_database(db)
+    assert [note for note in first.notes if "what a program drives by is not here" in note]
+
+
+async def test_a_replay_needs_the_same_import_and_says_so(merge_runner, tmp_path, db):
+    (tmp_path / "mine.toml").write_text(HUMAN)
+    command = ("mine.toml", "--model", "human-replay+idm", "--json")
     again = await merge_runner("replay", *command)
     assert again.summary["trials"] == {**again.summary["trials"], "failed": 0}
     elsewhere = await merge_runner("replay", *command, "--db", "none.duckdb")

@@ -42,6 +42,7 @@ def plan_of(folder, example, **asked):
         ("Prompts", 5),
         ("The driving task", 1),
         ("What a driver perceives", 2),
+        ("Drivers", 3),
         ("Money and plug-ins", 2),
     ],
 )

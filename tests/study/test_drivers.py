@@ -6,13 +6,11 @@ import json
 
 import pytest
 
-from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
-from merge_runner.prompts.render import render_prompt
-from merge_runner.records import SIDES
+from merge_runner.records import SIDES, ChatReply, ChatRequest
 from merge_runner.run.plan import make_plan
-from merge_runner.scenarios.registry import new_world
 from merge_runner.study.parts import adopt_declared
 from merge_runner.trial import play_trial
 
@@ -172,10 +170,23 @@ def test_a_step_that_is_given_and_does_not_fit_is_refused(plan_of):
             plan_of(text, "braking", scenario)
 
 
-def test_a_model_is_told_the_same_in_the_finer_world(plan_of):
-    plan = plan_of("", "emulator+braking")
-    prompts = set()
-    for scenario in (plan.arms[0].scenario, ScenarioConfig()):
-        seen = new_world(scenario, "N_0_0").observe("left")
-        prompts.add(render_prompt(seen, None, variant="baseline", scenario=scenario))
-    assert len(prompts) == 1
+async def test_a_model_is_told_the_same_in_the_finer_world(plan_of):
+    """Beside a program that keeps its speed, at 20 Hz and at the prompt rate."""
+    keeping = '[drivers.keeping]\nprogram = "braking"\nstrength = 0\n'
+    told = []
+    for pair in ("emulator+keeping", "emulator+constant"):
+        plan = plan_of(keeping, pair)
+        (spec, *_), (arm, *_), prompts = plan.trial_specs(), plan.arms, []
+
+        async def ask(prompt, slot, _, prompts=prompts):
+            prompts.append((prompt, slot))
+            request = ChatRequest("", "", "", "", "", {}, "", slot)
+            return ChatReply(f"Y\n```python\n{[-0.513, -0.107] * 10}\n```", "ok", request, (), 0)
+
+        makers = {"left": LanguageModel(ask), "right": PROGRAMS[arm.sides["right"]]}
+        drivers = {side: makers[side].make(arm.scenario, spec, side) for side in SIDES}
+        await play_trial(spec, arm.scenario, drivers)
+        told.append(prompts)
+    assert len(told[0]) > 5
+    assert told[0][:-1] == told[1][: len(told[0]) - 1]
+    assert abs(len(told[0]) - len(told[1])) <= 1  # the finer world may see the end a step earlier
