@@ -1,9 +1,11 @@
 """What a prompt may say of the state beyond the paper's numbers, in words where it has no value.
 
-All is computed from what the driver is told, at present speeds.
+All is computed from what the driver is told, at present speeds, and has its unit in it.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 
 from merge_runner.records import Observation
 
@@ -82,3 +84,13 @@ def _who_is_ahead(ahead_m: float, by: str) -> str:
     if abs(ahead_m) < LEVEL_M:
         return "neither, both cars are level"
     return f"you are {by} ahead" if ahead_m > 0 else f"{OTHER} is {by} ahead"
+
+
+LINES: Mapping[str, Callable[[Observation], str]] = {
+    "projected_headway": projected_headway,
+    "own_time_to_merge": own_time_to_merge,
+    "other_time_to_merge": other_time_to_merge,
+    "time_gap": time_gap,
+    "relative_speed_in_words": relative_speed,
+}
+"""What templates may name beside ``blocks.Fields``."""
