@@ -112,10 +112,6 @@ class Perception(Frozen):
 PERFECT = Perception()
 
 
-def _is_default(perception: Perception) -> bool:
-    return perception == PERFECT
-
-
 class ScenarioConfig(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
@@ -160,8 +156,8 @@ class ScenarioConfig(Frozen):
     fallback: Literal["continue", "restart"] = "continue"
     straight_after: Literal["own", "both"] = "own"
     # Left out where they are perfect, for the same reason.
-    perception_left: Perception = Field(default=PERFECT, exclude_if=_is_default)
-    perception_right: Perception = Field(default=PERFECT, exclude_if=_is_default)
+    perception_left: Perception = Field(default=PERFECT, exclude_if=lambda p: p == PERFECT)
+    perception_right: Perception = Field(default=PERFECT, exclude_if=lambda p: p == PERFECT)
 
     def perception(self, side: Side) -> Perception:
         """What the driver of a side perceives."""

@@ -285,6 +285,14 @@ async def test_a_trial_with_perception_that_changes_nothing_is_the_trial_without
     assert trial == await play()
 
 
+async def test_a_driver_whose_eyes_miss_nothing_drives_as_one_that_is_told_the_truth():
+    far = {"range_m": 1e6, "own": True}
+    trial, usual = await play(perception_left=far, perception_right=far), await play()
+    assert outcome(trial) == outcome(usual)
+    assert [row.decision for row in trial.decisions] == [row.decision for row in usual.decisions]
+    assert all(row.told and row.told.other_seen for row in trial.decisions)
+
+
 async def test_what_was_told_is_on_record_beside_the_truth():
     trial = await play(perception_right=FOGGY)
     assert outcome(trial) != outcome(await play())

@@ -14,6 +14,7 @@ from string import Formatter
 from typing import TypedDict
 
 from merge_runner.errors import UsageError
+from merge_runner.prompts.state_lines import LINES
 from merge_runner.records import Road
 from merge_runner.registry import Registry
 
@@ -21,7 +22,7 @@ OUTPUT_FORMAT = "C5"
 
 
 class Fields(TypedDict):
-    """What a template may name in braces, each as it is written in the prompt.
+    """What a template may name in braces beside ``state_lines``, as it is written in the prompt.
 
     Numbers have two decimals, in m, s, m/s and m/s^2, or in the unit of their name; lists are
     those of Python. What is about the other car is "not seen" while that is so, and without the
@@ -38,12 +39,6 @@ class Fields(TypedDict):
     relative_speed: str  # own minus other
     relative_distance: str  # how far the other car is ahead, negative if it is behind
     distance_to_merge: str  # before the merge point alone
-    # These have their units in them, and say in words where there is no number (state_lines).
-    projected_headway: str
-    own_time_to_merge: str
-    other_time_to_merge: str
-    time_gap: str
-    relative_speed_in_words: str
     own_accelerations: str
     other_speeds: str
     remaining_plan: str
@@ -53,6 +48,10 @@ class Fields(TypedDict):
     prompt_interval_s: str
     plan_actions: str
     max_acceleration: str
+
+
+NAMES = (*Fields.__annotations__, *LINES)
+"""All that a template may name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +73,10 @@ class Block:
 
     def __post_init__(self) -> None:
         for road, fields in (
-            ("merge", [*Fields.__annotations__]),
-            ("straight", [f for f in Fields.__annotations__ if f != "distance_to_merge"]),
+            ("merge", NAMES),
+            ("straight", [name for name in NAMES if name != "distance_to_merge"]),
         ):
-            for name in _named(getattr(self, road) or ""):
+            for name in named(getattr(self, road) or ""):
                 if name not in fields:
                     raise UsageError(
                         f"the block {self.meaning!r} names {{{name}}} on the road {road}; valid: "
@@ -112,7 +111,8 @@ class Variant:
     blocks: tuple[tuple[str, Block], ...] = ()
 
 
-def _named(template: str) -> list[str]:
+def named(template: str) -> list[str]:
+    """What a template names in braces; raises UsageError."""
     try:
         parts = [part for part in Formatter().parse(template) if part[1] is not None]
     except ValueError as exc:

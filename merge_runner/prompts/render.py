@@ -8,9 +8,8 @@ from functools import cache
 from statistics import fmean
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.prompts import state_lines
-from merge_runner.prompts.blocks import Fields, blocks_of
-from merge_runner.prompts.state_lines import NOT_SEEN
+from merge_runner.prompts.blocks import Fields, blocks_of, named
+from merge_runner.prompts.state_lines import LINES, NOT_SEEN
 from merge_runner.records import Observation, Road
 from merge_runner.registry import changes
 
@@ -31,22 +30,26 @@ def render_prompt(
     ``remaining_plan`` is the unexecuted rest of the last valid plan (normalised accelerations),
     None before the first.
     """
-    template = _template(variant, observation.road, changes())
-    prompt = template.format_map(fields(observation, remaining_plan, scenario))
+    template, lines = _template(variant, observation.road, changes())
+    values = {name: LINES[name](observation) for name in lines}
+    prompt = template.format_map({**_fields(observation, remaining_plan, scenario), **values})
     return prompt if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", prompt)
 
 
 @cache
-def _template(variant: str, road: Road, _: int) -> str:
-    """The blocks of a variant that a road has, one below the other."""
+def _template(variant: str, road: Road, _: int) -> tuple[str, list[str]]:
+    """The blocks of a variant that a road has, one below the other; and the lines that they name.
+
+    These take longer than all other fields, and few prompts have them.
+    """
     templates = (block.template(road) for block in blocks_of(variant).values())
-    return "\n\n".join(template for template in templates if template is not None) + "\n"
+    whole = "\n\n".join(template for template in templates if template is not None) + "\n"
+    return whole, [name for name in named(whole) if name in LINES]
 
 
-def fields(
+def _fields(
     observation: Observation, remaining_plan: Sequence[float] | None, scenario: ScenarioConfig
 ) -> Fields:
-    """What templates name, as it is written in a prompt."""
     distance = observation.distance_to_merge_m
     every = scenario.action_steps
     own, other = observation.own_speed_mps, observation.other_speed_mps
@@ -65,11 +68,6 @@ def fields(
         "relative_speed": of_other(own - other),
         "relative_distance": of_other(observation.relative_distance_m),
         "distance_to_merge": "" if distance is None else decimal(distance),
-        "projected_headway": state_lines.projected_headway(observation),
-        "own_time_to_merge": state_lines.own_time_to_merge(observation),
-        "other_time_to_merge": state_lines.other_time_to_merge(observation),
-        "time_gap": state_lines.time_gap(observation),
-        "relative_speed_in_words": state_lines.relative_speed(observation),
         "own_accelerations": listing(_means(observation.own_accelerations_mps2, every)),
         "other_speeds": (
             listing(_firsts(observation.other_speeds_mps, every))

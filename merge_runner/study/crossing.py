@@ -10,7 +10,7 @@ from itertools import product
 
 from pydantic import JsonValue
 
-from merge_runner.config import ModelEntry, Perception, ScenarioConfig, both_sides, validated
+from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, validated
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
@@ -188,7 +188,9 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
             f"the factor {PERCEPTION} is of both sides: name it, or {' and '.join(_PERCEPTIONS)}"
         )
     if PERFECT_ONE in file.perception:
-        raise UsageError(f"[perception.{PERFECT_ONE}] has another name: {PERFECT_ONE} is the truth")
+        raise UsageError(
+            f"[perception.{PERFECT_ONE}] needs another name: {PERFECT_ONE} is to be told the truth"
+        )
     known = known_parameters(registry.values())
     for name in filter(_is_parameter, file.factors):
         if name not in known:
@@ -241,7 +243,7 @@ def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
 
 def _perception(file: StudyFile, factor: str, level: str) -> dict[str, JsonValue]:
     """The perception that a level names; raises UsageError."""
-    known = {PERFECT_ONE: Perception(), **file.perception}
+    known = {PERFECT_ONE: PERFECT, **file.perception}
     hint = f"define another one as [{PERCEPTION}.NAME]"
     return require(known, f"level of the factor {factor}:", level, hint).model_dump()
 

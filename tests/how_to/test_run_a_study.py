@@ -9,8 +9,8 @@ import pytest
 from pydantic import BaseModel
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.prompts.blocks import BLOCKS, Fields
-from merge_runner.prompts.render import fields
+from merge_runner.prompts.blocks import BLOCKS, NAMES, VARIANTS, Variant
+from merge_runner.prompts.render import render_prompt
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.study.file import StudyFile
 from tests.harness import PROJECT
@@ -70,14 +70,17 @@ def test_every_key_is_explained_and_shown_in_an_example():
 
 def test_all_fields_and_blocks_of_a_prompt_are_named():
     (fields,) = re.findall(r"<!-- fields -->(.*?)<!-- end -->", PAGE, re.DOTALL)
-    assert re.findall(r"`(\w+)`", fields) == list(Fields.__annotations__)
+    assert re.findall(r"`(\w+)`", fields) == [*NAMES]
     for block in BLOCKS:
         assert f"`{block}`" in PAGE
 
 
 @pytest.mark.parametrize("name", [name for name in BLOCKS if name.startswith("state.")][:-1])
-def test_what_a_ready_block_says_is_shown(name):
-    said = BLOCKS[name].merge.format_map(fields(FIRST, None, ScenarioConfig()))
+def test_what_a_ready_block_says_is_shown(name, monkeypatch):
+    monkeypatch.setattr(VARIANTS, "_things", dict(VARIANTS))
+    VARIANTS.register(f"with_{name}", Variant(adds=frozenset({name})))
+    prompt = render_prompt(FIRST, None, variant=f"with_{name}", scenario=ScenarioConfig())
+    said = prompt.split("\n\n")[2]
     assert f"| `{name}` | {' '.join(said.splitlines())} |" in PAGE
 
 

@@ -22,7 +22,7 @@ SPEC = TrialSpec(
 )
 KEY = (SPEC.trial_id, SPEC.spec_hash)
 ANOTHER = {
-    "VARCHAR": "coalesce({0}, '') || 'x'", "JSON": "'[0]'", "BOOLEAN": "NOT {0}",
+    "VARCHAR": "coalesce({0}, '') || 'x'", "JSON": "'[0]'", "BOOLEAN": "NOT coalesce({0}, false)",
     "DOUBLE[]": "[1.0]", "TIMESTAMP": "{0} + INTERVAL 1 SECOND",
 }  # fmt: skip
 

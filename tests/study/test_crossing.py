@@ -244,7 +244,7 @@ def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
             '[factors]\nperception = ["foggy"]\nperception_left = ["foggy"]\n' + FOGGY,
             "of both sides: name it, or perception_left and perception_right",
         ),
-        ("[perception.perfect]\ndelay_s = 0.2\n", "has another name"),
+        ("[perception.perfect]\ndelay_s = 0.2\n", "needs another name"),
         (
             '[factors]\nperception = ["late"]\n[perception.late]\ndelay_s = 0.3\n',
             'no whole number of 0.2 s; .*model = "emulator", perception = "late"',

@@ -61,6 +61,27 @@ def test_a_paragraph_is_added_where_it_belongs(plan_of):
     assert lines[:place] + lines[place + 1 :] == prompt("baseline").split("\n\n")
 
 
+@pytest.mark.parametrize(
+    ("change", "neighbours"),
+    [
+        ("", ("C0", "C1")),
+        ('remove = ["C1", "C2"]\n', ("C0", "C3.safety")),
+        ('based_on = "A1"\n', ("C0", "C2")),
+    ],
+)
+def test_a_ready_block_stands_behind_the_situation_unless_it_is_put_elsewhere(
+    plan_of, change, neighbours
+):
+    head = '[factors]\nprompt = ["more"]\n[prompts.more]\n'
+    plan_of(f'{head}{change}add = [{{ block = "state.time_gap" }}]\n')
+    names = list(blocks_of("more"))
+    place = names.index("state.time_gap")
+    assert (names[place - 1], names[place + 1]) == neighbours
+    plan_of(f'{head}{change}add = [{{ block = "state.time_gap", before = "C5" }}]\n')
+    assert list(blocks_of("more"))[-2:] == ["state.time_gap", "C5"]
+    assert "\n\nTime gap (" in prompt("more")
+
+
 def test_an_edited_prompt_is_another_spec_at_once(plan_of):
     texts = ["You are late.", "You are early."]
     specs = [plan_of(persona(text)).trial_specs()[0].spec_hash for text in texts]
@@ -169,6 +190,8 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
             None,
             "give it a block, a text, or merge",
         ),
+        ('[prompts.x]\nadd = [{ block = "C9" }]\n', None, "unknown prompt block 'C9'; valid: C0"),
+        ('[prompts.x]\nadd = [{ block = "C2" }]\n', None, "'C2', which it has already"),
         ("[prompts.x]\nad = []\n", None, "unknown key 'prompts.x.ad'; valid: based_on, remove"),
         ('[plugins]\nfiles = ["none.py"]\n', None, "the plug-in none.py cannot be read"),
         (
