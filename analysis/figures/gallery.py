@@ -33,6 +33,7 @@ from analysis.figures.drawing import (
     wrapped,
 )
 from analysis.figures.factor_figure import figure_of_factors
+from analysis.figures.first_action_figure import figure_of_first_actions
 from analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     Point,
@@ -213,6 +214,13 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
         figure_of_factors,
         "Each factor's levels, pooled over all other factors, by every metric: its rate, mean or "
         "median with the 95 % interval that the table of this name prints.",
+    ),
+    "first-action": (
+        figure_of_first_actions,
+        "Net acceleration of the first step under control. (A) Means by own relative velocity, "
+        "with intervals of Student's t over trials. (B to D) Shares of first actions below each "
+        "acceleration, of drivers that are slower than the other, as fast, and faster; of humans "
+        "before an import between the published quantiles.",
     ),
 }
 
