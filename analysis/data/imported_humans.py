@@ -14,7 +14,13 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 OUTCOMES = ["left_first", "right_first", "collided"]
 COUNTS = ["trials", *OUTCOMES]
-TRIALS = "SELECT pair, condition, status, merged_first FROM trials WHERE source = 'human'"
+# What a spec says of trials that were not read from the recordings.
+RECORDINGS, VELOCITY_PAGES = "recordings", "velocity pages"
+TRIALS = f"""
+SELECT pair, condition, status, merged_first,
+    coalesce(spec->>'$.origin', '{RECORDINGS}') AS origin
+FROM trials LEFT JOIN specs USING (spec_hash) WHERE source = 'human'
+"""  # noqa: S608 # constants
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +30,8 @@ class Imported:
     ``complete``: every condition has as many trials as are published, so that they can stand in
     the place of the published counts. ``contradicting`` names, in words, what no part of the
     published trials can have: then these are another data set. ``left_out`` counts the trials of
-    pairs beside the published ones.
+    pairs beside the published ones. ``from_pages`` of the trials are of the velocity pages, the
+    others of the recordings.
     """
 
     trials: int
@@ -32,6 +39,7 @@ class Imported:
     complete: bool
     contradicting: tuple[str, ...]
     left_out: dict[str, int]
+    from_pages: int
 
     @property
     def label(self) -> str:
@@ -53,6 +61,11 @@ class Imported:
                 f"{which}: who merged first and collisions stay the {HUMAN_TRIALS} published "
                 "outcomes while a condition has fewer trials, the rest comes from these"
             )
+        if self.from_pages:
+            yield (
+                f"{self.from_pages} of {self.trials} trials are of the public velocity pages, with "
+                "positions made of the speeds; the others are of the recordings"
+            )
         for pair, trials in self.left_out.items():
             yield f"{pair}: {trials} trials, not of the nine published pairs: left out"
 
@@ -62,6 +75,11 @@ def human_trials(db: Path) -> pd.DataFrame:
     return load(TRIALS, db)
 
 
+def first_actions(db: Path) -> int:
+    """Of how many trials first actions are imported; raises UsageError."""
+    return int(load("SELECT count(DISTINCT trial) AS n FROM human_first_actions", db)["n"].iloc[0])
+
+
 def of_published_pairs(trials: pd.DataFrame) -> pd.DataFrame:
     """The trials of the nine published pairs; all, where there is none of these."""
     own = trials["pair"].isin(PAIRS.values())
@@ -69,7 +87,7 @@ def of_published_pairs(trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def imported(trials: pd.DataFrame) -> Imported:
-    """Compare human trials with the published counts."""
+    """Compare human trials, which have the columns of TRIALS, with the published counts."""
     chosen = of_published_pairs(trials)
     conditions = by_condition(trials)
     others = trials.loc[trials.index.difference(chosen.index), "pair"]
@@ -85,6 +103,7 @@ def imported(trials: pd.DataFrame) -> Imported:
             else tuple(_contradicting(conditions))
         ),
         left_out={str(pair): int(n) for pair, n in others.value_counts().sort_index().items()},
+        from_pages=int((chosen["origin"] == VELOCITY_PAGES).sum()),
     )
 
 

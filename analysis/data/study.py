@@ -17,7 +17,7 @@ import pandas as pd
 from analysis.data.collision_rules import judged
 from analysis.data.derived_cache import present_state
 from analysis.data.first_actions import FIRST_ACTIONS, HUMAN_FIRST_ACTIONS
-from analysis.data.imported_humans import Imported, imported, of_published_pairs
+from analysis.data.imported_humans import RECORDINGS, Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
     DEVIATIONS,
@@ -181,7 +181,7 @@ class Study:
         )
         trials = judged(self.db, trials)
         recorded = trials["source"] == HUMAN
-        self.imported = imported(trials[recorded]) if recorded.any() else None
+        self.imported = _imported(trials[recorded], specs) if recorded.any() else None
         self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
         every = _model_groups(trials[~recorded], specs)
         levels = self._read(LEVELS)
@@ -293,6 +293,11 @@ def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.Data
     # To join all rows takes longer than to leave out those of other groups first.
     near = frame["spec_hash"].isin(keys["spec_hash"].unique())
     return frame[near].merge(keys, on=["trial_id", "spec_hash"])
+
+
+def _imported(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> Imported:
+    origins = {name: spec.get("origin", RECORDINGS) for name, spec in specs.items()}
+    return imported(trials.assign(origin=trials["spec_hash"].map(origins)))
 
 
 def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:

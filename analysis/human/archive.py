@@ -22,6 +22,7 @@ MAX_TOTAL_BYTES = 4 * 2**30
 # hundredth.
 MAX_RATIO = 200
 ENCRYPTED = 0x1
+PAGE = ".html"
 DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
@@ -53,9 +54,12 @@ class File:
 
 @contextmanager
 def open_files(path: Path) -> Iterator[list[File]]:
-    """All files of a folder and those below it, or of a zip; raises UsageError."""
+    """All files of a folder and those below it, of a zip, or a page; raises UsageError."""
     if path.is_dir():
         yield list(_files_below(path))
+        return
+    if path.is_file() and path.suffix.lower() == PAGE:
+        yield [_file(path, path.name)]
         return
     if not path.exists():
         raise UsageError(f"there is no {path}: name the downloaded zip, or the folder of its files")
@@ -102,9 +106,12 @@ def _files_below(folder: Path) -> Iterator[File]:
     for parent, _, names in os.walk(folder, onerror=refuse):
         for name in names:
             path = Path(parent, name)
-            size = path.stat().st_size if path.is_file() else 0
-            shown = one_line(str(path.relative_to(folder)))
-            yield File(shown, size, size, partial(_read_file, path))
+            yield _file(path, str(path.relative_to(folder)))
+
+
+def _file(path: Path, name: str) -> File:
+    size = path.stat().st_size if path.is_file() else 0
+    return File(one_line(name), size, size, partial(_read_file, path))
 
 
 def _read_file(path: Path) -> bytes:

@@ -30,7 +30,12 @@ human_app = typer.Typer(
 @human_app.command("import")
 def human_import(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="The downloaded zip, or the folder of its files.")
+        Path,
+        typer.Argument(
+            metavar="PATH",
+            help="The downloaded zip, the folder of its files, or the public velocity pages: a "
+            "folder, or one of them.",
+        ),
     ],
     db: DbOption = DEFAULT_DB,
 ) -> None:
@@ -40,13 +45,13 @@ def human_import(
 
     from analysis.data.imported_humans import human_trials, imported
     from analysis.human.archive import open_files
-    from analysis.human.load import import_trials, sort_files
+    from analysis.human.load import import_pages, import_trials, sort_files
     from merge_runner.results.store import Store
 
     try:
         with open_files(path) as files:
             download = sort_files(files)
-            if not download.trials:
+            if not download.trials and not download.pages:
                 raise UsageError(_nothing_in(path, files))
             shown = track(
                 download.trials,
@@ -55,7 +60,9 @@ def human_import(
                 transient=True,
                 disable=not sys.stderr.isatty(),
             )
-            report = import_trials(shown, Store(db))
+            store = Store(db)
+            report = import_trials(shown, store)
+            import_pages(download.pages, store, report)
     except KeyboardInterrupt:
         say("interrupted: what is stored stays; run the same command again to go on")
         sys.exit(INTERRUPTED)
@@ -70,6 +77,39 @@ def human_import(
     sys.exit(1 if report.unreadable or report.differing else 0)
 
 
+@human_app.command("import-first-actions")
+def human_import_first_actions(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="The public page initial_action.html, or a CSV with relative_velocity_mps, "
+            "merged_first, left_mps2 and right_mps2.",
+        ),
+    ],
+    db: DbOption = DEFAULT_DB,
+) -> None:
+    """Add the first actions of the humans: what the table first-action compares drivers with."""
+    from analysis.human.archive import Unreadable
+    from analysis.human.first_actions import read_first_actions, rows_of
+    from merge_runner.results.store import Store
+
+    try:
+        trials, left_out = read_first_actions(file.read_bytes())
+    except OSError as exc:
+        raise UsageError(f"{file} cannot be read: {exc.strerror}") from exc
+    except Unreadable as exc:
+        raise UsageError(
+            f"{file}: {exc}; name docs/plots/initial_action.html of "
+            "github.com/tud-hri/simple-merging-experiment, or a CSV"
+        ) from exc
+    added = Store(db).add_human_first_actions(rows_of(trials))
+    print_out(
+        f"{len(trials) if added else 0} trials added, {0 if added else len(trials)} there already, "
+        f"{left_out} left out: their pedals do not tell the relative velocity"
+    )
+
+
 @human_app.command("status")
 def human_status(db: DbOption = DEFAULT_DB) -> None:
     """Count the human trials per pair and condition, beside the published counts."""
@@ -78,12 +118,16 @@ def human_status(db: DbOption = DEFAULT_DB) -> None:
         OUTCOMES,
         by_condition,
         by_pair,
+        first_actions,
         human_trials,
         imported,
     )
     from analysis.data.reference_data import HUMAN_DOI
 
     trials = human_trials(db) if db.exists() else None
+    actions = first_actions(db) if db.exists() else 0
+    if actions:
+        print_out(f"first actions of {actions} trials are imported")
     if trials is None or trials.empty:
         print_out(
             "no human recordings are imported: merge-runner human import PATH, where PATH is the "
@@ -103,7 +147,10 @@ def human_status(db: DbOption = DEFAULT_DB) -> None:
 def _nothing_in(path: Path, files: list[File]) -> str:
     inner = [file.name for file in files if file.name.lower().endswith(".zip")]
     hint = f"; unpack it, and import {', '.join(inner)} of it" if inner else ""
-    return f"no trial is in {path}: trials are experiment_N_iter_M.csv{hint}"
+    return (
+        f"no trial is in {path}: trials are experiment_N_iter_M.csv, and velocity pages are named "
+        f"like 4_-8.html{hint}"
+    )
 
 
 def _messages(download: Download, report: Report) -> Iterator[str]:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import PurePath
 
+from analysis.data.reference_data import PAIRS
 from analysis.human.archive import File, Unreadable, refuse_bombs
-from analysis.human.record import SPEC, SPEC_HASH, trial_record
+from analysis.human.record import PAGE_SPEC, PAGE_SPEC_HASH, SPEC, SPEC_HASH, trial_record
 from analysis.human.trace import parse_csv
+from analysis.human.velocity_pages import condition_of, trace_of, trials_of
 from merge_runner.records import TrialRecord
-from merge_runner.results.store import Store
+from merge_runner.results.store import Store, query
+from merge_runner.text_safety import quoted
 
 BATCH = 100
 NAME = re.compile(
@@ -36,11 +39,15 @@ class RecordedTrial:
 
 @dataclass(frozen=True, slots=True)
 class Download:
-    """A download's contents: its trials in order, and how many runs were training or simulated."""
+    """A download's contents: its trials in order, and how many runs were training or simulated.
+
+    ``pages`` are its velocity pages, each with its condition.
+    """
 
     trials: list[RecordedTrial]
     training: int
     simulated: int
+    pages: list[tuple[File, str]]
 
 
 @dataclass(slots=True)
@@ -64,7 +71,10 @@ def sort_files(files: Iterable[File]) -> Download:
     trials: dict[tuple[int, int], RecordedTrial] = {}
     training: set[tuple[int, int]] = set()
     simulated: set[tuple[int, int]] = set()
+    pages: list[tuple[File, str]] = []
     for file in files:
+        if (condition := condition_of(file.name)) is not None:
+            pages.append((file, condition))
         found = NAME.fullmatch(PurePath(file.name).name)
         if found is None:
             continue
@@ -81,10 +91,12 @@ def sort_files(files: Iterable[File]) -> Download:
             else:
                 trial.others.append(file.name)
     refuse_bombs(file for trial in trials.values() for file in trial.files)
+    refuse_bombs(file for file, _ in pages)
     return Download(
         trials=[trial for _, trial in sorted(trials.items())],
         training=len(training),
         simulated=len(simulated),
+        pages=sorted(pages, key=lambda page: page[0].name),
     )
 
 
@@ -94,11 +106,50 @@ def import_trials(trials: Iterable[RecordedTrial], store: Store) -> Report:
     remaining = iter(trials)
     while batch := list(islice(remaining, BATCH)):
         records = [record for trial in batch for record in _read(trial, report)]
-        added, there, differing = store.add_recorded(records, {SPEC_HASH: SPEC})
-        report.added += added
-        report.there += there
-        report.differing += differing
+        _add(records, store, (SPEC_HASH, SPEC), report)
     return report
+
+
+def import_pages(pages: Iterable[tuple[File, str]], store: Store, report: Report) -> None:
+    """Store the trials of the velocity pages, page by page. Raises StoreError."""
+    for file, condition in pages:
+        records = list(_read_page(file, condition, report))
+        _add(records, store, (PAGE_SPEC_HASH, PAGE_SPEC), report)
+
+
+def _add(
+    records: Sequence[TrialRecord], store: Store, spec: tuple[str, str], report: Report
+) -> None:
+    """Store trials, but those that were imported from the other kind of file: they are there."""
+    names = ", ".join(quoted(record.spec.trial_id) for record in records) or "''"
+    _, rows = query(
+        store.path,
+        f"SELECT trial_id FROM trials WHERE source = 'human' AND spec_hash <> {quoted(spec[0])} "  # noqa: S608 # quoted
+        f"AND trial_id IN ({names})",
+    )
+    elsewhere = {trial_id for (trial_id,) in rows}
+    new = [record for record in records if record.spec.trial_id not in elsewhere]
+    added, there, differing = store.add_recorded(new, dict([spec]) if new else {})
+    report.added += added
+    report.there += there + len(records) - len(new)
+    report.differing += differing
+
+
+def _read_page(file: File, condition: str, report: Report) -> Iterator[TrialRecord]:
+    """The trials of a page; what cannot be read is reported."""
+    try:
+        for experiment, iteration, trial in trials_of(file.read(), condition):
+            name = f"{file.name}: {PAIRS[experiment]}, trial {iteration}"
+            try:
+                trace = trace_of(trial, condition)
+                record = trial_record(trace, experiment, iteration, PAGE_SPEC_HASH)
+                if record.spec.condition != condition:
+                    raise Unreadable(f"its speeds are not those of {condition}")
+                yield record
+            except Unreadable as exc:
+                report.unreadable.append((name, str(exc)))
+    except Unreadable as exc:
+        report.unreadable.append((file.name, str(exc)))
 
 
 def _read(trial: RecordedTrial, report: Report) -> list[TrialRecord]:

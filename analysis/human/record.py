@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+from analysis.data.imported_humans import VELOCITY_PAGES
 from analysis.data.reference_data import HUMAN_DOI, PAIRS
 from analysis.human.archive import Unreadable
 from analysis.human.trace import Trace
@@ -23,24 +24,34 @@ START_TOLERANCE_M = 0.6
 START_TOLERANCE_MPS = 0.1
 # The experiment ended at a position, which differs from the distance travelled by some millimetres.
 END_TOLERANCE_M = 1.0
-SPEC = canonical_json(
-    {
-        "spec_version": 1,
-        "source": "human",
-        "doi": HUMAN_DOI,
-        "condition": "the one whose start is at most "
-        f"{START_TOLERANCE_M} m and {START_TOLERANCE_MPS} m/s from the first sample",
-        "time_s": f"from the first sample with both vehicles beyond {TRACK.tunnel_exit_m:g} m",
-        "position_m": "travelled_distance",
-        "velocity_mps": "velocities",
-        "acceleration_mps2": "difference of velocities over the step before",
-        "merged_first": f"at {TRACK.merge_point_m:g} m, interpolated within the step",
+_READ = {
+    "spec_version": 1,
+    "source": "human",
+    "doi": HUMAN_DOI,
+    "condition": "the one whose start is at most "
+    f"{START_TOLERANCE_M} m and {START_TOLERANCE_MPS} m/s from the first sample",
+    "time_s": f"from the first sample with both vehicles beyond {TRACK.tunnel_exit_m:g} m",
+    "position_m": "travelled_distance",
+    "velocity_mps": "velocities",
+    "acceleration_mps2": "difference of velocities over the step before",
+    "merged_first": f"at {TRACK.merge_point_m:g} m, interpolated within the step",
+}
+SPEC = canonical_json(_READ)
+SPEC_HASH = spec_hash(SPEC)
+# Of the velocity pages, which show no positions.
+PAGE_SPEC = canonical_json(
+    _READ
+    | {
+        "origin": VELOCITY_PAGES,
+        "position_m": "from the start of the condition by trapezoids of the velocities",
     }
 )
-SPEC_HASH = spec_hash(SPEC)
+PAGE_SPEC_HASH = spec_hash(PAGE_SPEC)
 
 
-def trial_record(trace: Trace, experiment: int, iteration: int) -> TrialRecord:
+def trial_record(
+    trace: Trace, experiment: int, iteration: int, read_as: str = SPEC_HASH
+) -> TrialRecord:
     """The record of trial ``iteration`` of an experiment; raises Unreadable."""
     status = _status(trace)
     condition = _condition(trace)
@@ -50,7 +61,7 @@ def trial_record(trace: Trace, experiment: int, iteration: int) -> TrialRecord:
     return TrialRecord(
         spec=TrialSpec(
             trial_id=f"human/{pair}/{condition}/iter{iteration:03d}",
-            spec_hash=SPEC_HASH,
+            spec_hash=read_as,
             source="human",
             pair=pair,
             model_left="human",

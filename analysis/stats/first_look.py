@@ -198,7 +198,8 @@ def cue(found: Acts, of: Array | None = None) -> tuple[Coefficient | None, Coeff
     if len(found.sides) == 1:
         side = found.sides[0]
         design = np.column_stack([np.ones(len(velocity)), velocity * (1 - 2 * side)])
-        return (_jackknife(design, actions[:, side], unit) or [None, None])[1], None
+        fitted = _jackknife(design, actions[:, side], unit)
+        return (fitted[1] if fitted else None), None
     design = np.column_stack([np.ones(len(velocity)), 2 * velocity])
     fitted = _jackknife(design, actions[:, 0] - actions[:, 1], unit)
     if fitted is not None:
@@ -331,7 +332,7 @@ def _jackknife(design: Array, values: Array, unit: NDArray[np.int_]) -> list[Coe
 
 def _cue(own: Acts, known: Humans) -> Fault | None:
     slope, _ = cue(own)
-    found = slope and _difference(slope, known.slope)
+    found = _difference(slope, known.slope) if slope else None
     if slope is None or found is None:
         return None
     turned = slope.value * known.slope.value < 0
@@ -342,7 +343,7 @@ def _cue(own: Acts, known: Humans) -> Fault | None:
 
 def _side(own: Acts) -> Fault | None:
     _, side = cue(own)
-    found = side and _difference(side, Coefficient(0.0, 0.0))
+    found = _difference(side, Coefficient(0.0, 0.0)) if side else None
     if side is None or found is None:
         return None
     said = f"the {SIDES[0] if side.value > 0 else SIDES[1]} vehicle accelerates more"

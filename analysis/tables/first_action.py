@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -143,9 +143,11 @@ def _rows(study: Study, group: Group) -> Iterator[Row]:
         for seat in seats(group):
             yield from _of_acts(seat, acts(study, seat), known)
         return
-    rows = _of_classes(group, known)
-    if known.acts is not None:
-        rows = list(_of_acts(Seat(group, (0, 1)), known.acts, known))
+    rows: Iterable[Row] = (
+        _of_classes(group, known)
+        if known.acts is None
+        else _of_acts(Seat(group, (0, 1)), known.acts, known)
+    )
     # Of humans whose recordings are imported in part, too, these are other trials than theirs.
     columns = tuple(column.name for column in VALUES)
     yield from (replace(row, published=columns, cited=FILE, note=known.source) for row in rows)

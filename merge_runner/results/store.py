@@ -164,6 +164,20 @@ class Store:
             there = len(records) - added - len(differing)
             return added, there, [trial_id for trial_id, _ in differing]
 
+    def add_human_first_actions(self, rows: Sequence[Row]) -> bool:
+        """Store first actions of humans; False: they are there. Others stay: raises UsageError."""
+        with self._writing() as connection:
+            there = connection.execute("FROM human_first_actions ORDER BY trial, side").fetchall()
+            if there == sorted(rows, key=itemgetter(0, 1)):
+                return False
+            if there:
+                raise UsageError(
+                    f"{self.path} holds {len(there)} other first actions, which stay: name another "
+                    "database with --db"
+                )
+            append(connection, "human_first_actions", rows)
+            return True
+
     @contextmanager
     def _writing(self, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
         with (

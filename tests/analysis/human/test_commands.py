@@ -72,8 +72,8 @@ def test_what_cannot_be_read_is_listed_and_the_rest_is_imported(human, tmp_path)
         (None, "error: there is no download.zip"),
         (
             {"a/data.zip": b"", "readme.txt": b""},
-            "error: no trial is in download.zip: trials are experiment_N_iter_M.csv; "
-            "unpack it, and import a/data.zip of it\n",
+            "error: no trial is in download.zip: trials are experiment_N_iter_M.csv, "
+            "and velocity pages are named like 4_-8.html; unpack it, and import a/data.zip of it\n",
         ),
         ({"../experiment_4_iter_1.csv": b""}, "error: download.zip is unsafe"),
     ],

@@ -1,0 +1,211 @@
+"""The tables of first actions and of words: their numbers are those of the stored trials."""
+
+from __future__ import annotations
+
+import duckdb
+import numpy as np
+import pytest
+
+from analysis.data.load import load
+from analysis.data.study import Study
+from analysis.explain import explain
+from analysis.tables import make_tables
+from merge_runner.config import ScenarioConfig
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from tests.analysis.studies import Drive, write_study, yielding
+
+FIRSTS = np.random.default_rng(8).uniform(-0.4, 0.4, (len(CONDITIONS), 4, 2))
+
+
+def following(driver, slope):
+    """A driver whose first action is a slope on the own relative velocity, and some noise."""
+    drives = []
+    for place, (name, condition) in enumerate(CONDITIONS.items()):
+        for rep in range(1, 5):
+            own = np.array([1, -1]) * condition.relative_velocity_mps
+            left, right = (slope * own + FIRSTS[place, rep - 1]) / 2.5
+            actions = ((float(left),) * 3, (float(right),) * 3)
+            drives.append(Drive(driver, "baseline", name, rep, *actions))
+    return drives
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    path = tmp_path_factory.mktemp("first") / "t.duckdb"
+    return write_study(path, [*following("alike", -0.34), *following("blind", 0.0)])
+
+
+@pytest.fixture(scope="module")
+def rows(db):
+    return {row.id: row for row in make_tables(Study(db), ["first-action"])[0].rows}
+
+
+def test_the_human_slope_stands_beside_each_drivers(rows):
+    assert rows["human/all"].values["slope"] == -0.338
+    assert rows["human/all"].values["slope_ci"] == pytest.approx((-0.375, -0.301))
+    assert [rows[f"human/{v}"].values["mean"] for v in ("-0.8", "0", "0.8")] == [
+        0.211,
+        -0.013,
+        -0.330,
+    ]
+    for driver, slope in (("alike", -0.34), ("blind", 0.0)):
+        low, high = rows[f"{driver}/baseline/all"].values["slope_ci"]
+        assert low < slope < high
+
+
+def test_the_numbers_of_a_class_are_those_of_the_states(db, rows):
+    found = load(
+        "SELECT acceleration_mps2 AS a FROM states JOIN trials USING (trial_id, spec_hash) "
+        "WHERE model_left = 'alike' AND step = 1 AND abs(relative_velocity_mps "
+        "* if(side = 'left', 1, -1) + 0.8) < 1e-9",
+        db,
+    )["a"]
+    values = rows["alike/baseline/-0.8"].values
+    assert values["velocity"] == "0.8 m/s slower"
+    assert values["n"] == len(found) == 32
+    assert values["mean"] == pytest.approx(found.mean())
+    assert values["sd"] == pytest.approx(found.std())
+    assert values["se"] == pytest.approx(found.std() / np.sqrt(32), rel=1e-6)
+    assert values["slow_percent"] == pytest.approx(100 * (found < -0.2).mean())
+    assert values["hold_percent"] == pytest.approx(100 * (found.abs() <= 0.2).mean())
+    assert values["go_percent"] == pytest.approx(100 * (found > 0.2).mean())
+    assert values["first_second"] == pytest.approx(found.mean()), "it is held for a second"
+
+
+def test_what_both_drivers_of_a_trial_do_is_counted_by_trial(db, rows):
+    found = load(
+        "SELECT min(acceleration_mps2) AS low, max(acceleration_mps2) AS high FROM states "
+        "WHERE trial_id LIKE 'blind/%' AND step = 1 GROUP BY trial_id",
+        db,
+    )
+    values = rows["blind/baseline/all"].values
+    assert values["both_go_percent"] == pytest.approx(100 * (found["low"] > 0.2).mean())
+    assert values["both_slow_percent"] == pytest.approx(100 * (found["high"] < -0.2).mean())
+    assert values["both_slow_percent"] > 0
+
+
+def test_a_row_leads_to_the_trials_of_its_relative_velocity(db):
+    study = Study(db)
+    (table,) = make_tables(study, ["first-action"])
+    (source,) = explain(study, table, "alike/baseline/-0.8:mean").sources
+    assert len(source.trials) == 32
+    assert not any("_0/" in trial for trial in source.trials)
+    assert len(explain(study, table, "alike/baseline/0:mean").sources[0].trials) == 12
+    (human,) = explain(study, table, "human/all:slope").sources
+    assert "initial_action.html" in human.text
+
+
+def test_drag_counts_as_it_was_realised(tmp_path):
+    db = write_study(
+        tmp_path / "t.duckdb",
+        [Drive("o3", "baseline", name, 1, (0.0,), (0.0,)) for name in CONDITIONS],
+        ScenarioConfig(resistance="human"),
+    )
+    rows = {row.id: row.values for row in make_tables(Study(db), ["first-action"])[0].rows}
+    assert rows["o3/baseline/0"]["mean"] == pytest.approx(-1.0)
+    assert rows["o3/baseline/all"]["slow_percent"] == 100
+
+
+def test_the_two_drivers_of_a_mixed_pair_have_rows_of_their_own(db, tmp_path):
+    mixed = tmp_path / "t.duckdb"
+    mixed.write_bytes(db.read_bytes())
+    with duckdb.connect(str(mixed)) as connection:
+        connection.execute("UPDATE trials SET model_right = 'other' WHERE model_left = 'alike'")
+    first, faults = make_tables(Study(mixed), ["first-action", "first-action-faults"])
+    rows = {row.id: row.values for row in first.rows}
+    left, right = (rows[f"alike+other/baseline/{side}/all"] for side in ("left", "right"))
+    assert (left["n"], right["n"]) == (44, 44)
+    assert left["driver"] == "alike+other (left)"
+    assert left["mean"] != right["mean"]
+    assert "both_go_percent" not in left
+    named = [row.values["fault"] for row in faults.rows if row.id.startswith("alike+other")]
+    assert "side" not in named
+
+
+def test_of_a_driver_that_does_not_look_this_fault_alone_is_shown(tmp_path):
+    study = Study(write_study(tmp_path / "t.duckdb", following("blind", 0.0)))
+    (table,) = make_tables(study, ["first-action-faults"])
+    shown = {row.values["fault"]: row.values["shown"] for row in table.rows}
+    assert shown == {"late": False, "relative velocity": True, "side": False, "level": False}
+    says = {row.values["fault"]: row.values["says"] for row in table.rows}
+    assert says["relative velocity"] == "it responds less to the relative velocity"
+
+
+def test_a_relative_velocity_that_no_human_had_has_a_row_and_is_not_compared(db, tmp_path):
+    own = tmp_path / "t.duckdb"
+    own.write_bytes(db.read_bytes())
+    with duckdb.connect(str(own)) as connection:
+        connection.execute(
+            "UPDATE trials SET relative_velocity_mps = 1.6, condition = 'own' "
+            "WHERE condition = 'L_4_8'"
+        )
+    first, faults = make_tables(Study(own), ["first-action", "first-action-faults"])
+    rows = {row.id: row.values for row in first.rows}
+    assert rows["alike/baseline/1.6"]["velocity"] == "1.6 m/s faster"
+    assert "crps" not in rows["alike/baseline/1.6"]
+    assert rows["alike/baseline/0.8"]["n"] == 28
+    assert len(faults.rows) == 8
+
+
+def spoken(drives, tmp_path, words):
+    """A study in which the word of a decision is what ``words`` says of trial, side and number."""
+    db = write_study(tmp_path / "w.duckdb", drives)
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(f"UPDATE decisions SET tactical = {words}")
+    return Study(db)
+
+
+def test_words_that_are_kept_and_that_are_broken_are_counted(tmp_path):
+    study = spoken(yielding("o3", reps=2), tmp_path, "if(applied[1] > 0, 'M', 'Y')")
+    (table,) = make_tables(study, ["words"])
+    values = {row.id: row.values for row in table.rows}["o3/baseline"]
+    assert values["merge_yields_percent"] == values["yield_goes_percent"] == 0
+    assert values["merge_second_percent"] == values["yield_first_percent"] == 0
+    assert values["merge_second_n"] + values["yield_first_n"] == 44
+    broken = spoken(yielding("o3", reps=2), tmp_path, "if(applied[1] > 0, 'Y', 'M')")
+    (table,) = make_tables(broken, ["words"])
+    values = table.rows[0].values
+    assert values["yield_goes_percent"] == 100
+    assert values["merge_second_percent"] == values["yield_first_percent"] == 100
+    # After three seconds the drivers keep their speed: that is no yielding.
+    acted = load("SELECT count(*) AS n FROM decisions WHERE applied[1] < 0", broken.db)["n"].iloc[0]
+    counted = values["merge_yields_percent"] / 100 * values["merge_yields_n"]
+    assert 0 < round(counted) <= acted
+
+
+OWN = "if(side = 'left', 1, -1)"
+
+
+@pytest.mark.parametrize(
+    ("cue", "follows"),
+    [
+        (f"{OWN} * projected_headway_m", "headway"),
+        (f"-{OWN} * relative_velocity_mps", "relative velocity"),
+        (f"{OWN} * (projected_headway_m - 4 * relative_velocity_mps)", "both"),
+        ("0", "neither"),
+    ],
+)
+def test_what_the_first_word_follows_is_told(cue, follows, tmp_path):
+    noise = "3 * ((hash(trial_id, side) % 1000) / 500.0 - 1)" if follows != "neither" else (
+        "(hash(trial_id, side) % 1000) / 500.0 - 1")  # fmt: skip
+    scale = "2.5 *" if follows == "relative velocity" else ""
+    words = (
+        f"(SELECT if({scale} ({cue}) + {noise} > 0, 'M', 'Y') FROM trials "
+        "WHERE trials.trial_id = decisions.trial_id)"
+    )
+    study = spoken(yielding("o3", reps=6), tmp_path, words)
+    (table,) = make_tables(study, ["words"])
+    values = table.rows[0].values
+    assert values["first_n"] == 132
+    assert values["follows"] == follows, values
+
+
+def test_one_word_alone_and_no_word_say_so(tmp_path):
+    study = spoken(yielding("o3", reps=1), tmp_path, "'M'")
+    (table,) = make_tables(study, ["words"])
+    assert table.rows[0].values["follows"] is None
+    assert "it is M in all 22 decisions" in table.rows[0].note
+    silent = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
+    (table,) = make_tables(silent, ["words"])
+    assert table.rows == []
+    assert any("no driver said a tactical word" in note for note in table.notes)
