@@ -105,7 +105,10 @@ class Program:
                 f"clock = {clock_s:g} is too fast: {name} decides every {1 / self.rate_hz:g} s, "
                 "and a clock can only slow it down"
             )
-        given = {each: _like(self.values, name, each, value) for each, value in changes.items()}
+        # Which other parameters there are depends on the set.
+        chosen = {SET: _like(self.values, name, SET, changes[SET])} if SET in changes else {}
+        values = replace(self, parameters={**self.parameters, **chosen}).values
+        given = {each: _like(values, name, each, value) for each, value in changes.items()}
         return replace(
             self,
             parameters={**self.parameters, **given},
