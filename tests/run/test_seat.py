@@ -9,12 +9,16 @@ from dataclasses import replace
 
 import pytest
 
+from merge_runner.config import USUAL_SCENARIO
 from merge_runner.errors import UsageError
 from merge_runner.records import SLOT_HEADER
+from merge_runner.registry import unregister
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import make_plan
 from merge_runner.run.seat import first_situations, grid_conditions
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
+from merge_runner.scenarios.registry import SCENARIOS
 from tests.harness import FAST, RECORDING, watched
 
 DB = "results/merge.duckdb"
@@ -273,6 +277,35 @@ def test_vehicles_that_collide_at_once_are_no_situation():
     arms = (replace(plan.arms[0], scenario=wide),)
     with pytest.raises(UsageError, match="collide before both are driven"):
         first_situations(replace(plan, arms=arms))
+
+
+class Endless(World):
+    """A world that has no timeout."""
+
+    def _end(self):
+        found = super()._end()
+        return None if found == "timeout" else found
+
+
+def test_a_scenario_whose_trials_do_not_end_in_time_is_refused(tmp_path):
+    usual = SCENARIOS[USUAL_SCENARIO]
+    SCENARIOS.replace("endless", replace(usual, make_world=Endless))
+    (tmp_path / "mine.toml").write_text('repetitions = 1\n[scenario]\nname = "endless"\n')
+    try:
+        plan = make_plan(str(tmp_path / "mine.toml"), "emulator")
+        with pytest.raises(UsageError, match="go on after timeout_s"):
+            first_situations(plan)
+    finally:
+        unregister("scenario endless")
+
+
+async def test_a_sweep_plays_the_points_of_a_grid_and_takes_what_was_asked(merge_runner):
+    point = ("--conditions", "h2_dv-1.2")
+    assert (await merge_runner("seat", "first", "--samples", 1, *point)).code == 0
+    run = await merge_runner("sweep", "baseline", "--reps", 1, *point, "--json")
+    assert (run.code, run.summary["calls"]["cached"]) == (0, 2), run.err
+    audit = await merge_runner("audit")
+    assert audit.code == 0, audit.out
 
 
 def test_no_question_knows_of_another():
