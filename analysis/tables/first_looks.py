@@ -80,7 +80,7 @@ def _remarks(found: Sequence[FirstLooks]) -> Iterator[str]:
             if fit.remark and fit.n and (looks.sampled or fit.headway is None):
                 yield f"{looks.id}: {what}: {fit.remark}"
         if not looks.sampled:
-            yield f"{looks.id}: there is no chance in its answers, and so no interval"
+            yield f"{looks.id}: no chance is in its answers: each counts once, without an interval"
 
 
 def _rate(found: Exchange) -> Estimate | None:

@@ -77,7 +77,7 @@ def test_a_driver_without_chance_counts_once_and_has_no_interval(table):
     assert found["h=+2 dv=+0"].values["asked"] == 2
     assert not any(value for row in found.values() for name, value in row.values.items()
                    if name.endswith("_ci"))  # fmt: skip
-    assert "projected-order/baseline: there is no chance in its answers" in "\n".join(table.notes)
+    assert "projected-order/baseline: no chance is in its answers" in "\n".join(table.notes)
     assert found["per m of headway"].values["action"] > 0
 
 
