@@ -76,9 +76,10 @@ def _remarks(found: Sequence[FirstLooks]) -> Iterator[str]:
         yield "no driver was only asked; `merge-runner seat first` asks, --grid at more points"
     for looks in found:
         for what, fit in zip(("M", "first action"), weighed(looks), strict=True):
-            # A program has no word, and its slopes no interval that could lack an end.
-            if fit.remark and fit.n and (looks.sampled or fit.headway is None):
-                yield f"{looks.id}: {what}: {fit.remark}"
+            # A program has no word, and without chance there is no interval to lack an end.
+            for remark in (fit.remark, fit.unbounded if looks.sampled else ""):
+                if remark and fit.n:
+                    yield f"{looks.id}: {what}: {remark}"
         if not looks.sampled:
             yield f"{looks.id}: no chance is in its answers: each counts once, without an interval"
 
@@ -137,7 +138,8 @@ def _query(looks: FirstLooks, where: str) -> str:
         "SELECT trial_id, side, tactical, valid, failure, plan FROM trials JOIN "  # noqa: S608 # ours
         "(SELECT *, if(side = 'left', 1, -1) AS own FROM decisions WHERE decision = 0) "
         "USING (trial_id, spec_hash) WHERE source = 'seat' AND status <> 'failed' AND spec_hash = "
-        f"{quoted(looks.spec_hash)} AND variant = {quoted(looks.setting)}{where} ORDER BY ALL"
+        f"{quoted(looks.spec_hash)} AND variant = {quoted(looks.setting)} AND "
+        f"if(side = 'left', model_left, model_right) = {quoted(looks.model)}{where} ORDER BY ALL"
     )
 
 
