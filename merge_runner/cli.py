@@ -302,7 +302,7 @@ def play(
 ) -> None:
     """Play a plan, or say what that would take; a replay that is not ``whole`` plays what it can.
 
-    Ends the program with the exit code of what happened.
+    Ends the program, but for an estimate, with the exit code of what happened.
     """
     import asyncio
 

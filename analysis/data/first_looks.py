@@ -28,10 +28,11 @@ class FirstLooks:
 
     ``rows`` are those of FIRST_LOOKS; of a driver without chance, whose repetitions are the same
     answers again, only the first, and it is not ``sampled``. ``label`` is how tables name the
-    driver; of a mixed pair each is one.
+    driver, ``model`` the name that was asked for; of a mixed pair each is one.
     """
 
     label: str
+    model: str
     setting: str
     spec_hash: str
     rows: pd.DataFrame
@@ -76,7 +77,7 @@ def _groups(rows: pd.DataFrame) -> Iterator[FirstLooks]:
         sampled = own["asked"].any() and not _without_chance(own)
         # Repetitions of a driver without chance are the same answer again.
         answers = own if sampled else own.groupby(["condition", "side"]).head(1)
-        yield FirstLooks(label, variant, spec, answers, bool(sampled))
+        yield FirstLooks(label, model, variant, spec, answers, bool(sampled))
 
 
 def _without_chance(rows: pd.DataFrame) -> bool:

@@ -52,7 +52,7 @@ GROUP BY provider, model_requested, model_served ORDER BY ALL
 SPECS = """
 SELECT DISTINCT driver, variant, spec_hash
 FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
-WHERE source <> 'human' ORDER BY ALL
+WHERE source NOT IN ('human', 'seat') ORDER BY ALL
 """
 # Answers by each model that answered.
 SERVED = f"""

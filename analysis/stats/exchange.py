@@ -28,8 +28,8 @@ class Exchange:
     """Slopes per metre of headway and per m/s of relative velocity, and their exchange rate.
 
     The rate is minus the second by the first, in m per m/s: as much more headway makes up for
-    1 m/s more. Where there is no fit all is None, and ``remark`` says why; where ``bounds`` are
-    None it says what the interval is.
+    1 m/s more. Where there is no fit all is None, and ``remark`` says why; where there is one it
+    says what to know of it. ``unbounded`` says what the rate's interval is if it has no ends.
     """
 
     n: int
@@ -38,6 +38,7 @@ class Exchange:
     rate: float | None = None
     bounds: tuple[float, float] | None = None
     remark: str = ""
+    unbounded: str = ""
     intercept: float = 0.0
 
     def indifferent_m(self, velocity_mps: float) -> float | None:
@@ -166,10 +167,9 @@ def _exchange(n: int, b: Array, errors: Array, clusters: Array, remark: str) -> 
         Estimate(float(b[i]), float(b[i] - t * se), float(b[i] + t * se), n)
         for i, se in enumerate(np.sqrt(np.diag(errors)))
     ]
-    bounds, words = fieller(b[1:], errors[1:, 1:], t)
+    bounds, unbounded = fieller(b[1:], errors[1:, 1:], t)
     rate = -float(b[2] / b[1]) if b[1] else None
-    remarks = "; ".join(filter(None, (remark, words)))
-    return Exchange(n, slopes[1], slopes[2], rate, bounds, remarks, float(b[0]))
+    return Exchange(n, slopes[1], slopes[2], rate, bounds, remark, unbounded, float(b[0]))
 
 
 def fieller(slopes: Array, errors: Array, t: float) -> tuple[tuple[float, float] | None, str]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import pandas as pd
 
 from analysis.data.first_looks import POINT, FirstLooks, first_looks
 from analysis.data.reference_data import citation
-from analysis.data.study import Study
+from analysis.data.study import HUMAN, Study
 from analysis.stats.exchange import Exchange, of_humans, weighed
 from analysis.stats.intervals import Estimate, mean, proportion
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value
@@ -29,7 +29,7 @@ HEADWAY, VELOCITY, RATE = "per m of headway", "per m/s of velocity", "exchange r
 def first_look_surface(study: Study) -> Table:
     """A row per driver, prompt and point, and for each the slopes and the exchange rate."""
     found = first_looks(study)
-    human = [_human()] if found and study.human in study.groups else []
+    human = [_human()] if study.human in study.groups else []
     return Table(
         "first-look-surface",
         "First situations asked without the loop, by headway and relative velocity",
@@ -53,9 +53,7 @@ def first_look_surface(study: Study) -> Table:
             ),
         ),
         [*human, *(row for looks in found for row in _rows(looks))],
-        (*NOTES, *(note for looks in found for note in _remarks(looks))) if found else (
-            "no driver was only asked; `merge-runner seat first` asks, --grid at more points",
-        ),
+        (*NOTES, *_remarks(found)),
     )  # fmt: skip
 
 
@@ -72,14 +70,18 @@ def _rows(looks: FirstLooks) -> Iterator[Row]:
             yield _row(looks, at, len(looks.rows), m, action)
 
 
-def _remarks(looks: FirstLooks) -> Iterator[str]:
-    """What is to be known of its slopes, or why there are none."""
-    for what, found in zip(("M", "first action"), weighed(looks), strict=True):
-        # A program has no word, and its slopes no interval that could lack an end.
-        if found.remark and found.n and (looks.sampled or found.headway is None):
-            yield f"{looks.id}: {what}: {found.remark}"
-    if not looks.sampled:
-        yield f"{looks.id}: there is no chance in its answers, and so no interval"
+def _remarks(found: Sequence[FirstLooks]) -> Iterator[str]:
+    """What is to be known of the slopes, or why there are none."""
+    if not found:
+        yield "no driver was only asked; `merge-runner seat first` asks, --grid at more points"
+    for looks in found:
+        for what, fit in zip(("M", "first action"), weighed(looks), strict=True):
+            # A program has no word, and without chance there is no interval to lack an end.
+            for remark in (fit.remark, fit.unbounded if looks.sampled else ""):
+                if remark and fit.n:
+                    yield f"{looks.id}: {what}: {remark}"
+        if not looks.sampled:
+            yield f"{looks.id}: no chance is in its answers: each counts once, without an interval"
 
 
 def _rate(found: Exchange) -> Estimate | None:
@@ -116,7 +118,7 @@ def _row(
 ) -> Row:
     return Row(
         f"{looks.id}/{at}",
-        (),
+        (looks.id,),
         {"driver": looks.label, "setting": looks.setting, "at": at, "asked": asked,
          **_cells("m", m, sampled=looks.sampled), **_cells("action", action, sampled=looks.sampled),
          **(more or {})},
@@ -136,11 +138,13 @@ def _query(looks: FirstLooks, where: str) -> str:
         "SELECT trial_id, side, tactical, valid, failure, plan FROM trials JOIN "  # noqa: S608 # ours
         "(SELECT *, if(side = 'left', 1, -1) AS own FROM decisions WHERE decision = 0) "
         "USING (trial_id, spec_hash) WHERE source = 'seat' AND status <> 'failed' AND spec_hash = "
-        f"{quoted(looks.spec_hash)} AND variant = {quoted(looks.setting)}{where} ORDER BY ALL"
+        f"{quoted(looks.spec_hash)} AND variant = {quoted(looks.setting)} AND "
+        f"if(side = 'left', model_left, model_right) = {quoted(looks.model)}{where} ORDER BY ALL"
     )
 
 
 def _human() -> Row:
     found = of_humans()
-    values: dict[str, Value] = {"driver": "human", "setting": "", "at": RATE, "asked": found.n}
-    return Row(f"human/{RATE}", (), {**values, **_cells("m", _rate(found), sampled=True)})
+    values: dict[str, Value] = {"driver": HUMAN, "setting": "", "at": RATE, "asked": found.n}
+    values |= _cells("m", _rate(found), sampled=True)
+    return Row(f"{HUMAN}/{RATE}", (HUMAN,), values, published=tuple(values), cited="human_outcomes")

@@ -25,7 +25,7 @@ from merge_runner.scenarios.registry import new_world
 
 USUAL_GRID = "h=-6:6:2,dv=-1.6:1.6:0.4"
 """Projected headways in m and relative velocities in m/s, left minus right: FROM:TO:STEP."""
-MOST_VALUES = 1000
+MOST_VALUES = 100  # of an axis
 _AXIS = re.compile(
     f"(?P<name>h|dv)=(?P<first>{NUMBER})(:(?P<last>{NUMBER}):(?P<step>{NUMBER}))?", re.ASCII
 )

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import signal
 from dataclasses import replace
 
 import pytest
+from aiohttp import web
 
+from merge_runner.config import USUAL_SCENARIO
 from merge_runner.errors import UsageError
 from merge_runner.records import SLOT_HEADER
+from merge_runner.registry import unregister
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import make_plan
-from merge_runner.run.seat import first_situations, grid_conditions
+from merge_runner.run.seat import USUAL_GRID, first_situations, grid_conditions
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.world import World
+from merge_runner.scenarios.registry import SCENARIOS
 from tests.harness import FAST, RECORDING, watched
 
 DB = "results/merge.duckdb"
@@ -220,13 +226,18 @@ async def test_factors_and_prompts_of_a_study_are_asked(merge_runner, tmp_path):
     assert part.summary["trials"]["planned"] == 2
 
 
+async def test_the_usual_grid_is_the_one_that_help_tells(merge_runner):
+    told = " ".join((await merge_runner("seat", "first", "--help")).out.split())
+    assert "usual: {} and {}".format(*re.findall(r"=([^,]+)", USUAL_GRID)) in told
+
+
 def test_a_grid_has_every_pair_of_its_values_in_decimals():
     assert grid_conditions("h=-4:4:4,dv=-0.8:0.4:0.4") == [
         "R_-4_-8", "h-4_dv-0.4", "R_-4_0", "h-4_dv0.4",
         "L_0_-8", "h0_dv-0.4", "N_0_0", "h0_dv0.4",
         "L_4_-8", "h4_dv-0.4", "L_4_0", "h4_dv0.4",
     ]  # fmt: skip
-    assert len(grid_conditions("usual")) == 7 * 9
+    assert len(grid_conditions("usual")) == len(grid_conditions(USUAL_GRID)) == 7 * 9
     assert grid_conditions("dv=0") == [
         "h-6_dv0", "R_-4_0", "h-2_dv0", "N_0_0", "h2_dv0", "L_4_0", "h6_dv0",
     ]  # fmt: skip
@@ -275,8 +286,54 @@ def test_vehicles_that_collide_at_once_are_no_situation():
         first_situations(replace(plan, arms=arms))
 
 
-def test_no_question_knows_of_another():
-    """Each request is fixed before any is sent, so that a batch can carry them all."""
-    plan = first_situations(make_plan("baseline", "emulator", 2))
-    assert {arm.scenario.timeout_steps for arm in plan.arms} == {5}
-    assert plan.calls_of_a_trial == 2
+class Endless(World):
+    """A world that has no timeout."""
+
+    def _end(self):
+        found = super()._end()
+        return None if found == "timeout" else found
+
+
+def test_a_scenario_whose_trials_do_not_end_in_time_is_refused(tmp_path):
+    usual = SCENARIOS[USUAL_SCENARIO]
+    SCENARIOS.replace("endless", replace(usual, make_world=Endless))
+    (tmp_path / "mine.toml").write_text('repetitions = 1\n[scenario]\nname = "endless"\n')
+    try:
+        plan = make_plan(str(tmp_path / "mine.toml"), "emulator")
+        with pytest.raises(UsageError, match="go on after timeout_s"):
+            first_situations(plan)
+    finally:
+        unregister("scenario endless")
+
+
+async def test_a_sweep_plays_the_points_of_a_grid_and_takes_what_was_asked(merge_runner):
+    point = ("--conditions", "h2_dv-1.2")
+    assert (await merge_runner("seat", "first", "--samples", 1, *point)).code == 0
+    run = await merge_runner("sweep", "baseline", "--reps", 1, *point, "--json")
+    assert (run.code, run.summary["calls"]["cached"]) == (0, 2), run.err
+    audit = await merge_runner("audit")
+    assert audit.code == 0, audit.out
+
+
+async def wordless(request: web.Request, handler) -> web.StreamResponse:
+    body = json.loads((await handler(request)).body)
+    body["choices"][0]["message"]["content"] = "I would rather not say."
+    return web.json_response(body)
+
+
+async def test_no_question_depends_on_an_answer_and_replies_without_a_plan_are_counted(
+    merge_runner,
+):
+    """So that a batch can carry them all."""
+    asked = []
+    for middle, name in ((None, "usual"), (wordless, "wordless")):
+        async with watched(middle) as server:
+            places = ("--cache", name, "--db", f"{name}.duckdb")
+            ask = ("seat", "first", "--samples", 2, *TWO, "--json", *places)
+            run = await merge_runner(*ask, EMULATOR_BASE_URL=f"{server.url}/v1")
+            assert run.code == 0, run.err
+            asked.append(server.asked)
+    assert asked[0] == asked[1]
+    for look in run.summary["first_looks"]:
+        assert look["invalid"] == look["asked"]
+        assert (look["share_m"], look["first_action_mps2"]) == (None, None)

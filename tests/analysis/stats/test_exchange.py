@@ -69,10 +69,10 @@ def test_without_an_effect_of_headway_the_interval_has_no_end_and_says_so():
     action = POINTS @ [0.0, -0.3] + rng.normal(0, 0.6, len(POINTS))
     found = of_actions(POINTS, action, ALONE)
     assert found.bounds is None
-    assert "has no end, since the slope on headway may be 0" in found.remark
+    assert "has no end, since the slope on headway may be 0" in found.unbounded
     nothing = of_actions(POINTS, rng.normal(0, 0.6, len(POINTS)), ALONE)
     assert nothing.bounds is None
-    assert "no value is excluded" in nothing.remark
+    assert "no value is excluded" in nothing.unbounded
 
 
 def test_fieller_is_the_delta_method_where_headway_is_sure():

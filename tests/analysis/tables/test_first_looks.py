@@ -77,15 +77,20 @@ def test_a_driver_without_chance_counts_once_and_has_no_interval(table):
     assert found["h=+2 dv=+0"].values["asked"] == 2
     assert not any(value for row in found.values() for name, value in row.values.items()
                    if name.endswith("_ci"))  # fmt: skip
-    assert "projected-order/baseline: there is no chance in its answers" in "\n".join(table.notes)
+    assert "projected-order/baseline: no chance is in its answers" in "\n".join(table.notes)
     assert found["per m of headway"].values["action"] > 0
 
 
-def test_the_drivers_of_a_mixed_pair_are_told_apart(table):
+def test_the_drivers_of_a_mixed_pair_are_told_apart(table, asked):
     program = rows(table, "constant of constant+emulator")
     model = rows(table, f"emulator of constant+emulator{EMULATOR.removeprefix('emulator')}")
     assert set(program) == set(model) == {"h=+0 dv=+0"}
     assert program["h=+0 dv=+0"].values.get("m") is None
+    with duckdb.connect(str(asked.db), read_only=True) as connection:
+        for rows_of_one, side in ((program, "left"), (model, "right")):
+            (source,) = explain(asked, table, rows_of_one["h=+0 dv=+0"].id).sources
+            answers = connection.execute(source.query).fetchall()
+            assert [answer[1] for answer in answers] == [side]
     assert model["h=+0 dv=+0"].values["m"] in (0, 1)
 
 

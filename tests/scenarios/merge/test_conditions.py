@@ -1,8 +1,10 @@
 """The 11 conditions have the start of control that the human experiment gave its participants."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS, condition_name
 from merge_runner.scenarios.merge.geometry import TRACK
 
 TOLERANCE = 1e-4  # the table is rounded to 1e-4 m and 1e-4 s
@@ -71,3 +73,37 @@ def test_the_mirror_image_of_every_condition_is_a_condition(name):
     assert mirror.speeds_mps == condition.speeds_mps[::-1]
     assert mirror.starts_m(TRACK) == condition.starts_m(TRACK)[::-1]
     assert mirror.exit_times_s(TRACK) == condition.exit_times_s(TRACK)[::-1]
+
+
+@given(st.integers(-9999, 9999), st.integers(-1999, 1999))
+def test_any_headway_and_velocity_have_one_name_that_leads_back_to_them(headway_cm, velocity_cm):
+    headway_m, velocity_mps = headway_cm / 100, velocity_cm / 100
+    found = CONDITIONS[condition_name(headway_m, velocity_mps)]
+    assert (found.projected_headway_m, found.relative_velocity_mps) == (headway_m, velocity_mps)
+    assert found.mean_speed_mps == 10.0
+
+
+def test_a_condition_of_the_humans_keeps_its_name_and_the_others_are_called_by_their_numbers():
+    assert condition_name(4.0, -0.8) == "L_4_-8"
+    assert condition_name(-0.0, 0.0) == "N_0_0"
+    assert condition_name(2.5, -1.2) == "h2.5_dv-1.2"
+    assert "h2.5_dv-1.2" not in list(CONDITIONS)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "h2.50_dv0",
+        "h02_dv0",
+        "h2_dv-0",
+        "h4_dv-0.8",
+        "h0_dv20",
+        "h2_dv1e1",
+        "h2",
+        "h2_dv0 ",
+        "h٢_dv0",
+    ],
+)
+def test_another_spelling_or_what_cannot_be_driven_is_no_name(name):
+    assert name not in CONDITIONS
+    assert CONDITIONS.get(name) is None
