@@ -16,10 +16,11 @@ import typer
 
 from analysis.human.commands import INTERRUPTED, human_app
 from analysis.table_format import TableFormat
-from merge_runner.cli import DbOption, StudyOption, app, levels, listed, main, print_out, say
+from merge_runner.cli import app, main
+from merge_runner.cli.options import DbOption, StudyOption, levels, listed
+from merge_runner.cli.output import print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB, refuse_another_kind
-from merge_runner.seat_commands import seat_app
 
 if TYPE_CHECKING:
     from analysis.data.study import Study
@@ -29,7 +30,6 @@ __all__ = ["app", "main"]
 HTML = b"<!doctype html"
 
 app.add_typer(human_app, name="human")
-app.add_typer(seat_app, name="seat")
 
 
 ModelsOption = Annotated[

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 
 def main() -> None:
     """Run all commands, those of the analysis among them; another ``analysis`` is named."""
-    from merge_runner.cli import say
+    from merge_runner.cli.output import say
     from merge_runner.errors import UsageError
 
     stranger = _another_analysis()

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from merge_runner.cli import DbOption, print_out, say
+from merge_runner.cli.options import DbOption
+from merge_runner.cli.output import print_out, say
 from merge_runner.drivers.cei.parameters import SETS, ThresholdSet
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB

@@ -6,7 +6,28 @@ from typing import Annotated
 
 import typer
 
-from merge_runner import cli
+from merge_runner.cli.options import (
+    CacheOption,
+    ConditionsOption,
+    DbOption,
+    DryRunOption,
+    InFlightOption,
+    JsonOption,
+    MaxCostOption,
+    ModelOption,
+    OnlyOption,
+    RecordingOption,
+    ReplayOption,
+    RpmOption,
+    SampleSetOption,
+    StrictModelOption,
+    TpmOption,
+    VariantsOption,
+    YesOption,
+    levels,
+    listed,
+)
+from merge_runner.cli.playing import check_money_and_replay, play
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 
@@ -28,8 +49,8 @@ def first(
             metavar="[NAME]", help="experiments/NAME.toml, or a path: prompts, factors."
         ),
     ] = "baseline",
-    model: cli.ModelOption = None,
-    only: cli.OnlyOption = None,
+    model: ModelOption = None,
+    only: OnlyOption = None,
     samples: Annotated[
         int | None,
         typer.Option("--samples", help="How often each is asked; else the study's repetitions."),
@@ -44,27 +65,27 @@ def first(
             "-1.6:1.6:0.4.",
         ),
     ] = None,
-    conditions: cli.ConditionsOption = None,
-    variants: cli.VariantsOption = None,
-    sample_set: cli.SampleSetOption = 0,
-    db: cli.DbOption = DEFAULT_DB,
-    cache: cli.CacheOption = DEFAULT_CACHE,
-    in_flight: cli.InFlightOption = 200,
-    rpm: cli.RpmOption = None,
-    tpm: cli.TpmOption = None,
-    max_cost: cli.MaxCostOption = None,
-    strict_model: cli.StrictModelOption = False,
-    dry_run: cli.DryRunOption = False,
-    yes: cli.YesOption = False,
-    replay: cli.ReplayOption = False,
-    recording: cli.RecordingOption = None,
-    as_json: cli.JsonOption = False,
+    conditions: ConditionsOption = None,
+    variants: VariantsOption = None,
+    sample_set: SampleSetOption = 0,
+    db: DbOption = DEFAULT_DB,
+    cache: CacheOption = DEFAULT_CACHE,
+    in_flight: InFlightOption = 200,
+    rpm: RpmOption = None,
+    tpm: TpmOption = None,
+    max_cost: MaxCostOption = None,
+    strict_model: StrictModelOption = False,
+    dry_run: DryRunOption = False,
+    yes: YesOption = False,
+    replay: ReplayOption = False,
+    recording: RecordingOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Ask what drivers do first: both sides of each condition, without the rest of the trial."""
     from merge_runner.run.plan import Options, make_plan
     from merge_runner.run.seat import first_situations, grid_conditions
 
-    cli.check_money_and_replay(max_cost, recording, replay=replay)
+    check_money_and_replay(max_cost, recording, replay=replay)
     if grid is not None and conditions is not None:
         raise UsageError("--grid takes the place of --conditions: give one of them")
     options = Options(
@@ -82,11 +103,11 @@ def first(
         name,
         model or (),
         samples,
-        cli.listed(conditions) if grid is None else grid_conditions(grid),
-        cli.listed(variants),
+        listed(conditions) if grid is None else grid_conditions(grid),
+        listed(variants),
         sample_set=sample_set,
-        only=cli.levels(only or (), "--only"),
+        only=levels(only or (), "--only"),
     )
     whole = any(part is not None for part in (samples, grid, conditions, variants))
     plan = first_situations(plan)
-    cli.play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json)
+    play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json)

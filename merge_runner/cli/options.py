@@ -1,0 +1,150 @@
+"""The options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from merge_runner.errors import UsageError
+
+DbOption = Annotated[Path, typer.Option("--db", help="The results database.")]
+
+
+CacheOption = Annotated[Path, typer.Option("--cache", help="The folder of recorded replies.")]
+
+
+ModelOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--model",
+        metavar="NAME",
+        help="A model of the registry, a program, or LEFT+RIGHT; may be given more than once. "
+        "Else those of the study's file, or the emulator.",
+    ),
+]
+
+
+OnlyOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--only",
+        metavar="FACTOR=LEVEL",
+        help="A part of the study: a level of a factor, or of model or prompt; may be given more "
+        "than once.",
+    ),
+]
+
+
+RepsOption = Annotated[
+    int | None, typer.Option("--reps", help="Repetitions per condition, for every variant.")
+]
+
+
+ConditionsOption = Annotated[
+    str | None, typer.Option("--conditions", help="Conditions, separated by commas.")
+]
+
+
+VariantsOption = Annotated[
+    str | None, typer.Option("--variants", help="Prompt variants, separated by commas.")
+]
+
+
+SampleSetOption = Annotated[
+    int, typer.Option("--sample-set", help="Another number draws a fresh set of samples.")
+]
+
+
+InFlightOption = Annotated[
+    int, typer.Option("--in-flight", help="Trials at once, over all workers.", min=1)
+]
+
+
+RpmOption = Annotated[int | None, typer.Option("--rpm", help="Requests a minute.", min=1)]
+
+
+TpmOption = Annotated[int | None, typer.Option("--tpm", help="Tokens a minute.", min=1)]
+
+
+MaxCostOption = Annotated[
+    float | None,
+    typer.Option("--max-cost", help="Never spend more USD on this, over all its runs.", min=0),
+]
+
+
+StrictModelOption = Annotated[
+    bool, typer.Option("--strict-model", help="Stop when another model answers.")
+]
+
+
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only estimate.")]
+
+
+YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask before spending.")]
+
+
+ReplayOption = Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")]
+
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object.")]
+
+
+NameArgument = Annotated[
+    str, typer.Argument(metavar="NAME", help="experiments/NAME.toml, or a path.")
+]
+
+
+def _adopt(file: str | None) -> str | None:
+    if file is not None:
+        from merge_runner.study.file import read_study
+        from merge_runner.study.parts import adopt
+
+        adopt(read_study(file))
+    return file
+
+
+StudyOption = Annotated[
+    str | None,
+    typer.Option(
+        "--study",
+        metavar="FILE",
+        callback=_adopt,
+        help="The study of the trials: its plug-ins run, and its prompts, conditions, drivers and "
+        "metrics are known.",
+    ),
+]
+
+
+RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
+
+
+ImportedFile = Annotated[
+    Path, typer.Argument(metavar="FILE", help="A recording (.parquet), or a cache folder.")
+]
+
+
+RecordingOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--recording", help="Also replay from this file, without importing it; may be repeated."
+    ),
+]
+
+
+def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:
+    """The levels of each factor that an option names; raises UsageError."""
+    found: dict[str, list[str]] = {}
+    for each in given:
+        factor, equals, level = each.partition("=")
+        if not equals:
+            raise UsageError(f"{option} {each}: write FACTOR=LEVEL, as in {option} temperature=0.2")
+        found.setdefault(factor.strip(), []).append(level.strip())
+    return found
+
+
+def listed(text: str | None) -> list[str] | None:
+    """The parts of an option that takes several names, None where it is not given."""
+    return None if text is None else [part.strip() for part in text.split(",") if part.strip()]

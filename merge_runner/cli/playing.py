@@ -1,0 +1,146 @@
+"""A plan is played, or it is said what that would take."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from merge_runner.cli.output import print_out, say
+from merge_runner.errors import UsageError
+
+if TYPE_CHECKING:
+    from merge_runner.run.estimate import Estimate
+    from merge_runner.run.plan import Options, Plan
+    from merge_runner.run.sweep import Sweep
+
+
+def check_money_and_replay(
+    max_cost: float | None, recording: list[Path] | None, *, replay: bool
+) -> None:
+    """Raise UsageError for a cap that is no number, and a recording without a replay."""
+    if max_cost is not None and not math.isfinite(max_cost):
+        raise UsageError("--max-cost is a number of USD")
+    if recording and not replay:
+        raise UsageError("--recording goes with a replay; to keep its replies: recording import")
+
+
+def play(
+    plan: Plan, options: Options, *, whole: bool, dry_run: bool, yes: bool, as_json: bool
+) -> None:
+    """Play a plan, or say what that would take; a replay that is not ``whole`` plays what it can.
+
+    Ends the program, but for an estimate, with the exit code of what happened.
+    """
+    import asyncio
+
+    from merge_runner.run.unsent import unsent
+
+    for note in plan.notes():
+        say(note)
+    if not options.replay:
+        options = plan.within_budget(options)
+    else:
+        from merge_runner.run.recorded_plan import replayed
+
+        plan, options, notes = replayed(plan, options, whole=whole)
+        for note in notes:
+            say(note)
+    if dry_run:
+        _print_estimate(asyncio.run(unsent(plan, options, say=say)), as_json=as_json)
+    else:
+        _run(plan, options, yes=yes, as_json=as_json)
+
+
+def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> None:
+    import asyncio
+
+    from merge_runner.run import summary
+    from merge_runner.run.sweep import INTERRUPTED, Sweep
+
+    prepared = Sweep(plan, options, say=say)
+    expected = None
+    if not options.replay and prepared.trials_to_play:
+        expected = _confirm(plan, prepared, yes=yes)
+    try:
+        outcome = asyncio.run(prepared.run())
+    except KeyboardInterrupt:  # before the trials began or after they ended
+        say("interrupted: run the same command again to go on")
+        sys.exit(INTERRUPTED)
+    if as_json:
+        whole = summary.as_dict(outcome, options, expected)
+        print_out(json.dumps(whole, ensure_ascii=False))
+    else:
+        for line in summary.as_lines(outcome, options, expected):
+            print_out(line)
+    for message in outcome.messages:
+        say(f"error: {message}")
+    sys.exit(outcome.exit_code)
+
+
+def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
+    """Check the keys, say what a live run of a paid model will cost, and ask once."""
+    import asyncio
+
+    from merge_runner.config import resolve_endpoint
+
+    for name, entry in plan.entries.items():
+        resolve_endpoint(name, entry)
+        if entry.shutdown:
+            say(f"note: {name} ({entry.id}) is announced to shut down on {entry.shutdown}")
+    if all(entry.price == "free" for entry in plan.entries.values()):
+        return None
+    expected = asyncio.run(prepared.estimate())
+    cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
+    say(
+        f"{expected.driver}: {expected.trials} trials, about {expected.calls} calls that are not "
+        f"recorded yet, {cost}, {expected.minutes} minutes or more"
+    )
+    if yes:
+        return expected
+    if not sys.stdin.isatty():
+        raise UsageError(
+            "this run spends money and there is no terminal to ask at: add --yes to go ahead, or "
+            "--dry-run to only see the estimate"
+        )
+    if not typer.confirm("Go ahead?", err=True):
+        raise UsageError("nothing was sent")
+    return expected
+
+
+def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
+    from dataclasses import asdict, astuple
+
+    from merge_runner.results.query_output import write_table
+
+    if as_json:
+        print_out(json.dumps(asdict(expected)))
+        return
+    cost = "unknown" if expected.cost_usd is None else f"{expected.cost_usd:.2f} USD"
+    for name, text in (
+        ("driver", expected.driver),
+        ("trials", f"{expected.trials} that have not ended yet"),
+        ("calls", f"about {expected.calls} that are not recorded yet"),
+        (
+            "tokens",
+            f"about {expected.input_tokens} in, {expected.output_tokens} out"
+            + (", as measured before" if expected.measured else ""),
+        ),
+        ("cost", f"about {cost}"),
+        ("time", f"about {expected.minutes} minutes"),
+    ):
+        print_out(f"{name:<8}{text}")
+    if expected.trials_within_cap is not None:
+        print_out(f"cap     buys about {expected.trials_within_cap} trials")
+    if len(expected.cells) > 1:
+        headings = ["cell", "trials", "calls", "tokens in", "tokens out", "USD", "minutes"]
+        write_table(
+            [*headings, "trials within the cap"],
+            [tuple("" if v is None else v for v in astuple(c)) for c in expected.cells],
+            sys.stdout,
+        )
+    print_out("Nothing was sent.")

@@ -1,0 +1,153 @@
+"""The commands on results that are there."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+from enum import StrEnum
+from itertools import chain
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from merge_runner.cli.options import (
+    DbOption,
+    JsonOption,
+    StudyOption,
+)
+from merge_runner.cli.output import agree, print_out, say
+from merge_runner.errors import UsageError
+from merge_runner.paths import DEFAULT_DB
+
+
+class Format(StrEnum):
+    """Output formats of a table."""
+
+    TEXT = "text"
+    CSV = "csv"
+    JSON = "json"
+
+
+def sql(
+    query: Annotated[str, typer.Argument(metavar="QUERY", help="One SQL query.")],
+    db: DbOption = DEFAULT_DB,
+    output: Annotated[Format, typer.Option("--format", help="Form of the result.")] = Format.TEXT,
+) -> None:
+    """Query the results; also while a sweep runs. Nothing can be changed."""
+    from merge_runner.results.query_output import write_csv, write_json, write_table
+    from merge_runner.results.store import answers
+
+    writers = {Format.TEXT: write_table, Format.CSV: write_csv, Format.JSON: write_json}
+    # A slow reader of a pipe would otherwise keep every sweep from writing meanwhile.
+    with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as spooled:
+        with answers(db, query) as (names, rows):
+            writers[output](names, rows, spooled)
+        spooled.seek(0)
+        shutil.copyfileobj(spooled, sys.stdout)
+
+
+def export(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A new folder, or that of an earlier export.")
+    ],
+    db: DbOption = DEFAULT_DB,
+) -> None:
+    """Write every table and view as Parquet and CSV, with a dictionary of all columns."""
+    from merge_runner.results.export import export_tables
+
+    for path in export_tables(db, folder):
+        say(f"wrote {path}")
+
+
+def digest(db: DbOption = DEFAULT_DB) -> None:
+    """Print one line: a hash of all results, equal for equal results."""
+    from merge_runner.results.store import results_digest
+
+    value, trials = results_digest(db)
+    print_out(f"{value}  {trials} trials")
+
+
+def audit(
+    db: DbOption = DEFAULT_DB,
+    sweep_id: Annotated[
+        str | None, typer.Option("--sweep", help="A sweep_id; everything if not given.")
+    ] = None,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Check this recording instead of a database.")
+    ] = None,
+    cache: Annotated[
+        Path | None,
+        typer.Option("--cache", help="Also compare every attempt with this cache folder."),
+    ] = None,
+    study: StudyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check that each sample is there, once, and that all else follows from the replies."""
+    from merge_runner.audit import (
+        NOT_DERIVED,
+        audit_cache,
+        audit_database,
+        audit_recording,
+        audit_sweep,
+    )
+
+    skipped: list[str] = []
+    if recording is not None:
+        if sweep_id is not None or cache is not None:
+            raise UsageError("--recording is checked by itself: without --sweep and --cache")
+        audits = [audit_recording(recording)]
+    else:
+        audits = audit_database(db) if sweep_id is None else [audit_sweep(db, sweep_id)]
+        skipped = list(NOT_DERIVED)
+        if cache is not None:
+            audits.append(audit_cache(db, cache, sweep_id))
+            skipped = [name for name in skipped if name == "calls.cached" or "calls" not in name]
+    ok = all(found.ok for found in audits)
+    if as_json:
+        whole = {"ok": ok, "not_derived": skipped, "audits": [found.as_dict() for found in audits]}
+        print_out(json.dumps(whole, ensure_ascii=False))
+    else:
+        for line in chain.from_iterable(found.lines() for found in audits):
+            print_out(line)
+        if skipped:
+            print_out(f"not checked, since neither replies nor specs tell it: {', '.join(skipped)}")
+    sys.exit(0 if ok else 1)
+
+
+def forget(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME ...]", help="Sweeps or trials; * stands for anything."),
+    ] = None,
+    sweeps: Annotated[
+        list[str] | None, typer.Option("--sweep", metavar="ID", help="A sweep_id.")
+    ] = None,
+    trials: Annotated[
+        list[str] | None, typer.Option("--trial", metavar="ID", help="A trial_id.")
+    ] = None,
+    db: DbOption = DEFAULT_DB,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before removing.")] = False,
+) -> None:
+    """Remove sweeps and trials from the database; their replies stay in the cache."""
+    from merge_runner.results import forgetting
+
+    # A trial's id has a slash, a sweep's has none.
+    of_trials = [*(trials or ()), *(name for name in names or () if "/" in name)]
+    of_sweeps = [*(sweeps or ()), *(name for name in names or () if "/" not in name)]
+    if not of_trials and not of_sweeps:
+        raise UsageError("name a sweep or a trial; `merge-runner sql 'from sweeps'` lists sweeps")
+    going = forgetting.to_forget(db, of_sweeps, of_trials)
+    agree(
+        f"these go from {db}: {going}",
+        "Remove them?",
+        otherwise="nothing was removed",
+        yes=yes,
+    )
+    gone = forgetting.forget(db, of_sweeps, of_trials, going)
+    say(
+        f"removed: {gone}. Their replies stay in the cache: the same `merge-runner sweep` plays "
+        "the trials again without a call"
+    )

@@ -1,0 +1,54 @@
+"""The emulator: the command that runs it, and what goes wrong at it on purpose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from merge_runner.cli.output import print_out
+from merge_runner.errors import UsageError
+
+if TYPE_CHECKING:
+    from merge_runner.emulator.faults import FaultPlan
+
+
+def emulate(
+    port: Annotated[int, typer.Option(help="0: any free port.", min=0, max=65535)] = 8765,
+    fault_rate: Annotated[float, typer.Option(help="Share of attempts with a fault.")] = 0.0,
+    faults: Annotated[Path | None, typer.Option(help="A TOML file of faults.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the faults.")] = 0,
+    until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
+) -> None:
+    """Run the local stand-in for a language model on 127.0.0.1; prints its base URL."""
+    import asyncio
+
+    from merge_runner.emulator.server import run
+
+    asyncio.run(
+        run(
+            port,
+            faults_of(fault_rate, faults, seed),
+            announce=print_out,
+            until_stdin_closes=until_stdin_closes,
+        )
+    )
+
+
+def faults_of(fault_rate: float, faults: Path | None, seed: int) -> FaultPlan:
+    """What goes wrong on purpose at the emulator; raises UsageError."""
+    from merge_runner.emulator.faults import load_faults, transient_faults
+
+    if faults is None:
+        return transient_faults(fault_rate, seed)
+    if fault_rate or seed:
+        raise UsageError("--faults names a file that holds the rates and the seed: give it alone")
+    return load_faults(faults)
+
+
+def emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list[str]:
+    """The same as options of ``emulate``."""
+    if faults is not None:
+        return ["--faults", str(faults.resolve())]
+    return ["--fault-rate", str(fault_rate), "--seed", str(seed)]

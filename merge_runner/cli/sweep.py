@@ -1,0 +1,165 @@
+"""The commands that play a study."""
+
+from __future__ import annotations
+
+import shlex
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from merge_runner.cli.options import (
+    CacheOption,
+    ConditionsOption,
+    DbOption,
+    DryRunOption,
+    InFlightOption,
+    JsonOption,
+    MaxCostOption,
+    ModelOption,
+    NameArgument,
+    OnlyOption,
+    RecordingOption,
+    ReplayOption,
+    RepsOption,
+    RpmOption,
+    SampleSetOption,
+    StrictModelOption,
+    TpmOption,
+    VariantsOption,
+    YesOption,
+    levels,
+    listed,
+)
+from merge_runner.cli.output import print_out, say
+from merge_runner.cli.playing import check_money_and_replay, play
+from merge_runner.cli.stand_in import emulator_options, faults_of
+from merge_runner.errors import UsageError
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
+) -> None:
+    """Write a folder with a study that runs as it is, to be changed into your own."""
+    from merge_runner.study.folder import write_folder
+
+    for path in write_folder(folder):
+        say(f"wrote {path}")
+    print_out(f"go on: cd {shlex.quote(str(folder))} && merge-runner sweep study.toml")
+
+
+def sweep(
+    name: NameArgument,
+    model: ModelOption = None,
+    only: OnlyOption = None,
+    reps: RepsOption = None,
+    conditions: ConditionsOption = None,
+    variants: VariantsOption = None,
+    sample_set: SampleSetOption = 0,
+    order_seed: Annotated[
+        int, typer.Option("--order-seed", help="Another number draws another order.")
+    ] = 0,
+    db: DbOption = DEFAULT_DB,
+    cache: CacheOption = DEFAULT_CACHE,
+    in_flight: InFlightOption = 200,
+    rpm: RpmOption = None,
+    tpm: TpmOption = None,
+    max_cost: MaxCostOption = None,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Begin no trial from this local time on, such as 07:00; the next run goes on.",
+        ),
+    ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(
+            "--dask",
+            metavar="CLUSTER",
+            help="Play on a Dask cluster: local:N, a scheduler's address, or its file.",
+        ),
+    ] = None,
+    strict_model: StrictModelOption = False,
+    dry_run: DryRunOption = False,
+    yes: YesOption = False,
+    replay: ReplayOption = False,
+    recording: RecordingOption = None,
+    fault_rate: Annotated[
+        float, typer.Option(help="Emulator only: share of attempts with a transient fault.")
+    ] = 0.0,
+    faults: Annotated[Path | None, typer.Option(help="Emulator only: a file of faults.")] = None,
+    seed: Annotated[int, typer.Option(help="Emulator only: seed of the faults.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Play all trials of a sweep that are not stored yet."""
+    from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.until import deadline
+
+    check_money_and_replay(max_cost, recording, replay=replay)
+    if dask is not None and replay:
+        raise UsageError("a replay needs no cluster: leave --dask out")
+    options = Options(
+        db=db,
+        cache=cache,
+        in_flight=in_flight,
+        rpm=rpm,
+        tpm=tpm,
+        max_cost_usd=max_cost,
+        replay=replay,
+        recordings=recording or (),
+        emulator_options=emulator_options(fault_rate, faults, seed),
+        faults_identity=faults_of(fault_rate, faults, seed).identity,
+        strict_model=strict_model,
+        dask=dask,
+        until=None if until is None else deadline(until, datetime.now(UTC)),
+    )
+    plan = make_plan(
+        name,
+        model or (),
+        reps,
+        listed(conditions),
+        listed(variants),
+        sample_set=sample_set,
+        order_seed=order_seed,
+        only=levels(only or (), "--only"),
+        db=db,
+    )
+    if dask is not None and plan.replays_humans:
+        raise UsageError("human-replay is played in this process: leave --dask out")
+    whole = any(part is not None for part in (reps, conditions, variants))
+    play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json)
+
+
+def replay(
+    name: NameArgument,
+    model: ModelOption = None,
+    only: OnlyOption = None,
+    reps: RepsOption = None,
+    conditions: ConditionsOption = None,
+    variants: VariantsOption = None,
+    sample_set: SampleSetOption = 0,
+    db: DbOption = DEFAULT_DB,
+    cache: CacheOption = DEFAULT_CACHE,
+    in_flight: InFlightOption = 200,
+    recording: RecordingOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Play a sweep from recorded replies alone: no key, no network."""
+    sweep(
+        name=name,
+        model=model,
+        only=only,
+        reps=reps,
+        conditions=conditions,
+        variants=variants,
+        sample_set=sample_set,
+        db=db,
+        cache=cache,
+        in_flight=in_flight,
+        replay=True,
+        recording=recording,
+        as_json=as_json,
+    )
