@@ -81,7 +81,7 @@ class Program:
 
     @property
     def described(self) -> str:
-        """What it does, how often it decides, and its parameters; of its sets the chosen one first."""
+        """What it does, how often it decides, and its parameters, the chosen set first."""
         often = "once" if self.rate_hz == 1 else f"{self.rate_hz or 0:g} times"
         rate = "" if self.rate_hz is None else f" ({often} a second)"
         shown = dict(self.values)
