@@ -81,13 +81,13 @@ class Program:
 
     @property
     def described(self) -> str:
-        """What it does, how often it decides, and its parameters with what they may be."""
+        """What it does, how often it decides, and its parameters, the chosen set first."""
         often = "once" if self.rate_hz == 1 else f"{self.rate_hz or 0:g} times"
         rate = "" if self.rate_hz is None else f" ({often} a second)"
-        choices = {SET: " | ".join(self.sets)} if self.sets else {}
-        parameters = ", ".join(
-            f"{name} = {choices.get(name, value)}" for name, value in self.values.items()
-        )
+        shown = dict(self.values)
+        if self.sets:
+            shown[SET] = " | ".join(dict.fromkeys([str(shown[SET]), *self.sets]))
+        parameters = ", ".join(f"{name} = {value}" for name, value in shown.items())
         kind = "parameters" if self.settable else "fixed"
         return self.meaning + rate + (f"; {kind}: {parameters}" if parameters else "")
 

@@ -216,7 +216,10 @@ def test_a_file_of_faults_that_cannot_be_read(program, tmp_path, content):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["nope"], "there is no sweep 'nope'; valid: ablations, baseline, mine, or a path"),
+        (
+            ["nope"],
+            "there is no sweep 'nope'; valid: ablations, baseline, mine, reference, or a path",
+        ),
         ([""], "there is no sweep ''; valid: ablations, baseline, mine"),
         (["models"], "there is no sweep 'models'; valid: ablations, baseline, mine"),
         (["../mine"], "there is no sweep '../mine'; valid: ablations, baseline, mine"),

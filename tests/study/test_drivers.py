@@ -156,7 +156,18 @@ def test_a_world_is_as_fine_as_its_drivers_need_and_otherwise_as_it_was(plan_of)
     }
     note = "note: braking is driven in steps of 0.05 s, as its drivers need"
     assert next(plan.notes()) == note
-    assert make_plan("baseline", "constant").trial_specs()[0].spec_hash == "16d39b26a2c1fa23"
+
+
+@pytest.mark.parametrize(
+    ("model", "spec_hash"),
+    [
+        ("constant", "16d39b26a2c1fa23"),
+        ("projected-order", "ac229326cf25778d"),
+        ("emulator+constant", "c03416351efdf87b"),
+    ],
+)
+def test_trials_that_were_played_before_programs_had_settable_parameters_stay(model, spec_hash):
+    assert make_plan("baseline", model).trial_specs()[0].spec_hash == spec_hash
 
 
 def test_what_a_sweep_stores_of_its_world_is_what_its_trials_are_played_in(plan_of):
