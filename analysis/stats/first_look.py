@@ -267,7 +267,7 @@ def skill(found: Acts, known: Humans) -> Skill | None:
     floor, ceiling = _drawn(known, tuple(sizes.items()))
     reach = ceiling.mean(axis=0) - floor.mean(axis=0)
     if (reach > -LEAST_REACH * floor.mean(axis=0)).any():
-        return None  # as at equal velocities alone: floor and ceiling nearly meet
+        return None  # as of humans of one relative velocity: floor and ceiling meet
     crps, wasserstein = (reached - floor.mean(axis=0)) / reach
     spread = (ceiling[:, 1] - floor[:, 1].mean()) / reach[1]
     low, high = np.quantile(spread, [0.025, 0.975])

@@ -171,9 +171,8 @@ def test_a_copy_scores_at_the_ceiling_and_one_that_does_not_look_at_the_floor():
 
 
 def test_where_floor_and_ceiling_meet_there_is_no_skill():
-    """At equal velocities humans do about what they do on average."""
     equal = replace(drawn(np.random.default_rng(9), 90), relative_velocity=np.zeros(90))
-    assert skill(equal, published_humans()) is None
+    assert skill(equal, humans_from(equal, "of equal velocities alone")) is None
 
 
 def test_a_single_human_trial_is_no_reference_that_a_test_could_use():
