@@ -37,6 +37,8 @@ from merge_runner.records import SIDES
 STEP_MPS2 = 0.01
 GRID = np.arange(-600, 401) * STEP_MPS2
 DRAWS = 200
+# A skill is told where the ceiling is at least this part of the floor away from it.
+LEAST_REACH = 0.1
 CUE, SIDE, LEVEL, LATE = "relative velocity", "side", "level", "late"
 MEASURES: dict[str, Callable[[Array], Array]] = {
     "mean": lambda actions: actions,
@@ -110,8 +112,7 @@ class Fault:
     """A way in which a driver's first actions may differ from the humans', and its test.
 
     ``found`` is the driver less the humans, whose bias towards a side is 0 by symmetry. ``p`` is
-    corrected by Holm for the driver's faults; ``shown`` says whether it is, ``said`` what
-    it is.
+    corrected by Holm for the driver's faults; ``shown`` says whether it is, ``said`` what it is.
     """
 
     name: str
@@ -265,6 +266,8 @@ def skill(found: Acts, known: Humans) -> Skill | None:
         reached += n / total * distances(ecdf(first[own.at(velocity)]), known.cdf[velocity])
     floor, ceiling = _drawn(known, tuple(sizes.items()))
     reach = ceiling.mean(axis=0) - floor.mean(axis=0)
+    if (reach > -LEAST_REACH * floor.mean(axis=0)).any():
+        return None  # as of humans of one relative velocity: floor and ceiling meet
     crps, wasserstein = (reached - floor.mean(axis=0)) / reach
     spread = (ceiling[:, 1] - floor[:, 1].mean()) / reach[1]
     low, high = np.quantile(spread, [0.025, 0.975])
@@ -417,6 +420,8 @@ def _error_at(known: Humans, shares: Mapping[float, float], measure: str) -> Coe
         )
     sums = np.bincount(known.acts.unit, apart)
     units = len(np.unique(known.acts.unit))
+    if units < 2:
+        return Coefficient(0.0, None)
     return Coefficient(0.0, sqrt(float((sums**2).sum()) * units / (units - 1)), units - 1)
 
 

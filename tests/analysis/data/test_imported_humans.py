@@ -7,7 +7,13 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from analysis.data.imported_humans import by_condition, by_pair, human_trials, imported
+from analysis.data.imported_humans import (
+    RECORDINGS,
+    by_condition,
+    by_pair,
+    human_trials,
+    imported,
+)
 from analysis.data.reference_data import PAIRS, human_outcomes
 from analysis.data.study import Study
 from analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST
@@ -23,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("few_draws")
 def published_trials() -> pd.DataFrame:
     """The 990 published outcomes as trials of nine pairs."""
     pairs = [list(PAIRS.values())[i % 9] for i in range(990)]
-    return human_outcomes().assign(pair=pairs)
+    return human_outcomes().assign(pair=pairs, origin=RECORDINGS)
 
 
 def changed(trials: pd.DataFrame, condition: str, before: tuple, after: tuple, n: int = 1):

@@ -170,6 +170,19 @@ def test_a_copy_scores_at_the_ceiling_and_one_that_does_not_look_at_the_floor():
     assert np.mean([one.wasserstein for one in blind]) == pytest.approx(0, abs=0.15)
 
 
+def test_where_floor_and_ceiling_meet_there_is_no_skill():
+    equal = replace(drawn(np.random.default_rng(9), 90), relative_velocity=np.zeros(90))
+    assert skill(equal, humans_from(equal, "of equal velocities alone")) is None
+
+
+def test_a_single_human_trial_is_no_reference_that_a_test_could_use():
+    rng = np.random.default_rng(10)
+    known = humans_from(drawn(rng, 1), "one trial")
+    named = [one.name for one in faults(drawn(rng, 55), known)]
+    assert CUE not in named
+    assert LEVEL not in named
+
+
 def test_distances_are_those_of_scipy():
     rng = np.random.default_rng(7)
     first, second = rng.normal(0, 1, 80).round(2), rng.normal(0.3, 0.8, 60).round(2)
