@@ -73,6 +73,12 @@ OnlyOption = Annotated[
         "than once.",
     ),
 ]
+MirrorOption = Annotated[
+    bool,
+    typer.Option(
+        "--mirror", help="Also play two different drivers with their sides changed, as LEFT+RIGHT."
+    ),
+]
 RepsOption = Annotated[
     int | None, typer.Option("--reps", help="Repetitions per condition, for every variant.")
 ]
@@ -196,6 +202,7 @@ def sweep(
     name: NameArgument,
     model: ModelOption = None,
     only: OnlyOption = None,
+    mirror: MirrorOption = False,
     reps: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
@@ -278,6 +285,7 @@ def sweep(
         sample_set=sample_set,
         order_seed=order_seed,
         only=levels(only or (), "--only"),
+        mirror=mirror,
     )
     for note in plan.notes():
         say(note)
@@ -301,6 +309,7 @@ def replay(
     name: NameArgument,
     model: ModelOption = None,
     only: OnlyOption = None,
+    mirror: MirrorOption = False,
     reps: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
@@ -316,6 +325,7 @@ def replay(
         name=name,
         model=model,
         only=only,
+        mirror=mirror,
         reps=reps,
         conditions=conditions,
         variants=variants,

@@ -28,6 +28,11 @@ SCRIPTED_FIELD = "merge_runner_scripted"
 ANSWERED_FIELD = "merge_runner_request"
 
 
+def other_side(side: Side) -> Side:
+    """The side across the road."""
+    return "right" if side == "left" else "left"
+
+
 @dataclass(frozen=True, slots=True)
 class Slot:
     """Where in a sweep a sample stands: two slots never share a sample by accident.

@@ -16,7 +16,7 @@ from merge_runner.drivers.pace import program_pace
 from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.errors import UsageError
 from merge_runner.main_source import MAIN, main_source
-from merge_runner.records import SIDES, Side, TrialSpec
+from merge_runner.records import SIDES, Side, TrialSpec, other_side
 from merge_runner.registry import Registry, require
 from merge_runner.source import source_digest
 
@@ -115,7 +115,6 @@ class Program:
         """The seat of a side of a trial."""
         pace = program_pace(scenario, self.rate_hz)
         seeds = {each: take_seat(scenario, spec, each, pace).seed for each in SIDES}
-        other: Side = "right" if side == "left" else "left"
         return ProgramSeat(
             scenario,
             side,
@@ -123,7 +122,7 @@ class Program:
             seeds[side],
             condition=spec.condition,
             repetition=spec.repetition,
-            other_seed=seeds[other],
+            other_seed=seeds[other_side(side)],
             parameters=self.values,
         )
 

@@ -31,6 +31,7 @@ class _Config(BaseModel):
     repetitions: dict[str, int]
     conditions: tuple[str, ...]
     sample_set: int
+    mirror: bool = False
     arms: tuple[_Arm, ...] = ()
 
 
@@ -38,7 +39,8 @@ class _Config(BaseModel):
 class RecordedSweep:
     """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition.
 
-    ``arms`` has the labels of the arms of a study, and is empty for a plain sweep.
+    ``arms`` has the labels of the arms of a study, and is empty for a plain sweep. ``mirror`` says
+    that two different drivers were played both ways round.
     """
 
     name: str
@@ -47,6 +49,7 @@ class RecordedSweep:
     conditions: tuple[str, ...]
     sample_set: int
     arms: frozenset[str] = frozenset()
+    mirror: bool = False
 
     def __str__(self) -> str:
         """As a part of a sentence."""
@@ -60,6 +63,7 @@ class RecordedSweep:
         """What replays it; its names may be anybody's, and are quoted for a shell."""
         words = ["merge-runner", "replay", self.name]
         words += [word for model in self.model.split(",") for word in ("--model", model)]
+        words += ["--mirror"] * self.mirror
         words += ["--sample-set", str(self.sample_set)] * bool(self.sample_set)
         words += [word for file in files for word in ("--recording", str(file))]
         return one_line(shlex.join(words))
@@ -88,6 +92,7 @@ def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
                     conditions=tuple(conditions),
                     sample_set=config.sample_set,
                     arms=frozenset(arm.label for arm in config.arms),
+                    mirror=config.mirror,
                 )
             )
     return found
@@ -109,7 +114,8 @@ def _joined(one: RecordedSweep, other: RecordedSweep) -> RecordedSweep:
     repetitions = {v: max(one.repetitions.get(v, 0), other.repetitions.get(v, 0)) for v in variants}
     conditions = tuple(dict.fromkeys([*one.conditions, *other.conditions]))
     arms = one.arms | other.arms
-    return replace(one, repetitions=repetitions, conditions=conditions, arms=arms)
+    mirror = one.mirror or other.mirror
+    return replace(one, repetitions=repetitions, conditions=conditions, arms=arms, mirror=mirror)
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:

@@ -89,7 +89,8 @@ class Plan:
     """A sweep before it runs: the arms of its study, each played in all conditions.
 
     ``entries`` are the language models of all arms by what an arm's ``asked`` calls them, and
-    ``endpoints`` the identities of their endpoints (see ``config.Endpoint``).
+    ``endpoints`` the identities of their endpoints (see ``config.Endpoint``). ``mirror``: its
+    pairs are played both ways round whatever its file says.
     """
 
     name: str
@@ -101,6 +102,7 @@ class Plan:
     conditions: tuple[str, ...]
     sample_set: int
     order_seed: int
+    mirror: bool = False
 
     @property
     def model(self) -> str:
@@ -156,7 +158,7 @@ class Plan:
     @property
     def driver(self) -> str:
         """The drivers with their endpoints; see ``pair_name``."""
-        pairs = (pair_name(arm.asked.values(), self.endpoints) for arm in self.arms)
+        pairs = (pair_name(arm.names, self.endpoints) for arm in self.arms)
         names = list(dict.fromkeys(pairs))
         more = f" and {len(names) - DRIVERS_SHOWN} more" if len(names) > DRIVERS_SHOWN else ""
         return ", ".join(names[:DRIVERS_SHOWN]) + more
@@ -275,7 +277,8 @@ class Plan:
         entries = {name: entry.model_dump(mode="json") for name, entry in self.entries.items()}
         prompt_blocks = {variant: block_digests(variant) for variant in self.repetitions}
         file = self.study.file
-        many = bool(file.factors) or len(self.models) > 1
+        mirrored = len(self.arms) > len(self.repetitions)
+        many = bool(file.factors) or len(self.models) > 1 or mirrored
         config: dict[str, object] = {
             "model": self.model,
             "models": entries,
@@ -287,6 +290,8 @@ class Plan:
             "order_seed": self.order_seed,
             "prompt_blocks": prompt_blocks,
         }
+        if self.mirror:
+            config["mirror"] = True
         if many:
             config["arms"] = [
                 {
@@ -352,6 +357,7 @@ def make_plan(
     sample_set: int = 0,
     order_seed: int = 0,
     only: Mapping[str, Sequence[str]] | None = None,
+    mirror: bool = False,
 ) -> Plan:
     """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
@@ -365,7 +371,7 @@ def make_plan(
     asked = (models,) if isinstance(models, str) else tuple(models)
     drivers = tuple(dict.fromkeys(asked or study.file.models or (EMULATOR,)))
     wanted = _repetitions(study, variants, repetitions)
-    arms = cross(study.file, drivers, wanted, registry, only or {})
+    arms = cross(study.file, drivers, wanted, registry, only or {}, mirror=mirror)
     entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
     return Plan(
         name=study.name,
@@ -377,6 +383,7 @@ def make_plan(
         conditions=_conditions(study.file, conditions, arms),
         sample_set=sample_set,
         order_seed=order_seed,
+        mirror=mirror,
     )
 
 

@@ -147,7 +147,8 @@ class StudyFile(Frozen):
     """One study. ``repetitions`` are per condition, for each prompt or for all of them.
 
     ``factors`` are crossed with each other, with the ``models`` and with the conditions; ``skip``
-    leaves crossings out: each row names levels, or lists of them.
+    leaves crossings out: each row names levels, or lists of them. With ``mirror`` two different
+    drivers are played both ways round.
     """
 
     nested: ClassVar[Mapping[str, type[BaseModel]]] = {
@@ -168,6 +169,7 @@ class StudyFile(Frozen):
     scenario: ScenarioConfig = ScenarioConfig()
     factors: dict[str, tuple[Json, ...]] = Field(default_factory=dict)
     skip: tuple[dict[str, Json], ...] = ()
+    mirror: bool = False
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)
     budget: BudgetTerms = BudgetTerms()
