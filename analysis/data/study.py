@@ -106,9 +106,14 @@ class Group:
         return bool(self.posing)
 
     @property
+    def is_mixed(self) -> bool:
+        """Whether two different drivers met."""
+        return len(self.models) > 1
+
+    @property
     def one_sided(self) -> bool:
         """Whether two different drivers met, and each of them on one side alone."""
-        return len(self.models) > 1 and 0 in self.seats
+        return self.is_mixed and 0 in self.seats
 
     @property
     def outcomes(self) -> pd.DataFrame:
@@ -480,7 +485,7 @@ def _distinct(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _again(rows: pd.DataFrame) -> pd.Index:
     """The trials that went the same way as an earlier repetition."""
-    ended = rows[rows["trace"].notna()].sort_values("rep", kind="stable")
+    ended = rows[rows["trace"].notna()].sort_values(["rep", "ego"], kind="stable")
     return ended.index[ended.duplicated(["condition", "trace"])]
 
 
