@@ -310,7 +310,9 @@ def _asked(group: Group, origin: Provenance) -> list[str]:
     alike = len({str(parameters) for parameters in sent.values()}) == 1
     # The spec is one with the ego on the left, if there is any.
     sides = SIDES if group.seats[0] else SIDES[::-1]
-    names = dict(zip(sides, group.models, strict=True)) if group.is_mixed else {}
+    names: dict[str, str] = {}
+    if group.is_mixed:
+        names.update(zip(sides, group.models, strict=True))
     listed = [
         _parameters(parameters) if alike else f"{names.get(side, side)}: {_parameters(parameters)}"
         for side, parameters in sent.items()

@@ -44,7 +44,7 @@ async def test_a_new_study_is_killed_resumed_replayed_and_shown(merge_runner, st
         assert await process.wait() != 0
         before = server.requests
         resumed = await merge_runner(*sweep, cwd=study, **env)
-        assert (resumed.code, resumed.summary["trials"]["planned"]) == (0, 16), resumed.err
+        assert (resumed.code, resumed.summary["trials"]["planned"]) == (0, 24), resumed.err
         assert resumed.summary["calls"]["live"] == server.requests - before
         done = server.requests
         again = await merge_runner("replay", "study.toml", "--db", "again.duckdb", cwd=study, **env)
