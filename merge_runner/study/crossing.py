@@ -53,6 +53,12 @@ class Arm:
         return self.sides["left"] != self.sides["right"]
 
     @property
+    def model_level(self) -> str:
+        """The model as results have it, as a factor: of a pair without an opponent, both."""
+        ego, other = self.sides[self.ego], self.sides[other_side(self.ego)]
+        return ego if self.factors.get(OPPONENT, SELF) != SELF else _pair(ego, other)
+
+    @property
     def names(self) -> tuple[str, str]:
         """Who is asked, the ego first."""
         return self.asked[self.ego], self.asked[other_side(self.ego)]

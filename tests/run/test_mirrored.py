@@ -49,3 +49,13 @@ async def test_a_mirrored_pair_is_killed_resumed_and_replayed_to_the_same_end(
     assert "emulator sat on the left in 11 trials, and on the right in 11, mirrored" in " ".join(
         notes.split()
     )
+
+
+async def test_the_summary_names_a_pair_as_the_tables_do(merge_runner):
+    part = ("--reps", 1, "--conditions", "L_4_0")
+    run = await merge_runner(
+        "sweep", "baseline", "--model", "projected-order+constant", "--model", "constant", *part
+    )
+    assert run.code == 0, run.err
+    counts = {line.split()[0]: line.split()[1] for line in run.out.splitlines() if line}
+    assert counts["constant+projected-order"] == counts["constant"] == "1"

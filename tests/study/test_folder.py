@@ -131,4 +131,4 @@ def test_the_commented_lines_of_the_study_can_be_used(study):
         check=False,
     )
     assert out.returncode == 0, out.stderr
-    assert re.search(r"trials +12 ", out.stdout)
+    assert re.search(r"trials +18 ", out.stdout)
