@@ -132,7 +132,7 @@ def query_of(group: Group, predicate: str) -> str:
 
 
 def _among(group: Group) -> str:
-    """Which specs its trials have: several where its conditions differ in their mean speeds."""
+    """Which specs its trials have: several where mean speeds differ, or drivers change sides."""
     names = [quoted(name) for name in sorted(group.trials["spec_hash"].unique())]
     return f"IN ({', '.join(names)})" if len(names) > 1 else f"= '{group.spec_hash}'"
 
@@ -154,11 +154,13 @@ def _source(study: Study, group: Group, predicate: str) -> Source:
     if group.spec_hash is None:
         text = f"published, not from traces: {citation('human_outcomes')}; see the table's notes"
         return Source(group.id, text, "", ())
-    query = query_of(group, predicate)
     found = _tables(study, group).sql(
         f"SELECT trial_id FROM trials WHERE {predicate} ORDER BY trial_id"  # noqa: S608 # ours
     )
     trials = tuple(trial_id for (trial_id,) in found.fetchall())
+    if group.seats[1] and trials:  # the database does not know mirrored trials by their images
+        predicate = f"trials.trial_id IN ({', '.join(map(quoted, trials))})"
+    query = query_of(group, predicate)
     text = f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}"
     return Source(group.id, text, query, trials)
 

@@ -8,7 +8,7 @@ import os
 import re
 import tempfile
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
@@ -429,10 +429,25 @@ def both_sides(model: str) -> dict[Side, str]:
     return {"left": left, "right": right or left}
 
 
-def pair_name(sides: Iterable[str], endpoints: Mapping[str, str]) -> str:
-    """Who drives left and right, as the view ``trial_drivers`` names it but for the sample set."""
-    left, right = (driver_name(model, endpoints.get(model)) for model in sides)
-    return left if left == right else f"{left}+{right}"
+def ego_side(sides: Mapping[Side, str], asking: Container[str], opponent: str = "") -> Side:
+    """On which side the ego of a pair sits: the driver whose odds are told, and who is named first.
+
+    It is the one that a study does not call the opponent; else a language model before a program
+    (``asking`` holds those), and of two alike the first in the alphabet. Where both sides have one
+    driver it is the left one. The view ``trial_drivers`` says the same.
+    """
+    left, right = sides["left"], sides["right"]
+    if left == right or opponent in (left, right):
+        return "right" if opponent == left != right else "left"
+    if (left in asking) != (right in asking):
+        return "left" if left in asking else "right"
+    return "left" if left < right else "right"
+
+
+def pair_name(pair: Iterable[str], endpoints: Mapping[str, str]) -> str:
+    """Who drives; from the ego on, as the view ``trial_drivers`` says but for the sample set."""
+    one, other = (driver_name(model, endpoints.get(model)) for model in pair)
+    return one if one == other else f"{one}+{other}"
 
 
 def key_status(

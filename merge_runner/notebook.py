@@ -112,8 +112,9 @@ class Study:
     """A study that can be run: a sweep of ``experiments``, or a file, and what of it is wanted.
 
     ``models``, ``repetitions``, ``conditions`` and ``prompts`` take the place of what the file
-    says; ``only`` names a level, or a list of levels, by factor. ``arun``, ``areplay`` and
-    ``adry_run`` are awaited, as in a notebook; ``run``, ``replay`` and ``dry_run`` are for scripts.
+    says; ``only`` names a level, or a list of levels, by factor; ``mirror`` plays two different
+    drivers both ways round. ``arun``, ``areplay`` and ``adry_run`` are awaited, as in a notebook;
+    ``run``, ``replay`` and ``dry_run`` are for scripts.
 
     All of them raise UsageError for what cannot be run as it is asked for. What goes wrong on the
     way is in the outcome, beside the trials that ended: the same call goes on from there.
@@ -127,6 +128,7 @@ class Study:
         cache: Path | str = DEFAULT_CACHE,
         models: Sequence[str] | str = (),
         only: Mapping[str, JsonValue] | None = None,
+        mirror: bool = False,
         repetitions: int | None = None,
         conditions: Sequence[str] | None = None,
         prompts: Sequence[str] | None = None,
@@ -141,6 +143,7 @@ class Study:
             "variants": prompts,
             "sample_set": sample_set,
             "only": {name: _texts(levels) for name, levels in (only or {}).items()},
+            "mirror": mirror,
         }
 
     def register(self, registry: Registry[T], name: str, thing: T) -> T:

@@ -31,6 +31,11 @@ FAR_BEHIND_M = 1000.0
 """Where the other vehicle is put while it is not seen; see Observation."""
 
 
+def other_side(side: Side) -> Side:
+    """The side across the road."""
+    return "right" if side == "left" else "left"
+
+
 @dataclass(frozen=True, slots=True)
 class Slot:
     """Where in a sweep a sample stands: two slots never share a sample by accident.

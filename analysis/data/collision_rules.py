@@ -18,7 +18,7 @@ import pandas as pd
 from analysis.data.load import load_each, load_specs
 from merge_runner.config import CollisionRule, ScenarioConfig
 from merge_runner.drivers.pace import pace_of
-from merge_runner.records import SIDES
+from merge_runner.records import Side, other_side
 from merge_runner.scenarios.merge.collision import collided, rectangles_overlap
 from merge_runner.scenarios.merge.conditions import Condition
 from merge_runner.scenarios.merge.geometry import TRACK, Track, track_of
@@ -113,7 +113,8 @@ def _collided(trials: pd.DataFrame, found: pd.DataFrame, reading: str) -> pd.Ser
 def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS) -> pd.DataFrame:
     """One row a trial that ended and a reading: trial_id, spec_hash, rule, status, merged_first.
 
-    ``status`` is finished, collided, timeout or undecided.
+    ``status`` is finished, collided, timeout or undecided. ``trials`` are rows of ``load_trials``,
+    and a mirrored one is driven on as it is there.
     """
     ended = trials[trials["status"] != "failed"]
     stored = load_specs(db)
@@ -147,10 +148,13 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
         if key not in speeds:  # humans have no plans that could be driven further
             return UNDECIDED, None
         start = Condition(trial.projected_headway_m, trial.relative_velocity_mps, speeds[key])
-        return _driven_further(task, start, specs[trial.spec_hash], plans[key], between=boxes)
+        sides = (trial.ego, other_side(trial.ego))
+        return _driven_further(
+            task, start, specs[trial.spec_hash], plans[key], sides, between=boxes
+        )
 
     columns = ["trial_id", "spec_hash", "source", "status", "merged_first"]
-    columns += ["projected_headway_m", "relative_velocity_mps"]
+    columns += ["projected_headway_m", "relative_velocity_mps", "ego"]
     rows = [
         (trial.trial_id, trial.spec_hash, reading, *judged_by(trial, reading))
         for trial in ended[columns].itertuples(index=False)
@@ -160,11 +164,20 @@ def outcomes(db: Path, trials: pd.DataFrame, readings: Sequence[str] = READINGS)
 
 
 def _driven_further(
-    task: Task, start: Condition, spec: dict[str, Any], plans: dict[str, Any], *, between: bool
+    task: Task,
+    start: Condition,
+    spec: dict[str, Any],
+    plans: dict[str, Any],
+    order: Sequence[Side],
+    *,
+    between: bool,
 ) -> Outcome:
-    """How a trial that collided goes on by its plans, under a task with another rule."""
-    sides = [plans[side] for side in SIDES]
-    lasting = [pace_of(task.config, spec.get(side, {})).action_steps for side in SIDES]
+    """How a trial that collided goes on by its plans, under a task with another rule.
+
+    ``order`` says whose plans drive on the left of the condition, and whose on the right.
+    """
+    sides = [plans[side] for side in order]
+    lasting = [pace_of(task.config, spec.get(side, {})).action_steps for side in order]
     return redrive(
         task,
         start,

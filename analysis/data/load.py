@@ -19,33 +19,75 @@ from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK, Track
 from merge_runner.served_model import ALIASES, PAIRS, Pair, others_among
+from merge_runner.text_safety import quoted
 
-# Those that were driven to their end: what was only asked has no outcome.
-TRIALS = (
-    "SELECT trials.*, driver, coalesce(left_scripted, false) AS left_scripted, "
-    "coalesce(right_scripted, false) AS right_scripted, "
-    "trial_metrics.* EXCLUDE (trial_id, spec_hash) "
-    "FROM trials JOIN trial_drivers USING (trial_id, spec_hash) "
-    "JOIN trial_metrics USING (trial_id, spec_hash) "
-    "LEFT JOIN (SELECT trial_id, spec_hash, bool_or(side = 'left') AS left_scripted, "
-    "bool_or(side = 'right') AS right_scripted FROM calls WHERE scripted GROUP BY ALL) "
-    "USING (trial_id, spec_hash) WHERE source <> 'seat' ORDER BY trial_id, spec_hash"
+# A trial that was driven to its end, as its ego sees it (see ``trial_drivers``): one whose ego sat
+# on the right is mirrored, so that "left" is the ego everywhere, headway and relative velocity are
+# the ego's minus the other's, and the condition is the one with such numbers. Where only an ego on
+# the right has driven that, it is called after the one that was driven.
+_PUBLISHED = ", ".join(
+    f"({quoted(name)}, {one.projected_headway_m!r}::DOUBLE, {one.relative_velocity_mps!r}::DOUBLE)"
+    for name, one in HUMAN_CONDITIONS.items()
 )
-# Of each driven trial that ended a hash of its states: equal ones went the same way.
+TRIALS = f"""
+WITH placed AS (
+    SELECT trials.*, driver, ego, ego = 'right' AS turned,
+        (spec->>'$.mean_speed_mps')::DOUBLE AS mean_mps
+    FROM trials JOIN trial_drivers USING (trial_id, spec_hash) LEFT JOIN specs USING (spec_hash)
+    WHERE source <> 'seat'
+), known (image, headway_m, velocity_mps, mean_mps, own) AS (
+    SELECT *, NULL::DOUBLE, false FROM (VALUES {_PUBLISHED})
+    UNION SELECT condition, projected_headway_m, relative_velocity_mps, mean_mps, true FROM placed
+), images AS (
+    SELECT headway_m, velocity_mps, mean_mps, arg_min(image, (own, image)) AS image
+    FROM known GROUP BY ALL
+)
+SELECT placed.* EXCLUDE (driver, ego, turned, mean_mps) REPLACE (
+        if(turned, coalesce(image, condition || ' mirrored'), condition) AS condition,
+        if(turned, 0 - projected_headway_m, projected_headway_m) AS projected_headway_m,
+        if(turned, 0 - relative_velocity_mps, relative_velocity_mps) AS relative_velocity_mps,
+        if(turned, model_right, model_left) AS model_left,
+        if(turned, model_left, model_right) AS model_right,
+        if(turned, CASE merged_first WHEN 'left' THEN 'right' WHEN 'right' THEN 'left' END,
+            merged_first) AS merged_first
+    ), driver,
+    coalesce(if(turned, right_scripted, left_scripted), false) AS left_scripted,
+    coalesce(if(turned, left_scripted, right_scripted), false) AS right_scripted,
+    trial_metrics.* EXCLUDE (trial_id, spec_hash) REPLACE (
+        if(turned, rmse_right_mps, rmse_left_mps) AS rmse_left_mps,
+        if(turned, rmse_left_mps, rmse_right_mps) AS rmse_right_mps
+    ), ego
+FROM placed JOIN trial_metrics USING (trial_id, spec_hash)
+LEFT JOIN (
+    SELECT trial_id, spec_hash, bool_or(side = 'left') AS left_scripted,
+        bool_or(side = 'right') AS right_scripted
+    FROM calls WHERE scripted GROUP BY ALL
+) USING (trial_id, spec_hash)
+LEFT JOIN images ON turned AND headway_m = 0 - projected_headway_m
+    AND velocity_mps = 0 - relative_velocity_mps
+    AND images.mean_mps IS NOT DISTINCT FROM placed.mean_mps
+ORDER BY trial_id, spec_hash
+"""  # noqa: S608 # constants
+# Of each driven trial that ended a hash of its states, as its ego sees them: equal ones went the
+# same way.
 TRACES = """
-SELECT trial_id, spec_hash, sum(hash(step, side, position_m, velocity_mps))::VARCHAR AS trace
-FROM states SEMI JOIN (FROM trials WHERE source <> 'human' AND status <> 'failed')
+SELECT trial_id, spec_hash, sum(hash(step, if(side = ego, 'left', 'right'), position_m,
+    velocity_mps))::VARCHAR AS trace
+FROM states JOIN trial_drivers USING (trial_id, spec_hash)
+SEMI JOIN (FROM trials WHERE source <> 'human' AND status <> 'failed')
 USING (trial_id, spec_hash) GROUP BY ALL
 """
-# One row a finished trial: the left vehicle's speeds.
-LEFT_SPEEDS = (
-    "SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s, "
-    "list(velocity_mps ORDER BY step) AS velocity_mps FROM states SEMI JOIN ("
-    "FROM trials WHERE status = 'finished') "
-    "USING (trial_id, spec_hash) WHERE time_s >= 0 AND side = 'left' GROUP BY ALL ORDER BY ALL"
-)
+# One row a finished trial: the ego's speeds.
+EGO_SPEEDS = """
+SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s,
+    list(velocity_mps ORDER BY step) AS velocity_mps
+FROM states JOIN trial_drivers USING (trial_id, spec_hash)
+SEMI JOIN (FROM trials WHERE status = 'finished') USING (trial_id, spec_hash)
+WHERE time_s >= 0 AND side = ego GROUP BY ALL ORDER BY ALL
+"""
 # One row a vehicle: its speeds under control, and whether the simulator slowed it by itself.
 SPEEDS = """
 SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
@@ -146,8 +188,9 @@ def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """One row a trial: condition, outcome and metrics in SI units (see docs/tables.md).
+    """One row a trial, as its ``ego`` sees it: condition, outcome and metrics in SI units.
 
+    See docs/tables.md. A trial whose ego sat on the right is mirrored: its left is the ego's side.
     First situations that were only asked are left out.
     """
     return load(TRIALS, db)

@@ -21,7 +21,7 @@ from analysis.data.imported_humans import RECORDINGS, Imported, imported, of_pub
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
     DEVIATIONS,
-    LEFT_SPEEDS,
+    EGO_SPEEDS,
     PLANS,
     SHARED,
     SPEEDS,
@@ -48,7 +48,7 @@ from merge_runner.text_safety import quoted
 HUMAN = "human"
 # What tells groups apart, and is no measure.
 COLUMNS_OF_GROUPS = [
-    "driver", "task", "usual", "mark", "apart", "shared", "trace", "left_scripted",
+    "driver", "image", "task", "usual", "mark", "apart", "shared", "trace", "left_scripted",
     "right_scripted",
 ]  # fmt: skip
 BASELINE = "baseline"
@@ -71,12 +71,13 @@ class Group:
     another. ``levels`` are those of its study's factors, and its model and prompt, by factor.
     ``driver`` is its ``name`` with the ``mark`` that tells it from itself under other settings, and
     with ``[scripted]`` where a stand-in answered only some of its trials. ``label`` is how tables
-    name the driver, ``models`` are the names that were asked for, left and right, an equal one
-    once, ``posing`` is what is said of a scripted stand-in, and ``caution`` of a human who is
-    replayed. Of a driver without chance, whose
-    repetitions are the same trial again, only the first are ``trials``, and ``repeated`` counts the
-    others; ``equal`` counts such trials of a driver that samples. ``narrowed`` is what tells the
-    trials in SQL from others of their spec and variant, empty where there are none.
+    name the driver, ``models`` are the names that were asked for, the ego's first, an equal one
+    once, ``seats`` are how many of the trials have the ego on the left and on the right, ``posing``
+    is what is said of a scripted stand-in, and ``caution`` of a human who is replayed. Of a driver
+    without chance, whose repetitions are the same trial again, only the first are ``trials``, and
+    ``repeated`` counts the others; ``equal`` counts such trials of a driver that samples.
+    ``narrowed`` is what tells the trials in SQL from others of their spec and variant, empty where
+    there are none.
     ``published_outcomes`` stand in the place of the trials' outcomes where these are a part of the
     published ones.
     """
@@ -89,6 +90,7 @@ class Group:
     models: tuple[str, ...]
     name: str
     mark: str = ""
+    seats: tuple[int, int] = (0, 0)
     measured: bool = True
     posing: str = ""
     caution: str = ""
@@ -107,6 +109,16 @@ class Group:
     def scripted(self) -> bool:
         """Whether a scripted stand-in answered."""
         return bool(self.posing)
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether two different drivers met."""
+        return len(self.models) > 1
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether two different drivers met, and each of them on one side alone."""
+        return self.is_mixed and 0 in self.seats
 
     @property
     def outcomes(self) -> pd.DataFrame:
@@ -244,9 +256,9 @@ class Study:
         return measure_profiles(self._read(SPEEDS))
 
     @cached_property
-    def left_speeds(self) -> pd.DataFrame:
-        """One row a finished trial: the left vehicle's speeds under control."""
-        return self._read(LEFT_SPEEDS)
+    def ego_speeds(self) -> pd.DataFrame:
+        """One row a finished trial: the ego's speeds under control, of equal drivers the left."""
+        return self._read(EGO_SPEEDS)
 
     @cached_property
     def deviations(self) -> pd.DataFrame:
@@ -384,8 +396,21 @@ def _tasks(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     return tasks
 
 
+def _mirrored(specs: Mapping[str, Mapping[str, Any]], names: Iterable[str]) -> dict[str, str]:
+    """The spec hashes by which the mirror images of these specs go."""
+    return {
+        name: spec_hash(canonical_json(_turned(specs[name])))
+        for name in names
+        if {*SIDES} <= specs.get(name, {}).keys()
+    }
+
+
+def _turned(spec: Mapping[str, Any]) -> dict[str, Any]:
+    return {**spec, "left": spec["right"], "right": spec["left"]}
+
+
 def _usual(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> pd.Series:
-    """The spec hash of each trial, or what it would be at the usual mean speed.
+    """What each trial's ``image`` would be at the usual mean speed.
 
     It stays as it is where a condition was driven at several mean speeds: these must not be mixed.
     """
@@ -394,10 +419,10 @@ def _usual(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> pd.S
         for name, spec in specs.items()
         if MEAN_SPEED in spec
     }
-    usual = trials["spec_hash"].replace(others)
-    speeds = trials.groupby([usual, "condition"])["spec_hash"].transform("nunique")
+    usual = trials["image"].replace(others)
+    speeds = trials.groupby([usual, "condition"])["image"].transform("nunique")
     mixed = usual.isin(usual[speeds > 1])
-    return usual.mask(mixed, trials["spec_hash"])
+    return usual.mask(mixed, trials["image"])
 
 
 def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> list[Group]:
@@ -409,9 +434,16 @@ def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) 
     """
     if trials.empty:
         return []
+    # The spec of a trial as its ego sees it: with the ego on the left.
+    turned = trials["ego"] == "right"
+    images = _mirrored(specs, trials.loc[turned, "spec_hash"].unique())
+    specs = {**specs, **{images[name]: _turned(specs[name]) for name in images}}
+    keyed = trials.assign(
+        image=trials["spec_hash"].mask(turned, trials["spec_hash"].replace(images))
+    )
     tasks = _tasks(specs)
-    task = trials["spec_hash"].map(lambda name: tasks.get(name, name[:8]))
-    keyed = trials.assign(task=task, usual=_usual(trials, specs))
+    keyed["task"] = keyed["image"].map(lambda name: tasks.get(name, name[:8]))
+    keyed["usual"] = _usual(keyed, specs)
     keyed["mark"] = _marks(keyed, ["driver"], "task")
     keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "usual")
     keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
@@ -437,8 +469,9 @@ def _model_group(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> 
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
     posing = stand_in(models, sides or SIDES) if scripted else ""
-    caution = unresponsive(specs.get(first["spec_hash"], {}))
+    caution = unresponsive(specs.get(first["image"], {}))
     said = "; ".join(filter(None, (posing, caution)))
+    seats = rows["ego"].value_counts()
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
     distinct = _distinct(rows)
     narrowed = [f"scripted = {str(scripted).lower()}"] if first["apart"] else []
@@ -454,6 +487,7 @@ def _model_group(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> 
         models=tuple(dict.fromkeys(models.values())),
         name=first["driver"],
         mark=first["mark"],
+        seats=(int(seats.get("left", 0)), int(seats.get("right", 0))),
         posing=posing,
         caution=caution,
         repeated=len(rows) - len(distinct),
@@ -479,7 +513,7 @@ def _distinct(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _again(rows: pd.DataFrame) -> pd.Index:
     """The trials that went the same way as an earlier repetition."""
-    ended = rows[rows["trace"].notna()].sort_values("rep", kind="stable")
+    ended = rows[rows["trace"].notna()].sort_values(["rep", "ego"], kind="stable")
     return ended.index[ended.duplicated(["condition", "trace"])]
 
 

@@ -179,6 +179,7 @@ def human_panels(study: Study) -> dict[str, Any]:
             {
                 "id": group.id,
                 "driver": group.label,
+                "mirrored": bool(group.seats[1]),
                 "scenario": specs.get(group.spec_hash or "", {}).get("scenario"),
                 "conditions": {name: _in_condition(group, name) for name in study.conditions},
             }

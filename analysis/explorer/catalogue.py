@@ -29,7 +29,7 @@ PAIRS = """
 SELECT one.condition, one.rep, one.trial_id, one.spec_hash, one.outcome, one.{fate} AS fate,
     base.trial_id AS base_id, base.spec_hash AS base_hash, base.outcome AS base_outcome,
     base.{fate} AS base_fate
-FROM listed AS one JOIN listed AS base USING (model, condition, rep)
+FROM listed AS one JOIN listed AS base USING (model, model_left, condition, rep)
 WHERE one.model = ? AND one.variant = ? AND base.variant = 'baseline' AND one.source <> 'human'
     AND one.{fate} IS NOT NULL AND base.{fate} IS NOT NULL
 ORDER BY one.trial_id, one.spec_hash, base.spec_hash

@@ -15,7 +15,7 @@ from merge_runner.audit.expected import ArmFacts, ModelFacts
 from merge_runner.config import both_sides, pair_name
 from merge_runner.drivers.registry import EMULATOR, stand_in
 from merge_runner.results.progress_file import Standing, read_standing
-from merge_runner.study.crossing import MODEL, OPPONENT, PROMPT, SELF
+from merge_runner.study.crossing import MODEL, PROMPT
 from merge_runner.study.file import study_files
 
 OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"
@@ -75,12 +75,16 @@ class Arm(ArmFacts):
 
     @property
     def state(self) -> dict[str, str]:
-        """The filter of its trials."""
-        left, right = self.sides["left"], self.sides["right"]
-        alone = left == right or self.factors.get(OPPONENT, SELF) != SELF
-        levels = {MODEL: left if alone else f"{left}+{right}", **self.factors}
-        levels.pop(PROMPT, None)
-        return {"variant": self.variant, **{f"{FACTOR}{n}": level for n, level in levels.items()}}
+        """The filter of its trials; of two drivers their names tell who sat on which side."""
+        mixed = self.sides["left"] != self.sides["right"]
+        levels = {} if mixed else {MODEL: self.model}
+        levels |= {name: level for name, level in self.factors.items() if name != PROMPT}
+        named = {"q": f"{self.model}/"} if mixed else {}
+        return {
+            "variant": self.variant,
+            **named,
+            **{f"{FACTOR}{name}": level for name, level in levels.items()},
+        }
 
 
 class Config(BaseModel):

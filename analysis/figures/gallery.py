@@ -55,6 +55,7 @@ from analysis.stats.measures import human_reference, known, values
 from merge_runner.errors import UsageError
 
 LEGEND_COLUMNS = 4
+OF_TWO = "Of two different drivers, the left vehicle is that of the one named first."
 PASSED, FAILED, UNKNOWN = SKY_BLUE, ORANGE, "#dddddd"
 # These settings are fixed, so that equal input gives equal files.
 SETTINGS: Any = {
@@ -190,7 +191,7 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
         "of control, where it merges first and second. (C) How often the left vehicle merges first "
         "by projected headway and relative velocity, with Wilson intervals. (D) Mean gap at the "
         "merge point and (E) mean RMSE of the speed from the initial speed, two values a trial, "
-        "with intervals of Student's t.",
+        f"with intervals of Student's t. {OF_TWO}",
     ),
     "figure2-variants": (
         figure_2_variants,
@@ -198,8 +199,9 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
         "B) Speed of the left vehicle from the start of control, where it merges first and second. "
         "(C) How often the left vehicle merges first by projected headway, with Wilson intervals. "
         "(D) Mean gap at the merge point and (E) mean RMSE of the speed from the initial speed, "
-        "two values a trial, with intervals of Student's t. Colours and markers tell the relative "
-        "velocities apart; few very wide intervals of D and E are cut at the frame.",
+        f"two values a trial, with intervals of Student's t. {OF_TWO} "
+        "Colours and markers tell the relative velocities apart; few very wide intervals of D and "
+        "E are cut at the frame.",
     ),
     "ablation-matrix": (
         ablation_matrix,

@@ -80,11 +80,14 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
 
 
 def left_traces(study: Study, group: Group, first: str) -> list[Array]:
-    """Panels A and B: times in s and left speeds in m/s, (n, 2), where ``first`` merged first."""
+    """Panels A and B: times in s and left speeds in m/s, (n, 2), where ``first`` merged first.
+
+    Of two different drivers the left one is the ego, as everywhere here.
+    """
     if not group.measured:
         return []
     chosen = group.finished[group.finished["merged_first"] == first]
-    rows = of_group(study.left_speeds, group, chosen)
+    rows = of_group(study.ego_speeds, group, chosen)
     return [
         np.column_stack(trace) for trace in zip(rows["time_s"], rows["velocity_mps"], strict=True)
     ]

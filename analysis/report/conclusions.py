@@ -24,6 +24,8 @@ from analysis.stats.measures import (
     no_human_value,
 )
 from analysis.stats.mixed import MIN_PAIRS
+from analysis.tables.notes import one_sided_note
+from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 NAMES = {
@@ -255,6 +257,8 @@ def _limits(study: Study, group: Group) -> list[str]:
             f"{group.driver}: that the gap does not depend on relative velocity is not shown; the "
             "effect is not significant, but one of 1 m is not excluded either."
         )
+    if group.one_sided:
+        texts.append(f"{group.driver}: {one_sided_note(group)}.")
     return texts + [
         f"{group.driver}: {', '.join(names)} cannot be judged {' or '.join(rules)}: {why}."
         for why, (names, rules) in unjudged(found, *INDICATORS).items()
@@ -301,12 +305,18 @@ def _asked(group: Group, origin: Provenance) -> list[str]:
     changed = origin.tasks.get(group.spec_hash or "")
     task = [f"{group.driver}: its task is not the default one: {changed}."] if changed else []
     if (group.trials["source"] == "driver").all():
-        return [*task, f"{group.driver} is a program: it reads no prompt, and samples nothing."]
+        what = "are programs: they read" if group.is_mixed else "is a program: it reads"
+        return [*task, f"{group.driver} {what} no prompt; what is left to chance has a seed."]
     sent = origin.sent.get(group.spec_hash or "") or {"": {}}
     # Usually both sides are sent the same, and the sides need no naming.
     alike = len({str(parameters) for parameters in sent.values()}) == 1
+    # The spec is one with the ego on the left, if there is any.
+    sides = SIDES if group.seats[0] else SIDES[::-1]
+    names: dict[str, str] = {}
+    if group.is_mixed:
+        names.update(zip(sides, group.models, strict=True))
     listed = [
-        _parameters(parameters) if alike else f"{side}: {_parameters(parameters)}"
+        _parameters(parameters) if alike else f"{names.get(side, side)}: {_parameters(parameters)}"
         for side, parameters in sent.items()
     ]
     return [

@@ -27,6 +27,7 @@ GAP_TERMS = (
     "abs_relative_velocity",
     "headway_x_velocity",
 )
+BY_SIDE = ("the left vehicle", "the right vehicle")
 # firthmodels' default of 25 is too few under separation.
 MAX_ITERATIONS = 1000
 # Gaps of a program can be equal but for the rounding of a step: that is no effect.
@@ -137,7 +138,7 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
     from statsmodels.tools.sm_exceptions import ConvergenceWarning
 
     design, left = who_first_data(trials)
-    problem = unfit_for_logit(design, left)
+    problem = unfit_for_logit(design, left, vehicles(trials))
     if problem:
         return Regression(len(left), {}, problem)
     with warnings.catch_warnings():
@@ -157,7 +158,7 @@ def who_first_firth(trials: pd.DataFrame) -> Regression:
     from firthmodels import FirthLogisticRegression
 
     design, left = who_first_data(trials)
-    problem = _unidentified(design, left)
+    problem = _unidentified(design, left, vehicles(trials))
     if problem:
         return Regression(len(left), {}, problem)
     fit = FirthLogisticRegression(max_iter=MAX_ITERATIONS).fit(design[:, 1:], left)
@@ -215,17 +216,26 @@ def _terms(names: tuple[str, ...], fit: _Fit) -> dict[str, Term]:
     }
 
 
-def unfit_for_logit(design: Array, left: Array) -> str:
+def vehicles(trials: pd.DataFrame) -> tuple[str, str]:
+    """What the left vehicle and the right one are called: of two different drivers, by these."""
+    models = trials[["model_left", "model_right"]] if "model_left" in trials else trials.iloc[:0]
+    pairs = models.drop_duplicates().to_numpy().tolist()
+    if len(pairs) == 1 and pairs[0][0] != pairs[0][1]:
+        return pairs[0][0], pairs[0][1]
+    return BY_SIDE
+
+
+def unfit_for_logit(design: Array, left: Array, called: tuple[str, str] = BY_SIDE) -> str:
     """Why a logit has no finite maximum likelihood estimate, empty where it has."""
-    return _unidentified(design, left) or _separated(design, left)
+    return _unidentified(design, left, called) or _separated(design, left)
 
 
-def _unidentified(design: Array, left: Array) -> str:
+def _unidentified(design: Array, left: Array, called: tuple[str, str]) -> str:
     if len(left) <= design.shape[1] or np.linalg.matrix_rank(design) < design.shape[1]:
         return _too_few(len(left), "with a first merger")
     if left.min() == left.max():
-        side = "left" if left[0] else "right"
-        return f"the {side} vehicle merged first in all {len(left)} trials: nothing to explain"
+        first = called[0] if left[0] else called[1]
+        return f"{first} merged first in all {len(left)} trials: nothing to explain"
     return ""
 
 

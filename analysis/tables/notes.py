@@ -35,7 +35,8 @@ def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) 
         )
     if study.human in study.groups:
         notes += [*_human_notes(study, pooled), *_own_notes(study, shown)]
-    return [*notes, *(f"{group.id}: {repeated_note(group)}" for group in shown if group.repeated)]
+    notes += [f"{group.id}: {repeated_note(group)}" for group in shown if group.repeated]
+    return [*notes, *(f"{group.id}: {pair_note(group)}" for group in shown if group.is_mixed)]
 
 
 def measured_notes(study: Study) -> list[str]:
@@ -66,6 +67,29 @@ def repeated_note(group: Group) -> str:
     return (
         f"{group.repeated} of {every} trials repeat an earlier one to the last state, as of a "
         "driver without chance: they are left out, and n counts the others"
+    )
+
+
+def pair_note(group: Group) -> str:
+    """Says whose odds those of two different drivers are, and on which sides they sat."""
+    ego, other = group.models
+    left, right = group.seats
+    whose = (
+        f"left stands for {ego} and right for {other}, wherever they sat: odds that {ego} goes "
+        f"first, against {other}"
+    )
+    if group.one_sided:
+        return f"{whose}; {one_sided_note(group)}"
+    return f"{whose}; {ego} sat on the left in {left} trials, and on the right in {right}, mirrored"
+
+
+def one_sided_note(group: Group) -> str:
+    """Says that two different drivers were played one way round alone."""
+    side = "left" if group.seats[0] else "right"
+    return (
+        f"{group.models[0]} sat on the {side} in all {sum(group.seats)} trials: what is its doing "
+        "cannot be told from what is its side's; `mirror = true` in the study, or --mirror, plays "
+        "both ways round"
     )
 
 

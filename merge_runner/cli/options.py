@@ -38,6 +38,12 @@ OnlyOption = Annotated[
 ]
 
 
+MirrorOption = Annotated[
+    bool,
+    typer.Option(
+        "--mirror", help="Also play two different drivers with their sides changed, as LEFT+RIGHT."
+    ),
+]
 RepsOption = Annotated[
     int | None, typer.Option("--reps", help="Repetitions per condition, for every variant.")
 ]

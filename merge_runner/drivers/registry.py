@@ -17,7 +17,7 @@ from merge_runner.drivers.pace import program_pace
 from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.errors import UsageError
 from merge_runner.main_source import MAIN, main_source
-from merge_runner.records import SIDES, Side, TrialSpec
+from merge_runner.records import SIDES, Side, TrialSpec, other_side
 from merge_runner.registry import Registry, require
 from merge_runner.source import source_digest
 
@@ -141,7 +141,6 @@ class Program:
         """The seat of a side of a trial."""
         pace = program_pace(scenario, self.rate_hz)
         seeds = {each: take_seat(scenario, spec, each, pace).seed for each in SIDES}
-        other: Side = "right" if side == "left" else "left"
         return ProgramSeat(
             scenario,
             side,
@@ -149,7 +148,7 @@ class Program:
             seeds[side],
             condition=spec.condition,
             repetition=spec.repetition,
-            other_seed=seeds[other],
+            other_seed=seeds[other_side(side)],
             parameters=self.values,
             data=self.data,
         )

@@ -31,6 +31,7 @@ class _Config(BaseModel):
     repetitions: dict[str, int]
     conditions: tuple[str, ...]
     sample_set: int
+    mirror: bool = False
     arms: tuple[_Arm, ...] = ()
     seat: str = ""
 
@@ -39,8 +40,9 @@ class _Config(BaseModel):
 class RecordedSweep:
     """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition.
 
-    ``arms`` has the labels of the arms of a study, and is empty for a plain sweep. ``seat`` is
-    ``first`` where only the first situations were asked.
+    ``arms`` has the labels of the arms of a study, and is empty for a plain sweep. ``mirror`` says
+    that two different drivers were played both ways round. ``seat`` is ``first`` where only the
+    first situations were asked.
     """
 
     name: str
@@ -50,6 +52,7 @@ class RecordedSweep:
     sample_set: int
     arms: frozenset[str] = frozenset()
     seat: str = ""
+    mirror: bool = False
 
     def __str__(self) -> str:
         """As a part of a sentence."""
@@ -67,6 +70,7 @@ class RecordedSweep:
             words = ["merge-runner", "seat", self.seat, study, "--replay"]
             words += ["--conditions", ",".join(self.conditions)]
         words += [word for model in self.model.split(",") for word in ("--model", model)]
+        words += ["--mirror"] * self.mirror
         words += ["--sample-set", str(self.sample_set)] * bool(self.sample_set)
         words += [word for file in files for word in ("--recording", str(file))]
         return one_line(shlex.join(words))
@@ -96,6 +100,7 @@ def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
                     sample_set=config.sample_set,
                     arms=frozenset(arm.label for arm in config.arms),
                     seat=config.seat,
+                    mirror=config.mirror,
                 )
             )
     return found
@@ -120,7 +125,8 @@ def _joined(one: RecordedSweep, other: RecordedSweep) -> RecordedSweep:
     repetitions = {v: max(one.repetitions.get(v, 0), other.repetitions.get(v, 0)) for v in variants}
     conditions = tuple(dict.fromkeys([*one.conditions, *other.conditions]))
     arms = one.arms | other.arms
-    return replace(one, repetitions=repetitions, conditions=conditions, arms=arms)
+    mirror = one.mirror or other.mirror
+    return replace(one, repetitions=repetitions, conditions=conditions, arms=arms, mirror=mirror)
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:

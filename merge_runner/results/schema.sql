@@ -161,24 +161,39 @@ JOIN states AS own USING (trial_id, spec_hash, time_s, side)
 JOIN states AS other USING (trial_id, spec_hash, step)
 WHERE other_seen IS NOT NULL AND other.side <> own.side;
 
--- Who drove: two different drivers are joined by a plus, another sample set has its number, and so
--- has each level of a study's factors but the prompt and the opponent, which are named already.
+-- Who drove: two different drivers are joined by a plus, the ego first, whichever side it sat on;
+-- another sample set has its number, and so has each level of a study's factors but the prompt and
+-- the opponent, which are named already.
 CREATE VIEW IF NOT EXISTS trial_drivers AS
 SELECT trial_id, spec_hash,
     -- the model, with its endpoint if that is not the provider's own
-    left_driver || CASE WHEN left_driver <> right_driver THEN '+' || right_driver ELSE '' END
+    CASE WHEN left_driver = right_driver THEN left_driver
+        WHEN ego = 'left' THEN left_driver || '+' || right_driver
+        ELSE right_driver || '+' || left_driver END
         || CASE WHEN sample_set > 0 THEN '/set' || sample_set ELSE '' END
-        || coalesce(' [' || levels || ']', '') AS driver
+        || coalesce(' [' || levels || ']', '') AS driver,
+    -- the side of the driver that is named first, whose odds are told: of two different ones that
+    -- which its study does not call the opponent, else a language model before a program, else the
+    -- first in the alphabet; of two equal ones, and of humans, the left one
+    ego
 FROM (
-    SELECT trial_id, spec_hash, sample_set,
+    SELECT trial_id, spec_hash, sample_set, levels,
         driver_name(model_left, spec->>'$.left.endpoint') AS left_driver,
-        driver_name(model_right, spec->>'$.right.endpoint') AS right_driver
-    FROM trials LEFT JOIN specs USING (spec_hash)
-) LEFT JOIN (
-    SELECT trial_id, spec_hash,
-        string_agg(factor || '=' || value, ', ' ORDER BY factor) AS levels
-    FROM trial_factors WHERE factor NOT IN ('prompt', 'opponent') GROUP BY ALL
-) USING (trial_id, spec_hash);
+        driver_name(model_right, spec->>'$.right.endpoint') AS right_driver,
+        (spec->'$.left.body') IS NOT NULL AS left_asks,
+        (spec->'$.right.body') IS NOT NULL AS right_asks,
+        CASE WHEN opponent = model_right THEN 'left'
+            WHEN opponent = model_left THEN 'right'
+            WHEN model_left = model_right THEN 'left'
+            WHEN left_asks <> right_asks THEN if(left_asks, 'left', 'right')
+            WHEN model_left > model_right THEN 'right' ELSE 'left' END AS ego
+    FROM trials LEFT JOIN specs USING (spec_hash) LEFT JOIN (
+        SELECT trial_id, spec_hash, max(value) FILTER (factor = 'opponent') AS opponent,
+            string_agg(factor || '=' || value, ', ' ORDER BY factor)
+                FILTER (factor NOT IN ('prompt', 'opponent')) AS levels
+        FROM trial_factors GROUP BY ALL
+    ) USING (trial_id, spec_hash)
+);
 
 -- The ledger of attempts: what became of each. retried: another one followed; driven: its plan was;
 -- fallback: it gave no valid plan (see failure), so that an older plan or 0 was driven; lost: its

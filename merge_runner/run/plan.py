@@ -102,8 +102,9 @@ class Plan:
     """A sweep before it runs: the arms of its study, each played in all conditions.
 
     ``entries`` are the language models of all arms by what an arm's ``asked`` calls them, and
-    ``endpoints`` the identities of their endpoints (see ``config.Endpoint``). ``seat`` is ``first``
-    where only the first situations are asked (see ``run.seat``), and empty in a sweep.
+    ``endpoints`` the identities of their endpoints (see ``config.Endpoint``). ``mirror``: its
+    pairs are played both ways round whatever its file says. ``seat`` is ``first`` where only the
+    first situations are asked (see ``run.seat``), and empty in a sweep.
     """
 
     name: str
@@ -116,6 +117,7 @@ class Plan:
     sample_set: int
     order_seed: int
     seat: Literal["", "first"] = ""
+    mirror: bool = False
 
     @property
     def model(self) -> str:
@@ -179,7 +181,7 @@ class Plan:
     @property
     def driver(self) -> str:
         """The drivers with their endpoints; see ``pair_name``."""
-        pairs = (pair_name(arm.asked.values(), self.endpoints) for arm in self.arms)
+        pairs = (pair_name(arm.names, self.endpoints) for arm in self.arms)
         names = list(dict.fromkeys(pairs))
         more = f" and {len(names) - DRIVERS_SHOWN} more" if len(names) > DRIVERS_SHOWN else ""
         return ", ".join(names[:DRIVERS_SHOWN]) + more
@@ -304,7 +306,8 @@ class Plan:
         entries = {name: entry.model_dump(mode="json") for name, entry in self.entries.items()}
         prompt_blocks = {variant: block_digests(variant) for variant in self.repetitions}
         file = self.study.file
-        many = bool(file.factors) or len(self.models) > 1
+        mirrored = len(self.arms) > len(self.repetitions)
+        many = bool(file.factors) or len(self.models) > 1 or mirrored
         config: dict[str, object] = {
             "model": self.model,
             "models": entries,
@@ -317,6 +320,8 @@ class Plan:
             "prompt_blocks": prompt_blocks,
             **({"seat": self.seat} if self.seat else {}),
         }
+        if self.mirror:
+            config["mirror"] = True
         if many:
             config["arms"] = [
                 {
@@ -394,6 +399,7 @@ def make_plan(
     order_seed: int = 0,
     only: Mapping[str, Sequence[str]] | None = None,
     db: Path | None = None,
+    mirror: bool = False,
 ) -> Plan:
     """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
@@ -410,7 +416,7 @@ def make_plan(
     if db is not None and _replays_humans(study.file, drivers):
         adopt_humans(human_trials(db))
     wanted = _repetitions(study, variants, repetitions)
-    arms = cross(study.file, drivers, wanted, registry, only or {})
+    arms = cross(study.file, drivers, wanted, registry, only or {}, mirror=mirror)
     entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
     return Plan(
         name=study.name,
@@ -422,6 +428,7 @@ def make_plan(
         conditions=_conditions(study.file, conditions, arms),
         sample_set=sample_set,
         order_seed=order_seed,
+        mirror=mirror,
     )
 
 

@@ -10,7 +10,6 @@ from operator import itemgetter
 from typing import Any, get_args
 
 from merge_runner.audit.findings import Audit, Sharing
-from merge_runner.config import both_sides
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.records import Status
@@ -228,8 +227,7 @@ def _asked(facts: SweepFacts) -> Iterator[str]:
 
 def _varying(plan: Plan) -> dict[str, list[str]]:
     """The models, and the factors but the prompt, where there are several, with their levels."""
-    models = ["+".join(dict.fromkeys(both_sides(name).values())) for name in plan.models]
-    found = {"model": models}
+    found = {"model": [arm.model_level for arm in plan.arms]}
     for arm in plan.arms:
         for factor, level in arm.factors.items():
             found.setdefault(factor, []).append(level)

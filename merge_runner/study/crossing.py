@@ -5,18 +5,18 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 from pydantic import JsonValue
 
-from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, validated
+from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, ego_side, validated
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats.parameters import known_parameters, with_parameter
 from merge_runner.prompts.blocks import VARIANTS
-from merge_runner.records import SIDES, Side
+from merge_runner.records import SIDES, Side, other_side
 from merge_runner.registry import require
 from merge_runner.scenarios.registry import SCENARIOS
 from merge_runner.study.file import StudyFile
@@ -37,6 +37,7 @@ class Arm:
     ``model`` is what ids of trials say, ``sides`` who drives, by their names in the registry, and
     ``asked`` the same, but by the names in ``entries`` of language models with these parameters.
     ``factors`` are the levels as texts; ``label`` names what sets this arm apart from the others.
+    ``ego`` is the side of the driver whose odds are told (see ``config.ego_side``).
     """
 
     model: str
@@ -48,6 +49,34 @@ class Arm:
     repetitions: int
     factors: dict[str, str] = field(default_factory=dict)
     label: str = ""
+    ego: Side = "left"
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether two different drivers meet."""
+        return self.sides["left"] != self.sides["right"]
+
+    @property
+    def model_level(self) -> str:
+        """The model as results have it, as a factor: of a pair without an opponent, both."""
+        ego, other = self.sides[self.ego], self.sides[other_side(self.ego)]
+        return ego if self.factors.get(OPPONENT, SELF) != SELF else _pair(ego, other)
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Who is asked, the ego first."""
+        return self.asked[self.ego], self.asked[other_side(self.ego)]
+
+    def turned(self) -> Arm:
+        """The same with the drivers' sides changed."""
+        return replace(
+            self,
+            model=_pair(self.sides["right"], self.sides["left"]),
+            sides={side: self.sides[other_side(side)] for side in SIDES},
+            asked={side: self.asked[other_side(side)] for side in SIDES},
+            label=f"{self.label} mirrored",
+            ego=other_side(self.ego),
+        )
 
 
 def cross(
@@ -56,10 +85,13 @@ def cross(
     repetitions: Mapping[str, int],
     registry: Mapping[str, ModelEntry],
     only: Mapping[str, Sequence[str]],
+    *,
+    mirror: bool = False,
 ) -> list[Arm]:
     """The arms of a study, model by model; raises UsageError for a crossing that cannot be.
 
-    ``repetitions`` are those of each prompt, ``only`` the levels, as texts, that are wanted.
+    ``repetitions`` are those of each prompt, ``only`` the levels, as texts, that are wanted. With
+    ``mirror``, or where the file says so, two different drivers are played both ways round.
     """
     factors = {name: levels for name, levels in file.factors.items() if name != PROMPT}
     if PROMPT in file.factors or len(repetitions) > 1:
@@ -75,15 +107,20 @@ def cross(
         if _is_left_out({PROMPT: prompt, **levels}, file.skip, only):
             continue
         try:
-            arms.append(_arm(file, levels, str(prompt), repetitions, registry, varying))
+            arm = _arm(file, levels, str(prompt), repetitions, registry, varying)
         except UsageError as exc:
             if not file.factors:
                 raise
             raise UsageError(f"{exc}; {_hint(exc, levels)}") from exc
+        both_ways = arm.is_mixed and (mirror or file.mirror)
+        arms += [arm, arm.turned()] if both_ways else [arm]
     if not arms:
         raise UsageError("nothing is left to play: look at skip, and at --only")
-    _refuse_twins(arms)
-    return arms
+    if mirror and not any(arm.is_mixed for arm in arms):
+        raise UsageError(
+            f"there are no two different drivers to mirror: name them, as --model {models[0]}+OTHER"
+        )
+    return list(_once(arms, mirrored=mirror or file.mirror))
 
 
 def _hint(error: UsageError, levels: Levels) -> str:
@@ -98,16 +135,21 @@ def _hint(error: UsageError, levels: Levels) -> str:
     return f"to leave such crossings out, write above [factors]: skip = [{{ {where} }}]"
 
 
-def _refuse_twins(arms: Iterable[Arm]) -> None:
-    """Raise UsageError where two arms are the same trials, as with a model as its own opponent."""
+def _once(arms: Iterable[Arm], *, mirrored: bool) -> Iterator[Arm]:
+    """The arms, but one of two ``mirrored`` pairs that are each other's mirror image.
+
+    Raises UsageError where others are the same trials, as with a model as its own opponent.
+    """
     known: dict[tuple[str, ...], Arm] = {}
     for arm in arms:
         apart = [f"{n}={level}" for n, level in arm.factors.items() if n not in (PROMPT, OPPONENT)]
         twin = known.setdefault((arm.model, arm.variant, *apart), arm)
-        if twin is not arm:
+        if twin is arm:
+            yield arm
+        elif not (mirrored and arm.is_mixed and arm.asked == twin.asked):
             raise UsageError(
                 f"the crossings {twin.label!r} and {arm.label!r} are the same trials: leave one "
-                f'out, by skip = [{{ model = "{arm.sides["left"]}", '
+                f'out, by skip = [{{ model = "{arm.sides[arm.ego]}", '
                 f'opponent = "{arm.factors.get(OPPONENT, SELF)}" }}]'
             )
 
@@ -145,7 +187,7 @@ def _arm(
         if entry is not None:
             entries[label] = entry
     return Arm(
-        model="+".join(dict.fromkeys(sides.values())),
+        model=_pair(*sides.values()),
         sides=sides,
         asked=asked,
         entries=entries,
@@ -160,7 +202,13 @@ def _arm(
             for name in varying
         )
         or prompt,
+        ego=ego_side(sides, registry, str(levels.get(OPPONENT, SELF))),
     )
+
+
+def _pair(left: str, right: str) -> str:
+    """Who drives, as ids of trials say."""
+    return left if left == right else f"{left}+{right}"
 
 
 def _sides(model: str, opponent: str) -> dict[Side, str]:

@@ -150,8 +150,9 @@ class StudyFile(Frozen):
     """One study. ``repetitions`` are per condition, for each prompt or for all of them.
 
     ``factors`` are crossed with each other, with the ``models`` and with the conditions; ``skip``
-    leaves crossings out: each row names levels, or lists of them. ``perception`` holds by name what
-    the levels of the factors perception, perception_left and perception_right stand for.
+    leaves crossings out: each row names levels, or lists of them. With ``mirror`` two different
+    drivers are played both ways round. ``perception`` holds by name what the levels of the factors
+    perception, perception_left and perception_right stand for.
     """
 
     nested: ClassVar[Mapping[str, type[BaseModel]]] = {
@@ -173,6 +174,7 @@ class StudyFile(Frozen):
     scenario: ScenarioConfig = ScenarioConfig()
     factors: dict[str, tuple[Json, ...]] = Field(default_factory=dict)
     skip: tuple[dict[str, Json], ...] = ()
+    mirror: bool = False
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)
     perception: dict[str, Perception] = Field(default_factory=dict)

@@ -44,7 +44,7 @@ async def test_a_new_study_is_killed_resumed_replayed_and_shown(merge_runner, st
         assert await process.wait() != 0
         before = server.requests
         resumed = await merge_runner(*sweep, cwd=study, **env)
-        assert (resumed.code, resumed.summary["trials"]["planned"]) == (0, 16), resumed.err
+        assert (resumed.code, resumed.summary["trials"]["planned"]) == (0, 24), resumed.err
         assert resumed.summary["calls"]["live"] == server.requests - before
         done = server.requests
         again = await merge_runner("replay", "study.toml", "--db", "again.duckdb", cwd=study, **env)
@@ -131,4 +131,4 @@ def test_the_commented_lines_of_the_study_can_be_used(study):
         check=False,
     )
     assert out.returncode == 0, out.stderr
-    assert re.search(r"trials +12 ", out.stdout)
+    assert re.search(r"trials +18 ", out.stdout)

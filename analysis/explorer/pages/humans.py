@@ -101,6 +101,8 @@ def humans_page(site: Site, asked: Mapping[str, str]) -> str:
             "own": [name for name in content["conditions"] if name not in HUMAN_CONDITIONS],
             "published": [one["text"] for one in content["published"].values()],
             "groups": groups,
+            # Their trials are listed as they were driven, and not by the condition that is shown.
+            "mirrored": {group["id"] for group in groups if group["mirrored"]},
             "rules": {group["id"]: rule_text(group) for group in groups},
             "marks": marks(groups),
             "charts": [
