@@ -18,13 +18,15 @@ from merge_runner.records import SIDES
 
 Array = NDArray[np.float64]
 
-# One row a vehicle. The first second ends within a step, in which the acceleration is constant.
+# One row a vehicle, its side as the ego sees it, which is on the left everywhere. The first second
+# ends within a step, in which the acceleration is constant.
 FIRST_ACTIONS = """
-SELECT trial_id, spec_hash, side,
+SELECT trial_id, spec_hash, if(side = ego, 'left', 'right') AS side,
     arg_min(acceleration_mps2, step) FILTER (time_s > 0) AS first_mps2,
     arg_min(velocity_mps - acceleration_mps2 * (time_s - 1), step) FILTER (time_s > 1 - 1e-9)
         - arg_min(velocity_mps, step) AS first_second_mps2
-FROM states WHERE time_s >= 0 GROUP BY ALL ORDER BY ALL
+FROM states JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE time_s >= 0 GROUP BY ALL ORDER BY ALL
 """
 # The imported ones: one row a vehicle, without the trial's pair.
 HUMAN_FIRST_ACTIONS = "FROM human_first_actions ORDER BY trial, side"

@@ -129,8 +129,10 @@ WITH speeds AS (
     SELECT trial_id, spec_hash, side, decision, tactical, round(time_s, 3)::DECIMAL(9, 3) AS time_s
     FROM decisions WHERE tactical IS NOT NULL
 )
-SELECT said.* EXCLUDE (time_s), later.velocity_mps - now.velocity_mps AS driven_mps2
+SELECT said.* EXCLUDE (time_s) REPLACE (if(said.side = ego, 'left', 'right') AS side),
+    later.velocity_mps - now.velocity_mps AS driven_mps2
 FROM said JOIN speeds AS now USING (trial_id, spec_hash, side, time_s)
+JOIN trial_drivers USING (trial_id, spec_hash)
 LEFT JOIN speeds AS later ON later.trial_id = said.trial_id AND later.spec_hash = said.spec_hash
     AND later.side = said.side AND later.time_s = said.time_s + 1
 ORDER BY ALL

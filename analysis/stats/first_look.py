@@ -64,7 +64,7 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Seat:
-    """A driver of a group: one on both sides, or that of one side of a mixed pair."""
+    """A driver of a group: one on both sides, or one of a mixed pair, the ego on the left."""
 
     group: Group
     sides: tuple[int, ...]
@@ -76,8 +76,9 @@ class Seat:
 
     @property
     def name(self) -> str:
-        """The group's label, with the side of a mixed pair."""
-        return f"{self.group.label} ({self.side})" if self.side else self.group.label
+        """The group's label, with the model's name where it is one of a mixed pair."""
+        model = self.group.models[self.sides[0]]
+        return f"{model} of {self.group.label}" if self.side else self.group.label
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import duckdb
 import numpy as np
 import pytest
@@ -14,6 +16,19 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Drive, write_study, yielding
 
+MIRRORED = {
+    name: next(
+        other
+        for other, image in CONDITIONS.items()
+        if image
+        == replace(
+            one,
+            projected_headway_m=-one.projected_headway_m,
+            relative_velocity_mps=-one.relative_velocity_mps,
+        )
+    )
+    for name, one in CONDITIONS.items()
+}
 FIRSTS = np.random.default_rng(8).uniform(-0.4, 0.4, (len(CONDITIONS), 4, 2))
 
 
@@ -115,11 +130,40 @@ def test_the_two_drivers_of_a_mixed_pair_have_rows_of_their_own(db, tmp_path):
     rows = {row.id: row.values for row in first.rows}
     left, right = (rows[f"alike+other/baseline/{side}/all"] for side in ("left", "right"))
     assert (left["n"], right["n"]) == (44, 44)
-    assert left["driver"] == "alike+other (left)"
+    assert left["driver"] == "alike of alike+other"
     assert left["mean"] != right["mean"]
     assert "both_go_percent" not in left
     named = [row.values["fault"] for row in faults.rows if row.id.startswith("alike+other")]
     assert "side" not in named
+
+
+def test_a_pair_that_changed_its_sides_is_as_its_ego_saw_it(tmp_path):
+    drives = following("alike", -0.34)
+    turned = [
+        replace(
+            drive,
+            condition=MIRRORED[drive.condition],
+            left=drive.right,
+            right=drive.left,
+        )
+        for drive in drives
+    ]
+    tables = []
+    for name, played, sides in (
+        ("one", drives, ("alike", "other")),
+        ("other", turned, ("other", "alike")),
+    ):
+        db = write_study(tmp_path / f"{name}.duckdb", played)
+        with duckdb.connect(str(db)) as connection:
+            connection.execute("UPDATE trials SET model_left = ?, model_right = ?", sides)
+        (table,) = make_tables(Study(db), ["first-action"])
+        tables.append(table.rows)
+    for one, other in zip(*tables, strict=True):
+        assert one.id == other.id
+        assert one.values == {
+            name: value if isinstance(value, str) else pytest.approx(value)
+            for name, value in other.values.items()
+        }
 
 
 def test_of_a_driver_that_does_not_look_this_fault_alone_is_shown(tmp_path):
