@@ -1,9 +1,10 @@
 # Needs GNU make and python3 >= 3.11. `make help` lists what there is.
 
-MODEL ?= emulator
+# Empty: what the sweep's file names, or the emulator.
+MODEL ?=
 SWEEP ?= baseline
 ARGS ?=
-RECORDING ?= $(wildcard cache/recordings/$(MODEL)-$(SWEEP).parquet)
+RECORDING ?= $(wildcard cache/recordings/$(or $(MODEL),emulator)-$(SWEEP).parquet)
 Q ?= select model_left, variant, status, count(*) as trials from trials group by all order by all
 PYTHON ?= python3
 RUN := .venv/bin/merge-runner
@@ -17,10 +18,10 @@ help:
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
 
 sweep: .venv/runtime $(if $(findstring --dask,$(ARGS)),.venv/dask) ## the main job: MODEL=, SWEEP=, ARGS=
-	@$(RUN) sweep $(SWEEP) --model $(MODEL) $(ARGS)
+	@$(RUN) sweep $(SWEEP) $(addprefix --model ,$(MODEL)) $(ARGS)
 
 replay: .venv/runtime ## the same from recorded replies alone: MODEL=, SWEEP=, RECORDING=, ARGS=
-	@$(RUN) replay $(SWEEP) --model $(MODEL) $(if $(RECORDING),--recording $(RECORDING)) $(ARGS)
+	@$(RUN) replay $(SWEEP) $(addprefix --model ,$(MODEL)) $(if $(RECORDING),--recording $(RECORDING)) $(ARGS)
 
 report: .venv/runtime ## tables, figures and the HTML report of what the database holds: ARGS=
 	@$(RUN) report --out results/report.html --files results/report $(ARGS)

@@ -278,7 +278,10 @@ def sweep(
         sample_set=sample_set,
         order_seed=order_seed,
         only=levels(only or (), "--only"),
+        db=db,
     )
+    if dask is not None and plan.replays_humans:
+        raise UsageError("human-replay is played in this process: leave --dask out")
     for note in plan.notes():
         say(note)
     if not replay:
@@ -533,8 +536,7 @@ def models() -> None:
             )
         )
     for name, program in PROGRAMS.items():
-        rate = f" ({program.rate_hz:g} times a second)" if program.rate_hz is not None else ""
-        rows.append((name, "program", "", "not needed", "0", "0", "", "", program.meaning + rate))
+        rows.append((name, "program", "", "not needed", "0", "0", "", "", program.described))
     headings = ["name", "provider", "id", "key", "USD/M in", "USD/M out", "prices", "shutdown"]
     write_table([*headings, "note"], rows, sys.stdout)
 

@@ -165,7 +165,7 @@ class Study:
 
     def plan(self) -> Plan:
         """What would be played; raises UsageError."""
-        return make_plan(self.file, **self._wanted)
+        return make_plan(self.file, db=self.db, **self._wanted)
 
     def dry_run(self, max_cost_usd: float | None = None) -> Estimate:
         """The trials, calls, tokens, cost and time of a run; nothing is sent."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
+from merge_runner.drivers.program_seat import StartsElsewhere
 from merge_runner.errors import CallFailed, ReplayMiss, UsageError
 from merge_runner.records import (
     SIDES,
@@ -20,6 +21,7 @@ from merge_runner.records import (
     TrialSpec,
 )
 from merge_runner.scenarios.base import World
+from merge_runner.scenarios.merge.world import Starts
 from merge_runner.scenarios.registry import new_world
 
 
@@ -27,7 +29,7 @@ async def play_trial(
     spec: TrialSpec, scenario: ScenarioConfig, drivers: Mapping[Side, Driver]
 ) -> TrialRecord:
     """Play a trial to its end, or until a call fails."""
-    world = new_world(scenario, spec.condition)
+    world = new_world(scenario, spec.condition, _starts(drivers))
     seats = {side: _Seated(drivers[side]) for side in SIDES}
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}
@@ -61,6 +63,17 @@ async def play_trial(
             for side, exc in failures.items()
         ),
     )
+
+
+def _starts(drivers: Mapping[Side, Driver]) -> Starts | None:
+    """Where the vehicles start, unless as the condition says; each driver knows best of its own."""
+    known = {
+        side: driver for side, driver in drivers.items() if isinstance(driver, StartsElsewhere)
+    }
+    if not known:
+        return None
+    (some, *_) = known.values()
+    return {side: known.get(side, some).starts[side] for side in SIDES}
 
 
 @dataclass(slots=True)

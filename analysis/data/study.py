@@ -31,6 +31,7 @@ from analysis.data.load import (
     load_specs,
 )
 from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
+from merge_runner.drivers.human_replay import unresponsive
 from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json, spec_hash
@@ -69,7 +70,8 @@ class Group:
     ``driver`` is its ``name`` with the ``mark`` that tells it from itself under other settings, and
     with ``[scripted]`` where a stand-in answered only some of its trials. ``label`` is how tables
     name the driver, ``models`` are the names that were asked for, left and right, an equal one
-    once, and ``posing`` is what is said of a scripted stand-in. Of a driver without chance, whose
+    once, ``posing`` is what is said of a scripted stand-in, and ``caution`` of a human who is
+    replayed. Of a driver without chance, whose
     repetitions are the same trial again, only the first are ``trials``, and ``repeated`` counts the
     others; ``equal`` counts such trials of a driver that samples. ``narrowed`` is what tells the
     trials in SQL from others of their spec and variant, empty where there are none.
@@ -87,6 +89,7 @@ class Group:
     mark: str = ""
     measured: bool = True
     posing: str = ""
+    caution: str = ""
     repeated: int = 0
     equal: int = 0
     narrowed: str = ""
@@ -393,7 +396,7 @@ def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) 
     # Two names of one model have equal specs, as under two prices.
     keyed["shared"] = keyed.groupby(["spec_hash", "variant"])["driver"].transform("nunique") > 1
     keys = ["driver", "mark", "apart", "scripted", "variant", "usual"]
-    groups = [_model_group(rows) for _, rows in keyed.groupby(keys)]
+    groups = [_model_group(rows, specs) for _, rows in keyed.groupby(keys)]
     return sorted(
         groups,
         key=lambda group: (
@@ -405,13 +408,15 @@ def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) 
     )
 
 
-def _model_group(rows: pd.DataFrame) -> Group:
+def _model_group(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> Group:
     """The group of these trials, which have equal keys."""
     first = rows.iloc[0]
     scripted = bool(first["scripted"])
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
     posing = stand_in(models, sides or SIDES) if scripted else ""
+    caution = unresponsive(specs.get(first["spec_hash"], {}))
+    said = "; ".join(filter(None, (posing, caution)))
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
     distinct = _distinct(rows)
     narrowed = [f"scripted = {str(scripted).lower()}"] if first["apart"] else []
@@ -423,11 +428,12 @@ def _model_group(rows: pd.DataFrame) -> Group:
         first["variant"],
         min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
         distinct.drop(columns=COLUMNS_OF_GROUPS),
-        label=f"{driver} ({posing})" if scripted else driver,
+        label=f"{driver} ({said})" if said else driver,
         models=tuple(dict.fromkeys(models.values())),
         name=first["driver"],
         mark=first["mark"],
         posing=posing,
+        caution=caution,
         repeated=len(rows) - len(distinct),
         equal=len(_again(distinct)),
         narrowed=" AND ".join(narrowed),

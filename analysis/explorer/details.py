@@ -11,6 +11,7 @@ from typing import Any
 from analysis.explorer.prompts import Part, parts_of
 from analysis.explorer.reading import Row, reading, records
 from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.human_replay import unresponsive
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.geometry import Track, track_of
@@ -50,7 +51,7 @@ SELECT * FROM calls WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
 class Trial:
     """A trial's samples by side and its decisions without prompts, and the task it is of.
 
-    ``paces`` say when each driver decided.
+    ``paces`` say when each driver decided, ``caution`` whether a human is replayed.
     """
 
     trial_id: str
@@ -60,6 +61,7 @@ class Trial:
     paces: dict[Side, Pace]
     states: dict[Side, Row]
     decisions: list[Row]
+    caution: str
 
     @property
     def end_s(self) -> float:
@@ -95,7 +97,8 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     scenario = scenario_of(task["source"], told.get("scenario"))
     ordered = {side: states[side] for side in SIDES if side in states}
     paces = {side: pace_of(scenario, told.get(side, {})) for side in SIDES}
-    trial = Trial(trial_id, spec_hash, scenario, track_of(told), paces, ordered, decisions)
+    track, caution = track_of(told), unresponsive(told)
+    trial = Trial(trial_id, spec_hash, scenario, track, paces, ordered, decisions, caution)
     for row in decisions:
         if row["lost"]:
             row["time_s"] = trial.end_s

@@ -25,10 +25,11 @@ MISSING = "human recordings\nare not imported"
 
 
 def named(group: Group) -> str:
-    """A group's name in figures: ``o3/A2``, with a stand-in marked as one."""
+    """A group's name in figures: ``o3/A2``, with a stand-in or a replayed human marked as such."""
     if not group.setting:
         return group.label
-    return f"{group.id} ({group.posing})" if group.scripted else group.id
+    said = "; ".join(filter(None, (group.posing, group.caution)))
+    return f"{group.id} ({said})" if said else group.id
 
 
 def wrapped(text: str, width_in: float) -> str:

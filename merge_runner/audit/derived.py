@@ -78,6 +78,7 @@ CALLS = f"trial_id, spec_hash, {', '.join(COLUMNS)}, sha256(request::VARCHAR) AS
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
 NOT_INSTALLED = "anything, since their condition or their scenario is not installed"
+OTHER_HUMANS = "anything, since the human trials that they replay are not in this database"
 OTHER_PROGRAM = "the decisions of a program that is not as it was"
 
 
@@ -233,6 +234,9 @@ def _trials(
         if scenario is None or row["condition"] not in CONDITIONS:
             left_out[NOT_INSTALLED] += 1
             continue
+        if not all(map(_is_here, map(spec.driver, SIDES))):
+            left_out[OTHER_HUMANS] += 1
+            continue
         paces = {side: pace for side in SIDES if (pace := spec.pace(side)) is not None}
         if len(paces) < len(SIDES):
             continue
@@ -259,6 +263,13 @@ def _trials(
         )
         left_out.update(_seat(trial, spec, paces))
         yield trial
+
+
+def _is_here(told: Mapping[str, Any]) -> bool:
+    """Whether what a driver of a spec drives by is here, if it is anything but its source."""
+    program = PROGRAMS.get(str(told.get("program", "")))
+    here = None if program is None or program.data is None else program.data.digest
+    return "data" not in told or told["data"] == here
 
 
 def _is_scripted(config: SweepConfig, arm: ArmFacts) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from math import inf, isfinite
 from pkgutil import iter_modules
+from typing import Protocol
 
 from merge_runner import drivers
 from merge_runner.config import ScenarioConfig
@@ -25,6 +26,15 @@ SET = "set"  # the parameter that names a set of others
 RESERVED = ("program", "clock")  # what a study says of a driver beside its parameters
 
 
+class Data(Protocol):
+    """What a program drives by beside its source and its parameters."""
+
+    @property
+    def digest(self) -> str:
+        """Its hash."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Program:
     """A class whose instances drive, made with a ProgramSeat.
@@ -33,8 +43,8 @@ class Program:
     decides ``rate_hz`` times a second; None: at the prompt rate of the scenario. A ``settable``
     program reads its parameters from its seat, so that a study can set them. ``sets`` are named
     sets of further parameters, of which the parameter ``set`` chooses one. ``check`` raises
-    UsageError for parameters that cannot be. ``based_on`` names the program that a study has
-    given other parameters or another clock.
+    UsageError for parameters that cannot be. ``data`` is what else it drives by. ``based_on``
+    names the program that a study has given other parameters or another clock.
     """
 
     driver: Callable[[ProgramSeat], Driver]
@@ -44,6 +54,7 @@ class Program:
     settable: bool = False
     sets: Mapping[str, Mapping[str, Parameter]] = field(default_factory=dict)
     check: Callable[[Mapping[str, Parameter]], None] | None = None
+    data: Data | None = None
     based_on: str = ""
 
     def __post_init__(self) -> None:
@@ -66,7 +77,19 @@ class Program:
     def values(self) -> dict[str, Parameter]:
         """All parameters: those of the set that is chosen, and over them those that are given."""
         chosen = self.sets[str(self.parameters[SET])] if self.sets else {}
-        return {**chosen, **self.parameters}
+        return {**self.parameters, **chosen, **self.parameters}
+
+    @property
+    def described(self) -> str:
+        """What it does, how often it decides, and its parameters with what they may be."""
+        often = "once" if self.rate_hz == 1 else f"{self.rate_hz or 0:g} times"
+        rate = "" if self.rate_hz is None else f" ({often} a second)"
+        choices = {SET: " | ".join(self.sets)} if self.sets else {}
+        parameters = ", ".join(
+            f"{name} = {choices.get(name, value)}" for name, value in self.values.items()
+        )
+        kind = "parameters" if self.settable else "fixed"
+        return self.meaning + rate + (f"; {kind}: {parameters}" if parameters else "")
 
     def with_changes(
         self, name: str, changes: Mapping[str, object], clock_s: float | None
@@ -82,7 +105,10 @@ class Program:
                 f"clock = {clock_s:g} is too fast: {name} decides every {1 / self.rate_hz:g} s, "
                 "and a clock can only slow it down"
             )
-        given = {each: _like(self.values, name, each, value) for each, value in changes.items()}
+        # Which other parameters there are depends on the set.
+        chosen = {SET: _like(self.values, name, SET, changes[SET])} if SET in changes else {}
+        values = replace(self, parameters={**self.parameters, **chosen}).values
+        given = {each: _like(values, name, each, value) for each, value in changes.items()}
         return replace(
             self,
             parameters={**self.parameters, **given},
@@ -125,6 +151,7 @@ class Program:
             repetition=spec.repetition,
             other_seed=seeds[other],
             parameters=self.values,
+            data=self.data,
         )
 
     def in_spec(self, name: str) -> dict[str, object]:
@@ -134,6 +161,7 @@ class Program:
             "parameters": self.values,
             "source": self.source,
             **({} if self.rate_hz is None else {"rate_hz": self.rate_hz}),
+            **({} if self.data is None else {"data": self.data.digest}),
             **({"based_on": self.based_on} if self.based_on else {}),
         }
 

@@ -16,7 +16,8 @@ from merge_runner.config import (
     endpoint_identity,
     pair_name,
 )
-from merge_runner.drivers.registry import EMULATOR, PROGRAMS
+from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials, require_trials
+from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
@@ -24,6 +25,7 @@ from merge_runner.llm.ledger import Caps
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import SIDES, Side, TrialSpec
+from merge_runner.results.human_trials import human_trials
 from merge_runner.scenarios.merge.conditions import CONDITIONS, MEAN_SPEED_MPS
 from merge_runner.scenarios.registry import SCENARIOS, new_world, task_of
 from merge_runner.study.crossing import OPPONENT, PROMPT, Arm, cross, level_text
@@ -35,7 +37,7 @@ from merge_runner.study.file import (
     StudySource,
     read_study,
 )
-from merge_runner.study.parts import adopt
+from merge_runner.study.parts import adopt, adopt_humans
 from merge_runner.text_safety import in_a_name
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
@@ -152,6 +154,11 @@ class Plan:
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
         return any(map(_is_scripted, self.arms))
+
+    @property
+    def replays_humans(self) -> bool:
+        """Whether imported human trials are replayed, which only this process has read."""
+        return any(map(_replaying, self.arms))
 
     @property
     def driver(self) -> str:
@@ -352,10 +359,12 @@ def make_plan(
     sample_set: int = 0,
     order_seed: int = 0,
     only: Mapping[str, Sequence[str]] | None = None,
+    db: Path | None = None,
 ) -> Plan:
     """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
-    Registers what the study adds (``study.parts.adopt``). Raises UsageError.
+    Registers what the study adds (``study.parts.adopt``), and the human trials of ``db`` where
+    they are to be replayed. Raises UsageError.
     """
     study = read_study(sweep)
     registry = load_models(study.path.parent)
@@ -364,6 +373,8 @@ def make_plan(
         raise UsageError("--sample-set is a whole number from 0")
     asked = (models,) if isinstance(models, str) else tuple(models)
     drivers = tuple(dict.fromkeys(asked or study.file.models or (EMULATOR,)))
+    if db is not None and _replays_humans(study.file, drivers):
+        adopt_humans(human_trials(db))
     wanted = _repetitions(study, variants, repetitions)
     arms = cross(study.file, drivers, wanted, registry, only or {})
     entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
@@ -378,6 +389,19 @@ def make_plan(
         sample_set=sample_set,
         order_seed=order_seed,
     )
+
+
+def _replays_humans(file: StudyFile, drivers: Sequence[str]) -> bool:
+    """Whether a driver of a study may replay imported human trials."""
+    pairs = [*drivers, *map(level_text, file.factors.get(OPPONENT, ()))]
+    sides = {name for pair in pairs for name in both_sides(pair).values()}
+    return HUMAN_REPLAY in {*sides, *(driver.program for driver in file.drivers.values())}
+
+
+def _replaying(arm: Arm) -> list[Program]:
+    """The programs of an arm that replay humans."""
+    programs = [PROGRAMS[name] for name in {*arm.asked.values()} - {*arm.entries}]
+    return [program for program in programs if isinstance(program.data, HumanTrials)]
 
 
 def _conditions(
@@ -398,6 +422,8 @@ def _conditions(
     for name in conditions:
         for arm in arms:
             new_world(arm.scenario, name)  # raises where the condition cannot be played
+            for program in _replaying(arm):
+                require_trials(program, arm.scenario, name, arm.repetitions)
     return conditions
 
 

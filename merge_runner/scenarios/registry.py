@@ -6,6 +6,7 @@ from dataclasses import asdict
 from typing import Any, get_args
 
 from merge_runner.config import USUAL_SCENARIO, CollisionRule, ScenarioConfig
+from merge_runner.errors import UsageError
 from merge_runner.registry import Registry
 from merge_runner.scenarios.base import Scenario, World
 from merge_runner.scenarios.merge import world as merge
@@ -38,7 +39,15 @@ def task_of(config: ScenarioConfig) -> dict[str, Any]:
     }
 
 
-def new_world(config: ScenarioConfig, condition: str) -> World:
-    """The world of a new trial; raises UsageError where the condition cannot be played."""
+def new_world(config: ScenarioConfig, condition: str, starts: merge.Starts | None = None) -> World:
+    """The world of a new trial, whose vehicles may start elsewhere than the condition says.
+
+    Raises UsageError where the condition cannot be played.
+    """
     scenario = SCENARIOS.require(config.name)
-    return scenario.make_world(config, CONDITIONS.require(condition), scenario.track)
+    world = scenario.make_world(config, CONDITIONS.require(condition), scenario.track)
+    if starts is not None:
+        if not isinstance(world, merge.World):
+            raise UsageError(f"the vehicles of the scenario {config.name} start by its own rules")
+        world.start_at(starts)
+    return world

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 
 import duckdb
 import pytest
 
-from tests.harness import how_to, plugin
+from tests.harness import PROJECT, how_to, plugin
 
 FINE = """
 conditions = ["L_4_0", "N_0_0"]
@@ -81,8 +82,8 @@ def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
     assert audit.code == 0
     notes = [note for one in json.loads(audit.out)["audits"] for note in one["notes"]]
     assert any(
-        "the decisions of 'impulsive', which is no driver here; valid: constant, projected-order "
-        "(install the package that registers it, or name the study: --study FILE)" in note
+        "the decisions of 'impulsive', which is no driver here; valid: constant, " in note
+        and "(install the package that registers it, or name the study: --study FILE)" in note
         for note in notes
     ), notes
     done = study.run("view", "--trials", "*", "--single", "bare.html")
@@ -90,7 +91,7 @@ def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
     asked = study.run("sweep", "fine.toml", "--model", "impulsive")
     assert asked.code == 2
     assert "unknown model 'impulsive'; valid: " in asked.err
-    assert "constant, projected-order" in asked.err
+    assert "projected-order" in asked.err
 
 
 def test_a_world_that_is_set_too_coarse_is_refused_with_what_to_type(study, installed):
@@ -105,13 +106,31 @@ def test_a_world_that_is_set_too_coarse_is_refused_with_what_to_type(study, inst
     )
 
 
+def test_a_study_gives_it_other_parameters_and_a_slower_clock(study, installed):
+    (part,) = re.findall(
+        r"```toml\n(\[drivers.*?)```", (PROJECT / "docs/how-to/add-a-driver.md").read_text(), re.S
+    )
+    (study.folder / "wild.toml").write_text(f'repetitions = 1\nconditions = ["N_0_0"]\n{part}')
+    played = ("wild.toml", "--model", "wild", "--json", "--db", "wild.duckdb")
+    done = study.run("sweep", *played, **installed)
+    assert done.code == 0, done.err
+    with duckdb.connect(str(study.folder / "wild.duckdb"), read_only=True) as connection:
+        (interval, hardest) = connection.execute(
+            "SELECT min(time_s) FILTER (time_s > 0), max(abs(plan[1])) FROM decisions"
+        ).fetchone()
+    assert interval == 1.0
+    assert 0.5 < hardest <= 0.9
+    audit = study.run("audit", "--db", "wild.duckdb", "--json", **installed)
+    assert (audit.code, "not derived" in audit.out) == (0, False), audit.out
+
+
 def test_programs_are_listed_with_what_they_do(study, installed):
     listed = (study.run("models", **installed)).out.splitlines()
-    programs = [line.split() for line in listed if " program " in line]
-    assert [line[0] for line in programs] == [
-        "constant",
-        "projected-order",
-        "impulsive",
-        "hesitant",
-    ]
-    assert "(20 times a second)" in " ".join(programs[2])
+    programs = {line.split()[0]: line for line in listed if " program " in line}
+    assert {"constant", "projected-order", "idm", "impulsive", "hesitant"} <= {*programs}
+    assert (
+        "(20 times a second); parameters: steady_from_m = 20.0, strength = 0.5"
+        in programs["impulsive"]
+    )
+    assert "set = highway-env | treiber-kesting" in programs["idm"]
+    assert "this human does not react" in programs["human-replay"]

@@ -39,6 +39,7 @@ def plan_of(folder, example, **asked):
         ("What varies", 12 + 6),
         ("Prompts", 4),
         ("The driving task", 1),
+        ("Drivers", 3),
         ("Money and plug-ins", 2),
     ],
 )
@@ -50,7 +51,7 @@ def test_every_example_can_be_played(example, arms, tmp_path):
 
 
 def test_no_example_is_left_out():
-    assert len(EXAMPLES) == PAGE.count("```toml\n") == 5
+    assert len(EXAMPLES) == PAGE.count("```toml\n") == 6
 
 
 def test_every_key_is_explained_and_shown_in_an_example():

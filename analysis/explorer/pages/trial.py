@@ -50,7 +50,7 @@ def shown(row: Row, trial: Trial) -> dict[str, Any]:
     return {
         "row": row,
         "outcome": views.outcome_text(row, trial.scenario),
-        "facts": views.facts(row),
+        "facts": [*views.facts(row), *([f"Note: {trial.caution}."] if trial.caution else [])],
         "judged": views.judged_text(trial.scenario),
         "view_box": views.view_box(trial.track),
         "data": embedded(views.replay_data(row, trial)) if trial.states else None,

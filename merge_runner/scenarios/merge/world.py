@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES, Observation, Side, StateRow, Status
@@ -11,6 +13,8 @@ from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration, time_to_reach
 
 OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
+Starts = Mapping[Side, tuple[float, float]]
+"""Travelled distance in m and speed in m/s by side."""
 
 
 class World:
@@ -40,6 +44,12 @@ class World:
             raise UsageError(f"{condition}: a vehicle is at the merge point before both are driven")
         if self._collided():
             self.status = "collided"
+
+    def start_at(self, starts: Starts) -> None:
+        """Let the vehicles start elsewhere than the condition says, before the first step."""
+        for side, (position, speed) in starts.items():
+            self._positions[side], self._velocities[side] = [position], [speed]
+        self.status = "collided" if self._collided() else None
 
     @property
     def time_s(self) -> float:

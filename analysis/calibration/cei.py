@@ -1,0 +1,122 @@
+"""``python -m analysis.calibration.cei``: finds thresholds, and shows what they come to."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from merge_runner.cli import DbOption, print_out, say
+from merge_runner.drivers.cei.parameters import SETS, ThresholdSet
+from merge_runner.errors import MergeRunnerError
+from merge_runner.paths import DEFAULT_DB
+from merge_runner.registry import require
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from analysis.calibration.authors_fit import Fit
+
+app = typer.Typer(
+    help="Thresholds of the driver cei; see docs/reference/cei.md.", no_args_is_help=True
+)
+SetArgument = Annotated[str, typer.Argument(metavar="SET", help=f"{', '.join(SETS)}.")]
+ResistanceOption = Annotated[
+    Literal["human", "none"],
+    typer.Option("--resistance", help="That of the human simulator, or none."),
+]
+
+
+@app.command()
+def check(
+    name: SetArgument,
+    resistance: ResistanceOption = "human",
+    sets: Annotated[int, typer.Option("--sets", help="How many times 990 trials.", min=1)] = 5,
+    tunnel: Annotated[
+        bool, typer.Option("--tunnel", help="Start in the tunnels, as the published model did.")
+    ] = False,
+) -> None:
+    """Simulate 990 trials of each sample set from 0 on, and compare with what is published."""
+    from analysis.calibration.design import experiment
+    from analysis.calibration.search import compared, numbers_of
+
+    thresholds, scenario = require(SETS, "set", name), experiment(resistance)
+    found = [numbers_of(thresholds, scenario, n, tunnel=tunnel) for n in range(sets)]
+    print_out(_text(compared(found)))
+
+
+@app.command()
+def search(
+    name: SetArgument,
+    resistance: ResistanceOption = "human",
+    first_action: Annotated[
+        bool, typer.Option(help="Whether the humans' first action is a target, too.")
+    ] = True,
+    generations: Annotated[int, typer.Option(min=1)] = 12,
+    size: Annotated[int, typer.Option(help="Candidates of a generation.", min=4)] = 12,
+    trials: Annotated[
+        int,
+        typer.Option(help="Of each synthetic pair in each condition; 10 are 990 in all.", min=2),
+    ] = 10,
+    seed: int = 1,
+) -> None:
+    """Look for thresholds that come nearer to what is published, from those of a set."""
+    from analysis.calibration.design import experiment
+    from analysis.calibration.search import search as generations_of
+    from analysis.calibration.search import targets
+
+    start = require(SETS, "set", name)
+    wanted = [one for one in targets() if first_action or one.origin == "model"]
+    for found in generations_of(
+        start,
+        experiment(resistance),
+        wanted,
+        generations=generations,
+        size=size,
+        trials_of_a_pair=trials,
+        seed=seed,
+    ):
+        say(f"generation {found.number}: cost {found.cost:.1f} at best; {_line(found.thresholds)}")
+    print_out(_line(found.thresholds))
+
+
+@app.command()
+def fit(db: DbOption = DEFAULT_DB) -> None:
+    """Fit thresholds to the imported humans, as the model's authors did."""
+    from analysis.calibration.authors_fit import fit_thresholds, threshold_set
+
+    fits = fit_thresholds(Path(db))
+    for name, one in zip(("lower", "upper"), fits, strict=True):
+        print_out(
+            f"{name} threshold, {one.n} trials; how far each driver's is off:\n{_drivers(one)}"
+        )
+    print_out(f'\n[drivers.fitted]\nprogram = "cei"\nset = "{next(iter(SETS))}"')
+    print_out(_line(threshold_set(*fits), "\n"))
+
+
+def _line(thresholds: ThresholdSet, between: str = ", ") -> str:
+    return between.join(f"{name} = {value:.4f}" for name, value in asdict(thresholds).items())
+
+
+def _drivers(one: Fit) -> str:
+    return "\n".join(f"  {name} {effect:+.4f}" for name, effect in sorted(one.drivers.items()))
+
+
+def _text(table: pd.DataFrame) -> str:
+    return str(table.to_string(index=False, float_format="{:.2f}".format, na_rep=""))
+
+
+def main() -> None:
+    """Run the command line; exit codes are those of merge-runner."""
+    try:
+        app()
+    except MergeRunnerError as exc:
+        say(f"error: {exc}")
+        sys.exit(exc.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""The drivers of the model, many at once: each array has an element for every one of them.
+
+One object with a single element drives a vehicle of a trial, one with thousands simulates a study:
+what they decide is the same (Siebinga, Zgonnikov and Abbink 2024).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from merge_runner.drivers.cei.motion import Array, Mask, Task, course
+from merge_runner.drivers.cei.parameters import (
+    BROADER,
+    HIGHEST_THRESHOLD,
+    LOWEST_THRESHOLD,
+    MEMORY_TICKS,
+    NODE_S,
+    NODES,
+    PLAN_NOISE,
+    PLANS,
+    TICK_S,
+    TO_LOWER,
+    TO_UPPER,
+    Base,
+    Habits,
+    ThresholdSet,
+)
+
+AHEAD_S = NODE_S * np.arange(1, NODES + 1)
+INPUTS = np.linspace(-1.0, 1.0, PLANS)
+# Most plans that are too risky are so at many nodes: a few of these are tried first.
+NODES_BY_TURNS = tuple(slice(first, None, 4) for first in (3, 1, 0, 2))
+OFF = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What all agents of a simulation share."""
+
+    task: Task
+    thresholds: ThresholdSet
+    habits: Habits
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicles:
+    """Positions in m and speeds in m/s, one of each agent."""
+
+    positions_m: Array
+    speeds_mps: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """Where the other will be: normal distributions of the shape (nodes, agents), in m."""
+
+    mean_m: Array
+    spread_m: Array
+
+    def of(self, nodes: slice, agents: NDArray[np.int64]) -> Belief:
+        """That of some agents, who may be there several times, at some nodes."""
+        return Belief(self.mean_m[nodes][:, agents], self.spread_m[nodes][:, agents])
+
+
+@dataclass(slots=True)
+class Agents:
+    """What drivers have in mind between two ticks.
+
+    ``lower`` and ``upper`` are their base thresholds, ``desired_mps`` is the speed that they would
+    drive alone. ``perceived_mps`` is the other's speed as they see it, ``memory_mps2`` holds the
+    other's last 40 accelerations, ``waited_ticks`` is how long the risk has been low, OFF where it
+    is not. ``unsolved``: no plan was safe enough. They drive ``inputs`` in [-1, 1].
+    """
+
+    lower: Array
+    upper: Array
+    desired_mps: Array
+    perceived_mps: Array
+    memory_mps2: Array
+    waited_ticks: NDArray[np.int64]
+    unsolved: Mask
+    last_mps: Array
+    inputs: Array
+
+    def perceive(self, model: Model, other: Vehicles, other_mps2: Array, noise: Array) -> None:
+        """See the other for one tick; ``noise`` is standard normal, one number an agent."""
+        remaining, wander = model.habits.remaining, model.habits.wander_mps
+        self.perceived_mps = (
+            other.speeds_mps + remaining * (self.perceived_mps - other.speeds_mps) + wander * noise
+        )
+        self.memory_mps2 = np.concatenate([self.memory_mps2[1:], other_mps2[None]])
+
+    def decide(
+        self,
+        model: Model,
+        own: Vehicles,
+        other: Vehicles,
+        noise: Array,
+        controls: Mask,
+        ticks: int = 1,
+    ) -> None:
+        """Judge the risk, and plan anew where there is a reason.
+
+        ``ticks`` have passed since the last time. Without ``controls`` a vehicle cruises by itself.
+        """
+        last_mps, self.last_mps = self.last_mps, own.speeds_mps
+        if not controls.any():
+            return
+        belief = self._belief(model, other)
+        lower, upper = self._thresholds(model.thresholds, own, other)
+        ahead = course(model.task, own.positions_m, own.speeds_mps, self.inputs)
+        risk = risks(model.task, ahead.positions_m[1:], belief).max(axis=0)
+        low, waiting = risk < lower, self.waited_ticks != OFF
+        waited = np.where(waiting, self.waited_ticks + ticks, np.where(low, 0, OFF))
+        returns = low & (waited > model.habits.saturation_ticks)
+        crossed = (last_mps - self.desired_mps) * (own.speeds_mps - self.desired_mps) < 0
+        # The first reason counts: no safe plan before, a low risk for long, a high risk, or the
+        # desired speed.
+        bounds = TO_LOWER * lower, TO_UPPER * upper, TO_LOWER * lower, TO_UPPER * upper
+        reasons = self.unsolved, returns, risk > upper, crossed
+        bound = np.select(reasons, bounds, np.inf)
+        restarts = returns & ~self.unsolved
+        ends = np.isfinite(bound) | (risk > lower)
+        waited = np.where(restarts, 0, np.where(ends, OFF, waited))
+        self.waited_ticks = np.where(controls, waited, OFF)
+        anew = np.isfinite(bound) & controls
+        if anew.any():
+            self._plan(model, own, other, belief, bound, noise, anew)
+
+    def keep(self, chosen: Mask) -> Agents:
+        """Some of them."""
+        kept = {field.name: getattr(self, field.name)[..., chosen] for field in fields(self)}
+        return replace(self, **kept)
+
+    def _belief(self, model: Model, other: Vehicles) -> Belief:
+        mean = self.memory_mps2.mean(axis=0)
+        spread = self.memory_mps2.std(axis=0) + model.habits.comfortable_mps2 / 3
+        seconds = AHEAD_S[:, None]
+        return Belief(
+            other.positions_m + self.perceived_mps * seconds + mean * seconds**2 / 2,
+            spread * seconds**2 / 2,
+        )
+
+    def _thresholds(self, of: ThresholdSet, own: Vehicles, other: Vehicles) -> tuple[Array, Array]:
+        headway = own.positions_m - other.positions_m
+        faster = own.speeds_mps - self.perceived_mps
+        lower = of.lower_headway * headway + of.lower_speed * faster
+        upper = of.upper_headway * headway + of.upper_speed * faster
+        product = headway * faster
+        return (
+            _clipped(self.lower + lower + of.lower_product * product),
+            _clipped(self.upper + upper + of.upper_product * product),
+        )
+
+    def _plan(
+        self,
+        model: Model,
+        own: Vehicles,
+        other: Vehicles,
+        belief: Belief,
+        bound: Array,
+        noise: Array,
+        anew: Mask,
+    ) -> None:
+        """The cheapest input with at most this risk, or else full power ahead, or full brakes."""
+        agents = np.flatnonzero(anew)
+        plans = course(model.task, own.positions_m[agents], own.speeds_mps[agents], INPUTS[:, None])
+        safe = np.ones((PLANS, agents.size), bool)
+        for nodes in NODES_BY_TURNS:
+            inputs, columns = np.nonzero(safe)
+            some = belief.of(nodes, agents[columns])
+            risk = risks(model.task, plans.positions_m[1:][nodes][:, inputs, columns], some)
+            safe[inputs, columns] = (risk <= bound[agents[columns]]).all(axis=0)
+        cost = np.where(safe, plans.cost(self.desired_mps[anew]), np.inf)
+        solved = safe.any(axis=0)
+        ahead = own.positions_m[anew] > other.positions_m[anew]
+        self.inputs = self.inputs.copy()
+        self.inputs[anew] = np.where(
+            solved,
+            _driven(model, INPUTS[cost.argmin(axis=0)], noise[anew]),
+            np.where(ahead, 1.0, -1.0),
+        )
+        self.unsolved = self.unsolved.copy()
+        self.unsolved[anew] = ~solved
+
+
+def start(
+    model: Model,
+    bases: Sequence[Base],
+    own: Vehicles,
+    other: Vehicles,
+    ticks: Array,
+    noise: Array,
+) -> Agents:
+    """Agents that have cruised in the tunnel for some ticks, each beside the other.
+
+    They have planned to hold their speeds, and have
+    seen the other since the start of the run, when they took its speed to be their own: what they
+    perceive now is normal. ``noise`` is standard normal, of the shape (agents, 2): of the
+    perception and of the plan.
+    """
+    habits = model.habits
+    remaining = habits.remaining**ticks
+    known = other.speeds_mps + remaining * (own.speeds_mps - other.speeds_mps)
+    wander = habits.wander_mps * np.sqrt((1 - remaining**2) / (1 - habits.remaining**2))
+    hold = course(model.task, own.positions_m, own.speeds_mps, INPUTS[:, None])
+    inputs = INPUTS[hold.cost(own.speeds_mps).argmin(axis=0)]
+    agents = len(own.positions_m)
+    return Agents(
+        lower=np.array([base.lower for base in bases]),
+        upper=np.array([base.upper for base in bases]),
+        desired_mps=own.speeds_mps,
+        perceived_mps=known + wander * noise[:, 0],
+        memory_mps2=np.zeros((MEMORY_TICKS, agents)),
+        waited_ticks=np.full(agents, OFF),
+        unsolved=np.zeros(agents, bool),
+        last_mps=own.speeds_mps,
+        inputs=_driven(model, inputs, noise[:, 1]),
+    )
+
+
+def tunnel_ticks(own: Vehicles, other: Vehicles) -> Array:
+    """How many ticks ago the run started, when the one farther back was at 0, at these speeds."""
+    return (
+        np.minimum(own.positions_m / own.speeds_mps, other.positions_m / other.speeds_mps) / TICK_S
+    )
+
+
+def risks(task: Task, positions_m: Array, belief: Belief) -> Array:
+    """The risk of being at positions at the nodes of a belief, both of the shape (nodes, n).
+
+    It is half that of a collision and half that of being too close.
+    """
+    risk = np.zeros(positions_m.shape)
+    near = positions_m >= task.interval.contact_m
+    mean, spread = belief.mean_m[near], belief.spread_m[near]
+    lower, upper = task.interval.at(positions_m[near])
+    below, above = (lower - mean) / spread, (upper - mean) / spread
+    close = ndtr(above / BROADER) - ndtr(below / BROADER)
+    risk[near] = (ndtr(above) - ndtr(below) + close) / 2
+    return risk
+
+
+def _clipped(threshold: Array) -> Array:
+    return np.clip(threshold, LOWEST_THRESHOLD, HIGHEST_THRESHOLD)
+
+
+def _driven(model: Model, inputs: Array, noise: Array) -> Array:
+    """A plan as it is driven: never with less than planned."""
+    more = PLAN_NOISE * np.abs(noise) if model.habits.noise else 0.0
+    return np.minimum(inputs + more, 1.0)

@@ -1,0 +1,189 @@
+"""Many trials of the model at once, with a world of their own: cars as arrays.
+
+A trial that starts at the tunnels' exits is, sample by sample, the one that the runner plays with
+two of the model's drivers at 20 Hz (to 1e-9). One that starts in the tunnels is the published
+simulation, with its cruise control.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_runner.drivers.cei.agents import Model, Vehicles, start, tunnel_ticks
+from merge_runner.drivers.cei.motion import Array, Mask, Task, move
+from merge_runner.drivers.cei.parameters import TICK_S, Base
+from merge_runner.scenarios.merge.collision import collided
+from merge_runner.scenarios.merge.conditions import Condition
+
+# The cruise control of the human simulator: input by error of speed, in s/m, and by its change.
+CRUISE_GAIN, CRUISE_DAMPING = 5.0, 0.05
+RUNNING = ""
+NOBODY = Base(1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What is simulated: where two vehicles start, and of both, left first, driver and seed.
+
+    None in the place of a driver: the vehicle keeps its speed by its cruise control.
+    """
+
+    condition: Condition
+    drivers: tuple[Base | None, Base | None]
+    seeds: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Traces:
+    """What became of n trials.
+
+    ``positions_m`` and ``speeds_mps`` have the shape (samples, 2, n), left first; samples are 50 ms
+    apart, and those after a trial's end repeat its last. ``control_at`` and ``ended_at`` are the
+    samples at which the drivers take over and the trial ends; ``status`` is how it ends.
+    """
+
+    positions_m: Array
+    speeds_mps: Array
+    control_at: NDArray[np.int64]
+    ended_at: NDArray[np.int64]
+    status: NDArray[np.str_]
+
+
+def simulate(model: Model, trials: Sequence[Trial], *, tunnel: bool = False) -> Traces:
+    """Play trials from when both vehicles have left their tunnels, or from the start in these."""
+    world = _World(model, trials, tunnel=tunnel)
+    while world.running.size:
+        world.step()
+    return Traces(
+        np.array(world.positions_m),
+        np.array(world.speeds_mps),
+        world.control_at,
+        world.ended_at,
+        world.status,
+    )
+
+
+class _World:
+    """Trials under way; those that have ended drop out of ``running`` and of the agents.
+
+    Agents, and arrays of their vehicles, are all left ones and then all right ones.
+    """
+
+    def __init__(self, model: Model, trials: Sequence[Trial], *, tunnel: bool) -> None:
+        self.model, self.task = model, model.task
+        begins = [
+            0.0 if tunnel else max(one.condition.exit_times_s(self.task.track)) for one in trials
+        ]
+        places = [
+            one.condition.positions_m(at, self.task.track)
+            for one, at in zip(trials, begins, strict=True)
+        ]
+        self.positions_m = [np.array(places).T]
+        self.speeds_mps = [np.array([one.condition.speeds_mps for one in trials]).T]
+        self.accelerations = np.zeros(2 * len(trials))
+        self.error = np.zeros(2 * len(trials))
+        seeds = [one.seeds[side] for side in (0, 1) for one in trials]
+        self.noise = np.stack([_noise(seed, self.task.scenario.timeout_s) for seed in seeds], 1)
+        self.running = np.arange(len(trials))
+        self.status = np.full(len(trials), RUNNING, "<U8")
+        self.ended_at = np.zeros(len(trials), np.int64)
+        self.control_at = np.zeros(len(trials), np.int64)
+        own = self._vehicles()
+        other = _others(own)
+        drivers = [one.drivers[side] for side in (0, 1) for one in trials]
+        self.driven = np.array([driver is not None for driver in drivers])
+        ticks = np.zeros(len(seeds)) if tunnel else tunnel_ticks(own, other)
+        bases = [driver or NOBODY for driver in drivers]
+        self.agents = start(model, bases, own, other, ticks, self.noise[0])
+        self._end()
+
+    def step(self) -> None:
+        """All observe and decide, and all are driven for 50 ms."""
+        sample = len(self.positions_m)
+        own = self._vehicles()
+        other = _others(own)
+        both = np.concatenate([self.running, self.running + self.status.size])
+        noise = self.noise[sample][both]
+        out = own.positions_m.reshape(2, -1).min(axis=0) > self.task.track.tunnel_exit_m - 1e-9
+        self.control_at[self.running[~out]] = sample
+        controls = np.concatenate([out, out]) & self.driven[both]
+        agents = self.agents
+        agents.perceive(self.model, other, _swapped(self.accelerations), noise[:, 0])
+        agents.decide(self.model, own, other, noise[:, 1], controls)
+        error = agents.desired_mps - own.speeds_mps
+        damping = CRUISE_DAMPING * (self.error - error) / TICK_S
+        cruise = np.clip(CRUISE_GAIN * error - damping, -1, 1)
+        self.error = error
+        inputs = np.where(controls, agents.inputs, cruise)
+        wanted = self.task.net_mps2(inputs, own.speeds_mps)
+        positions, speeds = move(own.positions_m, own.speeds_mps, wanted, TICK_S)
+        # Where a vehicle stops within the step, it executes less than the command.
+        stops = own.speeds_mps + wanted * TICK_S < 0
+        self.accelerations = np.where(stops, -own.speeds_mps / TICK_S, wanted)
+        self.positions_m.append(_with(self.positions_m[-1], self.running, positions))
+        self.speeds_mps.append(_with(self.speeds_mps[-1], self.running, speeds))
+        self._end()
+
+    def _end(self) -> None:
+        """Note which trials have ended by now, and go on with the others."""
+        sample = len(self.positions_m) - 1
+        positions = self.positions_m[-1][:, self.running]
+        scenario = self.task.scenario
+        status = np.full(self.running.size, RUNNING, "<U8")
+        if sample >= round(scenario.timeout_s / TICK_S):
+            status[:] = "timeout"
+        status[positions.max(axis=0) >= self.task.track.end_m] = "finished"
+        status[_collisions(self.task, positions)] = "collided"
+        ended = status != RUNNING
+        if ended.any():
+            self.status[self.running] = status
+            self.ended_at[self.running[ended]] = sample
+            self.running = self.running[~ended]
+            kept = np.concatenate([~ended, ~ended])
+            self.agents = self.agents.keep(kept)
+            self.accelerations, self.error = self.accelerations[kept], self.error[kept]
+
+    def _vehicles(self) -> Vehicles:
+        return Vehicles(
+            self.positions_m[-1][:, self.running].ravel(),
+            self.speeds_mps[-1][:, self.running].ravel(),
+        )
+
+
+def _noise(seed: int, seconds: float) -> Array:
+    """What a driver of the runner draws with its seed, of the shape (draws, 2)."""
+    return np.random.default_rng(seed).standard_normal((round(seconds / TICK_S) + 1, 2))
+
+
+def _others(own: Vehicles) -> Vehicles:
+    return Vehicles(_swapped(own.positions_m), _swapped(own.speeds_mps))
+
+
+def _swapped(values: Array) -> Array:
+    return np.roll(values, values.size // 2)
+
+
+def _with(values: Array, chosen: NDArray[np.int64], changed: Array) -> Array:
+    """Values of the shape (2, n), with other columns."""
+    copy = values.copy()
+    copy[:, chosen] = changed.reshape(2, -1)
+    return copy
+
+
+def _collisions(task: Task, positions_m: Array) -> Mask:
+    """Which pairs of vehicles collide, by the scenario's rule; positions of the shape (2, n)."""
+    track, scenario = task.track, task.scenario
+    # Centres farther apart than a diagonal never do; of the few others the world's rule is asked.
+    before = np.maximum(track.merge_point_m - positions_m, 0.0)
+    across = before.sum(axis=0) * track.branch_sine
+    along = np.diff(positions_m + before * (1 - track.branch_cosine), axis=0)[0]
+    reach = np.hypot(scenario.vehicle_length_m, scenario.vehicle_width_m)
+    found = across**2 + along**2 < reach**2
+    for n in np.flatnonzero(found):
+        left, right = map(float, positions_m[:, n])
+        found[n] = collided(scenario, track, left, right)
+    return np.asarray(found)

@@ -1,0 +1,134 @@
+"""The model's constants, the thresholds of its drivers, and its nine synthetic pairs.
+
+Equations and constants: Siebinga, Zgonnikov and Abbink, PNAS Nexus 3(10), pgae420 (2024), arXiv
+2312.09776. The fitted thresholds of that paper are not public: each set here is ours, calibrated to
+the outcomes that the paper published (docs/reference/cei.md says which it meets and which not).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+from typing import NamedTuple
+
+TICK_S = 0.05
+# The times that a belief and a plan are about: 24 nodes, up to 6 s ahead.
+NODE_S, NODES = 0.25, 24
+MEMORY_TICKS = 40
+# A plan is one of so many constant inputs in [-1, 1].
+PLANS = 81
+PLAN_NOISE = 0.025
+# The perceived speed follows the other's with a time constant of 2 s, and wanders by 0.6 m/s.
+PERCEPTION_RATE_HZ = 0.5
+PERCEPTION_NOISE = 0.6  # m/s per square root of a second
+# The second, broader part of the risk: being too close.
+BROADER = 3.0
+LOWEST_BASE, NARROWEST_BAND = 0.02, 0.05
+LOWEST_THRESHOLD, HIGHEST_THRESHOLD = 0.05, 1.0
+# What a solved plan may risk, as a share of the lower and of the upper threshold.
+TO_LOWER, TO_UPPER = 0.8, 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class Habits:
+    """What all drivers have in common.
+
+    ``comfortable_mps2`` is how strongly the other is expected to accelerate, ``saturation_s`` how
+    long a low risk is borne before the driver returns to its own speed. Without ``noise`` a driver
+    sees speeds as they are and drives as it planned.
+    """
+
+    comfortable_mps2: float = 1.0
+    saturation_s: float = 1.6
+    noise: bool = True
+
+    @property
+    def saturation_ticks(self) -> int:
+        """The same in ticks."""
+        return round(self.saturation_s / TICK_S)
+
+    @property
+    def remaining(self) -> float:
+        """How much of a wrong idea of the other's speed is left a tick later."""
+        return 1 - PERCEPTION_RATE_HZ * TICK_S if self.noise else 0.0
+
+    @property
+    def wander_mps(self) -> float:
+        """The standard deviation of what a tick adds to the perceived speed."""
+        return PERCEPTION_NOISE * sqrt(TICK_S) if self.noise else 0.0
+
+
+FITTING = Habits(comfortable_mps2=1.6, saturation_s=2.0, noise=False)
+"""Those of the agents to which the authors fitted the thresholds of their human drivers."""
+
+
+class Base(NamedTuple):
+    """What a driver accepts to risk, and from what risk on it acts, but for its incentives."""
+
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True, slots=True)
+class ThresholdSet:
+    """Risk thresholds of all drivers: ten numbers.
+
+    A driver's thresholds are ``mean - spread * z`` of its offset z, and change with its headway H
+    (m, positive ahead) and its relative speed D (m/s, positive if faster) by
+    ``headway * H + speed * D + product * H * D``.
+    """
+
+    lower_mean: float
+    upper_mean: float
+    lower_spread: float
+    upper_spread: float
+    lower_headway: float
+    lower_speed: float
+    lower_product: float
+    upper_headway: float
+    upper_speed: float
+    upper_product: float
+
+    def base(self, offset: float) -> Base:
+        """The thresholds of a driver without headway and relative speed."""
+        lower = max(self.lower_mean - self.lower_spread * offset, LOWEST_BASE)
+        upper = self.upper_mean - self.upper_spread * offset
+        return Base(lower, max(upper, lower + NARROWEST_BAND))
+
+
+# Found by a short search, from which the longer ones start. K0 was calibrated to the published
+# outcomes and to the humans' first action, F1 to the outcomes alone.
+SETS: dict[str, ThresholdSet] = {
+    "K0": ThresholdSet(
+        *(0.4188, 0.3511, 0.1371, 0.0227),
+        *(0.0158, -0.0721, -0.0130, 0.0434, 0.0616, 0.0109),
+    ),
+    "F1": ThresholdSet(
+        *(0.0839, 0.8586, 0.0589, 0.0768),
+        *(-0.0186, -0.0319, 0.0156, 0.0725, 0.1169, -0.0414),
+    ),
+}
+
+
+class Pair(NamedTuple):
+    """Two drivers."""
+
+    left: float
+    right: float
+
+
+# How much more than others each driver of the model's nine pairs changes its speed: the random
+# intercepts of the published model in table S8b of its supplement, in m/s.
+_INTERCEPTS = (
+    *(Pair(0.50, -0.20), Pair(-1.13, 0.84), Pair(0.82, -1.09)),
+    *(Pair(0.23, 0.14), Pair(0.50, -0.73), Pair(0.05, 0.40)),
+    *(Pair(-0.75, 0.32), Pair(0.57, -0.27), Pair(0.00, -0.19)),
+)
+_SPREAD_MPS = 0.589  # of the 18 values
+OFFSETS = tuple(Pair(pair.left / _SPREAD_MPS, pair.right / _SPREAD_MPS) for pair in _INTERCEPTS)
+"""Of the drivers of the nine synthetic pairs, in standard deviations."""
+
+
+def offsets_of(pair: int, repetition: int) -> Pair:
+    """Those of a pair from 1 to 9; pair 0 takes turns by the repetition, which counts from 1."""
+    return OFFSETS[(pair or repetition) % len(OFFSETS) - 1]

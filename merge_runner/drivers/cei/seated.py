@@ -1,0 +1,54 @@
+"""What one driver of the model has in mind during a trial: agents of which there is one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from merge_runner.drivers.cei.agents import Model, Vehicles, start, tunnel_ticks
+from merge_runner.drivers.cei.motion import Array, task_of
+from merge_runner.drivers.cei.parameters import TICK_S, Habits, ThresholdSet, offsets_of
+from merge_runner.drivers.program_seat import ProgramSeat
+from merge_runner.records import SIDES, Observation
+from merge_runner.scenarios.registry import SCENARIOS
+
+
+class Seated:
+    """The driver of a seat, from its first observation on."""
+
+    def __init__(self, seat: ProgramSeat, thresholds: ThresholdSet, seen: Observation) -> None:
+        track = SCENARIOS[seat.scenario.name].track
+        self._model = Model(task_of(seat.scenario, track), thresholds, Habits())
+        self._random = np.random.default_rng(seat.seed)
+        own, other = _vehicles(seen)
+        offsets = offsets_of(int(seat.number("pair")), seat.repetition)
+        base = thresholds.base(offsets[SIDES.index(seat.side)])
+        ticks = tunnel_ticks(own, other)
+        self._agents = start(self._model, [base], own, other, ticks, self._noise())
+        self._other_mps = seen.other_speed_mps
+
+    def decide(self, seen: Observation, ticks: int) -> float:
+        """The input in [-1, 1] to hold, where ``ticks`` have passed since the last decision."""
+        own, other = _vehicles(seen)
+        # Between two decisions that are more than a tick apart it saw a steady change of speed.
+        steady = (seen.other_speed_mps - self._other_mps) / (ticks * TICK_S)
+        accelerated = np.array([seen.other_acceleration_mps2 if ticks == 1 else steady])
+        noise = self._noise()
+        for tick in range(ticks):
+            noise = self._noise() if tick else noise
+            self._agents.perceive(self._model, other, accelerated, noise[:, 0])
+        controls = np.ones(1, bool)
+        self._agents.decide(self._model, own, other, noise[:, 1], controls, ticks)
+        self._other_mps = seen.other_speed_mps
+        return float(self._agents.inputs[0])
+
+    def _noise(self) -> Array:
+        return self._random.standard_normal((1, 2))
+
+
+def _vehicles(seen: Observation) -> tuple[Vehicles, Vehicles]:
+    """The own one and the other."""
+    own_m, other_m = seen.own_position_m, seen.own_position_m + seen.relative_distance_m
+    return (
+        Vehicles(np.array([own_m]), np.array([seen.own_speed_mps])),
+        Vehicles(np.array([other_m]), np.array([seen.other_speed_mps])),
+    )

@@ -1,0 +1,175 @@
+"""One side of an imported human trial, driven again as it was: this human does not react."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.program_seat import ProgramSeat
+from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.errors import UsageError
+from merge_runner.records import SIDES, Decision, Observation, Side
+from merge_runner.scenarios.merge.vehicle import net_acceleration
+
+HUMAN_REPLAY = "human-replay"
+EVERY_PAIR = "all"
+SAMPLE_S = 0.05  # the recorder's clock
+ROUNDING = 1e-6
+NOT_IMPORTED = (
+    f"{HUMAN_REPLAY} drives imported human trials, and the database holds none: merge-runner human "
+    "import PATH adds them (name the same --db)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class HumanTrial:
+    """A human trial from the start of control on, with a sample every 0.05 s.
+
+    ``number`` is its place among the trials of its ``pair``. Positions are travelled distances in
+    m, speeds in m/s, both by side.
+    """
+
+    pair: str
+    number: int
+    condition: str
+    positions_m: Mapping[Side, tuple[float, ...]]
+    speeds_mps: Mapping[Side, tuple[float, ...]]
+
+    @property
+    def starts(self) -> dict[Side, tuple[float, float]]:
+        """Position and speed of both sides at the start of control."""
+        return {side: (self.positions_m[side][0], self.speeds_mps[side][0]) for side in SIDES}
+
+    def net_mps2(self, side: Side) -> list[float]:
+        """What a side executed from each sample to the next."""
+        return [(after - before) / SAMPLE_S for before, after in pairwise(self.speeds_mps[side])]
+
+
+@dataclass(frozen=True)
+class HumanTrials:
+    """The finished human trials of a database; ``digest`` is their hash."""
+
+    trials: tuple[HumanTrial, ...] = ()
+    _usable: dict[tuple[object, ...], list[HumanTrial]] = field(default_factory=dict, compare=False)
+
+    @cached_property
+    def digest(self) -> str:
+        """The hash of all trials."""
+        return hashlib.sha256(repr(self.trials).encode()).hexdigest()
+
+    def usable(self, config: ScenarioConfig, condition: str, pair: str) -> list[HumanTrial]:
+        """Those of a condition that the scenario's vehicles can drive, the pairs taking turns."""
+        key = (condition, pair, config.resistance, config.max_acceleration_mps2)
+        if key not in self._usable:
+            chosen = [
+                trial
+                for trial in self.trials
+                if trial.condition == condition
+                and pair in (EVERY_PAIR, trial.pair)
+                and _can_be_driven(config, trial)
+            ]
+            turns: dict[str, int] = {}
+            order = []
+            for trial in sorted(chosen, key=lambda one: (one.pair, one.number)):
+                turns[trial.pair] = turns.get(trial.pair, 0) + 1
+                order.append((turns[trial.pair], trial.pair, trial))
+            self._usable[key] = [trial for *_, trial in sorted(order, key=lambda one: one[:2])]
+        return self._usable[key]
+
+
+def require_trials(
+    program: Program, config: ScenarioConfig, condition: str, repetitions: int
+) -> None:
+    """Raise UsageError unless a program that replays has a trial for each repetition."""
+    trials, pair = program.data, str(program.values["pair"])
+    assert isinstance(trials, HumanTrials)
+    if not trials.trials:
+        raise UsageError(NOT_IMPORTED)
+    if program.rate_hz != 1 / SAMPLE_S:
+        raise UsageError(f"{HUMAN_REPLAY} takes no clock: what a human did stays as it was")
+    pairs = sorted({trial.pair for trial in trials.trials})
+    if pair not in (EVERY_PAIR, *pairs):
+        valid = ", ".join((EVERY_PAIR, *pairs))
+        raise UsageError(f"{HUMAN_REPLAY} knows no pair {pair!r}; valid: {valid}")
+    if (config.step_s, config.control_start) != (SAMPLE_S, "both_exits"):
+        raise UsageError(
+            f"{HUMAN_REPLAY} needs a world of step_s = {SAMPLE_S} and control_start = "
+            '"both_exits": set them under [scenario] of the sweep\'s file'
+        )
+    there = len(trials.usable(config, condition, pair))
+    if repetitions > there:
+        raise UsageError(
+            f"{HUMAN_REPLAY} has {there} trials of {condition} to replay, and {repetitions} "
+            "repetitions are asked for: choose fewer by --reps, or other --conditions"
+        )
+
+
+def unresponsive(spec: Mapping[str, Any]) -> str:
+    """What is to be said wherever trials of a spec are shown; empty where no human is replayed."""
+    told = {side: spec.get(side) or {} for side in SIDES}
+    sides = [
+        side
+        for side, driver in told.items()
+        if HUMAN_REPLAY in (driver.get("program"), driver.get("based_on"))
+    ]
+    if len(sides) == len(SIDES):
+        return "both humans are replayed and do not react"
+    return f"the human on the {sides[0]} is replayed and does not react" if sides else ""
+
+
+def _can_be_driven(config: ScenarioConfig, trial: HumanTrial) -> bool:
+    """Whether no acceleration of the trial is beyond what the scenario's vehicles have."""
+    limit = config.max_acceleration_mps2 * (1 + ROUNDING)
+    return all(
+        abs(net - net_acceleration(0.0, speed, config.resistance)) <= limit
+        for side in SIDES
+        for net, speed in zip(trial.net_mps2(side), trial.speeds_mps[side], strict=False)
+    )
+
+
+@dataclass(slots=True)
+class HumanReplayDriver:
+    """Executes what a human executed, whatever the other does; after that it keeps its speed."""
+
+    seat: ProgramSeat
+    trial: HumanTrial = field(init=False)
+    _net_mps2: list[float] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Raises UsageError where there is no such trial."""
+        seat, trials = self.seat, self.seat.data
+        assert isinstance(trials, HumanTrials)
+        usable = trials.usable(seat.scenario, seat.condition, str(seat.parameters["pair"]))
+        if len(usable) < seat.repetition:
+            raise UsageError(NOT_IMPORTED)
+        self.trial = usable[seat.repetition - 1]
+        self._net_mps2 = self.trial.net_mps2(seat.side)
+
+    @property
+    def starts(self) -> Mapping[Side, tuple[float, float]]:
+        """Where both sides started in the human trial."""
+        return self.trial.starts
+
+    async def decide(self, observation: Observation, number: int) -> Decision:
+        """What the human did from this sample to the next."""
+        net_mps2 = self._net_mps2[number] if number < len(self._net_mps2) else 0.0
+        return self.seat.accelerating(net_mps2, observation.own_speed_mps)
+
+
+# Replaced once trials are imported (``study.parts.adopt_humans``).
+PROGRAMS.replace(
+    HUMAN_REPLAY,
+    Program(
+        HumanReplayDriver,
+        "one side of an imported human trial; this human does not react",
+        {"pair": EVERY_PAIR},
+        1 / SAMPLE_S,
+        settable=True,
+        data=HumanTrials(),
+    ),
+)

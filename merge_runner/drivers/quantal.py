@@ -1,0 +1,121 @@
+"""A game-theoretic driver of our own: level-1 quantal response on a few actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import exp
+from random import Random
+
+from merge_runner.drivers.program_seat import Parameter, ProgramSeat
+from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.errors import UsageError
+from merge_runner.records import Decision, Observation
+from merge_runner.scenarios.merge.collision import collided
+from merge_runner.scenarios.merge.geometry import Track
+from merge_runner.scenarios.merge.vehicle import advance
+from merge_runner.scenarios.registry import SCENARIOS
+
+NODE_S = 0.2
+SLOWEST_MPS = 0.5
+
+
+@dataclass(slots=True)
+class QuantalDriver:
+    """Thinks that the other keeps its speed, and draws an action by what each would come to.
+
+    An action is held until the next decision, and no acceleration is expected after it. Its cost
+    is the time that it loses, its squared acceleration, and a collision that it leads to within
+    the horizon. The probability of an action is proportional to exp(-precision * cost).
+    """
+
+    seat: ProgramSeat
+    _desired_mps: float | None = None
+    _chance: Random = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._chance = Random(self.seat.seed)  # noqa: S311 # a sample, no secret
+
+    async def decide(self, observation: Observation, number: int) -> Decision:
+        """Draw an action."""
+        if self._desired_mps is None:
+            self._desired_mps = observation.own_speed_mps
+        costs = {action: self._cost(observation, action) for action in self._actions()}
+        precision, least = self.seat.number("precision"), min(costs.values())
+        weights = [exp(-precision * (cost - least)) for cost in costs.values()]
+        (action,) = self._chance.choices(list(costs), weights)
+        return self.seat.accelerating(action, observation.own_speed_mps)
+
+    def _actions(self) -> tuple[float, ...]:
+        number = self.seat.number
+        return (
+            -number("hard_braking_mps2"),
+            -number("braking_mps2"),
+            0.0,
+            number("acceleration_mps2"),
+        )
+
+    def _cost(self, seen: Observation, action_mps2: float) -> float:
+        assert self._desired_mps is not None
+        number, held_s = self.seat.number, self.seat.interval_s
+        ahead_m, speed_mps = advance(0.0, seen.own_speed_mps, action_mps2, held_s)
+        rest_m = max(0.0, self._track.end_m - seen.own_position_m - ahead_m)
+        needed_s = held_s + rest_m / max(speed_mps, SLOWEST_MPS)
+        lost_s = max(0.0, needed_s - (ahead_m + rest_m) / self._desired_mps)
+        return (
+            number("time_weight") * lost_s
+            + number("effort_weight") * action_mps2**2 * held_s
+            + number("collision_cost") * self._leads_to_a_collision(seen, action_mps2)
+        )
+
+    def _leads_to_a_collision(self, seen: Observation, action_mps2: float) -> bool:
+        """Whether there is one at any instant from the end of the action to the horizon."""
+        own_m, speed_mps = advance(
+            seen.own_position_m, seen.own_speed_mps, action_mps2, self.seat.interval_s
+        )
+        other_m = seen.own_position_m + seen.relative_distance_m
+        nodes = range(int((self.seat.number("horizon_s") - self.seat.interval_s) / NODE_S) + 1)
+        times_s = [NODE_S * node for node in nodes]
+        return any(
+            self._collided(
+                own_m + speed_mps * time_s,
+                other_m + seen.other_speed_mps * (self.seat.interval_s + time_s),
+            )
+            for time_s in times_s
+        )
+
+    def _collided(self, own_m: float, other_m: float) -> bool:
+        places = (own_m, other_m) if self.seat.side == "left" else (other_m, own_m)
+        return collided(self.seat.scenario, self._track, *places)
+
+    @property
+    def _track(self) -> Track:
+        return SCENARIOS[self.seat.scenario.name].track
+
+
+def _check(parameters: Mapping[str, Parameter]) -> None:
+    for name, value in parameters.items():
+        if float(value) < 0:
+            raise UsageError(f"{name} of quantal cannot be below 0")
+
+
+PROGRAMS.register(
+    "quantal",
+    Program(
+        QuantalDriver,
+        "level-1 quantal response on four actions (ours)",
+        {
+            "horizon_s": 5.0,
+            "precision": 1.7,
+            "collision_cost": 2.3,
+            "time_weight": 0.7,
+            "effort_weight": 0.14,
+            "hard_braking_mps2": 2.5,
+            "braking_mps2": 1.5,
+            "acceleration_mps2": 0.5,
+        },
+        1.0,
+        settable=True,
+        check=_check,
+    ),
+)

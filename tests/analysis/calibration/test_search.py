@@ -1,0 +1,37 @@
+"""The search can be repeated, and looks where its targets are."""
+
+import pytest
+
+from analysis.calibration.design import design, experiment
+from analysis.calibration.search import MISSING, cost, search, targets
+from merge_runner.drivers.cei.parameters import SETS
+from tests.drivers.cei.trials import scenario, simulated
+
+
+def test_the_design_has_each_pair_ten_times_in_each_condition_with_the_seeds_of_the_slots():
+    trials = design(SETS["K0"], experiment(), 0)
+    assert len(trials) == 990
+    assert len({seed for one in trials for seed in one.seeds}) == 2 * 990
+    assert trials[:90] == [simulated("R_-4_-8", n, scenario()) for n in range(1, 91)]
+
+
+def test_a_miss_by_its_tolerance_costs_one_and_a_number_without_a_fit_much():
+    wanted = targets()
+    exact = {(one.measure, one.term): one.value for one in wanted}
+    assert cost(exact, wanted) == 0
+    assert cost({**exact, ("collisions", "count"): 33.0}, wanted) == pytest.approx(1)
+    del exact["who_first", "intercept"]
+    assert cost(exact, wanted) == MISSING**2
+
+
+@pytest.mark.slow
+def test_a_search_finds_the_same_thresholds_again():
+    def last():
+        *_, found = search(
+            SETS["K0"], experiment(), targets(), generations=1, size=4, seed=1, trials_of_a_pair=1
+        )
+        return found
+
+    found = last()
+    assert found == last()
+    assert found.thresholds != SETS["K0"]

@@ -1,0 +1,60 @@
+"""Trials of the model: played by the runner, and simulated."""
+
+from __future__ import annotations
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.cei.agents import Model
+from merge_runner.drivers.cei.batch import Trial
+from merge_runner.drivers.cei.motion import task_of
+from merge_runner.drivers.cei.parameters import SETS, Habits, offsets_of
+from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.records import SIDES, TrialRecord, TrialSpec
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.trial import play_trial
+
+
+def scenario(**changes) -> ScenarioConfig:
+    usual = {"step_s": 0.05, "collision_rule": "rectangle", "resistance": "human"}
+    return ScenarioConfig(**usual | changes)
+
+
+def model(task: ScenarioConfig, name: str = "K0", habits: Habits | None = None) -> Model:
+    return Model(task_of(task, TRACK), SETS[name], habits or Habits())
+
+
+def spec(condition: str, repetition: int = 1) -> TrialSpec:
+    return TrialSpec(
+        trial_id=f"cei/baseline/{condition}/rep{repetition:02d}",
+        spec_hash="cei",
+        source="driver",
+        model_left="cei",
+        model_right="cei",
+        variant="baseline",
+        condition=condition,
+        repetition=repetition,
+        sample_set=0,
+        order=0,
+    )
+
+
+def cei(**changes) -> Program:
+    """The program as a study may change it."""
+    clock = changes.pop("clock", None)
+    return PROGRAMS["cei"].with_changes("cei", changes, clock)
+
+
+async def played(
+    condition: str, repetition: int, task: ScenarioConfig, program: Program
+) -> TrialRecord:
+    one = spec(condition, repetition)
+    return await play_trial(one, task, {side: program.make(task, one, side) for side in SIDES})
+
+
+def simulated(condition: str, repetition: int, task: ScenarioConfig, name: str = "K0") -> Trial:
+    """The same trial for the batch: same seeds, same pair."""
+    one = spec(condition, repetition)
+    left, right = (PROGRAMS["cei"].seat(task, one, side).seed for side in SIDES)
+    offsets = offsets_of(0, repetition)
+    drivers = SETS[name].base(offsets.left), SETS[name].base(offsets.right)
+    return Trial(CONDITIONS[condition], drivers, (left, right))
