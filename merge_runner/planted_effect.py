@@ -9,8 +9,11 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 PREFIX = "x_"
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-NotNegative = Annotated[Number, Field(ge=0)]
+# The bounds keep every logit finite.
+Number = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
+NotNegative = Annotated[float, Field(strict=True, ge=0, le=1e6)]
+Exponent = Annotated[float, Field(strict=True, ge=-10, le=10)]
+Temperature = Annotated[float, Field(strict=True, ge=0, le=10)]
 
 
 class Persona(BaseModel):
@@ -40,11 +43,11 @@ class PlantedEffect(BaseModel):
     x_left_first: Number = -0.30
     x_headway: Number = 1.11
     x_relative_speed: Number = -3.30
-    x_temperature: Number = 0.0
+    x_temperature: Exponent = 0.0
     x_noise: NotNegative = 0.0
     x_gap_m: Number = 0.0
     x_persona: Persona | None = None
-    temperature: Number = 1.0
+    temperature: Temperature = 1.0
 
     def before(self, prompt: str) -> Self:
         """The effect on the reader of this prompt, without a persona."""

@@ -118,11 +118,11 @@ def _all_hold(sample: Sample, _: Sample | None) -> Holds:
     return np.asarray(np.logical_and.reduce(found))
 
 
-def _differs(term: int) -> Callable[[Sample, Sample | None], Holds]:
+def _differs(at: int) -> Callable[[Sample, Sample | None], Holds]:
     def found(sample: Sample, other: Sample | None) -> Holds:
         assert other is not None
-        fit = firth_differences(sample.draws, other.draws)
-        return fit.sound & (fit.p[:, term] < ALPHA)
+        fit = firth_differences(sample.draws, other.draws, WHO_FIRST_TERMS[at])
+        return fit.sound & (fit.p[:, at] < ALPHA)
 
     return found
 

@@ -38,10 +38,10 @@ def table(found: Power) -> Table:
             f"smallest: the smallest effect that is found with a chance of {100 * POWER:.0f} % at "
             f"n; n for {100 * POWER:.0f} %: the trials of an arm from which on the effect is found "
             f"with this chance, at most {MOST} times those of the study; USD: the whole study then",
-            "if trials go as: the published odds and gaps of humans; the same, but that who "
-            "merges first does not depend on the relative velocity; or what is planted in the "
-            "emulator. Against another arm: that one goes so, and this one lacks the cue, leaves "
-            "1 m more, or collides twice as often",
+            "if trials go as: the published odds and gaps of humans; those of the driver cei; "
+            "those of humans, but that who merges first does not depend on the relative velocity; "
+            "or what is planted in the emulator. Against another arm: that one goes so, and this "
+            "one lacks the cue, leaves 1 m more, or collides twice as often",
             "tests: Firth's likelihood ratio (who merges first), HC3 (gap), equivalence (I4), "
             "Fisher's exact test (collisions), the linear model within conditions (gap of two "
             "arms); each by itself, without correction for their number",

@@ -10,7 +10,7 @@ from scipy.special import expit
 
 from analysis.data.reference_data import HUMAN_GAP_SD_M, human_outcomes, published
 from analysis.stats.many_fits import Array
-from analysis.stats.regressions import WHO_FIRST_TERMS
+from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS
 from merge_runner.planted_effect import PlantedEffect
 
 SPEED = WHO_FIRST_TERMS.index("relative_velocity")
@@ -66,9 +66,21 @@ def without_relative_speed() -> Truth:
     return replace(human().with_who_first(SPEED, 0.0), name="no relative velocity")
 
 
+def cei() -> Truth:
+    """The driver ``cei``, a model of humans, as its simulated trials come to."""
+    found = published("cei_outcomes").set_index(["measure", "term"])["value"].astype(float)
+    return Truth(
+        "cei",
+        who_first=tuple(found["who_first"][list(WHO_FIRST_TERMS)]),
+        gap=tuple(found["gap"][list(GAP_TERMS)]),
+        gap_sd_m=found["gap", "residual_sd"],
+        collided=found["collided", "share"],
+    )
+
+
 def supposed() -> tuple[Truth, ...]:
     """What is supposed of a driver of which nothing is known."""
-    return human(), without_relative_speed()
+    return human(), cei(), without_relative_speed()
 
 
 def planted(effect: PlantedEffect) -> Truth:

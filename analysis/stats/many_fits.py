@@ -23,6 +23,8 @@ Holds = NDArray[np.bool_]
 WALD_STEPS = 35  # statsmodels' limit
 FIRTH_STEPS = 60
 HALVINGS = 8
+# Of a log-likelihood: what is smaller than this is no loss.
+ROUNDING = 1e-11
 
 HEADWAYS = np.array([c.projected_headway_m for c in HUMAN_CONDITIONS.values()])
 VELOCITIES = np.array([c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()])
@@ -127,16 +129,17 @@ def firth_fits(draws: Draws) -> Fits:
     return Fits(WHO_FIRST_TERMS, b, np.zeros_like(b), p, NORMAL, alive)
 
 
-def firth_differences(draws: Draws, others: Draws) -> Fits:
+def firth_differences(draws: Draws, others: Draws, term: str) -> Fits:
     """By term how the coefficients of two groups differ, first minus second.
 
-    Of one model of both in which every term may differ between them, with penalised
-    likelihood-ratio tests of the slopes' differences, as ``penalised.firth_differences`` has it.
+    Of one model of both in which every term may differ between them, with a penalised
+    likelihood-ratio test of one term's difference, as ``penalised.firth_differences`` has it.
     """
     own, rest = draws.logit_design, others.logit_design
     design = np.block([[rest, 0 * rest], [own, own]])
     n, left = (np.hstack(pair) for pair in ((others.n, draws.n), (others.left, draws.left)))
-    b, p, alive = _firth_tested(design, n, left, (4, 5))
+    at = 3 + WHO_FIRST_TERMS.index(term)
+    b, p, alive = _firth_tested(design, n, left, (at,))
     return Fits(WHO_FIRST_TERMS, b[:, 3:], np.zeros_like(b[:, 3:]), p[:, 3:], NORMAL, alive)
 
 
@@ -174,11 +177,11 @@ def _firth(
         step = _firth_step(design, some, firsts, b[rows], free)
         for _ in range(HALVINGS):
             tried = _penalised(design, some, firsts, b[rows] + step)
-            worse = tried < best[rows]
+            worse = tried < best[rows] - ROUNDING
             if not worse.any():
                 break
             step[worse] /= 2
-        step[tried < best[rows]] = 0
+        step[worse] = 0
         b[rows] += step
         best[rows] = np.maximum(tried, best[rows])
         rows = rows[np.abs(step).max(axis=1) >= 1e-8]

@@ -139,6 +139,7 @@ async def test_a_study_finds_what_it_planted_and_replays_it(merge_runner, tmp_pa
         ("x_headwya = 1.0", "unknown key 'x_headwya'; valid: x_left_first, x_headway"),
         ('x_headway = "much"', "x_headway"),
         ("x_noise = -1", "x_noise"),
+        ("x_temperature = 1000, temperature = 0", "x_temperature"),
     ],
 )
 async def test_an_effect_that_cannot_be_is_refused_in_words(

@@ -11,15 +11,16 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from analysis.power.cei import GAP, SAMPLE_SETS, trials
 from analysis.power.questions import BESIDE_HUMANS, OF_AN_ARM, OF_TWO_ARMS
 from analysis.power.samples import Conditions
 from analysis.power.search import Arms, Search, beside_humans
 from analysis.power.shown import table
 from analysis.power.study import power
-from analysis.power.truths import SPEED, human, planted, without_relative_speed
+from analysis.power.truths import SPEED, cei, human, planted, without_relative_speed
 from analysis.stats.ceiling import ceiling, published_humans
 from analysis.stats.indicators import ROBUST, judged
-from analysis.stats.regressions import who_first_firth
+from analysis.stats.regressions import gap_ols, who_first_firth, who_first_logit
 from analysis.table_format import TableFormat
 from analysis.tables.formats import render
 from merge_runner.config import ScenarioConfig
@@ -154,7 +155,9 @@ def powered(tmp_path, study, model=(), simulations=60, seed=0):
 
 
 def test_equal_seeds_give_equal_chances_and_other_seeds_others(tmp_path):
-    one, same, other = (powered(tmp_path, "baseline", seed=seed) for seed in (0, 0, 1))
+    one, same, other = (
+        powered(tmp_path, "baseline", simulations=20, seed=seed) for seed in (0, 0, 1)
+    )
     assert one == same
     assert one.chances != other.chances
 
@@ -193,7 +196,7 @@ def test_a_usual_study_takes_less_than_20_seconds_of_one_core_and_costs_what_it_
     # Seven ablations of the same size are one row.
     assert {len(each.arms) for each in found.chances} == {1, 7}
     # Whether gaps are found does not hang on who merges first.
-    assert {each.truth for each in found.chances if each.table == "gap"} == {"human"}
+    assert {each.truth for each in found.chances if each.table == "gap"} == {"human", "cei"}
 
 
 async def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(
@@ -213,3 +216,47 @@ async def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(
     assert found["costs_usd"] == [None] * 3
     assert {each["trials"] for each in found["chances"]} == {44}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["experiments"]
+
+
+@pytest.mark.slow
+def test_the_shipped_outcomes_of_cei_are_those_of_its_trials():
+    """If the thresholds of cei have changed: python -m analysis.power.cei."""
+    played = trials(SAMPLE_SETS[:1], each=3)
+    logit, gap = who_first_logit(played), gap_ols(played, GAP)
+    shipped = cei()
+    for values, fit in ((shipped.who_first, logit), (shipped.gap, gap)):
+        for value, term in zip(values, fit.terms.values(), strict=True):
+            assert abs(value - term.b) < 3 * term.se
+    low, high = stats.binom.interval(0.99, len(played), shipped.collided)
+    assert low <= (played["status"] == "collided").sum() <= high
+
+
+def test_the_odds_of_the_emulator_are_those_that_the_humans_are_supposed_to_have():
+    assert PlantedEffect().coefficients == human().who_first
+
+
+PERSONA = """
+repetitions = 4
+[factors]
+prompt = ["baseline", "hurried"]
+x_persona = [{text = "You are late.", x_relative_speed = 2.0}]
+[prompts.hurried]
+add = [{text = "You are late."}]
+"""
+
+
+def test_a_planted_persona_is_supposed_where_the_prompt_contains_it(tmp_path):
+    (tmp_path / "persona.toml").write_text(PERSONA)
+    found = powered(tmp_path, str(tmp_path / "persona.toml"), simulations=20)
+    effects = {
+        each.arms[0]: each.effect for each in found.chances if each.question == SPEED_FOUND.asked
+    }
+    assert effects == {"baseline": -3.3, "hurried": pytest.approx(-1.3)}
+    (between,) = (each for each in found.chances if each.table == "who-first-variants")
+    assert between.effect == pytest.approx(2.0)
+
+
+def test_a_program_is_free_and_supposed_to_go_like_any_driver(tmp_path):
+    found = powered(tmp_path, "baseline", ("projected-order",), simulations=20)
+    assert found.free
+    assert {each.truth for each in found.chances} == {"human", "cei", "no relative velocity"}

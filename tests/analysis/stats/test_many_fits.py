@@ -20,6 +20,7 @@ from analysis.stats.many_fits import (
     mean_gap_differences,
 )
 from analysis.stats.regressions import (
+    WHO_FIRST_TERMS,
     gap_ols,
     who_first_data,
     who_first_firth,
@@ -122,14 +123,15 @@ def test_penalised_fits_at_once_are_those_one_by_one_to_a_millionth(tables):
 def test_differences_at_once_are_those_of_one_model_of_both_groups(tables):
     rng = np.random.default_rng(2)
     others = [trials(rng, 5, 0.5) for _ in range(SETS)]
-    found = firth_differences(draws(tables), draws(others))
-    assert found.sound.all()
+    found = [firth_differences(draws(tables), draws(others), term) for term in WHO_FIRST_TERMS[1:]]
+    assert all(each.sound.all() for each in found)
     for i in range(SETS):
         (own, own_left), (rest, rest_left) = who_first_data(tables[i]), who_first_data(others[i])
         design = np.block([[rest, 0 * rest], [own, own]])
         b, p = fitted(design, np.concatenate([rest_left, own_left]))
-        assert found.b[i] == pytest.approx(b[3:], abs=1e-5)
-        assert found.p[i, 1:] == pytest.approx(p[3:], abs=1e-6)
+        for at, each in enumerate(found, start=1):
+            assert each.b[i] == pytest.approx(b[3:], abs=1e-5)
+            assert each.p[i, at] == pytest.approx(p[2 + at], abs=1e-6)
 
 
 def test_mean_gaps_differ_at_once_as_in_the_linear_model_of_one_by_one(tables):
