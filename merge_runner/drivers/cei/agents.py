@@ -35,7 +35,8 @@ AHEAD_S = NODE_S * np.arange(1, NODES + 1)
 INPUTS = np.linspace(-1.0, 1.0, PLANS)
 # Most plans that are too risky are so at many nodes: a few of these are tried first.
 NODES_BY_TURNS = tuple(slice(first, None, 4) for first in (3, 1, 0, 2))
-OFF = -1
+TURNS = 9
+OFF = UNSOLVED = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,29 +107,19 @@ class Agents:
     ) -> None:
         """Judge the risk, and plan anew where there is a reason.
 
-        ``ticks`` have passed since the last time. Without ``controls`` a vehicle cruises by itself.
+        ``noise`` is standard normal, one number an agent, and ``ticks`` have passed since the last
+        time. Without ``controls`` a vehicle cruises by itself.
         """
         last_mps, self.last_mps = self.last_mps, own.speeds_mps
         if not controls.any():
             return
         belief = self._belief(model, other)
-        lower, upper = self._thresholds(model.thresholds, own, other)
         ahead = course(model.task, own.positions_m, own.speeds_mps, self.inputs)
         risk = risks(model.task, ahead.positions_m[1:], belief).max(axis=0)
-        low, waiting = risk < lower, self.waited_ticks != OFF
-        waited = np.where(waiting, self.waited_ticks + ticks, np.where(low, 0, OFF))
-        returns = low & (waited > model.habits.saturation_ticks)
         crossed = (last_mps - self.desired_mps) * (own.speeds_mps - self.desired_mps) < 0
-        # The first reason counts: no safe plan before, a low risk for long, a high risk, or the
-        # desired speed.
-        bounds = TO_LOWER * lower, TO_UPPER * upper, TO_LOWER * lower, TO_UPPER * upper
-        reasons = self.unsolved, returns, risk > upper, crossed
-        bound = np.select(reasons, bounds, np.inf)
-        restarts = returns & ~self.unsolved
-        ends = np.isfinite(bound) | (risk > lower)
-        waited = np.where(restarts, 0, np.where(ends, OFF, waited))
-        self.waited_ticks = np.where(controls, waited, OFF)
-        anew = np.isfinite(bound) & controls
+        thresholds = self._thresholds(model.thresholds, own, other)
+        bound = self._bound(model.habits, risk, thresholds, crossed, controls, ticks)
+        anew = np.isfinite(bound)
         if anew.any():
             self._plan(model, own, other, belief, bound, noise, anew)
 
@@ -157,6 +148,33 @@ class Agents:
             _clipped(self.upper + upper + of.upper_product * product),
         )
 
+    def _bound(
+        self,
+        habits: Habits,
+        risk: Array,
+        thresholds: tuple[Array, Array],
+        crossed: Mask,
+        controls: Mask,
+        ticks: int,
+    ) -> Array:
+        """How much a new plan may risk, infinite where there is no reason for one.
+
+        The first reason counts: no safe plan before, a low risk for long, a high risk, or the
+        desired speed.
+        """
+        lower, upper = thresholds
+        low, waiting = risk < lower, self.waited_ticks != OFF
+        waited = np.where(waiting, self.waited_ticks + ticks, np.where(low, 0, OFF))
+        returns = low & (waited > habits.saturation_ticks) & ~self.unsolved
+        bound = np.select(
+            [~controls, self.unsolved, returns, risk > upper, crossed],
+            [np.inf, TO_LOWER * lower, TO_UPPER * upper, TO_LOWER * lower, TO_UPPER * upper],
+            np.inf,
+        )
+        ends = ~controls | np.isfinite(bound) | (risk > lower)
+        self.waited_ticks = np.where(controls & returns, 0, np.where(ends, OFF, waited))
+        return np.asarray(bound)
+
     def _plan(
         self,
         model: Model,
@@ -170,23 +188,20 @@ class Agents:
         """The cheapest input with at most this risk, or else full power ahead, or full brakes."""
         agents = np.flatnonzero(anew)
         plans = course(model.task, own.positions_m[agents], own.speeds_mps[agents], INPUTS[:, None])
-        safe = np.ones((PLANS, agents.size), bool)
-        for nodes in NODES_BY_TURNS:
-            inputs, columns = np.nonzero(safe)
-            some = belief.of(nodes, agents[columns])
-            risk = risks(model.task, plans.positions_m[1:][nodes][:, inputs, columns], some)
-            safe[inputs, columns] = (risk <= bound[agents[columns]]).all(axis=0)
-        cost = np.where(safe, plans.cost(self.desired_mps[anew]), np.inf)
-        solved = safe.any(axis=0)
-        ahead = own.positions_m[anew] > other.positions_m[anew]
-        self.inputs = self.inputs.copy()
-        self.inputs[anew] = np.where(
-            solved,
-            _driven(model, INPUTS[cost.argmin(axis=0)], noise[anew]),
-            np.where(ahead, 1.0, -1.0),
+        best = cheapest_safe(
+            model.task,
+            plans.positions_m[1:],
+            plans.cost(self.desired_mps[agents]),
+            belief.of(slice(None), agents),
+            bound[agents],
         )
-        self.unsolved = self.unsolved.copy()
-        self.unsolved[anew] = ~solved
+        solved = best != UNSOLVED
+        ahead = own.positions_m[agents] > other.positions_m[agents]
+        self.inputs, self.unsolved = self.inputs.copy(), self.unsolved.copy()
+        self.inputs[agents] = np.where(
+            solved, _driven(model, INPUTS[best], noise[agents]), np.where(ahead, 1.0, -1.0)
+        )
+        self.unsolved[agents] = ~solved
 
 
 def start(
@@ -199,10 +214,9 @@ def start(
 ) -> Agents:
     """Agents that have cruised in the tunnel for some ticks, each beside the other.
 
-    They have planned to hold their speeds, and have
-    seen the other since the start of the run, when they took its speed to be their own: what they
-    perceive now is normal. ``noise`` is standard normal, of the shape (agents, 2): of the
-    perception and of the plan.
+    They have planned to hold their speeds. They have seen the other since the start of the run,
+    when they took its speed to be their own, so that what they perceive now is normally
+    distributed. ``noise`` is standard normal, of the shape (agents, 2): of perception and of plan.
     """
     habits = model.habits
     remaining = habits.remaining**ticks
@@ -222,6 +236,33 @@ def start(
         last_mps=own.speeds_mps,
         inputs=_driven(model, inputs, noise[:, 1]),
     )
+
+
+def cheapest_safe(
+    task: Task, positions_m: Array, cost: Array, belief: Belief, bound: Array
+) -> NDArray[np.int64]:
+    """For each agent the number of its cheapest input that never risks more than its bound.
+
+    ``positions_m`` has the shape (nodes, inputs, agents), ``cost`` (inputs, agents). UNSOLVED where
+    there is none. The cheap inputs are tried first, and most agents need no others.
+    """
+    best = np.full(bound.size, UNSOLVED)
+    ranks = cost.argsort(axis=0, kind="stable")
+    left = np.arange(bound.size)
+    for inputs in np.array_split(ranks, TURNS):
+        safe = np.ones((len(inputs), left.size), bool)
+        for nodes in NODES_BY_TURNS:
+            rows, columns = np.nonzero(safe)
+            agents = left[columns]
+            ahead = positions_m[nodes][:, inputs[rows, agents], agents]
+            risk = risks(task, ahead, belief.of(nodes, agents))
+            safe[rows, columns] = (risk <= bound[agents]).all(axis=0)
+        found = safe.any(axis=0)
+        best[left[found]] = inputs[safe.argmax(axis=0)[found], left[found]]
+        left = left[~found]
+        if not left.size:
+            break
+    return best
 
 
 def tunnel_ticks(own: Vehicles, other: Vehicles) -> Array:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from merge_runner.drivers.cei.seated import Seated
 
 BY_RESISTANCE = "by-resistance"
-USUAL_SETS: dict[Resistance, str] = {"human": "K0", "none": "K0"}
+USUAL_SETS: dict[Resistance, str] = {"human": "K0", "none": "drag-free"}
 PAIR = "pair"
 
 

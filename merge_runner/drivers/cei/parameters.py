@@ -96,8 +96,9 @@ class ThresholdSet:
         return Base(lower, max(upper, lower + NARROWEST_BAND))
 
 
-# Found by a short search, from which the longer ones start. K0 was calibrated to the published
-# outcomes and to the humans' first action, F1 to the outcomes alone.
+# K0 and F1 were found by a short search: K0 for the published outcomes and the humans' first
+# action, F1 for the outcomes alone. `python -m analysis.calibration.cei search` found the others
+# from there; docs/reference/cei.md has the commands with their seeds.
 SETS: dict[str, ThresholdSet] = {
     "K0": ThresholdSet(
         *(0.4188, 0.3511, 0.1371, 0.0227),
@@ -106,6 +107,10 @@ SETS: dict[str, ThresholdSet] = {
     "F1": ThresholdSet(
         *(0.0839, 0.8586, 0.0589, 0.0768),
         *(-0.0186, -0.0319, 0.0156, 0.0725, 0.1169, -0.0414),
+    ),
+    "drag-free": ThresholdSet(
+        *(0.4038, 0.3510, 0.1184, 0.0129),
+        *(0.0127, -0.0696, -0.0089, 0.0407, 0.0521, 0.0085),
     ),
 }
 

@@ -32,12 +32,11 @@ class Seated:
         # Between two decisions that are more than a tick apart it saw a steady change of speed.
         steady = (seen.other_speed_mps - self._other_mps) / (ticks * TICK_S)
         accelerated = np.array([seen.other_acceleration_mps2 if ticks == 1 else steady])
-        noise = self._noise()
-        for tick in range(ticks):
-            noise = self._noise() if tick else noise
+        noises = [self._noise() for _ in range(ticks)]
+        for noise in noises:
             self._agents.perceive(self._model, other, accelerated, noise[:, 0])
         controls = np.ones(1, bool)
-        self._agents.decide(self._model, own, other, noise[:, 1], controls, ticks)
+        self._agents.decide(self._model, own, other, noises[-1][:, 1], controls, ticks)
         self._other_mps = seen.other_speed_mps
         return float(self._agents.inputs[0])
 

@@ -5,12 +5,13 @@ import pytest
 
 from merge_runner.drivers.cei.agents import Vehicles, start, tunnel_ticks
 from merge_runner.drivers.cei.collision_interval import collision_interval, exact_bounds
+from merge_runner.drivers.cei.driver import USUAL_SETS, thresholds_of
 from merge_runner.drivers.cei.motion import course
 from merge_runner.drivers.cei.parameters import OFFSETS, SETS, Base, Habits, offsets_of
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration
-from tests.drivers.cei.trials import cei, model, played, scenario
+from tests.drivers.cei.trials import cei, model, played, scenario, spec
 
 BOXES = (4.5, 1.8)
 
@@ -120,7 +121,12 @@ def test_the_nine_pairs_take_turns_by_the_repetition():
     assert offsets_of(9, 1) == OFFSETS[8]
 
 
-def test_the_sets_suit_the_resistance_unless_one_is_chosen():
-    usual = cei().values
-    assert "lower_mean" not in usual
-    assert cei(set="K0").values["lower_mean"] == SETS["K0"].lower_mean
+@pytest.mark.parametrize("resistance", ["human", "none"])
+def test_the_usual_set_suits_the_resistance_unless_one_is_chosen(resistance):
+    task = scenario(resistance=resistance)
+    usual, chosen = (
+        program.seat(task, spec("N_0_0"), "left") for program in (cei(), cei(set="F1"))
+    )
+    assert thresholds_of(usual) == SETS[USUAL_SETS[resistance]]
+    assert thresholds_of(chosen) == SETS["F1"]
+    assert USUAL_SETS["human"] != USUAL_SETS["none"]
