@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from analysis.human.commands import INTERRUPTED, human_app
+from analysis.power.commands import power
 from analysis.table_format import TableFormat
 from merge_runner.cli import app, main
 from merge_runner.cli.options import DbOption, StudyOption, levels, listed
@@ -30,6 +31,7 @@ __all__ = ["app", "main"]
 HTML = b"<!doctype html"
 
 app.add_typer(human_app, name="human")
+app.command()(power)
 
 
 ModelsOption = Annotated[

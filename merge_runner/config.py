@@ -28,6 +28,7 @@ from pydantic import (
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import SHIPPED_EXPERIMENTS
+from merge_runner.planted_effect import PARAMETERS as PLANTED
 from merge_runner.records import SIDES, Side
 from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
@@ -347,6 +348,7 @@ PROVIDERS.register(
         "http://127.0.0.1/v1",
         "EMULATOR_BASE_URL",
         key_needed=False,
+        parameters=PLANTED,
         if_nobody="start it with `merge-runner emulate`",
     ),
 )

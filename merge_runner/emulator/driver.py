@@ -1,8 +1,8 @@
 """A scripted human-like driver that reads the prompt and answers in free text, as a model would.
 
-Who goes first is drawn from the human logistic odds, logit P(left first) = -0.30 + 1.11 h - 3.30 dv
-(arXiv 2604.09609, Table III), once for a trial and shared by both sides. Both hold piecewise
-constant accelerations that open a gap. In every third repetition, in one condition, the driver
+Who goes first is drawn from the human logistic odds, or from those that a request plants
+(``planted_effect``), once for a trial and shared by both sides. Both hold piecewise constant
+accelerations that open a gap. In every third repetition, in one condition, the driver
 that should yield misjudges: it keeps level with the other, and they collide.
 """
 
@@ -12,7 +12,8 @@ import math
 import re
 from dataclasses import dataclass
 
-from merge_runner.chance import draw, draw_between, draw_index
+from merge_runner.chance import draw, draw_between, draw_index, draw_normal
+from merge_runner.planted_effect import PlantedEffect
 from merge_runner.prompts.state_lines import NOT_SEEN
 from merge_runner.records import FAR_BEHIND_M, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
@@ -21,6 +22,7 @@ from merge_runner.scenarios.merge.geometry import TRACK
 VEHICLE_LENGTH_M = 4.5
 MAX_ACCELERATION_MPS2 = 2.5
 SHORTEST_S = 1.0
+HUMAN = PlantedEffect()
 HARDEST_BRAKING_MPS2, HARDEST_PUSH_MPS2 = -2.2, 1.4
 
 
@@ -60,12 +62,12 @@ class Temper:
     leader_share: float
 
 
-def answer(prompt: str, slot: Slot | None) -> str:
+def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) -> str:
     """The reply's text for a prompt; without a slot it depends on the prompt alone."""
     seen = read_prompt(prompt)
     if seen is None:
         return "I am a scripted stand-in for a language model and can only answer driving prompts."
-    temper = temper_for(seen, slot, prompt)
+    temper = temper_for(seen, slot, None if effect is None else effect.before(prompt))
     if not seen.other_seen:
         action, why = 0.0, "I do not see the other car, and keep my speed."
     elif seen.distance_to_merge is None:
@@ -105,29 +107,39 @@ def read_prompt(prompt: str) -> Seen | None:
     )
 
 
-def temper_for(seen: Seen, slot: Slot | None, prompt: str) -> Temper:
+def temper_for(seen: Seen, slot: Slot | None, effect: PlantedEffect | None) -> Temper:
     """The trial's draws; without a slot the projected order decides who goes first."""
+    added_gap_m = 0.0 if effect is None else effect.x_gap_m
     if slot is None:
-        return Temper(_projected_lead_m(seen) > 0, False, 3.85, 0.5)
-    trial = (slot.condition, slot.repetition, slot.sample_set)
-    left_first = draw("who first", *trial) < _chance_left_first(slot.condition)
+        return Temper(_projected_lead_m(seen) > 0, False, 3.85 + added_gap_m, 0.5)
+    trial: tuple[object, ...] = (slot.condition, slot.repetition, slot.sample_set)
+    if effect is not None:  # trials with another effect are drawn independently
+        trial += (effect.model_dump_json(),)
+    noise = draw_normal("noise", *trial)
+    chance = _chance_left_first(effect or HUMAN, slot.condition, noise)
+    left_first = draw("who first", *trial) < chance
     goes_first = (slot.side == "left") == left_first
     misjudges = not goes_first and _somebody_misjudges(slot)
     return Temper(
         goes_first=goes_first or misjudges,
         misjudges=misjudges,
-        target_gap_m=draw_between(1.8, 6.5, "gap", *trial),
+        target_gap_m=draw_between(1.8, 6.5, "gap", *trial) + added_gap_m,
         leader_share=draw_between(0.1, 0.7, "share", *trial),
     )
 
 
-def _chance_left_first(condition: str) -> float:
+def _chance_left_first(effect: PlantedEffect, condition: str, noise: float) -> float:
     kinematics = CONDITIONS.get(condition)
     if kinematics is None:  # a study's own: this process may not know it
         return 0.5
-    # arXiv 2604.09609, Table III.
-    odds = -0.30 + 1.11 * kinematics.projected_headway_m - 3.30 * kinematics.relative_velocity_mps
-    return 1 / (1 + math.exp(-odds))
+    intercept, of_headway, of_speed = effect.coefficients
+    logit = (
+        intercept
+        + of_headway * kinematics.projected_headway_m
+        + of_speed * kinematics.relative_velocity_mps
+        + effect.x_noise * noise
+    )
+    return 1 / (1 + math.exp(-max(logit, -700.0)))  # exp of more than 709 overflows
 
 
 def _somebody_misjudges(slot: Slot) -> bool:

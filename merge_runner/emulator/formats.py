@@ -62,6 +62,10 @@ class ServedFormat(ABC):
         """The user's last message in a request."""
         return (body.get("messages") or [{}])[-1].get("content", "")
 
+    def parameters(self, body: dict[str, Any]) -> dict[str, Any]:
+        """Where the parameters of a request stand."""
+        return body
+
     @abstractmethod
     def answer(self, said: Said) -> dict[str, Any]:
         """The body of a reply."""
@@ -198,6 +202,9 @@ class _Gemini(ServedFormat):
 
     def last_turn(self, body: dict[str, Any]) -> Turn:
         return (body.get("contents") or [{}])[-1].get("parts", [])
+
+    def parameters(self, body: dict[str, Any]) -> dict[str, Any]:
+        return dict(body.get("generationConfig") or {})
 
     def answer(self, said: Said) -> dict[str, Any]:
         content: dict[str, Any] = {"role": "model"}

@@ -16,10 +16,12 @@ from typing import Any
 
 from aiohttp import web
 
+from merge_runner.config import validated
 from merge_runner.emulator.driver import answer
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.emulator.formats import SERVED, Said, ServedFormat
 from merge_runner.errors import UsageError
+from merge_runner.planted_effect import PlantedEffect, planted_fields
 from merge_runner.records import (
     ANSWERED_FIELD,
     ATTEMPT_HEADER,
@@ -80,8 +82,13 @@ class Emulator:
             prompt = wire.prompt(body)
             model = request.match_info.get("model") or str(body.get("model", MODELS[0]))
             (prompt + model).encode()
+            planted = planted_fields(wire.parameters(body))
         except UNREADABLE:
             return _error(wire, 400, "The body is not valid.")
+        try:
+            effect = validated(PlantedEffect, planted, "the emulator") if planted else None
+        except UsageError as exc:
+            return _error(wire, 400, str(exc))
         where = request.headers.get(SLOT_HEADER) or hashlib.sha256(raw).hexdigest()
         attempt = self._attempt(request, where)
         fault = self._faults.fault(where, attempt)
@@ -94,7 +101,7 @@ class Emulator:
             return _error(wire, 429, "Rate limit reached.", self._faults.wait_s(where, attempt))
         if fault in STATUS_FAULTS:
             return _error(wire, STATUS_FAULTS[fault], "An emulated fault.")
-        text = TEXTS[fault] if fault in TEXTS else answer(prompt, slot)
+        text = TEXTS[fault] if fault in TEXTS else answer(prompt, slot, effect)
         # Only the same attempt at the same request gets the same id: the audit takes one that
         # comes back for an answer that was given twice.
         reply_id = hashlib.sha256(raw + f"{request.path} {where} {attempt}".encode()).hexdigest()

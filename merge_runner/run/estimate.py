@@ -236,7 +236,7 @@ def _trial_calls(plan: Plan, arm: Arm) -> dict[str, TrialCalls]:
     sides = Counter(name for name in arm.asked.values() if name in arm.entries)
     usual, most = usual_prompts(arm), most_prompts(arm)
     # No tokeniser makes more tokens than bytes.
-    read = int(len(_typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
+    read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
     calls: dict[str, TrialCalls] = {}
     for name, number in sides.items():
         entry = arm.entries[name]
@@ -259,7 +259,7 @@ def _per_call(plan: Plan, arm: Arm, entry: ModelEntry, facts: CallTotals) -> _Pe
     if facts.measured:
         return _PerCall(_measured_usage(facts), facts.latency_s / facts.measured)
     # English has about 4 bytes a token.
-    prompt_tokens = len(_typical_prompt(plan, arm).encode()) // 4
+    prompt_tokens = len(typical_prompt(plan, arm).encode()) // 4
     usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
     return _PerCall(usage, entry.typical_latency_s)
 
@@ -279,7 +279,7 @@ def _limited_s(options: Options, calls: _Calls) -> float:
     return max(60 * number / rpm if rpm else 0.0, 60 * number * tokens / tpm if tpm else 0.0)
 
 
-def _typical_prompt(plan: Plan, arm: Arm) -> str:
+def typical_prompt(plan: Plan, arm: Arm) -> str:
     """An arm's prompt in the middle of an approach."""
     scenario = arm.scenario
     world = new_world(scenario, plan.conditions[0])

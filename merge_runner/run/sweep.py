@@ -263,9 +263,22 @@ class Sweep:
 
         clients = sealed_clients(plan, self._cache)
         await LocalRunner(plan, clients, in_flight=1).play(self._todo, ended)
-        todo = {label: Todo(trials[label], calls[label]) for label in self._arms}
+        return self._estimated({label: Todo(trials[label], calls[label]) for label in self._arms})
+
+    def estimate_of_all(self) -> Estimate:
+        """What all trials take, as if none were stored or recorded yet."""
+        conditions = len(self._plan.conditions)
+        todo = {}
+        for label, arm in self._arms.items():
+            trials = arm.repetitions * conditions
+            sides = Counter(name for name in arm.asked.values() if name in arm.entries)
+            calls = {name: trials * n * PROMPTS_PER_DRIVER for name, n in sides.items()}
+            todo[label] = Todo(trials, calls)
+        return self._estimated(todo)
+
+    def _estimated(self, todo: Mapping[str, Todo]) -> Estimate:
         return estimate(
-            plan,
+            self._plan,
             self._options,
             todo=todo,
             facts=self._measured(),

@@ -13,18 +13,14 @@ from analysis.data.reference_data import human_outcomes
 from analysis.stats.ceiling import (
     DATA_SETS,
     Ceiling,
-    Draws,
     Population,
     ceiling,
     drawn,
-    firth_fits,
-    gap_fits,
     imported_humans,
-    logit_fits,
-    passes,
     published_humans,
 )
 from analysis.stats.indicators import PAPER, ROBUST, verdicts
+from analysis.stats.many_fits import Draws, firth_fits, gap_fits, logit_fits, passes
 from analysis.stats.regressions import Regression, gap_ols, who_first_firth, who_first_logit
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 

@@ -1,0 +1,1 @@
+"""What a study can find, simulated before it is played."""

@@ -1,0 +1,65 @@
+"""The command ``merge-runner power``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from merge_runner.cli import (
+    CacheOption,
+    ConditionsOption,
+    DbOption,
+    JsonOption,
+    ModelOption,
+    OnlyOption,
+    RepsOption,
+    VariantsOption,
+    levels,
+    listed,
+    print_out,
+    say,
+)
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+
+
+def power(
+    study: Annotated[
+        str, typer.Argument(metavar="STUDY", help="experiments/STUDY.toml, or a path.")
+    ],
+    model: ModelOption = None,
+    only: OnlyOption = None,
+    reps: RepsOption = None,
+    conditions: ConditionsOption = None,
+    variants: VariantsOption = None,
+    sims: Annotated[int, typer.Option(help="Simulated studies of each size.", min=20)] = 200,
+    seed: Annotated[int, typer.Option(help="Another number draws other studies.", min=0)] = 0,
+    db: DbOption = DEFAULT_DB,
+    cache: CacheOption = DEFAULT_CACHE,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what a study could find and what that costs, before it is played; sends nothing."""
+    from analysis.power.shown import table
+    from analysis.power.study import power as chances
+    from analysis.table_format import TableFormat
+    from analysis.tables.formats import render
+    from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.unsent import of_all
+
+    plan = make_plan(
+        study,
+        model or (),
+        reps,
+        listed(conditions),
+        listed(variants),
+        only=levels(only or (), "--only"),
+    )
+    expected = of_all(plan, Options(db=Path(db), cache=Path(cache)), say=say)
+    found = chances(plan, expected, simulations=sims, seed=seed)
+    if as_json:
+        print_out(json.dumps(asdict(found), ensure_ascii=False))
+    else:
+        print_out(render([table(found)], TableFormat.TEXT))

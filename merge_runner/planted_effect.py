@@ -1,0 +1,77 @@
+"""An effect that a study plants in the emulator, so that an analysis can be rehearsed on it."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+PREFIX = "x_"
+
+# The bounds keep every logit finite.
+Number = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
+NotNegative = Annotated[float, Field(strict=True, ge=0, le=1e6)]
+Exponent = Annotated[float, Field(strict=True, ge=-10, le=10)]
+Temperature = Annotated[float, Field(strict=True, ge=0, le=10)]
+
+
+class Persona(BaseModel):
+    """What changes where a prompt contains the ``text``: each number is added to its namesake."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    text: Annotated[str, Field(min_length=1)]
+    x_left_first: Number = 0.0
+    x_headway: Number = 0.0
+    x_relative_speed: Number = 0.0
+    x_gap_m: Number = 0.0
+
+
+class PlantedEffect(BaseModel):
+    """Who goes first: logit P(left first) = k (x_left_first + x_headway h + x_relative_speed dv).
+
+    h is the projected headway in m, dv the relative speed in m/s, both left minus right, and
+    k = exp(-x_temperature (T - 1)) at the request's ``temperature`` T. What is not given is as in
+    humans (arXiv 2604.09609, Table III). ``x_noise`` is the standard deviation of what is added to
+    the logit of each trial; it flattens the coefficients that a regression finds. ``x_gap_m`` is
+    added to the gap that both aim at.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    x_left_first: Number = -0.30
+    x_headway: Number = 1.11
+    x_relative_speed: Number = -3.30
+    x_temperature: Exponent = 0.0
+    x_noise: NotNegative = 0.0
+    x_gap_m: Number = 0.0
+    x_persona: Persona | None = None
+    temperature: Temperature = 1.0
+
+    def before(self, prompt: str) -> Self:
+        """The effect on the reader of this prompt, without a persona."""
+        persona = self.x_persona
+        if persona is None:
+            return self
+        added = persona.model_dump(exclude={"text"}) if persona.text in prompt else {}
+        changed = {name: getattr(self, name) + more for name, more in added.items()}
+        return self.model_copy(update={**changed, "x_persona": None})
+
+    @property
+    def coefficients(self) -> tuple[float, float, float]:
+        """Those of the logit, without noise: the intercept, that of h and that of dv."""
+        k = math.exp(-self.x_temperature * (self.temperature - 1))
+        return k * self.x_left_first, k * self.x_headway, k * self.x_relative_speed
+
+
+PARAMETERS = frozenset(name for name in PlantedEffect.model_fields if name.startswith(PREFIX))
+"""The parameters of a request that plant an effect."""
+
+
+def planted_fields(parameters: dict[str, JsonValue]) -> dict[str, JsonValue]:
+    """Those of a request's parameters that say what is planted; empty where nothing is."""
+    planted = {name: value for name, value in parameters.items() if name.startswith(PREFIX)}
+    if planted and "temperature" in parameters:
+        planted["temperature"] = parameters["temperature"]
+    return planted

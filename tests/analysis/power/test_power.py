@@ -1,0 +1,262 @@
+"""What a study can find is what studies that are played find, at the stated rate."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from functools import cache
+
+import pandas as pd
+import pytest
+from scipy import stats
+
+from analysis.power.cei import GAP, SAMPLE_SETS, trials
+from analysis.power.questions import BESIDE_HUMANS, OF_AN_ARM, OF_TWO_ARMS
+from analysis.power.samples import Conditions
+from analysis.power.search import Arms, Search, beside_humans
+from analysis.power.shown import table
+from analysis.power.study import power
+from analysis.power.truths import SPEED, cei, human, planted, without_relative_speed
+from analysis.stats.ceiling import ceiling, published_humans
+from analysis.stats.indicators import ROBUST, judged
+from analysis.stats.regressions import gap_ols, who_first_firth, who_first_logit
+from analysis.table_format import TableFormat
+from analysis.tables.formats import render
+from merge_runner.config import ScenarioConfig
+from merge_runner.emulator.driver import answer
+from merge_runner.planted_effect import PlantedEffect
+from merge_runner.prompts.render import render_prompt
+from merge_runner.records import SIDES, Slot
+from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.unsent import of_all
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import World
+
+HUMANS = Conditions(
+    tuple(each.projected_headway_m for each in HUMAN_CONDITIONS.values()),
+    tuple(each.relative_velocity_mps for each in HUMAN_CONDITIONS.values()),
+)
+HEADWAY_FOUND, SPEED_FOUND, GAP_FOUND, GAP_STEADY, ALL_FOUND = OF_AN_ARM
+STUDIES = 20
+PLANTED = """
+repetitions = 10
+[factors]
+x_relative_speed = [-3.3, -0.2]
+"""
+
+
+@cache
+def first_prompt(condition: str, side: str) -> str:
+    scenario = ScenarioConfig()
+    seen = World(scenario, CONDITIONS[condition], TRACK).observe(side)
+    return render_prompt(seen, None, variant="baseline", scenario=scenario)
+
+
+def emulated(effect: PlantedEffect, repetitions: int, sample_set: int) -> pd.DataFrame:
+    """A study of the emulator, by what both of its drivers say first."""
+    rows = []
+    for name in HUMAN_CONDITIONS:
+        for repetition in range(1, repetitions + 1):
+            slots = [Slot(name, repetition, side, 0, sample_set) for side in SIDES]
+            letters = "".join(answer(first_prompt(name, s.side), s, effect)[0] for s in slots)
+            who = {"MY": "left", "YM": "right"}.get(letters)
+            c = CONDITIONS[name]
+            status = "finished" if who else "collided"
+            rows.append((c.projected_headway_m, c.relative_velocity_mps, status, who))
+    columns = ["projected_headway_m", "relative_velocity_mps", "status", "merged_first"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+@pytest.mark.parametrize("of_speed", [-0.9, -1.4, -2.2])
+def test_twenty_planted_studies_find_the_effect_at_the_stated_rate(of_speed):
+    effect = PlantedEffect(x_relative_speed=of_speed)
+    stated = Search(HUMANS, 1000, 0).chance(SPEED_FOUND, Arms(planted(effect), 10), 10)
+    found = sum(
+        bool(judged(ROBUST["I2"], who_first_firth(emulated(effect, 10, study))).passed)
+        for study in range(STUDIES)
+    )
+    low, high = stats.binom.interval(0.99, STUDIES, stated)
+    assert low <= found <= high
+    assert 0.2 < stated < 1
+
+
+def test_the_chances_of_humans_are_their_ceiling():
+    search, arms = Search(HUMANS, 1000, 1), Arms(human(), 10)
+    shares = ceiling(published_humans(), (10,) * len(HUMAN_CONDITIONS)).robust
+    for name, question in zip((*ROBUST, "I1-I4"), OF_AN_ARM, strict=True):
+        assert search.chance(question, arms, 10) == pytest.approx(shares[name], abs=0.06)
+
+
+def test_the_chance_to_find_nothing_is_that_of_a_false_alarm():
+    search, truth = Search(HUMANS, 1000, 2), without_relative_speed()
+    # Two-sided tests at 5 %, of which one side counts; between two arms both do.
+    assert search.chance(SPEED_FOUND, Arms(truth, 10), 10) == pytest.approx(0.025, abs=0.015)
+    two = Arms(truth, 10, truth, 10)
+    for question in OF_TWO_ARMS[:3]:
+        assert search.chance(question, two, 10) == pytest.approx(0.05, abs=0.025)
+    assert search.chance(OF_TWO_ARMS[3], two, 10) < 0.05  # Fisher's test is conservative
+
+
+@pytest.mark.parametrize(
+    ("question", "arms"),
+    [
+        (SPEED_FOUND, Arms(human(), 10)),
+        (GAP_FOUND, Arms(human(), 10)),
+        (BESIDE_HUMANS[0], beside_humans(human(), 10)),
+        (BESIDE_HUMANS[1], beside_humans(human(), 10)),
+        (OF_TWO_ARMS[1], Arms(human(), 10, human(), 5)),
+        (OF_TWO_ARMS[2], Arms(human(), 10, human(), 5)),
+    ],
+    ids=["speed", "gap slope", "humans", "collisions", "two arms", "gap of two arms"],
+)
+def test_the_smallest_effect_is_found_with_a_chance_of_80_percent_in_other_studies_too(
+    question, arms
+):
+    smallest = Search(HUMANS, 400, 3).smallest(question, arms)
+    none = 0.0 if arms.other is None else question.effect.of(arms.other)
+    elsewhere = Search(HUMANS, 1000, 4)
+
+    def chance(part):
+        truth = question.effect.put(arms.truth, none + part * smallest)
+        return elsewhere.chance(question, dataclasses.replace(arms, truth=truth), 10)
+
+    assert chance(1) == pytest.approx(0.8, abs=0.07)
+    assert chance(0.5) < 0.6
+
+
+def test_so_many_trials_as_are_said_to_be_enough_are_enough_and_half_of_them_are_not():
+    arms = Arms(human().with_who_first(SPEED, -1.2), 10)
+    enough = Search(HUMANS, 400, 5).fewest_repetitions(SPEED_FOUND, arms)
+    assert 10 < enough < 40
+    elsewhere = Search(HUMANS, 1000, 6)
+    assert elsewhere.chance(SPEED_FOUND, arms, enough) == pytest.approx(0.8, abs=0.06)
+    assert elsewhere.chance(SPEED_FOUND, arms, enough // 2) < 0.7
+
+
+def test_an_effect_that_four_times_the_trials_do_not_show_is_not_findable():
+    search = Search(HUMANS, 200, 0)
+    weak = Arms(human().with_who_first(SPEED, -0.5), 10)
+    assert search.chance(SPEED_FOUND, weak, 40) < 0.8
+    assert search.fewest_repetitions(SPEED_FOUND, weak) is None
+    assert search.fewest_repetitions(SPEED_FOUND, Arms(human().with_who_first(SPEED, -1.2), 10))
+    # One condition cannot tell the cues apart, however often it is played.
+    alone = Search(Conditions((4.0,), (-0.8,)), 50, 0)
+    assert alone.fewest_repetitions(SPEED_FOUND, Arms(human(), 10)) is None
+    assert alone.smallest(SPEED_FOUND, Arms(human(), 10)) is None
+
+
+def powered(tmp_path, study, model=(), simulations=60, seed=0):
+    plan = make_plan(study, model)
+    options = Options(db=tmp_path / "none.duckdb", cache=tmp_path / "none")
+    expected = of_all(plan, options, say=print)
+    return power(plan, expected, simulations=simulations, seed=seed)
+
+
+def test_equal_seeds_give_equal_chances_and_other_seeds_others(tmp_path):
+    one, same, other = (
+        powered(tmp_path, "baseline", simulations=20, seed=seed) for seed in (0, 0, 1)
+    )
+    assert one == same
+    assert one.chances != other.chances
+
+
+def test_a_planted_study_is_told_by_what_is_planted(tmp_path):
+    (tmp_path / "planted.toml").write_text(PLANTED)
+    found = powered(tmp_path, str(tmp_path / "planted.toml"))
+    assert {each.truth for each in found.chances} == {"as planted"}
+    speeds = {each.arms: each for each in found.chances if each.question == SPEED_FOUND.asked}
+    strong, weak = speeds["x_relative_speed=-3.3",], speeds["x_relative_speed=-0.2",]
+    assert (strong.effect, weak.effect) == (-3.3, -0.2)
+    assert strong.enough < strong.trials == 110
+    assert weak.enough is None
+    (between,) = (each for each in found.chances if each.table == "who-first-variants")
+    assert between.effect == pytest.approx(3.1)
+    assert between.against == "x_relative_speed=-3.3"
+    shown = render([table(found)], TableFormat.TEXT)
+    (line,) = (line for line in shown.splitlines() if SPEED_FOUND.asked in line and "=-0.2" in line)
+    assert line.rstrip().endswith("not findable")
+    assert "the whole study costs nothing" in shown
+
+
+@pytest.mark.slow
+def test_a_usual_study_takes_less_than_20_seconds_of_one_core_and_costs_what_it_would(tmp_path):
+    began = time.process_time()
+    found = powered(tmp_path, "ablations", ("o3",), simulations=200)
+    assert time.process_time() - began < 20
+    assert found.trials == 495
+    half, once, twice = found.costs_usd
+    assert (half, twice) == (once / 2, once * 2)
+    assert 50 < once < 500
+    for each in found.chances:
+        # The whole study's cost, in proportion to the trials of the arm.
+        expected = None if each.enough is None else once * each.enough / each.trials
+        assert each.cost_usd == pytest.approx(expected)
+    # Seven ablations of the same size are one row.
+    assert {len(each.arms) for each in found.chances} == {1, 7}
+    # Whether gaps are found does not hang on who merges first.
+    assert {each.truth for each in found.chances if each.table == "gap"} == {"human", "cei"}
+
+
+async def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(
+    merge_runner, tmp_path
+):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/models.toml").write_text(
+        '[dear]\nprovider = "openai"\nformat = "openai-chat"\nid = "no-such-model"\n'
+        "max_output_tokens = 4000\n"
+    )
+    few = ("power", "baseline", "--model", "dear", "--reps", 4, "--sims", 20)
+    run = await merge_runner(*few)
+    assert run.code == 0, run.err
+    assert "the whole study costs about unknown (x0.5), unknown (x1), unknown (x2) USD" in run.out
+    assert "nothing to find" in run.out
+    found = json.loads((await merge_runner(*few, "--json")).out)
+    assert found["costs_usd"] == [None] * 3
+    assert {each["trials"] for each in found["chances"]} == {44}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["experiments"]
+
+
+@pytest.mark.slow
+def test_the_shipped_outcomes_of_cei_are_those_of_its_trials():
+    """If the thresholds of cei have changed: python -m analysis.power.cei."""
+    played = trials(SAMPLE_SETS[:1], each=3)
+    logit, gap = who_first_logit(played), gap_ols(played, GAP)
+    shipped = cei()
+    for values, fit in ((shipped.who_first, logit), (shipped.gap, gap)):
+        for value, term in zip(values, fit.terms.values(), strict=True):
+            assert abs(value - term.b) < 3 * term.se
+    low, high = stats.binom.interval(0.99, len(played), shipped.collided)
+    assert low <= (played["status"] == "collided").sum() <= high
+
+
+def test_the_odds_of_the_emulator_are_those_that_the_humans_are_supposed_to_have():
+    assert PlantedEffect().coefficients == human().who_first
+
+
+PERSONA = """
+repetitions = 4
+[factors]
+prompt = ["baseline", "hurried"]
+x_persona = [{text = "You are late.", x_relative_speed = 2.0}]
+[prompts.hurried]
+add = [{text = "You are late."}]
+"""
+
+
+def test_a_planted_persona_is_supposed_where_the_prompt_contains_it(tmp_path):
+    (tmp_path / "persona.toml").write_text(PERSONA)
+    found = powered(tmp_path, str(tmp_path / "persona.toml"), simulations=20)
+    effects = {
+        each.arms[0]: each.effect for each in found.chances if each.question == SPEED_FOUND.asked
+    }
+    assert effects == {"baseline": -3.3, "hurried": pytest.approx(-1.3)}
+    (between,) = (each for each in found.chances if each.table == "who-first-variants")
+    assert between.effect == pytest.approx(2.0)
+
+
+def test_a_program_is_free_and_supposed_to_go_like_any_driver(tmp_path):
+    found = powered(tmp_path, "baseline", ("projected-order",), simulations=20)
+    assert found.free
+    assert {each.truth for each in found.chances} == {"human", "cei", "no relative velocity"}

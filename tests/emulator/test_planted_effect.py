@@ -1,0 +1,187 @@
+"""An effect that a study plants in the emulator is what its analysis finds in the long run."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from analysis.stats.regressions import WHO_FIRST_TERMS, who_first_logit
+from analysis.tables import table
+from merge_runner.config import PROVIDERS, ScenarioConfig
+from merge_runner.emulator.driver import answer
+from merge_runner.planted_effect import PARAMETERS, PlantedEffect, planted_fields
+from merge_runner.prompts.parse import parse_reply
+from merge_runner.prompts.render import render_prompt
+from merge_runner.records import SIDES, Slot
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import World
+
+HURRIED = "You are in a hurry."
+REPETITIONS = range(1, 201)
+STUDY = """
+repetitions = 12
+[factors]
+x_relative_speed = [-2.0, 0.0]
+"""
+
+
+@cache
+def first_prompt(condition: str, side: str) -> str:
+    scenario = ScenarioConfig()
+    seen = World(scenario, CONDITIONS[condition], TRACK).observe(side)
+    return render_prompt(seen, None, variant="baseline", scenario=scenario)
+
+
+def told(condition, repetition, side, effect, added=""):
+    slot = Slot(condition, repetition, side, 0, 0)
+    return answer(first_prompt(condition, side) + added, slot, effect)
+
+
+def firsts(effect, added=""):
+    """Who goes first by the letters of both, as trials; contested ones did not finish."""
+    rows = []
+    for name in HUMAN_CONDITIONS:
+        c = CONDITIONS[name]
+        for n in REPETITIONS:
+            letters = [told(name, n, side, effect, added)[0] for side in SIDES]
+            who = {("M", "Y"): "left", ("Y", "M"): "right"}.get(tuple(letters))
+            status = "finished" if who else "collided"
+            rows.append((name, c.projected_headway_m, c.relative_velocity_mps, status, who))
+    columns = ["condition", "projected_headway_m", "relative_velocity_mps"]
+    return pd.DataFrame(rows, columns=[*columns, "status", "merged_first"])
+
+
+@pytest.mark.parametrize(
+    ("given", "added", "expected"),
+    [
+        ({}, "", (-0.30, 1.11, -3.30)),
+        ({"x_relative_speed": 0}, "", (-0.30, 1.11, 0.0)),
+        ({"x_headway": 0.4, "x_relative_speed": 1.5, "x_left_first": 0.8}, "", (0.8, 0.4, 1.5)),
+        ({"x_temperature": 0.7, "temperature": 2.0}, "", (-0.149, 0.551, -1.639)),
+        ({"x_persona": {"text": HURRIED, "x_relative_speed": 2.3}}, "", (-0.30, 1.11, -3.30)),
+        ({"x_persona": {"text": HURRIED, "x_relative_speed": 2.3}}, HURRIED, (-0.30, 1.11, -1.0)),
+    ],
+    ids=["human", "no relative speed", "all three", "temperature", "not the persona", "persona"],
+)
+def test_the_logit_of_who_goes_first_has_the_planted_coefficients(given, added, expected):
+    fit = who_first_logit(firsts(PlantedEffect(**given), added))
+    for term, planted in zip(WHO_FIRST_TERMS, expected, strict=True):
+        assert abs(fit.terms[term].b - planted) < 3 * fit.terms[term].se
+
+
+def test_noise_flattens_the_coefficients_as_a_latent_normal_does():
+    fit = who_first_logit(firsts(PlantedEffect(x_noise=3.0)))
+    # A logit with normal noise of variance 9 is one of coefficients divided by the root of
+    # 1 + 9 (16 sqrt(3) / (15 pi))^2, to about 3 % (Zeger, Liang and Albert 1988).
+    flattened = np.array([1.11, -3.30]) / np.sqrt(1 + 9 * (16 * np.sqrt(3) / (15 * np.pi)) ** 2)
+    for term, expected in zip(WHO_FIRST_TERMS[1:], flattened, strict=True):
+        assert abs(fit.terms[term].b - expected) < 3 * fit.terms[term].se + 0.05 * abs(expected)
+
+
+def test_without_a_planted_effect_the_script_answers_as_before_whatever_the_temperature():
+    assert planted_fields({"temperature": 0.2, "model": "scripted-driver"}) == {}
+    # The humans' coefficients said aloud are the same odds, but drawn anew.
+    said, unsaid = firsts(PlantedEffect())["merged_first"], firsts(None)["merged_first"]
+    assert (said == "left").mean() == pytest.approx((unsaid == "left").mean(), abs=0.03)
+    assert list(said) != list(unsaid)
+
+
+def test_trials_of_two_effects_are_independent():
+    one, other = (
+        (firsts(PlantedEffect(x_gap_m=gap)).query("condition == 'N_0_0'")["merged_first"] == "left")
+        for gap in (0, 0.1)
+    )
+    assert abs(np.corrcoef(one, other)[0, 1]) < 3 / np.sqrt(len(one))
+
+
+def test_the_planted_gap_opens_a_wider_gap():
+    def hardest(gap_m):
+        told_all = (
+            parse_reply(told("N_0_0", n, side, PlantedEffect(x_gap_m=gap_m)), 20).plan[0]
+            for n in range(1, 101)
+            for side in SIDES
+        )
+        return np.mean(np.abs(list(told_all)))
+
+    assert hardest(0) < hardest(2) < hardest(4)
+
+
+def test_the_registry_lets_every_planted_parameter_through_to_the_emulator_alone():
+    takers = {name for name, provider in PROVIDERS.items() if PARAMETERS & provider.parameters}
+    assert takers == {"emulator"}
+    assert PROVIDERS["emulator"].parameters == PARAMETERS
+
+
+@pytest.mark.slow
+async def test_a_study_finds_what_it_planted_and_replays_it(merge_runner, tmp_path):
+    (tmp_path / "planted.toml").write_text(STUDY)
+    run = await merge_runner("sweep", "planted.toml", "--json")
+    assert run.code == 0, run.err
+    found = table(tmp_path / "results/merge.duckdb", "who-first")
+    for speed in (-2.0, 0.0):
+        for term, planted in zip(WHO_FIRST_TERMS, (-0.30, 1.11, speed), strict=True):
+            row = found.loc[f"emulator [x_relative_speed={speed}]/baseline/{term}"]
+            assert abs(row.b - planted) < 3 * row.se
+    digest = (await merge_runner("digest")).out
+    again = await merge_runner("replay", "planted.toml", "--db", "again.duckdb")
+    assert again.code == 0, again.err
+    assert (await merge_runner("digest", "--db", "again.duckdb")).out == digest
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ("x_headwya = 1.0", "unknown key 'x_headwya'; valid: x_left_first, x_headway"),
+        ('x_headway = "much"', "x_headway"),
+        ("x_noise = -1", "x_noise"),
+        ("x_temperature = 1000, temperature = 0", "x_temperature"),
+    ],
+)
+async def test_an_effect_that_cannot_be_is_refused_in_words(
+    merge_runner, tmp_path, parameters, said
+):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/models.toml").write_text(
+        f'[planted]\nprovider = "emulator"\nformat = "openai-chat"\nid = "scripted-driver"\n'
+        f'max_output_tokens = 4000\nprice = "free"\nparameters = {{ {parameters} }}\n'
+    )
+    run = await merge_runner("sweep", "baseline", "--model", "planted", "--reps", 1)
+    assert run.code != 0
+    assert said in run.err
+
+
+@pytest.mark.parametrize("form", ["openai-chat", "openai-responses", "gemini", "anthropic"])
+async def test_every_wire_format_plants(emulator, form):
+    import aiohttp
+
+    from merge_runner.config import ModelEntry
+    from merge_runner.llm.formats import FORMATS
+
+    url = await emulator()
+    slot = Slot("L_4_8", 1, "left", 0, 0)
+
+    async def letter(**parameters):
+        entry = ModelEntry(
+            provider="emulator",
+            format=form,
+            id="m",
+            max_output_tokens=4000,
+            parameters=parameters,
+        )
+        sent = FORMATS[form].request(entry, first_prompt("L_4_8", "left"))
+        base = url + ("" if form in ("gemini", "anthropic") else "/v1")
+        headers = {"x-merge-runner-slot": json.dumps(slot.as_dict())}
+        async with (
+            aiohttp.ClientSession() as session,
+            session.post(base + sent.path, json=sent.body, headers=headers) as reply,
+        ):
+            assert reply.status == 200
+            return FORMATS[form].read(await reply.json()).text[0]
+
+    assert await letter(x_left_first=1000) == "M"
+    assert await letter(x_left_first=-1000) == "Y"
