@@ -10,7 +10,7 @@ import pandas as pd
 from analysis.calibration.design import TRIALS_OF_A_PAIR, design, experiment, model_of
 from analysis.calibration.outcomes import measured
 from analysis.stats.regressions import gap_data, gap_ols, who_first_logit
-from merge_runner.cli import print_out
+from merge_runner.cli.output import print_out
 from merge_runner.drivers.cei.batch import simulate
 from merge_runner.drivers.cei.driver import USUAL_SETS
 from merge_runner.drivers.cei.parameters import SETS

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from merge_runner.cli import (
+from merge_runner.cli.options import (
     CacheOption,
     ConditionsOption,
     DbOption,
@@ -20,9 +20,8 @@ from merge_runner.cli import (
     VariantsOption,
     levels,
     listed,
-    print_out,
-    say,
 )
+from merge_runner.cli.output import print_out, say
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 
 

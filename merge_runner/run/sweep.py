@@ -272,7 +272,7 @@ class Sweep:
         for label, arm in self._arms.items():
             trials = arm.repetitions * conditions
             sides = Counter(name for name in arm.asked.values() if name in arm.entries)
-            calls = {name: trials * n * PROMPTS_PER_DRIVER for name, n in sides.items()}
+            calls = {name: trials * n * usual_prompts(arm) for name, n in sides.items()}
             todo[label] = Todo(trials, calls)
         return self._estimated(todo)
 
