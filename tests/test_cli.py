@@ -16,7 +16,7 @@ from analysis.commands import app
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
     *("tables", "figures", "report", "explain", "human", "ledger", "view"),
-    *("init", "export", "forget", "seat"),
+    *("init", "export", "forget", "seat", "power"),
 }
 # The promised options; more may be there.
 SWEEP_OPTIONS = {
