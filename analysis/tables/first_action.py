@@ -80,7 +80,7 @@ def first_action(study: Study) -> Table:
             "the first action is the net acceleration of the first step under control, drag "
             "included; own velocity is relative to the other vehicle's",
             *_human_notes(study),
-            *sample_notes(study, study.groups, pooled=False),
+            *sample_notes(study, study.models, pooled=False, whole=False),
         ),
     )
 
@@ -109,7 +109,7 @@ def first_action_faults(study: Study) -> Table:
             "only if more acceleration, either way, also follows within the first second. Of a "
             "driver that is late the others are not called shown",
             *_human_notes(study),
-            *sample_notes(study, study.models, pooled=False),
+            *sample_notes(study, study.models, pooled=False, whole=False),
         ),
     )
 

@@ -18,15 +18,20 @@ def listed(items: Sequence[str]) -> str:
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
-def sample_notes(study: Study, groups: Iterable[Group], *, pooled: bool = True) -> list[str]:
+def sample_notes(
+    study: Study, groups: Iterable[Group], *, pooled: bool = True, whole: bool = True
+) -> list[str]:
     """A note for each group on its trials and those left out, and caveats about the drivers.
 
-    ``pooled`` means that the table treats imported human trials as independent.
+    ``pooled`` means that the table treats imported human trials as independent, ``whole`` that it
+    leaves out those that did not finish.
     """
     shown = list(groups)
     notes = [
         f"{group.id}: {len(group.finished)} of {len(group.trials)} trials finished, left out: "
-        + group.left_out
+        f"{group.left_out}"
+        if whole
+        else f"{group.id}: {len(group.ended)} of {len(group.trials)} trials ended, and count"
         for group in shown
     ]
     if study.empty:

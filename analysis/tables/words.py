@@ -35,7 +35,9 @@ def words(study: Study) -> Table:
             "velocity (m/s), with penalised likelihood ratios; both drivers of a trial count, "
             "since neither knows the other's first word. It follows what has p < .05",
             *([] if any(found for _, found in spoken) else ["no driver said a tactical word"]),
-            *sample_notes(study, [group for group, found in spoken if found], pooled=False),
+            *sample_notes(
+                study, [group for group, found in spoken if found], pooled=False, whole=False
+            ),
         ),
     )
 
