@@ -106,7 +106,7 @@ def compared(found: Sequence[Numbers]) -> pd.DataFrame:
                 "off": None if mean is None else (mean - target.value) / target.tolerance,
             }
         )
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows).astype({"std_error": float, "spread": float})
 
 
 def cost(numbers: Numbers, wanted: list[Target]) -> float:

@@ -16,6 +16,7 @@ from scipy.special import ndtr
 from merge_runner.drivers.cei.motion import Array, Mask, Task, course
 from merge_runner.drivers.cei.parameters import (
     BROADER,
+    CRUISE_GAIN,
     HIGHEST_THRESHOLD,
     LOWEST_THRESHOLD,
     MEMORY_TICKS,
@@ -209,26 +210,27 @@ def start(
     bases: Sequence[Base],
     own: Vehicles,
     other: Vehicles,
+    desired_mps: Array,
     ticks: Array,
     noise: Array,
 ) -> Agents:
     """Agents that have cruised in the tunnel for some ticks, each beside the other.
 
-    They have planned to hold their speeds. They have seen the other since the start of the run,
-    when they took its speed to be their own, so that what they perceive now is normally
+    They have planned to hold the speeds that they desire. They have seen the other since the start
+    of the run, when they took its speed to be their own, so that what they perceive now is normally
     distributed. ``noise`` is standard normal, of the shape (agents, 2): of perception and of plan.
     """
     habits = model.habits
     remaining = habits.remaining**ticks
     known = other.speeds_mps + remaining * (own.speeds_mps - other.speeds_mps)
     wander = habits.wander_mps * np.sqrt((1 - remaining**2) / (1 - habits.remaining**2))
-    hold = course(model.task, own.positions_m, own.speeds_mps, INPUTS[:, None])
-    inputs = INPUTS[hold.cost(own.speeds_mps).argmin(axis=0)]
+    hold = course(model.task, own.positions_m, desired_mps, INPUTS[:, None])
+    inputs = INPUTS[hold.cost(desired_mps).argmin(axis=0)]
     agents = len(own.positions_m)
     return Agents(
         lower=np.array([base.lower for base in bases]),
         upper=np.array([base.upper for base in bases]),
-        desired_mps=own.speeds_mps,
+        desired_mps=desired_mps,
         perceived_mps=known + wander * noise[:, 0],
         memory_mps2=np.zeros((MEMORY_TICKS, agents)),
         waited_ticks=np.full(agents, OFF),
@@ -236,6 +238,12 @@ def start(
         last_mps=own.speeds_mps,
         inputs=_driven(model, inputs, noise[:, 1]),
     )
+
+
+def set_speeds(task: Task, speeds_mps: Array) -> Array:
+    """The speeds in m/s that cruise controls are set to which hold these against the resistance."""
+    resisted = task.net_mps2(np.zeros_like(speeds_mps), speeds_mps)
+    return speeds_mps - resisted / (CRUISE_GAIN * task.scenario.max_acceleration_mps2)
 
 
 def cheapest_safe(

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_runner.drivers.cei.agents import Model, Vehicles, start, tunnel_ticks
+from merge_runner.drivers.cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
 from merge_runner.drivers.cei.motion import Array, Mask, Task, move
-from merge_runner.drivers.cei.parameters import TICK_S, Base
+from merge_runner.drivers.cei.parameters import CRUISE_DAMPING, CRUISE_GAIN, TICK_S, Base
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
 
-# The cruise control of the human simulator: input by error of speed, in s/m, and by its change.
-CRUISE_GAIN, CRUISE_DAMPING = 5.0, 0.05
 RUNNING = ""
 NOBODY = Base(1.0, 1.0)
 
@@ -96,9 +94,11 @@ class _World:
         other = _others(own)
         drivers = [one.drivers[side] for side in (0, 1) for one in trials]
         self.driven = np.array([driver is not None for driver in drivers])
+        # At their start vehicles have the speeds that their cruise controls are set to.
+        desired = own.speeds_mps if tunnel else set_speeds(self.task, own.speeds_mps)
         ticks = np.zeros(len(seeds)) if tunnel else tunnel_ticks(own, other)
         bases = [driver or NOBODY for driver in drivers]
-        self.agents = start(model, bases, own, other, ticks, self.noise[0])
+        self.agents = start(model, bases, own, other, desired, ticks, self.noise[0])
         self._end()
 
     def step(self) -> None:

@@ -21,6 +21,9 @@ PLAN_NOISE = 0.025
 # The perceived speed follows the other's with a time constant of 2 s, and wanders by 0.6 m/s.
 PERCEPTION_RATE_HZ = 0.5
 PERCEPTION_NOISE = 0.6  # m/s per square root of a second
+# The cruise control of the human simulator: input by error of speed, in s/m, and by its change. At
+# 10 m/s it leaves an error of 0.08 m/s, by which drivers start below the speed that they desire.
+CRUISE_GAIN, CRUISE_DAMPING = 5.0, 0.05
 # The second, broader part of the risk: being too close.
 BROADER = 3.0
 LOWEST_BASE, NARROWEST_BAND = 0.02, 0.05

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from merge_runner.drivers.cei.agents import Model, Vehicles, start, tunnel_ticks
+from merge_runner.drivers.cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
 from merge_runner.drivers.cei.motion import Array, task_of
 from merge_runner.drivers.cei.parameters import TICK_S, Habits, ThresholdSet, offsets_of
 from merge_runner.drivers.program_seat import ProgramSeat
@@ -22,8 +22,9 @@ class Seated:
         own, other = _vehicles(seen)
         offsets = offsets_of(int(seat.number("pair")), seat.repetition)
         base = thresholds.base(offsets[SIDES.index(seat.side)])
+        desired = set_speeds(self._model.task, own.speeds_mps)
         ticks = tunnel_ticks(own, other)
-        self._agents = start(self._model, [base], own, other, ticks, self._noise())
+        self._agents = start(self._model, [base], own, other, desired, ticks, self._noise())
         self._other_mps = seen.other_speed_mps
 
     def decide(self, seen: Observation, ticks: int) -> float:

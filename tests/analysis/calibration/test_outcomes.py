@@ -17,7 +17,7 @@ TRIALS = [
     (condition, repetition)
     for condition in ("N_0_0", "L_0_-8", "R_-4_8", "L_4_8")
     for repetition in range(1, 4)
-] + [("N_0_0", repetition) for repetition in range(4, 12)]
+] + [("N_0_0", 18), ("N_0_0", 25)]
 MEASURES = ("gap_mean100_m", "conflict_resolution_s")
 
 

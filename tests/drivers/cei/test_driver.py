@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from merge_runner.drivers.cei.agents import Vehicles, start, tunnel_ticks
+from merge_runner.drivers.cei.agents import Vehicles, set_speeds, start, tunnel_ticks
 from merge_runner.drivers.cei.collision_interval import collision_interval, exact_bounds
 from merge_runner.drivers.cei.driver import USUAL_SETS, thresholds_of
 from merge_runner.drivers.cei.motion import course
@@ -23,7 +23,7 @@ async def test_one_seeded_trial_stays_as_it_is():
         key: (rows[key].position_m, rows[key].velocity_mps)
         for key in ((20, "left"), (20, "right"), (80, "left"), (80, "right"))
     }
-    assert (record.status, record.merged_first, record.end_time_s) == ("finished", "right", 9.85)
+    assert (record.status, record.merged_first, record.end_time_s) == ("finished", "right", 9.9)
     for key, values in GOLDEN.items():
         assert found[key] == pytest.approx(values, abs=1e-6)
 
@@ -31,8 +31,8 @@ async def test_one_seeded_trial_stays_as_it_is():
 GOLDEN = {
     (20, "left"): (59.891102, 9.398751),
     (20, "right"): (63.474206, 9.655218),
-    (80, "left"): (85.044170, 7.847453),
-    (80, "right"): (92.692951, 9.799106),
+    (80, "left"): (84.936777, 7.740166),
+    (80, "right"): (92.471917, 9.682950),
 }
 
 
@@ -68,8 +68,12 @@ def test_what_a_driver_sees_at_the_exit_is_what_it_would_after_the_tunnel():
     task, random = model(scenario()), np.random.default_rng(0)
     bases = [Base(0.3, 0.5)] * many
     ticks = tunnel_ticks(own, other)
-    at_once = start(task, bases, own, other, ticks, random.standard_normal((many, 2)))
-    watched = start(task, bases, own, other, 0 * ticks, random.standard_normal((many, 2)))
+    at_once = start(
+        task, bases, own, other, own.speeds_mps, ticks, random.standard_normal((many, 2))
+    )
+    watched = start(
+        task, bases, own, other, own.speeds_mps, 0 * ticks, random.standard_normal((many, 2))
+    )
     for _ in range(round(ticks[0])):
         watched.perceive(task, other, np.zeros(many), random.standard_normal(many))
     for seen in (at_once.perceived_mps, watched.perceived_mps):
@@ -77,12 +81,29 @@ def test_what_a_driver_sees_at_the_exit_is_what_it_would_after_the_tunnel():
         assert seen.std() == pytest.approx(0.60, abs=0.03)
 
 
+def test_a_driver_starts_below_the_speed_it_desires_by_the_error_of_the_cruise_control():
+    found = {
+        resistance: set_speeds(model(scenario(resistance=resistance)).task, np.array([9.92063]))
+        for resistance in ("human", "none")
+    }
+    assert found["human"] == pytest.approx(10.0, abs=2e-4)
+    assert found["none"] == pytest.approx(9.92063, abs=1e-12)
+
+
 async def test_drivers_without_a_conflict_keep_their_speed():
     calm = Habits(noise=False)
     task = model(scenario(resistance="none"), habits=calm)
     own = Vehicles(np.array([110.0]), np.array([10.0]))
     other = Vehicles(np.array([60.0]), np.array([10.0]))
-    agents = start(task, [Base(0.1, 0.5)], own, other, np.array([100.0]), np.zeros((1, 2)))
+    agents = start(
+        task,
+        [Base(0.1, 0.5)],
+        own,
+        other,
+        own.speeds_mps,
+        np.array([100.0]),
+        np.zeros((1, 2)),
+    )
     for _ in range(100):
         agents.perceive(task, other, np.zeros(1), np.zeros(1))
         agents.decide(task, own, other, np.zeros(1), np.ones(1, bool))
