@@ -185,7 +185,8 @@ FROM (
         CASE WHEN opponent = model_right THEN 'left'
             WHEN opponent = model_left THEN 'right'
             WHEN model_left = model_right THEN 'left'
-            WHEN left_asks <> right_asks THEN if(left_asks, 'left', 'right')
+            WHEN left_asks AND NOT right_asks THEN 'left'
+            WHEN right_asks AND NOT left_asks THEN 'right'
             WHEN model_left > model_right THEN 'right' ELSE 'left' END AS ego
     FROM trials LEFT JOIN specs USING (spec_hash) LEFT JOIN (
         SELECT trial_id, spec_hash, max(value) FILTER (factor = 'opponent') AS opponent,
