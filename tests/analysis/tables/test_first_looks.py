@@ -82,8 +82,8 @@ def test_a_driver_without_chance_counts_once_and_has_no_interval(table):
 
 
 def test_the_drivers_of_a_mixed_pair_are_told_apart(table, asked):
-    program = rows(table, "constant of constant+emulator")
-    model = rows(table, f"emulator of constant+emulator{EMULATOR.removeprefix('emulator')}")
+    program = rows(table, "constant of emulator+constant")
+    model = rows(table, f"emulator of emulator+constant{EMULATOR.removeprefix('emulator')}")
     assert set(program) == set(model) == {"h=+0 dv=+0"}
     assert program["h=+0 dv=+0"].values.get("m") is None
     with duckdb.connect(str(asked.db), read_only=True) as connection:
