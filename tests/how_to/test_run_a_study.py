@@ -54,7 +54,7 @@ def test_every_example_can_be_played(example, arms, tmp_path):
 
 
 def test_no_example_is_left_out():
-    assert len(EXAMPLES) == PAGE.count("```toml\n") == 6
+    assert len(EXAMPLES) == PAGE.count("```toml\n") == 7
 
 
 def test_every_key_is_explained_and_shown_in_an_example():

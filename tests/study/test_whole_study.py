@@ -71,7 +71,7 @@ async def test_a_study_in_one_file_runs_within_its_budget_and_is_shown_by_factor
         assert "raise [budget] of study.toml" in short.err
         with_budget(mine, 20)
         whole = await merge_runner(*sweep, cwd=mine, **env)
-        assert (whole.code, whole.summary["trials"]["planned"]) == (0, 32), whole.err
+        assert (whole.code, whole.summary["trials"]["planned"]) == (0, 48), whole.err
         assert whole.summary["sweep_cost_usd"] == pytest.approx(bill.usd, rel=0.05)
         assert max(server.asked.values()) <= 2  # the calls that the kill cut off
     assert (await merge_runner("recording", "export", "all.parquet", cwd=mine)).code == 0
@@ -93,5 +93,5 @@ async def test_a_study_in_one_file_runs_within_its_budget_and_is_shown_by_factor
     monkeypatch.chdir(mine)
     monkeypatch.setenv("EMULATOR_BASE_URL", env["EMULATOR_BASE_URL"])
     trials = (await Study("study.toml", db="n.duckdb").areplay("all.parquet")).trials()
-    assert trials.shape[0] == 32
-    assert trials.groupby("temperature").size().to_dict() == {0.2: 16, 1.0: 16}
+    assert trials.shape[0] == 48
+    assert trials.groupby("temperature").size().to_dict() == {0.2: 24, 1.0: 24}
