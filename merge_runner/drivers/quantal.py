@@ -39,7 +39,7 @@ class QuantalDriver:
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Draw an action."""
         if self._desired_mps is None:
-            self._desired_mps = observation.own_speed_mps
+            self._desired_mps = max(observation.own_speed_mps, SLOWEST_MPS)
         costs = {action: self._cost(observation, action) for action in self._actions()}
         precision, least = self.seat.number("precision"), min(costs.values())
         weights = [exp(-precision * (cost - least)) for cost in costs.values()]
