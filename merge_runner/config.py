@@ -206,10 +206,19 @@ class ScenarioConfig(Frozen):
             whole_steps(name, seconds, step_s)
         for side in SIDES:
             if delay_s := self.perception(side).delay_s:
-                whole_steps(f"perception_{side}.delay_s", delay_s, self.step_s)
+                self._check_delay(f"perception_{side}.delay_s", delay_s)
         if self.executed_actions > self.plan_actions:
             raise ValueError("the horizon is shorter than the time between two prompts")
         return self
+
+    def _check_delay(self, name: str, delay_s: float) -> None:
+        try:
+            whole_steps(name, delay_s, self.step_s)
+        except ValueError as exc:
+            raise ValueError(
+                f"{exc}: set step_s under [scenario] so that it fits, and plan_step_s = "
+                f"{self.action_s:g} to leave a language model's plan as it is"
+            ) from exc
 
 
 class Price(Frozen):

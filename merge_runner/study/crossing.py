@@ -172,7 +172,7 @@ def _arm(
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
     programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
-    scenario = with_world_step(scenario, programs)
+    scenario = _perceived(file, with_world_step(scenario, programs), levels)
     for name, program in programs.items():
         pace_of(scenario, program.in_spec(name))
     parameters = {name: level for name, level in levels.items() if _is_parameter(name)}
@@ -272,14 +272,8 @@ def _refuse_parameters(program: str, parameters: Levels) -> None:
 
 
 def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
-    switches = {name: levels[name] for name in levels if name in ScenarioConfig.model_fields}
-    for factor in SET_BY.keys() & levels.keys():
-        perception = _perception(file, factor, level_text(levels[factor]))
-        switches.update(dict.fromkeys(SET_BY[factor], perception))
-    made = file.scenario
-    if switches:
-        given = made.model_dump(exclude_unset=True)
-        made = validated(ScenarioConfig, {**given, **switches}, "factors")
+    fields = ScenarioConfig.model_fields.keys() - SET_BY.keys()
+    made = _switched(file.scenario, {name: levels[name] for name in levels if name in fields})
     rules = SCENARIOS.require(made.name).collision_rules
     if made.collision_rule not in rules:
         raise UsageError(
@@ -287,6 +281,23 @@ def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
             + ", ".join(rules)
         )
     return made
+
+
+def _perceived(file: StudyFile, scenario: ScenarioConfig, levels: Levels) -> ScenarioConfig:
+    """The scenario with the perceptions of these levels, whose delays suit the world's step."""
+    switches: dict[str, JsonValue] = {}
+    for factor in SET_BY.keys() & levels.keys():
+        perception = _perception(file, factor, level_text(levels[factor]))
+        switches.update(dict.fromkeys(SET_BY[factor], perception))
+    return _switched(scenario, switches)
+
+
+def _switched(scenario: ScenarioConfig, switches: Levels) -> ScenarioConfig:
+    """The scenario with other switches; raises UsageError."""
+    if not switches:
+        return scenario
+    given = scenario.model_dump(exclude_unset=True)
+    return validated(ScenarioConfig, {**given, **switches}, "factors")
 
 
 def _perception(file: StudyFile, factor: str, level: str) -> dict[str, JsonValue]:
