@@ -117,6 +117,14 @@ async def test_a_clock_holds_each_action(plan_of):
         (MINE + "strength = 2\n", r"\[drivers\.mine\]: strength is at most 1"),
         (MINE + "clock = 0.01\n", "braking decides every 0.05 s, and a clock can only slow it"),
         (MINE + "clock = 0\n", "clock: Input should be greater than 0"),
+        (
+            '[drivers.mine]\nprogram = "cei"\nclock = 0.12\n',
+            r"\[drivers\.mine\]: the driver cei perceives every 0\.05 s: clock = 0\.12 s",
+        ),
+        (
+            '[drivers.mine]\nprogram = "quantal"\nclock = 2.0\nhorizon_s = 1.5\n',
+            r"\[drivers\.mine\]: horizon_s of quantal is at least its clock, 2 s",
+        ),
         ('[drivers.mine]\nprogram = "brake"\n', "unknown driver 'brake'; valid: cei, constant, "),
         ('[drivers.braking]\nprogram = "constant"\n', "there is a driver 'braking' already"),
         ('[drivers.o3]\nprogram = "constant"\n', "needs another name: there is a model o3"),
