@@ -112,6 +112,12 @@ class Program:
         # Which other parameters there are depends on the set.
         chosen = {SET: _like(self.values, name, SET, changes[SET])} if SET in changes else {}
         values = replace(self, parameters={**self.parameters, **chosen}).values
+        for each in changes.keys() - values.keys():
+            if having := [f'"{one}"' for one, numbers in self.sets.items() if each in numbers]:
+                raise UsageError(
+                    f"{each} of {name} is a number of its sets: name one beside it, "
+                    f"{SET} = {' or '.join(having)}"
+                )
         given = {each: _like(values, name, each, value) for each, value in changes.items()}
         return replace(
             self,

@@ -122,6 +122,11 @@ async def test_a_clock_holds_each_action(plan_of):
             r"\[drivers\.mine\]: the driver cei perceives every 0\.05 s: clock = 0\.12 s",
         ),
         (
+            '[drivers.mine]\nprogram = "cei"\nupper_mean = 0.8\n',
+            r"\[drivers\.mine\]: upper_mean of cei is a number of its sets: name one beside it, "
+            r'set = "K0" or "F1" or "drag-free"',
+        ),
+        (
             '[drivers.mine]\nprogram = "quantal"\nclock = 2.0\nhorizon_s = 1.5\n',
             r"\[drivers\.mine\]: horizon_s of quantal is at least its clock, 2 s",
         ),
