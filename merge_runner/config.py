@@ -90,7 +90,7 @@ class Perception(Frozen):
     as it was ``delay_s`` ago. A decision receives nothing with the probability ``dropout``, and
     shows what was received last. The other is seen up to a relative distance of ``range_m``, and
     once the own car is within ``view_from_m`` of the merge point, or past it. ``own`` gives the own
-    position and speed errors of the same sizes.
+    position and speed errors of the same sizes. ``own`` and ``autocorrelation_s`` need an error.
     """
 
     position_sd_m: NotNegative = 0.0
@@ -105,9 +105,14 @@ class Perception(Frozen):
     @cached_property
     def is_perfect(self) -> bool:
         """Whether a driver is told the truth."""
-        changing = self.position_sd_m, self.speed_sd_mps, self.delay_s, self.dropout
-        # A length is above 0 where it is given.
-        return not any((*changing, self.range_m, self.view_from_m))
+        return self == PERFECT
+
+    @model_validator(mode="after")
+    def _errors_of_a_size(self) -> Perception:
+        for name, given in (("autocorrelation_s", self.autocorrelation_s), ("own", self.own)):
+            if given and not (self.position_sd_m or self.speed_sd_mps):
+                raise ValueError(f"{name} needs an error: set position_sd_m or speed_sd_mps")
+        return self
 
 
 PERFECT = Perception()
