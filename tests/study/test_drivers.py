@@ -144,6 +144,15 @@ def test_what_cannot_be_a_driver_is_refused_with_the_valid_choices(plan_of, text
         plan_of(text, "constant")
 
 
+def test_a_clock_cannot_make_a_program_without_a_rate_faster_than_the_prompt_rate(plan_of):
+    hurried = '[drivers.mine]\nprogram = "constant"\nclock = 0.5\n'
+    said = r"mine: clock = 0\.5 is too fast: constant decides every 1 s \(1 / prompt_rate_hz\)"
+    with pytest.raises(UsageError, match=said):
+        plan_of(hurried, "mine")
+    faster = plan_of(hurried, "mine", "[scenario]\nprompt_rate_hz = 2.0\nstep_s = 0.1\n")
+    assert specs(faster)[0]["left"]["rate_hz"] == 2.0
+
+
 def test_a_stored_study_registers_its_drivers_without_running_its_plugins(plan_of):
     text = plan_of(MINE + '[drivers.slow]\nprogram = "constant"\nclock = 2.0\n', "mine").study.text
     plan_of("", "constant")
