@@ -219,3 +219,4 @@ def test_what_cannot_be_is_refused_in_one_line(plan_of, text, plugin, says):
 def test_a_situation_in_other_words_may_stand_beside_the_table(plan_of):
     table = '[prompts.x]\nadd = [{ block = "state.table" }]\n'
     plan_of(table + 'replace = { C0 = "You drive a car." }\n')
+    make_plan("baseline", "constant")  # what the study added is taken out again
