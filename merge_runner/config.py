@@ -90,7 +90,7 @@ class Perception(Frozen):
     as it was ``delay_s`` ago. A decision receives nothing with the probability ``dropout``, and
     shows what was received last. The other is seen up to a relative distance of ``range_m``, and
     once the own car is within ``view_from_m`` of the merge point, or past it. ``own`` gives the own
-    position and speed errors of the same sizes.
+    position and speed errors of the same sizes. ``own`` and ``autocorrelation_s`` need an error.
     """
 
     position_sd_m: NotNegative = 0.0
@@ -105,9 +105,14 @@ class Perception(Frozen):
     @cached_property
     def is_perfect(self) -> bool:
         """Whether a driver is told the truth."""
-        changing = self.position_sd_m, self.speed_sd_mps, self.delay_s, self.dropout
-        # A length is above 0 where it is given.
-        return not any((*changing, self.range_m, self.view_from_m))
+        return self == PERFECT
+
+    @model_validator(mode="after")
+    def _errors_of_a_size(self) -> Perception:
+        for name, given in (("autocorrelation_s", self.autocorrelation_s), ("own", self.own)):
+            if given and not (self.position_sd_m or self.speed_sd_mps):
+                raise ValueError(f"{name} needs an error: set position_sd_m or speed_sd_mps")
+        return self
 
 
 PERFECT = Perception()
@@ -206,10 +211,19 @@ class ScenarioConfig(Frozen):
             whole_steps(name, seconds, step_s)
         for side in SIDES:
             if delay_s := self.perception(side).delay_s:
-                whole_steps(f"perception_{side}.delay_s", delay_s, self.step_s)
+                self._check_delay(f"perception_{side}.delay_s", delay_s)
         if self.executed_actions > self.plan_actions:
             raise ValueError("the horizon is shorter than the time between two prompts")
         return self
+
+    def _check_delay(self, name: str, delay_s: float) -> None:
+        try:
+            whole_steps(name, delay_s, self.step_s)
+        except ValueError as exc:
+            raise ValueError(
+                f"{exc}: set step_s under [scenario] so that it fits, and plan_step_s = "
+                f"{self.action_s:g} to leave a language model's plan as it is"
+            ) from exc
 
 
 class Price(Frozen):

@@ -25,15 +25,17 @@ PARAMETERS = {
     "gap_sd_m": 1.82,
 }
 SLOWEST_MPS = 0.1
+CERTAIN = 700.0  # log odds beyond which exp has no number
 
 
 @dataclass(slots=True)
 class HumanOddsDriver:
-    """Draws at its first decision who goes first and how large the gap will be, then never looks.
+    """Draws who goes first and how large the gap will be once it sees the other, then never looks.
 
-    Whoever goes first keeps its speed. The other one holds one acceleration until the first is at
-    the merge point, with which the gap is then open, and keeps its speed from then on. Both sides
-    draw from both seeds, and so agree.
+    Until then it keeps its speed. Whoever goes first goes on to keep it. The other one holds one
+    acceleration until the first is at the merge point, with which the gap is then open, and keeps
+    its speed from then on. Both sides draw from both seeds, and so agree where both are told the
+    truth. Under imperfect perception each has odds of its own: both may go first, or neither.
     """
 
     seat: ProgramSeat
@@ -46,9 +48,9 @@ class HumanOddsDriver:
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Hold the acceleration, or keep the speed."""
-        if self._until is None:
+        if self._until is None and observation.other_seen:
             self._until = number + self._choose(observation) / self.seat.interval_s
-        holding = number < self._until - 1e-9
+        holding = self._until is not None and number < self._until - 1e-9
         return self.seat.accelerating(
             self._acceleration_mps2 if holding else 0.0, observation.own_speed_mps
         )
@@ -77,7 +79,7 @@ class HumanOddsDriver:
         log_odds = number("odds_intercept") * sign
         log_odds += number("odds_headway") * headway_m + number("odds_velocity") * velocity_mps
         own, other = self._chance, Random(self.seat.other_seed)  # noqa: S311 # a sample, no secret
-        return own.expovariate(1.0) < exp(log_odds) * other.expovariate(1.0)
+        return own.expovariate(1.0) < exp(min(log_odds, CERTAIN)) * other.expovariate(1.0)
 
     def _gap_m(self, headway_m: float, velocity_mps: float) -> float:
         number = self.seat.number

@@ -156,9 +156,11 @@ class HumanReplayDriver:
         return self.trial.starts
 
     async def decide(self, observation: Observation, number: int) -> Decision:
-        """What the human did from this sample to the next."""
-        net_mps2 = self._net_mps2[number] if number < len(self._net_mps2) else 0.0
-        return self.seat.accelerating(net_mps2, observation.own_speed_mps)
+        """What the human did from this sample to the next, whatever it is told of its speed."""
+        if number < len(self._net_mps2):
+            own_mps = self.trial.speeds_mps[self.seat.side][number]
+            return self.seat.accelerating(self._net_mps2[number], own_mps)
+        return self.seat.accelerating(0.0, observation.own_speed_mps)
 
 
 # Replaced once trials are imported (``study.parts.adopt_humans``).

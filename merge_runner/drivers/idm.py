@@ -50,7 +50,8 @@ class IdmDriver:
         """Accelerate freely, or follow."""
         seen = observation
         if self._desired_mps is None:
-            self._desired_mps = self.seat.number("desired_speed_factor") * seen.own_speed_mps
+            first_mps = max(seen.own_speed_mps, SLOWEST_MPS)
+            self._desired_mps = self.seat.number("desired_speed_factor") * first_mps
         acceleration = self._free(seen.own_speed_mps, self._desired_mps)
         if not self._leads(seen):
             acceleration -= self._interaction(seen)

@@ -39,7 +39,7 @@ class QuantalDriver:
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Draw an action."""
         if self._desired_mps is None:
-            self._desired_mps = observation.own_speed_mps
+            self._desired_mps = max(observation.own_speed_mps, SLOWEST_MPS)
         costs = {action: self._cost(observation, action) for action in self._actions()}
         precision, least = self.seat.number("precision"), min(costs.values())
         weights = [exp(-precision * (cost - least)) for cost in costs.values()]
@@ -99,6 +99,11 @@ def _check(parameters: Mapping[str, Parameter]) -> None:
             raise UsageError(f"{name} of quantal cannot be below 0")
 
 
+def _check_clock(parameters: Mapping[str, Parameter], clock_s: float) -> None:
+    if float(parameters["horizon_s"]) < clock_s:
+        raise UsageError(f"horizon_s of quantal is at least its clock, {clock_s:g} s")
+
+
 PROGRAMS.register(
     "quantal",
     Program(
@@ -117,5 +122,6 @@ PROGRAMS.register(
         1.0,
         settable=True,
         check=_check,
+        check_clock=_check_clock,
     ),
 )

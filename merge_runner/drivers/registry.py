@@ -43,7 +43,8 @@ class Program:
     decides ``rate_hz`` times a second; None: at the prompt rate of the scenario. A ``settable``
     program reads its parameters from its seat, so that a study can set them. ``sets`` are named
     sets of further parameters, of which the parameter ``set`` chooses one. ``check`` raises
-    UsageError for parameters that cannot be. ``data`` is what else it drives by. ``based_on``
+    UsageError for parameters that cannot be, ``check_clock`` for a clock in s (the time between two
+    decisions) that cannot be beside them. ``data`` is what else it drives by. ``based_on``
     names the program that a study has given other parameters or another clock.
     """
 
@@ -54,6 +55,7 @@ class Program:
     settable: bool = False
     sets: Mapping[str, Mapping[str, Parameter]] = field(default_factory=dict)
     check: Callable[[Mapping[str, Parameter]], None] | None = None
+    check_clock: Callable[[Mapping[str, Parameter], float], None] | None = None
     data: Data | None = None
     based_on: str = ""
 
@@ -72,6 +74,8 @@ class Program:
             raise UsageError(f"the driver {name} needs another name for its parameter {min(taken)}")
         if self.check is not None:
             self.check(self.values)
+        if self.check_clock is not None and self.rate_hz is not None:
+            self.check_clock(self.values, 1 / self.rate_hz)
 
     @property
     def values(self) -> dict[str, Parameter]:
@@ -108,6 +112,12 @@ class Program:
         # Which other parameters there are depends on the set.
         chosen = {SET: _like(self.values, name, SET, changes[SET])} if SET in changes else {}
         values = replace(self, parameters={**self.parameters, **chosen}).values
+        for each in changes.keys() - values.keys():
+            if having := [f'"{one}"' for one, numbers in self.sets.items() if each in numbers]:
+                raise UsageError(
+                    f"{each} of {name} is a number of its sets: name one beside it, "
+                    f"{SET} = {' or '.join(having)}"
+                )
         given = {each: _like(values, name, each, value) for each, value in changes.items()}
         return replace(
             self,

@@ -19,6 +19,7 @@ from merge_runner.records import Road
 from merge_runner.registry import Registry
 
 OUTPUT_FORMAT = "C5"
+SITUATION, TABLE = "C0", "state.table"  # the second stands in place of the first
 
 
 class Fields(TypedDict):
@@ -198,7 +199,7 @@ Write the list in a Python code block that holds nothing but the list."""
 BLOCKS = Registry[Block]("prompt block")
 _of_paper = partial(Block, in_baseline=True, before=None)
 BLOCKS.register(
-    "C0", _of_paper("situation", _listed(_APPROACHING, _BEFORE), _listed(_MERGED, _AFTER))
+    SITUATION, _of_paper("situation", _listed(_APPROACHING, _BEFORE), _listed(_MERGED, _AFTER))
 )
 BLOCKS.register("C1", _of_paper("history", _HISTORY, _HISTORY))
 BLOCKS.register("C2", _of_paper("previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN))
@@ -228,7 +229,7 @@ BLOCKS.register("state.time_gap", _of_state("time gap", _GAP, _GAP))
 BLOCKS.register("state.relative_speed", _of_state("relative speed in words", _FASTER, _FASTER))
 BLOCKS.register("state.kmh", _of_state("speeds in km/h", _KMH, _KMH))
 BLOCKS.register("state.mph", _of_state("speeds in mph", _MPH, _MPH))
-BLOCKS.register("state.table", _of_state("situation as a table, in place of C0", *_TABLES))
+BLOCKS.register(TABLE, _of_state("situation as a table, in place of C0", *_TABLES))
 
 VARIANTS = Registry[Variant]("variant")
 VARIANTS.register("baseline", Variant(title="Baseline"))

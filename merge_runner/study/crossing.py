@@ -12,7 +12,7 @@ from pydantic import JsonValue
 
 from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, ego_side, validated
 from merge_runner.drivers.pace import pace_of
-from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats.parameters import known_parameters, with_parameter
 from merge_runner.prompts.blocks import VARIANTS
@@ -172,8 +172,9 @@ def _arm(
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
     programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
-    scenario = with_world_step(scenario, programs)
+    scenario = _perceived(file, with_world_step(scenario, programs), levels)
     for name, program in programs.items():
+        _refuse_hurry(name, program, scenario)
         pace_of(scenario, program.in_spec(name))
     parameters = {name: level for name, level in levels.items() if _is_parameter(name)}
     changed = set(both_sides(str(levels[MODEL])).values())
@@ -204,6 +205,19 @@ def _arm(
         or prompt,
         ego=ego_side(sides, registry, str(levels.get(OPPONENT, SELF))),
     )
+
+
+def _refuse_hurry(name: str, program: Program, scenario: ScenarioConfig) -> None:
+    """Raise UsageError for a clock faster than the prompt rate, if that is the program's own."""
+    source, rate_hz = PROGRAMS.get(program.based_on), program.rate_hz
+    if source is None or source.rate_hz is not None or rate_hz is None:
+        return
+    if rate_hz > scenario.prompt_rate_hz * (1 + 1e-9):
+        raise UsageError(
+            f"{name}: clock = {1 / rate_hz:g} is too fast: {program.based_on} decides every "
+            f"{1 / scenario.prompt_rate_hz:g} s (1 / prompt_rate_hz), and a clock can only slow it "
+            "down"
+        )
 
 
 def _pair(left: str, right: str) -> str:
@@ -272,14 +286,8 @@ def _refuse_parameters(program: str, parameters: Levels) -> None:
 
 
 def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
-    switches = {name: levels[name] for name in levels if name in ScenarioConfig.model_fields}
-    for factor in SET_BY.keys() & levels.keys():
-        perception = _perception(file, factor, level_text(levels[factor]))
-        switches.update(dict.fromkeys(SET_BY[factor], perception))
-    made = file.scenario
-    if switches:
-        given = made.model_dump(exclude_unset=True)
-        made = validated(ScenarioConfig, {**given, **switches}, "factors")
+    fields = ScenarioConfig.model_fields.keys() - SET_BY.keys()
+    made = _switched(file.scenario, {name: levels[name] for name in levels if name in fields})
     rules = SCENARIOS.require(made.name).collision_rules
     if made.collision_rule not in rules:
         raise UsageError(
@@ -287,6 +295,23 @@ def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
             + ", ".join(rules)
         )
     return made
+
+
+def _perceived(file: StudyFile, scenario: ScenarioConfig, levels: Levels) -> ScenarioConfig:
+    """The scenario with the perceptions of these levels, whose delays suit the world's step."""
+    switches: dict[str, JsonValue] = {}
+    for factor in SET_BY.keys() & levels.keys():
+        perception = _perception(file, factor, level_text(levels[factor]))
+        switches.update(dict.fromkeys(SET_BY[factor], perception))
+    return _switched(scenario, switches)
+
+
+def _switched(scenario: ScenarioConfig, switches: Levels) -> ScenarioConfig:
+    """The scenario with other switches; raises UsageError."""
+    if not switches:
+        return scenario
+    given = scenario.model_dump(exclude_unset=True)
+    return validated(ScenarioConfig, {**given, **switches}, "factors")
 
 
 def _perception(file: StudyFile, factor: str, level: str) -> dict[str, JsonValue]:

@@ -18,7 +18,15 @@ from merge_runner.config import validated
 from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of
+from merge_runner.prompts.blocks import (
+    BLOCKS,
+    SITUATION,
+    TABLE,
+    VARIANTS,
+    Block,
+    Variant,
+    blocks_of,
+)
 from merge_runner.registry import (
     FAULTS,
     changes,
@@ -204,6 +212,7 @@ def _variant(name: str, prompt: StudyPrompt) -> Variant:
         blocks[each] = Block(old.meaning, texts.merge, texts.straight, before=old.before)
     for number, added in enumerate(prompt.add, 1):
         blocks = dict(_inserted(name, blocks, number, added))
+    _refuse_twice(name, blocks)
     if prompt.order:
         blocks = _ordered(name, blocks, prompt.order)
     changed = {each for each, block in before.items() if blocks.get(each) != block}
@@ -213,6 +222,16 @@ def _variant(name: str, prompt: StudyPrompt) -> Variant:
         title=prompt.title,
         blocks=tuple(blocks.items()),
     )
+
+
+def _refuse_twice(prompt: str, blocks: Mapping[str, Block]) -> None:
+    """Raise UsageError where the table stands beside the list that it is in place of."""
+    both = {SITUATION, TABLE} <= blocks.keys()
+    if both and blocks[SITUATION].merge == BLOCKS[SITUATION].merge:
+        raise UsageError(
+            f"the prompt {prompt} says the situation twice, in {SITUATION} and in {TABLE}: write "
+            f'remove = ["{SITUATION}"]'
+        )
 
 
 def _inserted(

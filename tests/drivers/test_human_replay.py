@@ -93,6 +93,22 @@ async def test_a_replayed_human_keeps_its_trace_beside_a_free_driver(db, plan_of
     assert driven(trial, (other,))[0, other] == wanted[0, other]
 
 
+BLURRED = """
+[factors]
+perception = ["blurred"]
+[perception.blurred]
+speed_sd_mps = 0.5
+own = true
+"""
+
+
+async def test_a_human_who_is_told_a_wrong_own_speed_keeps_its_trace(db, plan_of):
+    trial = await played(plan_of(HUMAN_REPLAY, HUMAN + BLURRED))
+    wanted, found = recorded(db, "human/pair1/L_4_0/iter001"), driven(trial)
+    assert found.keys() == wanted.keys()
+    assert all(found[at] == pytest.approx(wanted[at], abs=1e-6) for at in wanted)
+
+
 async def test_the_pairs_take_turns_and_a_trial_that_collided_is_left_out(db, plan_of):
     plan = plan_of(HUMAN_REPLAY, repetitions=2)
     second = await played(plan, 1)

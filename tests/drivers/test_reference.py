@@ -12,7 +12,7 @@ from analysis.data.reference_data import HUMAN_GAP_SD_M, published
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
-from merge_runner.records import SIDES, Observation, TrialSpec
+from merge_runner.records import FAR_BEHIND_M, SIDES, Observation, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.vehicle import advance
 from merge_runner.trial import play_trial
@@ -219,8 +219,36 @@ async def test_a_clock_changes_no_more_than_when_a_program_decides(name):
         ("idm", {"set": "mobil"}, "valid: highway-env, treiber-kesting"),
         ("human-odds", {"gap_sd_m": -1}, "gap_sd_m of human-odds cannot be below 0"),
         ("quantal", {"precision": -1}, "precision of quantal cannot be below 0"),
+        ("quantal", {"horizon_s": 0.5}, "horizon_s of quantal is at least its clock, 1 s"),
+        ("cei", {"set": "K0", "lower_mean": -5}, "lower_mean of cei is a risk: from 0 to 1"),
+        ("cei", {"set": "F1", "upper_mean": 1.5}, "upper_mean of cei is a risk: from 0 to 1"),
+        ("cei", {"set": "F1", "upper_spread": -0.1}, "upper_spread of cei is a risk: from 0 to 1"),
     ],
 )
 def test_parameters_that_cannot_be_are_refused(name, parameters, said):
     with pytest.raises(UsageError, match=said):
         changed(name, **parameters)
+
+
+@pytest.mark.parametrize("side", SIDES)
+async def test_human_odds_keeps_its_speed_and_draws_once_the_other_is_in_sight(side):
+    always_yields = changed("human-odds", odds_intercept=-1000.0 if side == "left" else 1000.0)
+    driver = always_yields.make(FINE, spec_of("N_0_0"), side)
+    unseen = replace(seen(other_ahead_m=-FAR_BEHIND_M), other_seen=False)
+    assert [await accelerates(driver, unseen, number) for number in range(3)] == [0.0] * 3
+    assert await accelerates(driver, seen(distance_m=30.0), 3) < 0
+
+
+@pytest.mark.parametrize("parameter", ["odds_intercept", "odds_headway", "odds_velocity"])
+@pytest.mark.parametrize("value", [1000.0, -1000.0])
+async def test_human_odds_that_are_certain_are_drawn_as_others(parameter, value):
+    program = changed("human-odds", **{parameter: value})
+    trial = await play(both(program), "L_4_8")
+    assert trial.status in ("finished", "collided")
+
+
+@pytest.mark.parametrize("name", ["idm", "quantal"])
+async def test_a_driver_that_seems_to_stand_at_first_drives_on(name):
+    driver = PROGRAMS[name].make(FINE, spec_of("N_0_0"), "left")
+    for number, speed_mps in enumerate((0.0, 10.0)):
+        assert -2.5 <= await accelerates(driver, seen(speed_mps), number) <= 2.5

@@ -247,7 +247,7 @@ def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
         ("[perception.perfect]\ndelay_s = 0.2\n", "needs another name"),
         (
             '[factors]\nperception = ["late"]\n[perception.late]\ndelay_s = 0.3\n',
-            'no whole number of 0.2 s; .*model = "emulator", perception = "late"',
+            'no whole number of 0.2 s: set step_s .*; .*model = "emulator", perception = "late"',
         ),
         ("[perception.foggy]\nspeed_sd = 1\n", "'perception.foggy.speed_sd'; valid: position_sd"),
     ],
@@ -255,6 +255,13 @@ def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
 def test_a_perception_that_there_is_not_is_refused_with_those_that_there_are(plan_of, text, said):
     with pytest.raises(UsageError, match=said):
         plan_of(text)
+
+
+@pytest.mark.parametrize("scenario", ["", "[scenario]\nstep_s = 0.05\nplan_step_s = 0.2\n"])
+def test_a_delay_has_to_fit_the_step_of_the_world_that_is_played(plan_of, scenario):
+    late = '[factors]\nperception = ["late"]\n[perception.late]\ndelay_s = 0.3\n'
+    arm = plan_of(scenario + late, "idm").arms[0]
+    assert (arm.scenario.step_s, arm.scenario.perception_left.delay_s) == (0.05, 0.3)
 
 
 def test_a_perception_that_no_factor_names_is_noted(plan_of):

@@ -117,6 +117,19 @@ async def test_a_clock_holds_each_action(plan_of):
         (MINE + "strength = 2\n", r"\[drivers\.mine\]: strength is at most 1"),
         (MINE + "clock = 0.01\n", "braking decides every 0.05 s, and a clock can only slow it"),
         (MINE + "clock = 0\n", "clock: Input should be greater than 0"),
+        (
+            '[drivers.mine]\nprogram = "cei"\nclock = 0.12\n',
+            r"\[drivers\.mine\]: the driver cei perceives every 0\.05 s: clock = 0\.12 s",
+        ),
+        (
+            '[drivers.mine]\nprogram = "cei"\nupper_mean = 0.8\n',
+            r"\[drivers\.mine\]: upper_mean of cei is a number of its sets: name one beside it, "
+            r'set = "K0" or "F1" or "drag-free"',
+        ),
+        (
+            '[drivers.mine]\nprogram = "quantal"\nclock = 2.0\nhorizon_s = 1.5\n',
+            r"\[drivers\.mine\]: horizon_s of quantal is at least its clock, 2 s",
+        ),
         ('[drivers.mine]\nprogram = "brake"\n', "unknown driver 'brake'; valid: cei, constant, "),
         ('[drivers.braking]\nprogram = "constant"\n', "there is a driver 'braking' already"),
         ('[drivers.o3]\nprogram = "constant"\n', "needs another name: there is a model o3"),
@@ -129,6 +142,15 @@ async def test_a_clock_holds_each_action(plan_of):
 def test_what_cannot_be_a_driver_is_refused_with_the_valid_choices(plan_of, text, said):
     with pytest.raises(UsageError, match=said):
         plan_of(text, "constant")
+
+
+def test_a_clock_cannot_make_a_program_without_a_rate_faster_than_the_prompt_rate(plan_of):
+    hurried = '[drivers.mine]\nprogram = "constant"\nclock = 0.5\n'
+    said = r"mine: clock = 0\.5 is too fast: constant decides every 1 s \(1 / prompt_rate_hz\)"
+    with pytest.raises(UsageError, match=said):
+        plan_of(hurried, "mine")
+    faster = plan_of(hurried, "mine", "[scenario]\nprompt_rate_hz = 2.0\nstep_s = 0.1\n")
+    assert specs(faster)[0]["left"]["rate_hz"] == 2.0
 
 
 def test_a_stored_study_registers_its_drivers_without_running_its_plugins(plan_of):

@@ -192,6 +192,11 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
         ),
         ('[prompts.x]\nadd = [{ block = "C9" }]\n', None, "unknown prompt block 'C9'; valid: C0"),
         ('[prompts.x]\nadd = [{ block = "C2" }]\n', None, "'C2', which it has already"),
+        (
+            '[prompts.x]\nadd = [{ block = "state.table" }]\n',
+            None,
+            "says the situation twice, in C0 and in state.table: write remove = ",
+        ),
         ("[prompts.x]\nad = []\n", None, "unknown key 'prompts.x.ad'; valid: based_on, remove"),
         ('[plugins]\nfiles = ["none.py"]\n', None, "the plug-in none.py cannot be read"),
         (
@@ -209,3 +214,9 @@ def test_what_cannot_be_is_refused_in_one_line(plan_of, text, plugin, says):
         plan_of(text, plugin=plugin)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_situation_in_other_words_may_stand_beside_the_table(plan_of):
+    table = '[prompts.x]\nadd = [{ block = "state.table" }]\n'
+    plan_of(table + 'replace = { C0 = "You drive a car." }\n')
+    make_plan("baseline", "constant")  # what the study added is taken out again

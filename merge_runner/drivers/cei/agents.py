@@ -38,6 +38,7 @@ INPUTS = np.linspace(-1.0, 1.0, PLANS)
 NODES_BY_TURNS = tuple(slice(first, None, 4) for first in (3, 1, 0, 2))
 TURNS = 9
 OFF = UNSOLVED = -1
+SLOWEST_MPS = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,10 +275,15 @@ def cheapest_safe(
 
 
 def tunnel_ticks(own: Vehicles, other: Vehicles) -> Array:
-    """How many ticks ago the run started, when the one farther back was at 0, at these speeds."""
-    return (
-        np.minimum(own.positions_m / own.speeds_mps, other.positions_m / other.speeds_mps) / TICK_S
-    )
+    """How many ticks ago the run started, when the one farther back was at 0, at these speeds.
+
+    A vehicle that seems to stand, as it may where speeds are told with errors, crawls.
+    """
+    return np.asarray(np.minimum(_since_start_s(own), _since_start_s(other)) / TICK_S)
+
+
+def _since_start_s(vehicles: Vehicles) -> Array:
+    return np.asarray(vehicles.positions_m / np.maximum(vehicles.speeds_mps, SLOWEST_MPS))
 
 
 def risks(task: Task, positions_m: Array, belief: Belief) -> Array:

@@ -19,17 +19,15 @@ if TYPE_CHECKING:
 BY_RESISTANCE = "by-resistance"
 USUAL_SETS: dict[Resistance, str] = {"human": "K0", "none": "drag-free"}
 PAIR = "pair"
+RISKS = {"lower_mean", "upper_mean", "lower_spread", "upper_spread"}
 
 
 class CeiDriver:
     """See Driver; it loads numpy and scipy with its first decision."""
 
     def __init__(self, seat: ProgramSeat) -> None:
-        try:
-            self.ticks = whole_steps("clock", seat.interval_s, TICK_S)
-        except ValueError as exc:
-            raise UsageError(f"the driver cei perceives every {TICK_S} s: {exc}") from exc
         self.seat = seat
+        self.ticks = round(seat.interval_s / TICK_S)
         self._seated: Seated | None = None
 
     async def decide(self, observation: Observation, number: int) -> Decision:
@@ -50,12 +48,23 @@ def thresholds_of(seat: ProgramSeat) -> ThresholdSet:
 
 
 def check(parameters: Mapping[str, Parameter]) -> None:
-    """Raises UsageError for a pair that there is not."""
+    """Raises UsageError for a pair that there is not, and for thresholds that are no risks."""
     if parameters[PAIR] not in range(len(OFFSETS) + 1):
         raise UsageError(
             f"the driver cei has no pair {parameters[PAIR]}: 1 to {len(OFFSETS)} can be chosen, "
             "and 0 takes turns by the repetition"
         )
+    for name in sorted(RISKS & parameters.keys()):
+        if not 0 <= float(parameters[name]) <= 1:
+            raise UsageError(f"{name} of cei is a risk: from 0 to 1, not {parameters[name]}")
+
+
+def check_clock(_: Mapping[str, Parameter], clock_s: float) -> None:
+    """Raises UsageError for a clock that is no whole number of ticks."""
+    try:
+        whole_steps("clock", clock_s, TICK_S)
+    except ValueError as exc:
+        raise UsageError(f"the driver cei perceives every {TICK_S} s: {exc}") from exc
 
 
 PROGRAMS.register(
@@ -68,5 +77,6 @@ PROGRAMS.register(
         settable=True,
         sets={BY_RESISTANCE: {}, **{name: asdict(one) for name, one in SETS.items()}},
         check=check,
+        check_clock=check_clock,
     ),
 )

@@ -1,14 +1,18 @@
 """The driver cei in a trial: what it sees, what a study can set, and one trial as it went."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from merge_runner.config import Perception
 from merge_runner.drivers.cei.agents import Vehicles, set_speeds, start, tunnel_ticks
 from merge_runner.drivers.cei.collision_interval import collision_interval, exact_bounds
 from merge_runner.drivers.cei.driver import USUAL_SETS, thresholds_of
 from merge_runner.drivers.cei.motion import course
 from merge_runner.drivers.cei.parameters import OFFSETS, SETS, Base, Habits, offsets_of
 from merge_runner.errors import UsageError
+from merge_runner.records import FAR_BEHIND_M, SIDES, Observation
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration
 from tests.drivers.cei.trials import cei, model, played, scenario, spec
@@ -151,3 +155,55 @@ def test_the_usual_set_suits_the_resistance_unless_one_is_chosen(resistance):
     assert thresholds_of(usual) == SETS[USUAL_SETS[resistance]]
     assert thresholds_of(chosen) == SETS["F1"]
     assert USUAL_SETS["human"] != USUAL_SETS["none"]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("clock_s", [None, 1.0])
+@pytest.mark.parametrize("perception", [{"view_from_m": 25.0}, {"range_m": 7.0}])
+@pytest.mark.parametrize("resistance", ["none", "human"])
+async def test_drivers_that_see_each_other_late_mostly_still_avoid_a_collision(
+    perception, clock_s, resistance
+):
+    eyes = {f"perception_{side}": Perception(**perception) for side in SIDES}
+    collided = 0
+    for condition in ("L_4_-8", "N_0_0", "R_-4_8"):
+        for repetition in range(1, 4):
+            driver = cei(clock=clock_s)
+            task = scenario(resistance=resistance, **eyes)
+            trial = await played(condition, repetition, task, driver)
+            collided += trial.status == "collided"
+    assert collided <= 4
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("set_", ["K0", "F1", "drag-free"])
+async def test_a_driver_that_never_sees_the_other_drives_at_the_speed_that_it_desires(set_):
+    blind = {f"perception_{side}": Perception(view_from_m=1e-9, delay_s=20.0) for side in SIDES}
+    trial = await played("L_4_-8", 1, scenario(**blind), cei(set=set_))
+    assert not any(row.told.other_seen for row in trial.decisions)
+    own = [row.velocity_mps for row in trial.states if row.side == "left"]
+    assert own == pytest.approx([own[0]] * len(own), abs=0.3)
+
+
+async def test_until_it_sees_the_other_a_driver_takes_its_speed_to_be_the_own():
+    view = {"perception_left": Perception(view_from_m=25.0)}
+    seat = cei().seat(scenario(**view), spec("L_4_-8", 1), "left")
+    driver = cei().driver(seat)
+    unseen = Observation(
+        road="merge",
+        own_speed_mps=9.0,
+        other_speed_mps=9.0,
+        own_position_m=50.0,
+        relative_distance_m=-FAR_BEHIND_M,
+        distance_to_merge_m=50.0,
+        own_accelerations_mps2=(),
+        other_speeds_mps=(),
+        other_acceleration_mps2=0.0,
+        other_seen=False,
+    )
+    for number in range(40):
+        await driver.decide(unseen, number)
+    perceived = driver._seated._agents.perceived_mps
+    assert perceived == pytest.approx([9.0])
+    await driver.decide(replace(unseen, other_seen=True, other_speed_mps=11.0), 40)
+    assert 9.0 != driver._seated._agents.perceived_mps[0] < 10.0
