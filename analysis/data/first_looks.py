@@ -74,16 +74,17 @@ def _groups(rows: pd.DataFrame) -> Iterator[FirstLooks]:
         label = f"{model} of {driver}" if own["mixed"].any() else driver
         label += f" [{spec[:8]}]" if specs[driver, model, variant] > 1 else ""
         label += f" ({stand_in(dict.fromkeys(SIDES, model))})" if own["scripted"].any() else ""
-        sampled = own["asked"].any() and not _without_chance(own)
+        sampled = _sampled(own)
         # Repetitions of a driver without chance are the same answer again.
         answers = own if sampled else own.groupby(["condition", "side"]).head(1)
-        yield FirstLooks(label, model, variant, spec, answers, bool(sampled))
+        yield FirstLooks(label, model, variant, spec, answers, sampled)
 
 
-def _without_chance(rows: pd.DataFrame) -> bool:
-    """Whether every situation that was asked again was answered as before."""
+def _sampled(rows: pd.DataFrame) -> bool:
+    """Whether chance is in the answers, as far as those to a repeated situation tell."""
     ways = rows.groupby(["condition", "side"])[["tactical", "action_mps2"]].agg(["size", "nunique"])
     again = ways[ways["action_mps2", "size"] > 1]
-    same = (again.xs("nunique", axis=1, level=1) <= 1).all(axis=None)
-    # In a single situation it may be chance.
-    return len(again) > 1 and bool(same)
+    differ = bool((again.xs("nunique", axis=1, level=1) > 1).any(axis=None))
+    # A program has chance where it shows. Of a model equal answers to a single situation may be
+    # chance.
+    return differ or (bool(rows["asked"].any()) and len(again) < 2)

@@ -26,6 +26,7 @@ def folder(prepare, tmp_path_factory):
     for ask in (
         ("seat", "first", "--samples", 4, *grid),
         ("seat", "first", "--model", "projected-order", "--samples", 2, *grid),
+        ("seat", "first", "--model", "human-odds", "--samples", 4, "--grid", "h=0:2:2,dv=0"),
         ("seat", "first", "--model", "constant+emulator", "--samples", 1, "--grid", "h=0,dv=0"),
         ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0"),
     ):
@@ -77,8 +78,16 @@ def test_a_driver_without_chance_counts_once_and_has_no_interval(table):
     assert found["h=+2 dv=+0"].values["asked"] == 2
     assert not any(value for row in found.values() for name, value in row.values.items()
                    if name.endswith("_ci"))  # fmt: skip
-    assert "projected-order/baseline: no chance is in its answers" in "\n".join(table.notes)
+    assert "projected-order/baseline: no chance shows in its answers" in "\n".join(table.notes)
     assert found["per m of headway"].values["action"] > 0
+
+
+def test_a_program_that_draws_counts_with_each_answer_and_has_intervals(table):
+    point = rows(table, "human-odds")["h=+0 dv=+0"].values
+    assert point["asked"] == 2 * 4
+    low, high = point["action_ci"]
+    assert low < point["action"] < high
+    assert not any("human-odds/baseline: no chance" in note for note in table.notes)
 
 
 def test_the_drivers_of_a_mixed_pair_are_told_apart(table, asked):
@@ -96,7 +105,7 @@ def test_the_drivers_of_a_mixed_pair_are_told_apart(table, asked):
 
 def test_the_figure_has_a_panel_for_words_and_one_for_actions(asked):
     figure = figure_of_first_looks(asked)
-    assert len(figure.axes) == 2 * len(first_looks(asked)) == 8
+    assert len(figure.axes) == 2 * len(first_looks(asked)) == 10
     figure.canvas.draw()
 
 
