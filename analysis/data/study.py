@@ -187,7 +187,7 @@ class Study:
         self.chosen = models
         self.where = where
         self.state = present_state(self.db)
-        specs = load_specs(self.db)
+        self.specs = specs = load_specs(self.db)
         trials = trials_with_metrics(self.db).merge(
             self._read(TRACES), on=["trial_id", "spec_hash"], how="left"
         )
@@ -396,6 +396,15 @@ def _tasks(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     return tasks
 
 
+def with_images(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """The trials with their ``image``: the hash of the spec that has the ego on the left."""
+    turned = trials["ego"] == "right"
+    images = _mirrored(specs, trials.loc[turned, "spec_hash"].unique())
+    return trials.assign(
+        image=trials["spec_hash"].mask(turned, trials["spec_hash"].replace(images))
+    )
+
+
 def _mirrored(specs: Mapping[str, Mapping[str, Any]], names: Iterable[str]) -> dict[str, str]:
     """The spec hashes by which the mirror images of these specs go."""
     return {
@@ -434,13 +443,9 @@ def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) 
     """
     if trials.empty:
         return []
-    # The spec of a trial as its ego sees it: with the ego on the left.
-    turned = trials["ego"] == "right"
-    images = _mirrored(specs, trials.loc[turned, "spec_hash"].unique())
+    images = _mirrored(specs, trials.loc[trials["ego"] == "right", "spec_hash"].unique())
+    keyed = with_images(trials, specs)
     specs = {**specs, **{images[name]: _turned(specs[name]) for name in images}}
-    keyed = trials.assign(
-        image=trials["spec_hash"].mask(turned, trials["spec_hash"].replace(images))
-    )
     tasks = _tasks(specs)
     keyed["task"] = keyed["image"].map(lambda name: tasks.get(name, name[:8]))
     keyed["usual"] = _usual(keyed, specs)

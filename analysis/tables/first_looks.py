@@ -134,11 +134,12 @@ def _cells(name: str, found: Estimate | None, *, sampled: bool) -> dict[str, Val
 
 def _query(looks: FirstLooks, where: str) -> str:
     """The query that lists the answers behind a row."""
+    specs = ", ".join(map(quoted, looks.spec_hashes))
     return (
         "SELECT trial_id, side, tactical, valid, failure, plan FROM trials JOIN "  # noqa: S608 # ours
         "(SELECT *, if(side = 'left', 1, -1) AS own FROM decisions WHERE decision = 0) "
-        "USING (trial_id, spec_hash) WHERE source = 'seat' AND status <> 'failed' AND spec_hash = "
-        f"{quoted(looks.spec_hash)} AND variant = {quoted(looks.setting)} AND "
+        "USING (trial_id, spec_hash) WHERE source = 'seat' AND status <> 'failed' AND spec_hash IN "
+        f"({specs}) AND variant = {quoted(looks.setting)} AND "
         f"if(side = 'left', model_left, model_right) = {quoted(looks.model)}{where} ORDER BY ALL"
     )
 

@@ -103,6 +103,33 @@ def test_the_drivers_of_a_mixed_pair_are_told_apart(table, asked):
     assert model["h=+0 dv=+0"].values["m"] in (0, 1)
 
 
+def test_rows_have_the_ids_of_other_tables(table):
+    ids = {row.id for row in table.rows}
+    assert "emulator/baseline/h=+2 dv=-0.8" in ids
+    assert {f"emulator+constant/baseline/{side}/h=+0 dv=+0" for side in ("left", "right")} <= ids
+
+
+def test_the_answers_of_a_driver_from_both_seats_are_one(prepare, tmp_path):
+    pair = ("--model", "emulator+constant", "--mirror", "--samples", 2, "--grid", "h=2,dv=0")
+    run = prepare(tmp_path, "seat", "first", *pair)
+    assert run.code == 0, run.err
+    study = Study(tmp_path / "results/merge.duckdb")
+    (table,) = make_tables(study, ["first-look-surface"])
+    points = {row.id: row for row in table.rows if " dv=" in row.id}
+    here = [f"emulator+constant/baseline/{side}/h={h} dv=+0" for side in ("left", "right")
+            for h in ("+2", "-2")]  # fmt: skip
+    assert sorted(points) == sorted(here)
+    own = points[here[0]]
+    assert own.values["driver"].startswith("emulator of emulator+constant (scripted")
+    assert own.values["asked"] == 2
+    for row in points.values():
+        (source,) = explain(study, table, row.id).sources
+        with duckdb.connect(str(study.db), read_only=True) as connection:
+            found = connection.execute(source.query).fetchall()
+        assert len(found) == 2
+        assert len({side for _, side, *_ in found}) == 1
+
+
 def test_the_figure_has_a_panel_for_words_and_one_for_actions(asked):
     figure = figure_of_first_looks(asked)
     assert len(figure.axes) == 2 * len(first_looks(asked)) == 10
