@@ -210,6 +210,23 @@ async def test_a_program_is_asked_too_and_has_no_word(merge_runner):
     assert (await merge_runner("audit")).code == 0
 
 
+async def test_the_two_drivers_of_a_pair_are_summed_up_apart(merge_runner):
+    pair = ("--model", "emulator+constant", "--mirror", "--samples", 1, "--conditions", "N_0_0")
+    run = await merge_runner("seat", "first", *pair, "--json")
+    assert run.code == 0, run.err
+    looks = run.summary["first_looks"]
+    assert [(look["model"], look["side"], look["asked"]) for look in looks] == [
+        ("constant", "left", 1),
+        ("constant", "right", 1),
+        ("emulator", "left", 1),
+        ("emulator", "right", 1),
+    ]
+    assert [look["with_a_word"] for look in looks] == [0, 0, 1, 1]
+    again = await merge_runner("seat", "first", *pair)
+    for model in ("constant", "emulator"):
+        assert f"{model} of emulator+constant/baseline: share of M" in again.out
+
+
 async def test_factors_and_prompts_of_a_study_are_asked(merge_runner, tmp_path):
     (tmp_path / "mine.toml").write_text(
         'repetitions = 1\nmodels = ["emulator"]\nconditions = ["N_0_0"]\n'
