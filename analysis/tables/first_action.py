@@ -24,6 +24,7 @@ from analysis.stats.first_look import (
     ecdf,
     faults,
     humans,
+    repeats_itself,
     seats,
     skill,
 )
@@ -81,6 +82,7 @@ def first_action(study: Study) -> Table:
             "included; own velocity is relative to the other vehicle's",
             *_human_notes(study),
             *sample_notes(study, study.models, pooled=False, whole=False),
+            *_left_out_notes(study),
         ),
     )
 
@@ -110,6 +112,7 @@ def first_action_faults(study: Study) -> Table:
             "driver that is late the others are not called shown",
             *_human_notes(study),
             *sample_notes(study, study.models, pooled=False, whole=False),
+            *_left_out_notes(study),
         ),
     )
 
@@ -135,6 +138,23 @@ def _human_notes(study: Study) -> list[str]:
         f"both humans of a trial go in {go['low']:g} to {go['high']:g} %, and slow in "
         f"{slow['low']:g} to {slow['high']:g} %",
     ]
+
+
+def _left_out_notes(study: Study) -> Iterator[str]:
+    """Which of the trials have no first action, and which repeat one."""
+    for group in study.models:
+        scenario = study.specs.get(group.spec_hash or "", {}).get("scenario", {})
+        if scenario.get("control_start") == "own_exit":
+            yield (
+                f'{group.id}: left out: with control_start = "own_exit" one driver acts while the '
+                "other is in its tunnel yet"
+            )
+        for seat in seats(group):
+            if repeats_itself(study, seat):
+                yield (
+                    f"{seat.name}: it does the same first in all repetitions of a situation, as a "
+                    "driver without chance: each situation counts once"
+                )
 
 
 def _rows(study: Study, group: Group) -> Iterator[Row]:
