@@ -79,9 +79,9 @@ class Seat:
 
     @property
     def name(self) -> str:
-        """The group's label, with the model's name where it is one of a mixed pair."""
+        """The group's label, or that of one of a mixed pair."""
         model = self.group.models[self.sides[0]]
-        return f"{model} of {self.group.label}" if self.side else self.group.label
+        return self.group.label_of(model) if self.side else self.group.label
 
 
 @dataclass(frozen=True, eq=False)

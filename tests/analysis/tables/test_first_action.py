@@ -180,6 +180,17 @@ def test_a_driver_without_chance_in_a_mixed_pair_counts_once_in_each_situation(t
     assert note.startswith("zero of alike+zero: it does the same first")
 
 
+def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
+    pair = ("--model", "emulator+projected-order", "--reps", 1)
+    assert prepare(tmp_path, "sweep", "baseline", *pair, "--conditions", "N_0_0").code == 0
+    (table,) = make_tables(Study(tmp_path / "results/merge.duckdb"), ["first-action"])
+    names = {row.values["driver"] for row in table.rows} - {"human"}
+    assert names == {
+        "emulator of emulator+projected-order (scripted stand-in, no language model)",
+        "projected-order of emulator+projected-order",
+    }
+
+
 def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(prepare, tmp_path):
     (tmp_path / "mine.toml").write_text(
         'repetitions = 2\nconditions = ["L_4_8", "R_-4_-8"]\n'

@@ -12,6 +12,7 @@ from analysis.data.study import Study
 from analysis.explain import explain
 from analysis.figures.first_look_figure import figure_of_first_looks
 from analysis.tables import make_tables
+from merge_runner.errors import UsageError
 from tests.harness import Run
 
 EMULATOR = "emulator (scripted stand-in, no language model)"
@@ -140,6 +141,14 @@ def test_models_and_factors_restrict_it(asked):
     assert [looks.label for looks in first_looks(Study(asked.db, ["emulator"]))] == [EMULATOR]
     none = Study(asked.db, where={"prompt": ["baseline"], "model": ["emulator"]})
     assert [looks.label for looks in first_looks(none)] == [EMULATOR]
+
+
+def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
+    study = Study(asked.db, ["projected-order"], where={"model": ["projected-order"]})
+    assert [looks.label for looks in first_looks(study)] == ["projected-order"]
+    assert study.models == []
+    with pytest.raises(UsageError, match=r"valid: human, emulator, .*projected-order"):
+        Study(asked.db, ["idm"])
 
 
 def test_a_reply_without_a_plan_is_counted_and_is_no_action(prepare, tmp_path):
