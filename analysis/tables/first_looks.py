@@ -48,7 +48,8 @@ def first_look_surface(study: Study) -> Table:
             Column("action_ci", "95 % CI", "interval", 3, "of the first action", optional=True),
             Column(
                 "mean", "first second", "number", 3,
-                "mean net acceleration over the first second, in m/s^2, of valid answers",
+                "mean net acceleration over the first second, in m/s^2, of valid answers; empty "
+                "where the next decision comes sooner",
                 optional=True,
             ),
         ),
@@ -93,7 +94,7 @@ def _point(looks: FirstLooks, at: str, rows: pd.DataFrame) -> Row:
     valid, words = rows[rows["valid"]], rows["tactical"].dropna()
     m = proportion(int((words == "M").sum()), len(words))
     headway_m, velocity_mps = map(float, rows[POINT].iloc[0])
-    driven = mean(valid["mean_mps2"].to_numpy(float))
+    driven = mean(valid["mean_mps2"].dropna().to_numpy(float))
     return _row(
         looks,
         at,

@@ -13,6 +13,7 @@ from analysis.explain import explain
 from analysis.figures.first_look_figure import figure_of_first_looks
 from analysis.tables import make_tables
 from merge_runner.errors import UsageError
+from merge_runner.results.first_looks import FIRST_LOOKS
 from tests.harness import Run
 
 EMULATOR = "emulator (scripted stand-in, no language model)"
@@ -164,6 +165,22 @@ def test_a_reply_without_a_plan_is_counted_and_is_no_action(prepare, tmp_path):
     (looks,) = first_looks(study)
     right = looks.rows[(looks.rows["condition"] == "N_0_0") & (looks.rows["side"] == "right")]
     assert values["action"] == right["action_mps2"].iloc[0]
+
+
+def test_a_first_second_is_told_only_of_trials_that_lasted_one(prepare, tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        'repetitions = 1\nconditions = ["N_0_0"]\n[factors]\nprompt_rate_hz = [2.5, 1.0, 0.5]\n'
+    )
+    assert prepare(tmp_path, "seat", "first", "mine.toml").code == 0
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
+        found = connection.execute(
+            f"SELECT end_time_s, mean_mps2 IS NOT NULL FROM ({FIRST_LOOKS}) "
+            "JOIN trials USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL"
+        ).fetchall()
+    assert found == [(0.4, False), (1.0, True), (2.0, True)]
+    table = make_tables(Study(tmp_path / "results/merge.duckdb"), ["first-look-surface"])[0]
+    told = [row.values["mean"] is None for row in table.rows if row.id.endswith("dv=+0")]
+    assert sorted(told) == [False, False, True]
 
 
 def test_the_explorer_lists_no_situation_and_no_run_that_only_asked(asked):
