@@ -38,6 +38,8 @@ from merge_runner.records import SIDES
 STEP_MPS2 = 0.01
 GRID = np.arange(-600, 401) * STEP_MPS2
 DRAWS = 200
+# Of so many trials imported first actions stand in the place of the published aggregates.
+LEAST_TRIALS = 100
 # Equal but for the last digits of a vehicle that drove on the other side.
 SAME_MPS2 = 1e-9
 # A skill is told where the ceiling is at least this part of the floor away from it.
@@ -187,7 +189,7 @@ def humans(study: Study) -> Humans:
     if study.complete:
         return humans_from(acts(study, Seat(study.human, (0, 1))), TRACES)
     decoded = study.human_first_actions
-    if len(decoded):
+    if decoded["trial"].nunique() >= LEAST_TRIALS:
         return humans_from(acts_of(decoded.assign(first_second_mps2=np.nan), "trial"), DECODED)
     return published_humans()
 

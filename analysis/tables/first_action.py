@@ -11,6 +11,7 @@ from analysis.data.first_actions import HOLD_MPS2, Acts
 from analysis.data.reference_data import citation, published
 from analysis.data.study import Group, Study
 from analysis.stats.first_look import (
+    LEAST_TRIALS,
     PUBLISHED,
     TRACES,
     Fault,
@@ -130,7 +131,13 @@ def _human_notes(study: Study) -> list[str]:
     go, slow = (trials.loc[f"both_{what}_percent"] for what in ("go", "slow"))
     if known.source != PUBLISHED:
         return [f"human first actions: {known.source}"]
+    few = study.human_first_actions["trial"].nunique()
     return [
+        *(
+            [f"the imported first actions of {few} trials do not count: {LEAST_TRIALS} are needed"]
+            if few
+            else []
+        ),
         f"human first actions: {citation(FILE)}. Between the published quantiles and shares the "
         "distribution is taken as linear, up to full throttle, and down to where its mean is the "
         "published one; `merge-runner human import-first-actions FILE` imports the actions",
