@@ -107,7 +107,8 @@ def first_action_faults(study: Study) -> Table:
         ],
         (
             "relative velocity: the slope; side: the left vehicle's action less the right one's "
-            "at equal velocities, of humans 0 by symmetry; level: the mean, of humans at the "
+            "at equal velocities, of humans 0 by symmetry, and not tested of the drivers of a "
+            "mixed pair; level: the mean, of humans at the "
             f"driver's relative velocities; late: the share within {HOLD_MPS2} m/s² of 0, shown "
             "only if more acceleration, either way, also follows within the first second. Of a "
             "driver that is late the others are not called shown",
