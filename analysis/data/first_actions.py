@@ -19,13 +19,15 @@ from merge_runner.records import SIDES
 Array = NDArray[np.float64]
 
 # One row a vehicle, its side as the ego sees it, which is on the left everywhere. The first second
-# ends within a step, in which the acceleration is constant.
+# ends within a step, in which the acceleration is constant. Where each driver takes control at its
+# own exit the other one cruises yet: that is no first action.
 FIRST_ACTIONS = """
 SELECT trial_id, spec_hash, if(side = ego, 'left', 'right') AS side,
     arg_min(acceleration_mps2, step) FILTER (time_s > 0) AS first_mps2,
     arg_min(velocity_mps - acceleration_mps2 * (time_s - 1), step) FILTER (time_s > 1 - 1e-9)
         - arg_min(velocity_mps, step) AS first_second_mps2
 FROM states JOIN trial_drivers USING (trial_id, spec_hash)
+ANTI JOIN (FROM specs WHERE spec->>'$.scenario.control_start' = 'own_exit') USING (spec_hash)
 WHERE time_s >= 0 GROUP BY ALL ORDER BY ALL
 """
 # The imported ones: one row a vehicle, without the trial's pair.

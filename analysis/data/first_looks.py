@@ -9,14 +9,14 @@ from functools import cache
 import pandas as pd
 
 from analysis.data.load import load_each
-from analysis.data.study import Study
+from analysis.data.study import Study, with_images
 from merge_runner.drivers.registry import stand_in
 from merge_runner.records import SIDES
 from merge_runner.results.first_looks import FIRST_LOOKS
 from merge_runner.results.levels import LEVELS
 
 ROWS = (
-    f"SELECT looks.*, driver FROM ({FIRST_LOOKS}) AS looks "  # noqa: S608 # constants
+    f"SELECT looks.*, driver, ego FROM ({FIRST_LOOKS}) AS looks "  # noqa: S608 # constants
     "JOIN trial_drivers USING (trial_id, spec_hash) ORDER BY ALL"
 )
 POINT = ["headway_m", "velocity_mps"]
@@ -28,20 +28,24 @@ class FirstLooks:
 
     ``rows`` are those of FIRST_LOOKS; of a driver without chance, whose repetitions are the same
     answers again, only the first, and it is not ``sampled``. ``label`` is how tables name the
-    driver, ``model`` the name that was asked for; of a mixed pair each is one.
+    driver, ``model`` the name that was asked for; of a mixed pair each is one, and its ``seat`` is
+    ``left`` for the ego, wherever it sat, and ``right`` for the other. ``driver`` is the label
+    without what is said of a stand-in, ``spec_hashes`` those of its trials, both ways round.
     """
 
+    driver: str
     label: str
     model: str
     setting: str
-    spec_hash: str
+    seat: str
+    spec_hashes: tuple[str, ...]
     rows: pd.DataFrame
     sampled: bool
 
     @property
     def id(self) -> str:
-        """``o3/A2``; tables name rows by it."""
-        return f"{self.label}/{self.setting}"
+        """``o3/A2``, or ``o3+constant/A2/left`` of a mixed pair; tables name rows by it."""
+        return "/".join(filter(None, (self.driver, self.setting, self.seat)))
 
     @property
     def valid(self) -> pd.DataFrame:
@@ -64,26 +68,32 @@ def first_looks(study: Study) -> list[FirstLooks]:
     for factor, wanted in (study.where or {}).items():
         at = levels[(levels["factor"] == factor) & levels["value"].isin(wanted)]
         rows = rows.merge(at[["trial_id", "spec_hash"]], on=["trial_id", "spec_hash"])
-    return list(_groups(rows))
+    return list(_groups(with_images(rows, study.specs)))
 
 
 def _groups(rows: pd.DataFrame) -> Iterator[FirstLooks]:
-    keys = ["driver", "model", "variant", "spec_hash"]
-    specs = rows.groupby(keys[:-1])["spec_hash"].nunique()
-    for (driver, model, variant, spec), own in rows.groupby(keys):
-        label = f"{model} of {driver}" if own["mixed"].any() else driver
-        label += f" [{spec[:8]}]" if specs[driver, model, variant] > 1 else ""
+    keys = ["driver", "model", "variant", "image"]
+    specs = rows.groupby(keys[:-1])["image"].nunique()
+    for (pair, model, variant, image), own in rows.groupby(keys):
+        mark = f" [{image[:8]}]" if specs[pair, model, variant] > 1 else ""
+        driver = pair + mark
+        label, seat = driver, ""
+        if own["mixed"].any():
+            first = own.iloc[0]
+            label, seat = f"{model} of {driver}", SIDES[first["side"] != first["ego"]]
         label += f" ({stand_in(dict.fromkeys(SIDES, model))})" if own["scripted"].any() else ""
-        sampled = own["asked"].any() and not _without_chance(own)
+        sampled = _sampled(own)
         # Repetitions of a driver without chance are the same answer again.
         answers = own if sampled else own.groupby(["condition", "side"]).head(1)
-        yield FirstLooks(label, model, variant, spec, answers, bool(sampled))
+        hashes = tuple(sorted(own["spec_hash"].unique()))
+        yield FirstLooks(driver, label, model, variant, seat, hashes, answers, sampled)
 
 
-def _without_chance(rows: pd.DataFrame) -> bool:
-    """Whether every situation that was asked again was answered as before."""
+def _sampled(rows: pd.DataFrame) -> bool:
+    """Whether chance is in the answers, as far as those to a repeated situation tell."""
     ways = rows.groupby(["condition", "side"])[["tactical", "action_mps2"]].agg(["size", "nunique"])
     again = ways[ways["action_mps2", "size"] > 1]
-    same = (again.xs("nunique", axis=1, level=1) <= 1).all(axis=None)
-    # In a single situation it may be chance.
-    return len(again) > 1 and bool(same)
+    differ = bool((again.xs("nunique", axis=1, level=1) > 1).any(axis=None))
+    # A program has chance where it shows. Of a model equal answers to a single situation may be
+    # chance.
+    return differ or (bool(rows["asked"].any()) and len(again) < 2)

@@ -119,15 +119,16 @@ SELECT trial_id, spec_hash, count(*) AS plans, count(*) FILTER (coarse) AS coars
     count(*) FILTER (revision > 0.1) AS large_revisions
 FROM compared GROUP BY ALL ORDER BY ALL
 """
-# One row a decision with a tactical word: the mean acceleration of the second that follows it, NULL
-# where the trial ends before.
+# One row a decision with a tactical word: whether it is its driver's first, and the mean
+# acceleration of the second that follows it, NULL where the trial ends before.
 WORDS = """
 WITH speeds AS (
     SELECT trial_id, spec_hash, side, round(time_s, 3)::DECIMAL(9, 3) AS time_s, velocity_mps
     FROM states WHERE time_s >= 0
 ), said AS (
-    SELECT trial_id, spec_hash, side, decision, tactical, round(time_s, 3)::DECIMAL(9, 3) AS time_s
-    FROM decisions WHERE tactical IS NOT NULL
+    SELECT trial_id, spec_hash, side, decision, tactical, round(time_s, 3)::DECIMAL(9, 3) AS time_s,
+        decision = min(decision) OVER (PARTITION BY trial_id, spec_hash, side) AS at_first
+    FROM decisions QUALIFY tactical IS NOT NULL
 )
 SELECT said.* EXCLUDE (time_s) REPLACE (if(said.side = ego, 'left', 'right') AS side),
     later.velocity_mps - now.velocity_mps AS driven_mps2

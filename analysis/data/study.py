@@ -56,6 +56,12 @@ MEAN_SPEED = "mean_speed_mps"
 # Factors that every study has, and levels that others are compared with.
 FIRST = (MODEL, PROMPT)
 USUAL = (BASELINE, DEFAULT, SELF)
+# One row a trial and factor of drivers that were only asked.
+ASKED = f"""
+SELECT trial_id, spec_hash, driver, factor, value FROM ({LEVELS})
+JOIN trial_drivers USING (trial_id, spec_hash)
+SEMI JOIN (FROM trials WHERE source = 'seat') USING (trial_id, spec_hash) ORDER BY ALL
+"""  # noqa: S608 # constants
 NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
@@ -73,7 +79,8 @@ class Group:
     with ``[scripted]`` where a stand-in answered only some of its trials. ``label`` is how tables
     name the driver, ``models`` are the names that were asked for, the ego's first, an equal one
     once, ``seats`` are how many of the trials have the ego on the left and on the right, ``posing``
-    is what is said of a scripted stand-in, and ``caution`` of a human who is replayed. Of a driver
+    is what is said of a scripted stand-in, which answered for the models ``posed``, and ``caution``
+    what is said of a human who is replayed. Of a driver
     without chance, whose repetitions are the same trial again, only the first are ``trials``, and
     ``repeated`` counts the others; ``equal`` counts such trials of a driver that samples.
     ``narrowed`` is what tells the trials in SQL from others of their spec and variant, empty where
@@ -93,6 +100,7 @@ class Group:
     seats: tuple[int, int] = (0, 0)
     measured: bool = True
     posing: str = ""
+    posed: frozenset[str] = frozenset()
     caution: str = ""
     repeated: int = 0
     equal: int = 0
@@ -104,6 +112,11 @@ class Group:
     def id(self) -> str:
         """``o3/A2``, or ``human``."""
         return f"{self.driver}/{self.setting}" if self.setting else self.driver
+
+    def label_of(self, model: str) -> str:
+        """How tables name one driver of a mixed pair: a program is no stand-in."""
+        said = filter(None, (self.posing if model in self.posed else "", self.caution))
+        return _label(f"{model} of {self.driver}", "; ".join(said))
 
     @property
     def scripted(self) -> bool:
@@ -187,7 +200,7 @@ class Study:
         self.chosen = models
         self.where = where
         self.state = present_state(self.db)
-        specs = load_specs(self.db)
+        self.specs = specs = load_specs(self.db)
         trials = trials_with_metrics(self.db).merge(
             self._read(TRACES), on=["trial_id", "spec_hash"], how="left"
         )
@@ -198,7 +211,9 @@ class Study:
         every = _model_groups(trials[~recorded], specs)
         levels = self._read(LEVELS)
         every = [replace(group, levels=_levels(levels, group)) for group in every]
-        valid = [HUMAN, *dict.fromkeys(group.driver for group in every)]
+        asked = self._read(ASKED)
+        drivers = [*(group.driver for group in every), *asked["driver"].unique()]
+        valid = list(dict.fromkeys([HUMAN, *drivers]))
         wanted = valid if models is None else list(models)
         unknown = [name for name in wanted if name not in valid]
         if unknown or not wanted:
@@ -206,7 +221,10 @@ class Study:
             raise UsageError(f"{db} holds {named}; valid: {', '.join(valid)}")
         self.empty = not every
         self.models = _at(
-            where or {}, [group for group in every if group.driver in wanted], self.db
+            where or {},
+            [group for group in every if group.driver in wanted],
+            asked[asked["driver"].isin(wanted)],
+            self.db,
         )
         self.groups = [self.human, *self.models] if HUMAN in wanted else self.models
 
@@ -362,9 +380,16 @@ def _place(level: str) -> tuple[bool, float, str]:
     return level not in USUAL, number, level
 
 
-def _at(where: Mapping[str, Sequence[str]], groups: list[Group], db: Path) -> list[Group]:
-    """The groups at these levels; raises UsageError where there is none, or no such level."""
+def _at(
+    where: Mapping[str, Sequence[str]], groups: list[Group], asked: pd.DataFrame, db: Path
+) -> list[Group]:
+    """The groups at these levels.
+
+    Raises UsageError where nothing was driven there or ``asked``, or there is no such level.
+    """
     there = levels_of(groups)
+    for factor, found in asked.groupby("factor")["value"]:
+        there[factor] = list(dict.fromkeys([*there.get(factor, ()), *found]))
     for factor, levels in where.items():
         known = require(there, "factor", factor)
         for level in levels:
@@ -374,10 +399,18 @@ def _at(where: Mapping[str, Sequence[str]], groups: list[Group], db: Path) -> li
         for group in groups
         if all(group.levels.get(factor) in levels for factor, levels in where.items())
     ]
-    if where and not kept:
-        asked = " and ".join(f"{factor}={'|'.join(levels)}" for factor, levels in where.items())
-        raise UsageError(f"{db} holds no trial with {asked}: there are some with each alone")
+    if where and not kept and not _asked_at(where, asked):
+        named = " and ".join(f"{factor}={'|'.join(levels)}" for factor, levels in where.items())
+        raise UsageError(f"{db} holds no trial with {named}: there are some with each alone")
     return kept
+
+
+def _asked_at(where: Mapping[str, Sequence[str]], asked: pd.DataFrame) -> bool:
+    """Whether a trial has a level of each of these factors."""
+    pairs = zip(asked["factor"], asked["value"], strict=True)
+    meant = [value in where.get(factor, ()) for factor, value in pairs]
+    there = asked[pd.Series(meant, index=asked.index, dtype=bool)]
+    return bool((there.groupby(["trial_id", "spec_hash"]).size() == len(where)).any())
 
 
 def _without(spec: Mapping[str, Any], *names: str) -> dict[str, Any]:
@@ -394,6 +427,15 @@ def _tasks(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
         text = json.dumps(_without(spec, "prompt_blocks", MEAN_SPEED), sort_keys=True)
         tasks[name] = hashlib.sha256(text.encode()).hexdigest()[:8]
     return tasks
+
+
+def with_images(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """The trials with their ``image``: the hash of the spec that has the ego on the left."""
+    turned = trials["ego"] == "right"
+    images = _mirrored(specs, trials.loc[turned, "spec_hash"].unique())
+    return trials.assign(
+        image=trials["spec_hash"].mask(turned, trials["spec_hash"].replace(images))
+    )
 
 
 def _mirrored(specs: Mapping[str, Mapping[str, Any]], names: Iterable[str]) -> dict[str, str]:
@@ -434,13 +476,9 @@ def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) 
     """
     if trials.empty:
         return []
-    # The spec of a trial as its ego sees it: with the ego on the left.
-    turned = trials["ego"] == "right"
-    images = _mirrored(specs, trials.loc[turned, "spec_hash"].unique())
+    images = _mirrored(specs, trials.loc[trials["ego"] == "right", "spec_hash"].unique())
+    keyed = with_images(trials, specs)
     specs = {**specs, **{images[name]: _turned(specs[name]) for name in images}}
-    keyed = trials.assign(
-        image=trials["spec_hash"].mask(turned, trials["spec_hash"].replace(images))
-    )
     tasks = _tasks(specs)
     keyed["task"] = keyed["image"].map(lambda name: tasks.get(name, name[:8]))
     keyed["usual"] = _usual(keyed, specs)
@@ -483,17 +521,22 @@ def _model_group(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> 
         first["variant"],
         min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
         distinct.drop(columns=COLUMNS_OF_GROUPS),
-        label=f"{driver} ({said})" if said else driver,
+        label=_label(driver, said),
         models=tuple(dict.fromkeys(models.values())),
         name=first["driver"],
         mark=first["mark"],
         seats=(int(seats.get("left", 0)), int(seats.get("right", 0))),
         posing=posing,
+        posed=frozenset(models[side] for side in sides),
         caution=caution,
         repeated=len(rows) - len(distinct),
         equal=len(_again(distinct)),
         narrowed=" AND ".join(narrowed),
     )
+
+
+def _label(driver: str, said: str) -> str:
+    return f"{driver} ({said})" if said else driver
 
 
 def _distinct(rows: pd.DataFrame) -> pd.DataFrame:

@@ -25,7 +25,7 @@ def figure_of_first_looks(study: Study) -> Figure:
         figure = Figure(figsize=(PAGE_IN, 1.0))
         say(figure.subplots(), "no driver was only asked (merge-runner seat first)")
         return figure
-    names = [wrapped(looks.id, PAGE_IN - 1) for looks in found]
+    names = [wrapped(f"{looks.label}/{looks.setting}", PAGE_IN - 1) for looks in found]
     height_in = len(found) * (ROW_IN + 0.12 * line_count(names))
     figure = Figure(figsize=(PAGE_IN, height_in), layout="constrained")
     axes = figure.subplots(len(found), 2, squeeze=False, sharex="row", sharey="row")

@@ -88,6 +88,9 @@ def human_import_first_actions(
             "merged_first, left_mps2 and right_mps2.",
         ),
     ],
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Put them in the place of what was imported before.")
+    ] = False,
     db: DbOption = DEFAULT_DB,
 ) -> None:
     """Add the first actions of the humans: what the table first-action compares drivers with."""
@@ -104,7 +107,7 @@ def human_import_first_actions(
             f"{file}: {exc}; name docs/plots/initial_action.html of "
             "github.com/tud-hri/simple-merging-experiment, or a CSV"
         ) from exc
-    added = Store(db).add_human_first_actions(rows_of(trials))
+    added = Store(db).add_human_first_actions(rows_of(trials), replace=replace)
     print_out(
         f"{len(trials) if added else 0} trials added, {0 if added else len(trials)} there already, "
         f"{left_out} left out: their pedals do not tell the relative velocity"

@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 STEP_S = 0.05
 MAX_MPS2 = 2.5
+# What the vehicle can do by itself or against its drag, either way.
+LIMIT_MPS2 = -net_acceleration(-MAX_MPS2, MEAN_SPEED_MPS + 0.4, "human")
 # The cruise control's gain, of the pedal on the speed error.
 GAIN = 5.0
 # Steps of the pedal above and below its middle, which is half of the way.
@@ -52,7 +54,10 @@ def read_first_actions(content: bytes) -> tuple[list[FirstActions], int]:
     """The trials of a page or of a CSV, and how many were left out; raises Unreadable."""
     if content.lstrip()[:1] == b"<":
         return _of_page(content)
-    return list(_of_csv(content)), 0
+    trials = list(_of_csv(content))
+    if not trials:
+        raise Unreadable("it holds no first action")
+    return trials, 0
 
 
 def rows_of(trials: list[FirstActions]) -> list[tuple[int, str, float, Side | None, float]]:
@@ -153,6 +158,12 @@ def _of_row(row: dict[str, str], number: int) -> FirstActions:
     if values[0] not in VELOCITIES:
         valid = ", ".join(f"{velocity:g}" for velocity in VELOCITIES)
         raise Unreadable(f"relative_velocity_mps is {values[0]:g} in row {number}; valid: {valid}")
+    beyond = max(values[1:], key=abs)
+    if abs(beyond) > LIMIT_MPS2:
+        raise Unreadable(
+            f"an acceleration is {beyond:g} m/s² in row {number}: the vehicle of the experiment "
+            f"can do {LIMIT_MPS2:.2f} at most, drag included"
+        )
     return FirstActions(values[0], FIRST[first], values[1], values[2])
 
 

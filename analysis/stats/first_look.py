@@ -14,6 +14,7 @@ from functools import cache
 from math import inf, sqrt
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from analysis.data.first_actions import (
@@ -37,6 +38,10 @@ from merge_runner.records import SIDES
 STEP_MPS2 = 0.01
 GRID = np.arange(-600, 401) * STEP_MPS2
 DRAWS = 200
+# Of so many trials imported first actions stand in the place of the published aggregates.
+LEAST_TRIALS = 100
+# Equal but for the last digits of a vehicle that drove on the other side.
+SAME_MPS2 = 1e-9
 # A skill is told where the ceiling is at least this part of the floor away from it.
 LEAST_REACH = 0.1
 CUE, SIDE, LEVEL, LATE = "relative velocity", "side", "level", "late"
@@ -76,9 +81,9 @@ class Seat:
 
     @property
     def name(self) -> str:
-        """The group's label, with the model's name where it is one of a mixed pair."""
+        """The group's label, or that of one of a mixed pair."""
         model = self.group.models[self.sides[0]]
-        return f"{model} of {self.group.label}" if self.side else self.group.label
+        return self.group.label_of(model) if self.side else self.group.label
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,12 +151,36 @@ def seats(group: Group) -> list[Seat]:
 @cache
 def acts(study: Study, seat: Seat) -> Acts:
     """The first actions of a driver in the trials that ended; those of humans by pair."""
-    columns = ["trial_id", "spec_hash", "relative_velocity_mps", "pair"]
+    rows = _rows(study, seat)
+    if repeats_itself(study, seat):
+        # What follows within a second may answer to the other driver, which has chance.
+        means = rows.groupby(["condition", "side"])["first_second_mps2"].transform("mean")
+        once = rows.drop_duplicates("condition")["trial"]
+        rows = rows.assign(first_second_mps2=means)[rows["trial"].isin(once)]
+    by_pair = seat.group.ended["pair"].nunique() >= MIN_PAIRS
+    return acts_of(rows, "pair" if by_pair else "trial", seat.sides)
+
+
+def repeats_itself(study: Study, seat: Seat) -> bool:
+    """Whether one of a mixed pair does the same first in all repetitions of each situation.
+
+    They are the same action again, as of a driver without chance. The trials of equal drivers
+    without chance are equal, and are left out of their group.
+    """
+    rows = _rows(study, seat)
+    own = rows[rows["side"] == seat.side]
+    ways = own.groupby("condition")["first_mps2"].agg(["size", np.ptp])
+    return len(ways) < len(own) and bool((ways["ptp"] < SAME_MPS2).all())
+
+
+@cache
+def _rows(study: Study, seat: Seat) -> pd.DataFrame:
+    """The first actions in the trials of a driver that ended, one row a vehicle."""
+    columns = ["trial_id", "spec_hash", "condition", "relative_velocity_mps", "pair"]
     trials = seat.group.ended[columns].reset_index(drop=True)
-    rows = of_group(study.first_actions, seat.group, trials).merge(
+    return of_group(study.first_actions, seat.group, trials).merge(
         trials.assign(trial=trials.index), on=["trial_id", "spec_hash"]
     )
-    return acts_of(rows, "pair" if trials["pair"].nunique() >= MIN_PAIRS else "trial", seat.sides)
 
 
 @cache
@@ -160,7 +189,7 @@ def humans(study: Study) -> Humans:
     if study.complete:
         return humans_from(acts(study, Seat(study.human, (0, 1))), TRACES)
     decoded = study.human_first_actions
-    if len(decoded):
+    if decoded["trial"].nunique() >= LEAST_TRIALS:
         return humans_from(acts_of(decoded.assign(first_second_mps2=np.nan), "trial"), DECODED)
     return published_humans()
 

@@ -12,17 +12,19 @@ from functools import cache
 import pandas as pd
 
 from analysis.data.first_actions import HOLD_MPS2
-from analysis.data.study import Group, Study, of_group
+from analysis.data.study import Study, of_group
+from analysis.stats.first_look import Seat
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import Estimate, proportion
 from analysis.stats.regressions import Regression, who_first_firth
+from merge_runner.records import SIDES
 
 CUES = {"projected_headway": "headway", "relative_velocity": "relative velocity"}
 
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """What a group's tactical words come to.
+    """What a driver's tactical words come to.
 
     ``merge_yields`` is the share of M that yielding follows, ``yield_goes`` that of Y that going
     follows. Of first words in finished trials, ``merge_second`` is the share of M of who merged
@@ -46,15 +48,16 @@ class Words:
 
 
 @cache
-def words(study: Study, group: Group) -> Words | None:
-    """The words of a group in the trials that ended; None where there are none."""
+def words(study: Study, seat: Seat) -> Words | None:
+    """The words of a driver in the trials that ended; None where there are none."""
     columns = ["trial_id", "spec_hash", "status", "merged_first", "projected_headway_m",
                "relative_velocity_mps"]  # fmt: skip
-    trials = group.ended[columns]
-    said = of_group(study.words, group, trials).merge(trials, on=["trial_id", "spec_hash"])
+    trials = seat.group.ended[columns]
+    said = of_group(study.words, seat.group, trials).merge(trials, on=["trial_id", "spec_hash"])
+    said = said[said["side"].isin([SIDES[place] for place in seat.sides])]
     if said.empty:
         return None
-    first = said[said["decision"] == 0]
+    first = said[said["at_first"]]
     merges, yields = (said[said["tactical"] == word]["driven_mps2"].dropna() for word in "MY")
     over = first[(first["status"] == "finished") & first["merged_first"].notna()]
     won = over["side"] == over["merged_first"]

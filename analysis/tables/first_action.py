@@ -11,6 +11,7 @@ from analysis.data.first_actions import HOLD_MPS2, Acts
 from analysis.data.reference_data import citation, published
 from analysis.data.study import Group, Study
 from analysis.stats.first_look import (
+    LEAST_TRIALS,
     PUBLISHED,
     TRACES,
     Fault,
@@ -24,6 +25,7 @@ from analysis.stats.first_look import (
     ecdf,
     faults,
     humans,
+    repeats_itself,
     seats,
     skill,
 )
@@ -81,6 +83,7 @@ def first_action(study: Study) -> Table:
             "included; own velocity is relative to the other vehicle's",
             *_human_notes(study),
             *sample_notes(study, study.models, pooled=False, whole=False),
+            *_left_out_notes(study),
         ),
     )
 
@@ -104,12 +107,14 @@ def first_action_faults(study: Study) -> Table:
         ],
         (
             "relative velocity: the slope; side: the left vehicle's action less the right one's "
-            "at equal velocities, of humans 0 by symmetry; level: the mean, of humans at the "
+            "at equal velocities, of humans 0 by symmetry, and not tested of the drivers of a "
+            "mixed pair; level: the mean, of humans at the "
             f"driver's relative velocities; late: the share within {HOLD_MPS2} m/s² of 0, shown "
             "only if more acceleration, either way, also follows within the first second. Of a "
             "driver that is late the others are not called shown",
             *_human_notes(study),
             *sample_notes(study, study.models, pooled=False, whole=False),
+            *_left_out_notes(study),
         ),
     )
 
@@ -127,7 +132,13 @@ def _human_notes(study: Study) -> list[str]:
     go, slow = (trials.loc[f"both_{what}_percent"] for what in ("go", "slow"))
     if known.source != PUBLISHED:
         return [f"human first actions: {known.source}"]
+    few = study.human_first_actions["trial"].nunique()
     return [
+        *(
+            [f"the imported first actions of {few} trials do not count: {LEAST_TRIALS} are needed"]
+            if few
+            else []
+        ),
         f"human first actions: {citation(FILE)}. Between the published quantiles and shares the "
         "distribution is taken as linear, up to full throttle, and down to where its mean is the "
         "published one; `merge-runner human import-first-actions FILE` imports the actions",
@@ -135,6 +146,23 @@ def _human_notes(study: Study) -> list[str]:
         f"both humans of a trial go in {go['low']:g} to {go['high']:g} %, and slow in "
         f"{slow['low']:g} to {slow['high']:g} %",
     ]
+
+
+def _left_out_notes(study: Study) -> Iterator[str]:
+    """Which of the trials have no first action, and which repeat one."""
+    for group in study.models:
+        scenario = study.specs.get(group.spec_hash or "", {}).get("scenario", {})
+        if scenario.get("control_start") == "own_exit":
+            yield (
+                f'{group.id}: left out: with control_start = "own_exit" one driver acts while the '
+                "other is in its tunnel yet"
+            )
+        for seat in seats(group):
+            if repeats_itself(study, seat):
+                yield (
+                    f"{seat.name}: it does the same first in all repetitions of a situation, as a "
+                    "driver without chance: each situation counts once"
+                )
 
 
 def _rows(study: Study, group: Group) -> Iterator[Row]:

@@ -48,7 +48,8 @@ def first_look_surface(study: Study) -> Table:
             Column("action_ci", "95 % CI", "interval", 3, "of the first action", optional=True),
             Column(
                 "mean", "first second", "number", 3,
-                "mean net acceleration over the first second, in m/s^2, of valid answers",
+                "mean net acceleration over the first second, in m/s^2, of valid answers; empty "
+                "where the next decision comes sooner",
                 optional=True,
             ),
         ),
@@ -81,7 +82,7 @@ def _remarks(found: Sequence[FirstLooks]) -> Iterator[str]:
                 if remark and fit.n:
                     yield f"{looks.id}: {what}: {remark}"
         if not looks.sampled:
-            yield f"{looks.id}: no chance is in its answers: each counts once, without an interval"
+            yield f"{looks.id}: no chance shows in its answers: each counts once, with no interval"
 
 
 def _rate(found: Exchange) -> Estimate | None:
@@ -93,7 +94,7 @@ def _point(looks: FirstLooks, at: str, rows: pd.DataFrame) -> Row:
     valid, words = rows[rows["valid"]], rows["tactical"].dropna()
     m = proportion(int((words == "M").sum()), len(words))
     headway_m, velocity_mps = map(float, rows[POINT].iloc[0])
-    driven = mean(valid["mean_mps2"].to_numpy(float))
+    driven = mean(valid["mean_mps2"].dropna().to_numpy(float))
     return _row(
         looks,
         at,
@@ -134,11 +135,12 @@ def _cells(name: str, found: Estimate | None, *, sampled: bool) -> dict[str, Val
 
 def _query(looks: FirstLooks, where: str) -> str:
     """The query that lists the answers behind a row."""
+    specs = ", ".join(map(quoted, looks.spec_hashes))
     return (
         "SELECT trial_id, side, tactical, valid, failure, plan FROM trials JOIN "  # noqa: S608 # ours
         "(SELECT *, if(side = 'left', 1, -1) AS own FROM decisions WHERE decision = 0) "
-        "USING (trial_id, spec_hash) WHERE source = 'seat' AND status <> 'failed' AND spec_hash = "
-        f"{quoted(looks.spec_hash)} AND variant = {quoted(looks.setting)} AND "
+        "USING (trial_id, spec_hash) WHERE source = 'seat' AND status <> 'failed' AND spec_hash IN "
+        f"({specs}) AND variant = {quoted(looks.setting)} AND "
         f"if(side = 'left', model_left, model_right) = {quoted(looks.model)}{where} ORDER BY ALL"
     )
 

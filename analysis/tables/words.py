@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from analysis.data.first_actions import HOLD_MPS2
-from analysis.data.study import Group, Study
+from analysis.data.study import Study
+from analysis.stats.first_look import Seat, seats
 from analysis.stats.intervals import Estimate
 from analysis.stats.words import CUES, Words
 from analysis.stats.words import words as words_of
@@ -20,13 +21,14 @@ SHARES = {
 
 
 def words(study: Study) -> Table:
-    """A row per driver and variant that said M or Y."""
-    spoken = [(group, words_of(study, group)) for group in study.models]
+    """A row per driver and variant that said M or Y, and for each of a mixed pair that did."""
+    every = [(seat, words_of(study, seat)) for group in study.models for seat in seats(group)]
+    spoken = [(seat, found) for seat, found in every if found is not None]
     return Table(
         "words",
         "Words and deeds: what follows M (merge first) and Y (yield)",
         (*GROUP_COLUMNS, *_share_columns(), *_cue_columns()),
-        [_row(group, found) for group, found in spoken if found is not None],
+        [_row(seat, found) for seat, found in spoken],
         (
             "going and yielding: the mean acceleration of the second after the decision is above "
             f"{HOLD_MPS2} or below -{HOLD_MPS2} m/s²; decisions whose trial ends within it do not "
@@ -34,9 +36,9 @@ def words(study: Study) -> Table:
             "the first word: Firth's logit of M on own projected headway (m) and own relative "
             "velocity (m/s), with penalised likelihood ratios; both drivers of a trial count, "
             "since neither knows the other's first word. It follows what has p < .05",
-            *([] if any(found for _, found in spoken) else ["no driver said a tactical word"]),
+            *([] if spoken else ["no driver said a tactical word"]),
             *sample_notes(
-                study, [group for group, found in spoken if found], pooled=False, whole=False
+                study, dict.fromkeys(seat.group for seat, _ in spoken), pooled=False, whole=False
             ),
         ),
     )
@@ -55,7 +57,7 @@ def _share_columns() -> list[Column]:
 
 
 def _cue_columns() -> list[Column]:
-    columns = [Column("first_n", "first words", "count", 0, "of both drivers", ENDED)]
+    columns = [Column("first_n", "first words", "count", 0, "of the drivers", ENDED)]
     for term, name in CUES.items():
         columns += [
             Column(f"{term}_b", f"{name} b", "number", 2, f"of own {name}, in logits", ENDED),
@@ -64,8 +66,12 @@ def _cue_columns() -> list[Column]:
     return [*columns, Column("follows", "follows", meaning="what the first word follows")]
 
 
-def _row(group: Group, found: Words) -> Row:
-    cells: dict[str, Value] = {"first_n": found.first.n, "follows": found.follows}
+def _row(seat: Seat, found: Words) -> Row:
+    cells: dict[str, Value] = {
+        "driver": seat.name,
+        "first_n": found.first.n,
+        "follows": found.follows,
+    }
     for name in SHARES:
         share: Estimate = getattr(found, name)
         cells[f"{name}_n"] = share.n
@@ -75,4 +81,4 @@ def _row(group: Group, found: Words) -> Row:
         if name in CUES:
             cells |= {f"{name}_b": term.b, f"{name}_p": term.p}
     note = f"the first word: {found.first.problem}" if found.first.problem else ""
-    return row_of(group, cells, note)
+    return row_of(seat.group, cells, note, item=seat.side)

@@ -14,6 +14,7 @@ from merge_runner.cli.options import (
     InFlightOption,
     JsonOption,
     MaxCostOption,
+    MirrorOption,
     ModelOption,
     OnlyOption,
     RecordingOption,
@@ -51,6 +52,7 @@ def first(
     ] = "baseline",
     model: ModelOption = None,
     only: OnlyOption = None,
+    mirror: MirrorOption = False,
     samples: Annotated[
         int | None,
         typer.Option("--samples", help="How often each is asked; else the study's repetitions."),
@@ -107,6 +109,8 @@ def first(
         listed(variants),
         sample_set=sample_set,
         only=levels(only or (), "--only"),
+        db=db,
+        mirror=mirror,
     )
     whole = any(part is not None for part in (samples, grid, conditions, variants))
     plan = first_situations(plan)

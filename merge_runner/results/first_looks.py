@@ -2,7 +2,8 @@
 
 # One row a trial and side, but for trials that failed: ``model`` was asked, or is a program.
 # Headway and velocity are the driver's own, minus the other's; the action is the net acceleration
-# over the first step, the mean that up to one second. Both are the fallback's where the reply was
+# over the first step, the mean that up to one second, NULL
+# where the trial ends before. Both are the fallback's where the reply was
 # invalid.
 FIRST_LOOKS = """
 SELECT trial_id, spec_hash, side, variant, condition, rep,
@@ -15,7 +16,8 @@ JOIN (FROM trials WHERE source = 'seat' AND status <> 'failed') USING (trial_id,
 JOIN (
     SELECT trial_id, spec_hash, side,
         min_by(acceleration_mps2, step) FILTER (step > 0) AS action_mps2,
-        (max_by(velocity_mps, step) - min_by(velocity_mps, step)) / max(time_s) AS mean_mps2
-    FROM states WHERE time_s BETWEEN 0 AND 1 GROUP BY ALL
+        CASE WHEN max(time_s) > 1 - 1e-9
+            THEN max_by(velocity_mps, step) - min_by(velocity_mps, step) END AS mean_mps2
+    FROM states WHERE time_s BETWEEN 0 AND 1 + 1e-9 GROUP BY ALL
 ) USING (trial_id, spec_hash, side)
 """

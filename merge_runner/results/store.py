@@ -164,17 +164,21 @@ class Store:
             there = len(records) - added - len(differing)
             return added, there, [trial_id for trial_id, _ in differing]
 
-    def add_human_first_actions(self, rows: Sequence[Row]) -> bool:
-        """Store first actions of humans; False: they are there. Others stay: raises UsageError."""
+    def add_human_first_actions(self, rows: Sequence[Row], *, replace: bool = False) -> bool:
+        """Store first actions of humans; False: they are there.
+
+        Others are replaced only if asked for; else raises UsageError.
+        """
         with self._writing() as connection:
             there = connection.execute("FROM human_first_actions ORDER BY trial, side").fetchall()
             if there == sorted(rows, key=itemgetter(0, 1)):
                 return False
-            if there:
+            if there and not replace:
                 raise UsageError(
-                    f"{self.path} holds {len(there)} other first actions, which stay: name another "
-                    "database with --db"
+                    f"{self.path} holds {len(there)} other first actions, which stay: add "
+                    "--replace, or name another database with --db"
                 )
+            connection.execute("DELETE FROM human_first_actions")
             append(connection, "human_first_actions", rows)
             return True
 
@@ -347,8 +351,8 @@ class SweepFacts:
     ``failed`` (trial_id, error), ``others`` (model requested, model served, answers) where another
     model answered, and ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
     scripted stand-in answered. Where drivers were only asked, ``first_looks`` holds (driver,
-    variant, side, own relative velocity in m/s, answers, invalid ones, those with a tactical word,
-    those with M, mean first action of valid ones in m/s^2).
+    variant, model that was asked, or program, side, own relative velocity in m/s, answers, invalid
+    ones, those with a tactical word, those with M, mean first action of valid ones in m/s^2).
     """
 
     outcomes: list[tuple[str, str, str, str | None, bool, int]]
@@ -357,7 +361,7 @@ class SweepFacts:
     failed: list[tuple[str, str]]
     others: list[tuple[str, str, int]]
     stand_ins: list[tuple[str, str, str, int, int]]
-    first_looks: list[tuple[str, str, str, float, int, int, int, int, float | None]]
+    first_looks: list[tuple[str, str, str, str, float, int, int, int, int, float | None]]
     decisions: int
     invalid: int
     fallbacks: int
@@ -418,7 +422,7 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 "ORDER BY ALL",
             ),
             first_looks=rows(
-                "SELECT driver, variant, side, velocity_mps, count(*), "  # noqa: S608 # constants
+                "SELECT driver, variant, model, side, velocity_mps, count(*), "  # noqa: S608 # constants
                 "count(*) FILTER (NOT valid), count(tactical), count(*) FILTER (tactical = 'M'), "
                 f"avg(action_mps2) FILTER (valid) FROM ({FIRST_LOOKS}) "
                 "JOIN trial_drivers USING (trial_id, spec_hash)",

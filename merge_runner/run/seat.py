@@ -73,8 +73,10 @@ def grid_conditions(text: str) -> list[str]:
     ``h`` or ``dv`` may be one number, or be left out for that of the usual grid. Raises UsageError.
     """
     axes = dict(map(_axis, USUAL_GRID.split(",")))
-    axes |= dict(map(_axis, [] if text == "usual" else text.split(",")))
-    return [_named(*point) for point in product(*axes.values())]
+    given = list(map(_axis, [] if text == "usual" else text.split(",")))
+    if len({name for name, _ in given}) < len(given):
+        raise UsageError(f"--grid: {text!r} has an axis twice; write it once, as FROM:TO:STEP")
+    return [_named(*point) for point in product(*(axes | dict(given)).values())]
 
 
 def _axis(text: str) -> tuple[str, list[float]]:
@@ -87,11 +89,15 @@ def _axis(text: str) -> tuple[str, list[float]]:
         )
     first = Decimal(found["first"])
     last, step = Decimal(found["last"] or first), Decimal(found["step"] or 1)
-    count = int((last - first) / step) + 1 if step else 0
-    if first > last or not 1 <= count <= MOST_VALUES:
+    if step <= 0:
+        raise UsageError(f"--grid: {text!r} has a step of {step}; it must be above 0")
+    if first > last:
         raise UsageError(
-            f"--grid: {text!r} is {max(count, 0)} values; it may be 1 to {MOST_VALUES}"
+            f"--grid: {text!r} runs backwards; write {found['name']}={last}:{first}:{step}"
         )
+    count = int((last - first) / step) + 1
+    if count > MOST_VALUES:
+        raise UsageError(f"--grid: {text!r} is {count} values; it may be up to {MOST_VALUES}")
     return found["name"], [float(first + i * step) for i in range(count)]
 
 

@@ -188,15 +188,18 @@ def _table(plan: Plan, facts: SweepFacts) -> Iterator[str]:
 
 
 def _first_looks(facts: SweepFacts | None) -> Iterator[dict[str, Any]]:
-    """By driver, prompt, side and own relative velocity: what was done first, and with what word.
+    """What was done first, by driver, prompt, model, side and own relative velocity.
 
     The share of M is that among answers with a tactical word.
     """
     for row in facts.first_looks if facts else ():
-        driver, variant, side, velocity_mps, asked, invalid, words, merging, action_mps2 = row
+        driver, variant, model, side, velocity_mps, asked, invalid, words, merging, action_mps2 = (
+            row
+        )
         yield {
             "driver": driver,
             "variant": variant,
+            "model": model,
             "side": side,
             "relative_velocity_mps": velocity_mps,
             "asked": asked,
@@ -208,10 +211,15 @@ def _first_looks(facts: SweepFacts | None) -> Iterator[dict[str, Any]]:
 
 
 def _asked(facts: SweepFacts) -> Iterator[str]:
-    """The same as a table for each driver and prompt."""
-    found = groupby(_first_looks(facts), key=itemgetter("driver", "variant"))
-    for (driver, variant), rows in found:
-        yield f"{driver}/{variant}: share of M, first action in m/s^2, by own relative velocity"
+    """The same as a table for each driver and prompt, for each of the two that met."""
+    looks = list(_first_looks(facts))
+    models = {(look["driver"], look["model"]) for look in looks}
+    met = Counter(driver for driver, _ in models)
+    for (driver, variant, model), rows in groupby(
+        looks, key=itemgetter("driver", "variant", "model")
+    ):
+        who = f"{model} of {driver}" if met[driver] > 1 else driver
+        yield f"{who}/{variant}: share of M, first action in m/s^2, by own relative velocity"
         yield _row(ASKED[0], ASKED[1:])
         for row in rows:
             merging, action_mps2 = row["share_m"], row["first_action_mps2"]

@@ -210,6 +210,23 @@ async def test_a_program_is_asked_too_and_has_no_word(merge_runner):
     assert (await merge_runner("audit")).code == 0
 
 
+async def test_the_two_drivers_of_a_pair_are_summed_up_apart(merge_runner):
+    pair = ("--model", "emulator+constant", "--mirror", "--samples", 1, "--conditions", "N_0_0")
+    run = await merge_runner("seat", "first", *pair, "--json")
+    assert run.code == 0, run.err
+    looks = run.summary["first_looks"]
+    assert [(look["model"], look["side"], look["asked"]) for look in looks] == [
+        ("constant", "left", 1),
+        ("constant", "right", 1),
+        ("emulator", "left", 1),
+        ("emulator", "right", 1),
+    ]
+    assert [look["with_a_word"] for look in looks] == [0, 0, 1, 1]
+    again = await merge_runner("seat", "first", *pair)
+    for model in ("constant", "emulator"):
+        assert f"{model} of emulator+constant/baseline: share of M" in again.out
+
+
 async def test_factors_and_prompts_of_a_study_are_asked(merge_runner, tmp_path):
     (tmp_path / "mine.toml").write_text(
         'repetitions = 1\nmodels = ["emulator"]\nconditions = ["N_0_0"]\n'
@@ -249,9 +266,11 @@ def test_a_grid_has_every_pair_of_its_values_in_decimals():
         ("h=1:2", "--grid usual"),
         ("x=1", "'x=1' is no axis"),
         ("h=nan", "'h=nan' is no axis"),
-        ("h=2:1:1", "0 values"),
-        ("h=0:1:0", "0 values"),
-        ("h=0:9999:0.01", "may be 1 to"),
+        ("h=2:1:1", "runs backwards; write h=1:2:1"),
+        ("h=0:1:0", "a step of 0; it must be above 0"),
+        ("h=0:1:-1", "a step of -1; it must be above 0"),
+        ("h=0:9999:0.01", "may be up to 100"),
+        ("h=2,h=3", "an axis twice"),
         ("h=0,dv=20", "both vehicles must drive forwards"),
     ],
 )
@@ -272,6 +291,7 @@ async def test_situations_that_cannot_be_asked_are_refused_before_anything_is(
         )
         tunnel = await merge_runner("seat", "first", "mine.toml", **env)
         assert server.requests == 0
+    assert "error: a projected headway of 60 m, a relative velocity of 0 m/s" in near.err
     assert (near.code, "at the merge point before both are driven" in near.err) == (2, True)
     assert (both.code, "give one of them" in both.err) == (2, True)
     assert (tunnel.code, 'control_start = "both_exits"' in tunnel.err) == (2, True)

@@ -31,7 +31,15 @@ class Condition:
 
     def __post_init__(self) -> None:
         if not isfinite(self.projected_headway_m) or not all(v > 0 for v in self.speeds_mps):
-            raise UsageError(f"{self} is no condition: both vehicles must drive forwards")
+            raise UsageError(f"{self.described} is no condition: both vehicles must drive forwards")
+
+    @property
+    def described(self) -> str:
+        """Its numbers in words."""
+        return (
+            f"a projected headway of {self.projected_headway_m:g} m, a relative velocity of "
+            f"{self.relative_velocity_mps:g} m/s and a mean speed of {self.mean_speed_mps:g} m/s"
+        )
 
     @property
     def speeds_mps(self) -> tuple[float, float]:

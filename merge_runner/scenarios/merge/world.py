@@ -41,7 +41,9 @@ class World:
         }
         self._accelerations: dict[Side, list[float]] = {side: [0.0] for side in SIDES}
         if max(self._positions["left"][0], self._positions["right"][0]) >= track.merge_point_m:
-            raise UsageError(f"{condition}: a vehicle is at the merge point before both are driven")
+            raise UsageError(
+                f"{condition.described}: a vehicle is at the merge point before both are driven"
+            )
         if self._collided():
             self.status = "collided"
 

@@ -14,7 +14,7 @@ from analysis.human.first_actions import (
     pedal,
     read_first_actions,
 )
-from analysis.stats.first_look import DECODED, humans
+from analysis.stats.first_look import DECODED, PUBLISHED, humans
 from analysis.tables import make_tables
 from merge_runner.results.store import query
 from tests.analysis.pages import first_action_page, first_actions, packed, page
@@ -87,6 +87,8 @@ def test_a_csv_holds_the_same():
         (as_csv([(0.3, "left", 0.1, 0.2)]), r"relative_velocity_mps is 0.3 in row 1; valid: -0.8"),
         (as_csv([(0.8, "both", 0.1, 0.2)]), "merged_first is 'both' in row 1"),
         (as_csv([(0.8, "left", float("nan"), 0.2)]), "left_mps2 is 'nan' in row 1"),
+        (as_csv([(0.8, "left", 0.1, -3.6)]), "an acceleration is -3.6 m/s² in row 1"),
+        (as_csv([]), "it holds no first action"),
         (b"\xff\xfe", "neither a page nor a CSV"),
     ],
 )
@@ -110,7 +112,13 @@ def test_a_page_is_imported_once_and_drivers_are_compared_with_it(human, tmp_pat
     (tmp_path / "other.csv").write_bytes(as_csv(TRIALS[:20]))
     other = human("import-first-actions", "other.csv", "--db", db)
     assert other.code == 2
-    assert "other first actions, which stay" in other.err
+    assert "other first actions, which stay: add --replace" in other.err
+    few = human("import-first-actions", "other.csv", "--replace", "--db", db)
+    assert (few.code, few.out.startswith("20 trials added")) == (0, True), few.err
+    assert humans(Study(db)).source == PUBLISHED
+    notes = make_tables(Study(db), ["first-action"])[0].notes
+    assert any("first actions of 20 trials do not count: 100 are needed" in note for note in notes)
+    assert human("import-first-actions", "initial_action.html", "--replace", "--db", db).code == 0
     study = Study(db)
     assert humans(study).source == DECODED
     (table,) = make_tables(study, ["first-action"])

@@ -166,6 +166,48 @@ def test_a_pair_that_changed_its_sides_is_as_its_ego_saw_it(tmp_path):
         }
 
 
+def test_a_driver_without_chance_in_a_mixed_pair_counts_once_in_each_situation(tmp_path):
+    drives = [replace(drive, right=(0.1,) * 3) for drive in following("alike", -0.34)]
+    db = write_study(tmp_path / "t.duckdb", drives)
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("UPDATE trials SET model_right = 'zero'")
+    (table,) = make_tables(Study(db), ["first-action"])
+    rows = {row.id: row.values for row in table.rows}
+    assert rows["alike+zero/baseline/left/all"]["n"] == 44
+    assert rows["alike+zero/baseline/right/all"]["n"] == 11
+    assert rows["alike+zero/baseline/right/all"]["mean"] == pytest.approx(0.25)
+    (note,) = [note for note in table.notes if "without chance" in note]
+    assert note.startswith("zero of alike+zero: it does the same first")
+
+
+def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
+    pair = ("--model", "emulator+projected-order", "--reps", 1)
+    assert prepare(tmp_path, "sweep", "baseline", *pair, "--conditions", "N_0_0").code == 0
+    (table,) = make_tables(Study(tmp_path / "results/merge.duckdb"), ["first-action"])
+    names = {row.values["driver"] for row in table.rows} - {"human"}
+    assert names == {
+        "emulator of emulator+projected-order (scripted stand-in, no language model)",
+        "projected-order of emulator+projected-order",
+    }
+
+
+def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(prepare, tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        'repetitions = 2\nconditions = ["L_4_8", "R_-4_-8"]\n'
+        '[scenario]\ncontrol_start = "own_exit"\n'
+    )
+    run = prepare(tmp_path, "sweep", "mine.toml")
+    assert run.code == 0, run.err
+    study = Study(tmp_path / "results/merge.duckdb")
+    first, faults, words = make_tables(study, ["first-action", "first-action-faults", "words"])
+    (row,) = [row for row in first.rows if row.id.startswith("emulator")]
+    assert row.values["n"] == 0
+    assert not faults.rows
+    for table in (first, faults):
+        assert any('"own_exit" one driver acts while' in note for note in table.notes)
+    assert words.rows[0].values["first_n"] == 8, "each driver has a first word, also a later one"
+
+
 def test_of_a_driver_that_does_not_look_this_fault_alone_is_shown(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", following("blind", 0.0)))
     (table,) = make_tables(study, ["first-action-faults"])
@@ -242,6 +284,19 @@ def test_what_the_first_word_follows_is_told(cue, follows, tmp_path):
     values = table.rows[0].values
     assert values["first_n"] == 132
     assert values["follows"] == follows, values
+
+
+def test_the_words_of_two_models_of_a_pair_are_not_pooled(tmp_path):
+    study = spoken(yielding("o3", reps=1), tmp_path, "if(side = 'left', 'M', 'Y')")
+    with duckdb.connect(str(study.db)) as connection:
+        connection.execute("UPDATE trials SET model_right = 'other'")
+    (table,) = make_tables(Study(study.db), ["words"])
+    found = {row.id: row for row in table.rows}
+    assert set(found) == {"o3+other/baseline/left", "o3+other/baseline/right"}
+    left, right = found.values()
+    assert left.values["driver"] == "o3 of o3+other"
+    assert "it is M in all 11 decisions" in left.note
+    assert "it is Y in all 11 decisions" in right.note
 
 
 def test_one_word_alone_and_no_word_say_so(tmp_path):

@@ -12,6 +12,8 @@ from analysis.data.study import Study
 from analysis.explain import explain
 from analysis.figures.first_look_figure import figure_of_first_looks
 from analysis.tables import make_tables
+from merge_runner.errors import UsageError
+from merge_runner.results.first_looks import FIRST_LOOKS
 from tests.harness import Run
 
 EMULATOR = "emulator (scripted stand-in, no language model)"
@@ -26,6 +28,7 @@ def folder(prepare, tmp_path_factory):
     for ask in (
         ("seat", "first", "--samples", 4, *grid),
         ("seat", "first", "--model", "projected-order", "--samples", 2, *grid),
+        ("seat", "first", "--model", "human-odds", "--samples", 4, "--grid", "h=0:2:2,dv=0"),
         ("seat", "first", "--model", "constant+emulator", "--samples", 1, "--grid", "h=0,dv=0"),
         ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0"),
     ):
@@ -77,8 +80,16 @@ def test_a_driver_without_chance_counts_once_and_has_no_interval(table):
     assert found["h=+2 dv=+0"].values["asked"] == 2
     assert not any(value for row in found.values() for name, value in row.values.items()
                    if name.endswith("_ci"))  # fmt: skip
-    assert "projected-order/baseline: no chance is in its answers" in "\n".join(table.notes)
+    assert "projected-order/baseline: no chance shows in its answers" in "\n".join(table.notes)
     assert found["per m of headway"].values["action"] > 0
+
+
+def test_a_program_that_draws_counts_with_each_answer_and_has_intervals(table):
+    point = rows(table, "human-odds")["h=+0 dv=+0"].values
+    assert point["asked"] == 2 * 4
+    low, high = point["action_ci"]
+    assert low < point["action"] < high
+    assert not any("human-odds/baseline: no chance" in note for note in table.notes)
 
 
 def test_the_drivers_of_a_mixed_pair_are_told_apart(table, asked):
@@ -94,9 +105,36 @@ def test_the_drivers_of_a_mixed_pair_are_told_apart(table, asked):
     assert model["h=+0 dv=+0"].values["m"] in (0, 1)
 
 
+def test_rows_have_the_ids_of_other_tables(table):
+    ids = {row.id for row in table.rows}
+    assert "emulator/baseline/h=+2 dv=-0.8" in ids
+    assert {f"emulator+constant/baseline/{side}/h=+0 dv=+0" for side in ("left", "right")} <= ids
+
+
+def test_the_answers_of_a_driver_from_both_seats_are_one(prepare, tmp_path):
+    pair = ("--model", "emulator+constant", "--mirror", "--samples", 2, "--grid", "h=2,dv=0")
+    run = prepare(tmp_path, "seat", "first", *pair)
+    assert run.code == 0, run.err
+    study = Study(tmp_path / "results/merge.duckdb")
+    (table,) = make_tables(study, ["first-look-surface"])
+    points = {row.id: row for row in table.rows if " dv=" in row.id}
+    here = [f"emulator+constant/baseline/{side}/h={h} dv=+0" for side in ("left", "right")
+            for h in ("+2", "-2")]  # fmt: skip
+    assert sorted(points) == sorted(here)
+    own = points[here[0]]
+    assert own.values["driver"].startswith("emulator of emulator+constant (scripted")
+    assert own.values["asked"] == 2
+    for row in points.values():
+        (source,) = explain(study, table, row.id).sources
+        with duckdb.connect(str(study.db), read_only=True) as connection:
+            found = connection.execute(source.query).fetchall()
+        assert len(found) == 2
+        assert len({side for _, side, *_ in found}) == 1
+
+
 def test_the_figure_has_a_panel_for_words_and_one_for_actions(asked):
     figure = figure_of_first_looks(asked)
-    assert len(figure.axes) == 2 * len(first_looks(asked)) == 8
+    assert len(figure.axes) == 2 * len(first_looks(asked)) == 10
     figure.canvas.draw()
 
 
@@ -104,6 +142,14 @@ def test_models_and_factors_restrict_it(asked):
     assert [looks.label for looks in first_looks(Study(asked.db, ["emulator"]))] == [EMULATOR]
     none = Study(asked.db, where={"prompt": ["baseline"], "model": ["emulator"]})
     assert [looks.label for looks in first_looks(none)] == [EMULATOR]
+
+
+def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
+    study = Study(asked.db, ["projected-order"], where={"model": ["projected-order"]})
+    assert [looks.label for looks in first_looks(study)] == ["projected-order"]
+    assert study.models == []
+    with pytest.raises(UsageError, match=r"valid: human, emulator, .*projected-order"):
+        Study(asked.db, ["idm"])
 
 
 def test_a_reply_without_a_plan_is_counted_and_is_no_action(prepare, tmp_path):
@@ -119,6 +165,22 @@ def test_a_reply_without_a_plan_is_counted_and_is_no_action(prepare, tmp_path):
     (looks,) = first_looks(study)
     right = looks.rows[(looks.rows["condition"] == "N_0_0") & (looks.rows["side"] == "right")]
     assert values["action"] == right["action_mps2"].iloc[0]
+
+
+def test_a_first_second_is_told_only_of_trials_that_lasted_one(prepare, tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        'repetitions = 1\nconditions = ["N_0_0"]\n[factors]\nprompt_rate_hz = [2.5, 1.0, 0.5]\n'
+    )
+    assert prepare(tmp_path, "seat", "first", "mine.toml").code == 0
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
+        found = connection.execute(
+            f"SELECT end_time_s, mean_mps2 IS NOT NULL FROM ({FIRST_LOOKS}) "
+            "JOIN trials USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL"
+        ).fetchall()
+    assert found == [(0.4, False), (1.0, True), (2.0, True)]
+    table = make_tables(Study(tmp_path / "results/merge.duckdb"), ["first-look-surface"])[0]
+    told = [row.values["mean"] is None for row in table.rows if row.id.endswith("dv=+0")]
+    assert sorted(told) == [False, False, True]
 
 
 def test_the_explorer_lists_no_situation_and_no_run_that_only_asked(asked):
