@@ -45,7 +45,7 @@ class Waiting:
 def worker(db: Path) -> Child:
     """The process that computes, with the same study's plug-ins as this one; raises NoAnswer."""
     study = adopted()
-    own = [str(study.path)] if study else []
+    own = [str(study.path)] if study and study.is_own else []
     return Child("analysis.explorer.analysis_worker", str(db), *own)
 
 
