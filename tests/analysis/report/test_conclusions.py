@@ -125,7 +125,10 @@ def test_what_was_sent_is_named_and_a_default_only_where_nothing_was(tmp_path):
 def test_a_program_has_no_wording_and_no_temperature(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("projected-order", reps=1))
     _, limits = texts(changed(db, "UPDATE trials SET source = 'driver'"))
-    assert "projected-order is a program: it reads no prompt; what is left to chance has a seed." in limits
+    assert (
+        "projected-order is a program: it reads no prompt; what is left to chance has a seed."
+        in limits
+    )
     assert "temperature" not in limits
     assert "wording" not in limits
 
