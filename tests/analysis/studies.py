@@ -28,7 +28,7 @@ from merge_runner.records import (
     TrialSpec,
 )
 from merge_runner.results.store import Store, SweepRow
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
@@ -197,7 +197,7 @@ def _empty() -> bytes:
 def yielding(driver: str, variant: str = "baseline", reps: int = 3) -> list[Drive]:
     """A driver like the humans: who is ahead, or slower where level, goes first."""
     drives = []
-    for name, condition in CONDITIONS.items():
+    for name, condition in HUMAN_CONDITIONS.items():  # whatever a study before has registered
         ahead = condition.projected_headway_m - 2 * condition.relative_velocity_mps
         for rep in range(1, reps + 1):
             # One repetition in five, and every second where nobody is ahead, is decided otherwise.
