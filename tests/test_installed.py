@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
-import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
@@ -102,8 +102,7 @@ def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the
     ).stdout.split()  # fmt: skip
     run(PROJECT, "cp", "--parents", "--no-dereference", *tracked, checkout)
     sdist = built("sdist", checkout, tmp_path)
-    with tarfile.open(sdist) as archive:
-        archive.extractall(tmp_path / "sdist", filter="data")
+    shutil.unpack_archive(sdist, tmp_path / "sdist")
     (unpacked,) = (tmp_path / "sdist").iterdir()
     contents = []
     for source in (checkout, unpacked):
