@@ -34,7 +34,7 @@ from analysis.data.load import (
 )
 from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
 from merge_runner.drivers.human_replay import unresponsive
-from merge_runner.drivers.registry import stand_in
+from merge_runner.drivers.registry import language_models, stand_in
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json, spec_hash
 from merge_runner.paths import DEFAULT_DB
@@ -506,8 +506,9 @@ def _model_group(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> 
     scripted = bool(first["scripted"])
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
-    posing = stand_in(models, sides or SIDES) if scripted else ""
-    caution = unresponsive(specs.get(first["image"], {}))
+    spec = specs.get(first["image"], {})
+    posing = stand_in(language_models(models, spec), sides or SIDES) if scripted else ""
+    caution = unresponsive(spec)
     said = "; ".join(filter(None, (posing, caution)))
     seats = rows["ego"].value_counts()
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 import threading
 from dataclasses import dataclass, field, fields
@@ -12,7 +13,7 @@ import duckdb
 
 from analysis.explorer.query_worker import csv_cell
 from analysis.explorer.reading import PATIENCE_S, Row, reading, records
-from merge_runner.drivers.registry import stand_in
+from merge_runner.drivers.registry import language_models, stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, schema_sql, spill_folder
@@ -162,10 +163,10 @@ INSERT INTO levels SELECT number, factor, value FROM new_levels
     JOIN listed USING (trial_id, spec_hash) WHERE factor <> 'prompt';
 TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states; TRUNCATE decided; TRUNCATE called;
 """
-# Trials that a stand-in drove, without a note on it yet: by the models asked for, and its sides.
+# Trials that a stand-in drove, without a note on it yet: by their drivers and spec, and its sides.
 UNNAMED = """
-SELECT model_left, model_right, posed, list(number)
-FROM listed WHERE scripted AND stand_in IS NULL GROUP BY ALL
+SELECT model_left, model_right, spec::VARCHAR, posed, list(number)
+FROM listed LEFT JOIN specs USING (spec_hash) WHERE scripted AND stand_in IS NULL GROUP BY ALL
 """
 # Before the name of a factor: its facet.
 FACTOR = "factor."
@@ -454,10 +455,11 @@ class Catalogue:
     def _name_stand_ins(self) -> None:
         """Note for each trial that a stand-in drove which model it stood in for."""
         unnamed = self._memory.execute(UNNAMED).fetchall()
-        for left, right, sides, numbers in unnamed:
+        for left, right, spec, sides, numbers in unnamed:
+            models = language_models({"left": left, "right": right}, json.loads(spec or "{}"))
             self._memory.execute(
                 "UPDATE listed SET stand_in = ? WHERE number IN (SELECT unnest(?))",
-                [stand_in({"left": left, "right": right}, sides or SIDES), numbers],
+                [stand_in(models, sides or SIDES), numbers],
             )
 
     def _note_others(self) -> None:
