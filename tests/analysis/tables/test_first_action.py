@@ -191,6 +191,36 @@ def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
     }
 
 
+def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_actions(
+    prepare, tmp_path
+):
+    pair = ("--model", "emulator+idm", "--mirror", "--conditions", "L_4_8,R_-4_-8,N_0_0")
+    for played in (("sweep", "baseline", "--reps"), ("seat", "first", "--samples")):
+        for models in ((), pair):
+            run = prepare(tmp_path, *played, 2, *models)
+            assert run.code == 0, run.err
+    study = Study(tmp_path / "results/merge.duckdb")
+    first, faults = make_tables(study, ["first-action", "first-action-faults"])
+    for table in (first, faults):
+        driven = {row.id: row for row in table.rows if "human" not in row.id}
+        asked = {name: row for name, row in driven.items() if " [asked]/" in name}
+        assert len(asked) == len(driven) / 2
+        for name, row in asked.items():
+            twin = driven[name.replace(" [asked]", "")]
+            assert " [asked]" in row.values["driver"]
+            assert row.values | {"driver": twin.values["driver"]} == twin.values
+        (note, _) = [note for note in table.notes if "asked without the loop" in note]
+        assert note.startswith("emulator [asked]/baseline: ")
+        assert "in 22 trials" in note
+    (source,) = explain(study, first, "emulator [asked]/baseline/0.8:mean").sources
+    assert len(source.trials) == len(load(source.query, study.db)) == 16
+    assert all(trial.startswith("seat/") for trial in source.trials)
+    narrowed = make_tables(Study(study.db, ["emulator"]), ["first-action"])[0].rows
+    assert {row.groups[0] for row in narrowed} == {"emulator/baseline", "emulator [asked]/baseline"}
+    of_model = Study(study.db, where={"model": ["emulator"]})
+    assert [group.id for group in of_model.asked] == ["emulator [asked]/baseline"]
+
+
 def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(prepare, tmp_path):
     (tmp_path / "mine.toml").write_text(
         'repetitions = 2\nconditions = ["L_4_8", "R_-4_-8"]\n'

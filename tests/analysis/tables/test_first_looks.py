@@ -56,6 +56,10 @@ def test_the_planted_exchange_rate_of_the_emulator_is_found_beside_the_humans(ta
     assert own["m_ci"][0] < 3.30 / 1.11 < own["m_ci"][1]
     assert own["asked"] == 7 * 5 * 2 * 4
     assert (round(human["m"], 2), human["asked"]) == (2.97, 962)
+    slope = rows(table, "human")["per m/s of velocity"].values
+    assert (slope["action"], slope["asked"]) == (-0.338, 1898)
+    assert slope["action_ci"] == pytest.approx((-0.375, -0.301))
+    assert "m" not in slope
 
 
 def test_a_point_counts_both_sides_by_their_own_headway_and_velocity(table, asked):
