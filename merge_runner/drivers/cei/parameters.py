@@ -106,8 +106,8 @@ RISKS = ("lower_mean", "upper_mean", "lower_spread", "upper_spread")
 # outcomes and the humans' first action, F1 for the outcomes alone.
 SETS: dict[str, ThresholdSet] = {
     "K0": ThresholdSet(
-        *(0.4188, 0.3511, 0.1371, 0.0227),
-        *(0.0158, -0.0721, -0.0130, 0.0434, 0.0616, 0.0109),
+        *(0.4218, 0.3586, 0.1412, 0.0076),
+        *(0.0170, -0.0678, -0.0057, 0.0508, 0.0609, 0.0091),
     ),
     "F1": ThresholdSet(
         *(0.0957, 0.8409, 0.0537, 0.1318),
