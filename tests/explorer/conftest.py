@@ -55,8 +55,9 @@ def site(study):
 @pytest.fixture(scope="module")
 def browser():
     """Chromium without a window; while it is there an event loop runs, and no other test's can."""
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import expect, sync_playwright
 
+    expect.set_options(timeout=60_000)  # ms: a busy machine is slow, not wrong
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield chromium
