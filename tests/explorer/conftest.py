@@ -18,6 +18,13 @@ HERE = ("http://127.0.0.1:", "file:", "data:", "blob:")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
+def pytest_collection_modifyitems(items):
+    """Tests in a browser are slow: each waits for its pages, and every module starts one."""
+    for item in items:
+        if "browser" in item.fixturenames:
+            item.add_marker(pytest.mark.slow)
+
+
 def pytest_runtest_setup(item):
     """Without a browser the tests of pages are skipped, but not where they are required."""
     if "page" in item.fixturenames and CHROMIUM is None:

@@ -32,6 +32,7 @@ def content(path: Path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+@pytest.mark.slow
 async def test_its_database_is_brought_up_to_date_and_kept(merge_runner, old):
     before = content(old / "results.duckdb")
     run = await merge_runner("replay", "baseline", "--model", "constant", "--reps", 1,

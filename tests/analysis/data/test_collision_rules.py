@@ -70,6 +70,7 @@ def test_the_rules_are_those_of_the_scenario():
     assert (*RULES, "rectangle at 20 Hz") == READINGS
 
 
+@pytest.mark.slow
 def test_a_sweeps_trials_have_their_stored_outcomes_under_their_own_rule(in_process, tmp_path):
     assert in_process("replay", "baseline", "--recording", RECORDING, "--reps", 1) == 0
     db = tmp_path / "results/merge.duckdb"

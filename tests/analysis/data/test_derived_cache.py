@@ -80,6 +80,7 @@ def test_a_table_reads_the_same_after_it_was_a_text(tables, name, form):
     assert to_text(again) == to_text(tables[name])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 def test_tables_are_made_once_and_then_read(db, made):
     first = finished_tables(db, None, ["gap", "attempts"])
@@ -158,6 +159,7 @@ def test_a_study_that_was_read_before_a_change_takes_no_table_of_the_later_state
     assert made == ["attempts", "attempts"]
 
 
+@pytest.mark.slow
 def test_beside_another_program_tables_are_made_and_not_kept(db, made, caplog):
     with subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(db)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -172,6 +174,7 @@ def test_beside_another_program_tables_are_made_and_not_kept(db, made, caplog):
     assert to_text(held[0]) == to_text(free[0])
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
     drawn = []
     monkeypatch.setattr("analysis.report.writer.FIGURES", {"figure2": None, "distributions": None})

@@ -72,6 +72,7 @@ def test_a_bracket_in_a_drivers_name_is_no_mark(tmp_path):
     assert "Several settings under one name" not in titles
 
 
+@pytest.mark.slow
 def test_stand_ins_stand_last_and_every_row_of_theirs_says_so(db):
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%'")
     assert [group.label for group in study.models] == ["other", "o3 (scripted stand-in, not o3)"]

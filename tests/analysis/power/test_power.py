@@ -154,6 +154,7 @@ def powered(tmp_path, study, model=(), simulations=60, seed=0):
     return power(plan, expected, simulations=simulations, seed=seed)
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_chances_and_other_seeds_others(tmp_path):
     one, same, other = (
         powered(tmp_path, "baseline", simulations=20, seed=seed) for seed in (0, 0, 1)
@@ -162,6 +163,7 @@ def test_equal_seeds_give_equal_chances_and_other_seeds_others(tmp_path):
     assert one.chances != other.chances
 
 
+@pytest.mark.slow
 def test_a_planted_study_is_told_by_what_is_planted(tmp_path):
     (tmp_path / "planted.toml").write_text(PLANTED)
     found = powered(tmp_path, str(tmp_path / "planted.toml"))
@@ -199,6 +201,7 @@ def test_a_usual_study_takes_less_than_20_seconds_of_one_core_and_costs_what_it_
     assert {each.truth for each in found.chances if each.table == "gap"} == {"human", "cei"}
 
 
+@pytest.mark.slow
 async def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(
     merge_runner, tmp_path
 ):

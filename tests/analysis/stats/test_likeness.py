@@ -163,6 +163,7 @@ def test_a_model_that_drives_against_the_resistance_is_measured_as_without(tmp_p
     assert (study.profiles["gain"] > 0).all()
 
 
+@pytest.mark.slow
 def test_a_trial_without_action_neither_passes_nor_fails_and_is_told(tmp_path):
     study = driving(tmp_path)
     with duckdb.connect(str(study.db)) as connection:

@@ -137,6 +137,7 @@ def test_the_two_drivers_of_a_mixed_pair_have_rows_of_their_own(db, tmp_path):
     assert "side" not in named
 
 
+@pytest.mark.slow
 def test_a_pair_that_changed_its_sides_is_as_its_ego_saw_it(tmp_path):
     drives = following("alike", -0.34)
     turned = [
@@ -180,6 +181,7 @@ def test_a_driver_without_chance_in_a_mixed_pair_counts_once_in_each_situation(t
     assert note.startswith("zero of alike+zero: it does the same first")
 
 
+@pytest.mark.slow
 def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
     pair = ("--model", "emulator+projected-order", "--reps", 1)
     assert prepare(tmp_path, "sweep", "baseline", *pair, "--conditions", "N_0_0").code == 0
@@ -191,6 +193,7 @@ def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(prepare, tmp_path):
     (tmp_path / "mine.toml").write_text(
         'repetitions = 2\nconditions = ["L_4_8", "R_-4_-8"]\n'
@@ -241,6 +244,7 @@ def spoken(drives, tmp_path, words):
     return Study(db)
 
 
+@pytest.mark.slow
 def test_words_that_are_kept_and_that_are_broken_are_counted(tmp_path):
     study = spoken(yielding("o3", reps=2), tmp_path, "if(applied[1] > 0, 'M', 'Y')")
     (table,) = make_tables(study, ["words"])
@@ -286,6 +290,7 @@ def test_what_the_first_word_follows_is_told(cue, follows, tmp_path):
     assert values["follows"] == follows, values
 
 
+@pytest.mark.slow
 def test_the_words_of_two_models_of_a_pair_are_not_pooled(tmp_path):
     study = spoken(yielding("o3", reps=1), tmp_path, "if(side = 'left', 'M', 'Y')")
     with duckdb.connect(str(study.db)) as connection:
@@ -299,6 +304,7 @@ def test_the_words_of_two_models_of_a_pair_are_not_pooled(tmp_path):
     assert "it is Y in all 11 decisions" in right.note
 
 
+@pytest.mark.slow
 def test_one_word_alone_and_no_word_say_so(tmp_path):
     study = spoken(yielding("o3", reps=1), tmp_path, "'M'")
     (table,) = make_tables(study, ["words"])
