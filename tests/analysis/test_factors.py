@@ -140,6 +140,7 @@ def test_means_are_compared_within_the_cells_that_both_levels_have(study):
     assert abs(pooled[1] - pooled[0]) > 0.1
 
 
+@pytest.mark.slow
 def test_a_difference_leads_to_the_trials_of_both_levels(study):
     (table,) = make_tables(study, ["factors"])
     found = explain(study, table, "opponent=sleepy/collided_percent:difference")

@@ -662,6 +662,7 @@ async def test_ids_that_a_server_gives_to_different_answers_are_a_note(
         assert ("gave to different answers" in found.notes) == repeats
 
 
+@pytest.mark.slow
 def test_one_id_of_two_answers_does_not_hide_one_answer_of_two_samples(db):
     slots = [f"{OF_PAIR} AND side = 'left' AND decision = {n}" for n in range(4)]
     (one, other) = (f"(SELECT reply FROM calls WHERE {slot})" for slot in slots[:2])
@@ -678,6 +679,7 @@ def test_one_id_of_two_answers_does_not_hide_one_answer_of_two_samples(db):
     assert "2 replies of scripted-driver at " in found.notes
 
 
+@pytest.mark.slow
 async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tmp_path):
     numbers = count()
     new_ids = caching({}, id=lambda: f"new-{next(numbers)}")
@@ -690,6 +692,7 @@ async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tm
     assert "word for word as before: are they samples?" in found.notes
 
 
+@pytest.mark.slow
 async def test_another_models_answers_end_an_audit_with_1_and_no_sweep(merge_runner):
     async def other(request, handler):
         return web.json_response(json.loads((await handler(request)).body) | {"model": "gpt-0"})
@@ -873,6 +876,7 @@ def test_a_cache_that_holds_every_reply_passes(db, cache):
     assert found.audits[-1]["counts"]["calls"] > 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -897,6 +901,7 @@ def test_a_table_that_is_not_ours_is_an_error_and_no_traceback(db):
         audit_database(db)
 
 
+@pytest.mark.slow
 def test_another_reply_in_the_cache_than_in_the_database_is_found(db, cache):
     damage(db, f"UPDATE calls SET reply = replace(reply::VARCHAR, 'stop', 'halt') WHERE {SLOT}")
     (finding,) = audit("--db", db, "--cache", cache).findings

@@ -90,6 +90,7 @@ def test_the_page_has_the_notes_of_its_rows_and_is_made_anew_after_an_import(ask
     assert all(note in after for note in notes)
 
 
+@pytest.mark.slow
 def test_the_page_says_what_counts_as_a_collision_for_whom(ask):
     text = ask()
     assert (

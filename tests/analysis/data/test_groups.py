@@ -89,6 +89,7 @@ def test_the_emulator_is_a_stand_in_for_no_model(tmp_path):
     assert alarms(Study(db), provenance(db)) == [], "nobody takes it for a model"
 
 
+@pytest.mark.slow
 def test_trials_of_a_stand_in_are_never_pooled_with_those_of_the_model(db):
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%/rep01'")
     sizes = {group.driver: len(group.trials) for group in study.models}
@@ -138,6 +139,7 @@ def test_two_equal_trials_of_a_driver_that_samples_are_two_samples(db):
     assert study.models[0].repeated == 0
 
 
+@pytest.mark.slow
 def test_equal_trials_of_a_driver_that_samples_are_told_and_count(db):
     study = changed(db, *same_each_time(db, "trial_id LIKE 'o3/baseline/N_0_0/%'"))
     (alarm,) = alarms(study, provenance(db))

@@ -246,6 +246,7 @@ def test_each_group_has_a_row_of_its_own_with_its_trials(study):
                 )
 
 
+@pytest.mark.slow
 def test_variants_are_shown_by_the_same_scales_and_before_an_import_humans_as_published(study):
     rows = rows_of(figure_2_variants(study))
     for row in rows:

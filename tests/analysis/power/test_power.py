@@ -89,6 +89,7 @@ def test_the_chances_of_humans_are_their_ceiling():
         assert search.chance(question, arms, 10) == pytest.approx(shares[name], abs=0.06)
 
 
+@pytest.mark.slow
 def test_the_chance_to_find_nothing_is_that_of_a_false_alarm():
     search, truth = Search(HUMANS, 1000, 2), without_relative_speed()
     # Two-sided tests at 5 %, of which one side counts; between two arms both do.
@@ -259,6 +260,7 @@ def test_a_planted_persona_is_supposed_where_the_prompt_contains_it(tmp_path):
     assert between.effect == pytest.approx(2.0)
 
 
+@pytest.mark.slow
 def test_a_program_is_free_and_supposed_to_go_like_any_driver(tmp_path):
     found = powered(tmp_path, "baseline", ("projected-order",), simulations=20)
     assert found.free

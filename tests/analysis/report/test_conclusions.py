@@ -47,6 +47,7 @@ def test_a_difference_that_chance_seldom_makes_is_called_so(tmp_path):
     assert "p < 0.001: a difference that chance alone seldom makes" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robust", "paper", "strength"),
     [(0.99, 0.83, "strong"), (0.9, 0.5, "some"), (0.3, 0.39, "weak")],
@@ -79,6 +80,7 @@ def test_a_missing_mark_weighs_by_as_many_human_trials_as_lie_in_the_humans_cond
     assert "of this size" not in said
 
 
+@pytest.mark.slow
 def test_nothing_is_said_of_a_ceiling_where_no_human_drove(tmp_path):
     db = write_study(tmp_path / "t.duckdb", level("o3"))
     said, limits = texts(changed(db, "UPDATE trials SET condition = 'own_' || condition"))
@@ -124,6 +126,7 @@ def test_what_was_sent_is_named_and_a_default_only_where_nothing_was(tmp_path):
     assert "temperature = 1.0, thinkingBudget = -1." in nested
 
 
+@pytest.mark.slow
 def test_a_program_has_no_wording_and_no_temperature(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("projected-order", reps=1))
     _, limits = texts(changed(db, "UPDATE trials SET source = 'driver'"))

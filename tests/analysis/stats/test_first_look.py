@@ -117,6 +117,7 @@ def test_a_planted_fault_is_named_and_no_other(fault, make):
     assert sum(map(bool, others)) <= 0.08 * STUDIES
 
 
+@pytest.mark.slow
 def test_a_driver_that_accelerates_less_in_every_situation_is_named_for_its_level():
     named = studies(3, lambda rng: lower(drawn(rng, SITUATIONS // 2)))
     assert sum(one == {LEVEL} for one in named) >= 0.9 * STUDIES

@@ -181,6 +181,7 @@ def test_a_trial_without_action_neither_passes_nor_fails_and_is_told(tmp_path):
     assert row.values["value"] == mean_gain(study, group).value
 
 
+@pytest.mark.slow
 def test_a_driver_that_never_acts_has_no_number_and_it_is_said_why(tmp_path):
     study = driving(tmp_path)
     with duckdb.connect(str(study.db)) as connection:

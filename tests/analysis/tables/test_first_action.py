@@ -220,6 +220,7 @@ def test_of_a_driver_that_does_not_look_this_fault_alone_is_shown(tmp_path):
     assert says["relative velocity"] == "it responds less to the relative velocity"
 
 
+@pytest.mark.slow
 def test_a_relative_velocity_that_no_human_had_has_a_row_and_is_not_compared(db, tmp_path):
     own = tmp_path / "t.duckdb"
     own.write_bytes(db.read_bytes())

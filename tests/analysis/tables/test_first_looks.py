@@ -146,6 +146,7 @@ def test_models_and_factors_restrict_it(asked):
     assert [looks.label for looks in first_looks(none)] == [EMULATOR]
 
 
+@pytest.mark.slow
 def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
     study = Study(asked.db, ["projected-order"], where={"model": ["projected-order"]})
     assert [looks.label for looks in first_looks(study)] == ["projected-order"]

@@ -241,6 +241,7 @@ def test_where_no_human_drove_there_is_no_ceiling_but_a_note(tmp_path):
     assert "no ceiling" not in rows["o3/baseline/I5"].note + rows["human"].note
 
 
+@pytest.mark.slow
 def test_a_model_under_two_specs_makes_two_rows_that_tell_themselves_apart(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
     other = write_study(tmp_path / "u.duckdb", yielding("o3", reps=1))
