@@ -50,7 +50,7 @@ def test_what_is_no_time_to_come_is_refused_with_an_example(text):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seconds", "where"), [(3, ()), (8, ("--dask", "local:2"))], ids=["here", "on a cluster"]
+    ("seconds", "where"), [(5, ()), (10, ("--dask", "local:2"))], ids=["here", "on a cluster"]
 )
 async def test_at_its_time_a_sweep_begins_no_trial_and_the_same_command_goes_on(
     merge_runner, seconds, where
