@@ -75,6 +75,7 @@ def test_a_bracket_in_a_drivers_name_is_no_mark(tmp_path):
     assert "Several settings under one name" not in titles
 
 
+@pytest.mark.slow
 def test_stand_ins_stand_last_and_every_row_of_theirs_says_so(db):
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%'")
     assert [group.label for group in study.models] == ["other", "o3 (scripted stand-in, not o3)"]
@@ -91,6 +92,7 @@ def test_the_emulator_is_a_stand_in_for_no_model(tmp_path):
     assert alarms(Study(db), provenance(db)) == [], "nobody takes it for a model"
 
 
+@pytest.mark.slow
 def test_trials_of_a_stand_in_are_never_pooled_with_those_of_the_model(db):
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%/rep01'")
     sizes = {group.driver: len(group.trials) for group in study.models}
@@ -140,6 +142,7 @@ def test_two_equal_trials_of_a_driver_that_samples_are_two_samples(db):
     assert study.models[0].repeated == 0
 
 
+@pytest.mark.slow
 def test_equal_trials_of_a_driver_that_samples_are_told_and_count(db):
     study = changed(db, *same_each_time(db, "trial_id LIKE 'o3/baseline/N_0_0/%'"))
     (alarm,) = alarms(study, provenance(db))
