@@ -43,7 +43,7 @@ from merge_runner.run.clients import (
     start_endpoints,
 )
 from merge_runner.run.estimate import Estimate, Todo, estimate
-from merge_runner.run.flusher import AGAIN, Flusher
+from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
 from merge_runner.run.plan import Options, Plan, usual_prompts
@@ -57,7 +57,7 @@ GO_ON = "Run the same command again to go on."
 SHOWN = 5
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
-FROM_RECORDINGS = 16
+FROM_PROGRAMS = 16
 LOOK_AT_CLOCK_S = 1.0
 
 
@@ -212,7 +212,8 @@ class Sweep:
             stack.callback(self._cache.close)
             runner = await self._runner(stack)
             self._progress.runner = runner
-            flusher = Flusher(self._store, outcome.sweep_id, self._say)
+            batch = BATCH_OF_REPLAY if self._options.replay else BATCH
+            flusher = Flusher(self._store, outcome.sweep_id, self._say, batch)
             self._progress.unstored = lambda: flusher.problem
             began = time.perf_counter()
             try:
@@ -336,8 +337,8 @@ class Sweep:
         plan, options = self._plan, self._options
         if options.replay or not self._todo or not plan.entries:
             clients = sealed_clients(plan, self._cache)
-            # Recorded replies come at once: more trials in flight would only take more memory.
-            return LocalRunner(plan, clients, min(options.in_flight, FROM_RECORDINGS))
+            # Recorded replies come at once: more trials in flight would only wait for each other.
+            return LocalRunner(plan, clients, 1 if plan.entries else FROM_PROGRAMS)
         services = open_services(plan, options, self._cache, self._ledger, self._measured(), stack)
         urls = await start_endpoints(plan.entries, options.emulator_options, stack)
         known = frozenset(
