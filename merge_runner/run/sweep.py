@@ -162,10 +162,13 @@ class Sweep:
 
     async def run(self) -> Outcome:
         """Play what is missing and store it; what goes wrong is in the outcome."""
+        # Git is another process, and takes as long as it takes to make a database.
+        source = asyncio.get_running_loop().run_in_executor(None, git_state)
         if self._options.replay and (misses := await self._all_missing()):
             return self._not_recorded(misses)
         with unreadable_is_usage():
-            sweep_id = self._begin()
+            store = self._store
+            sweep_id = self._begin(store, *await source)
         file = ProgressFile(self._options.db, sweep_id)
         async with publish_progress(self._progress, file):
             outcome = await self._run(sweep_id)
@@ -310,13 +313,12 @@ class Sweep:
                 f"{len(left_out)} rows of the cache are left out of this, the first: {left_out[0]}"
             )
 
-    def _begin(self) -> str:
+    def _begin(self, store: Store, commit: str, dirty: bool | None) -> str:
         """Add the sweep to the database, with the trials that are stored already."""
         started_at = datetime.now(UTC).replace(tzinfo=None)
         sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
-        commit, dirty = git_state()
         config = {**self._plan.config(), "max_cost_usd": self._options.max_cost_usd}
-        self._store.begin_sweep(
+        store.begin_sweep(
             SweepRow(
                 sweep_id=sweep_id,
                 name=self._plan.name,
