@@ -151,13 +151,14 @@ async def _decide(
 ) -> dict[Side, Decision | CallFailed]:
     """Ask all who are due; where one call fails, the other's answer is still awaited."""
     asked = {
-        side: _answer(seated, seated.observe(world), world.step)
+        side: (seated, seated.observe(world), world.step)
         for side, seated in seats.items()
         if seated.is_due(world.step) and world.in_control(side)
     }
     if in_turn or not asked:
-        return {side: await answer for side, answer in asked.items()}
-    return dict(zip(asked, await asyncio.gather(*asked.values()), strict=True))
+        return {side: await _answer(*told) for side, told in asked.items()}
+    answers = await asyncio.gather(*(_answer(*told) for told in asked.values()))
+    return dict(zip(asked, answers, strict=True))
 
 
 async def _answer(seated: _Seated, observation: Observation, step: int) -> Decision | CallFailed:

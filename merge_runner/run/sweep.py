@@ -340,7 +340,8 @@ class Sweep:
         if options.replay or not self._todo or not plan.entries:
             clients = sealed_clients(plan, self._cache)
             # Recorded replies come at once: more trials in flight would only wait for each other.
-            return LocalRunner(plan, clients, 1 if plan.entries else FROM_PROGRAMS)
+            in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
+            return LocalRunner(plan, clients, in_flight)
         services = open_services(plan, options, self._cache, self._ledger, self._measured(), stack)
         urls = await start_endpoints(plan.entries, options.emulator_options, stack)
         known = frozenset(
