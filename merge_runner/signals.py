@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# A query that is about to begin forgets that it was to end.
+AGAIN_S = 0.1
 
 
 @contextmanager
@@ -32,17 +34,19 @@ def on_interrupt(first: Callable[[], object], again: Callable[[], object]) -> It
 
 @contextmanager
 def at_signals(act: Callable[[], object]) -> Iterator[None]:
-    """Call ``act`` from a thread at each signal, although the main thread is not in Python.
+    """Call ``act`` from a thread at a signal, although the main thread is not in Python.
 
-    DuckDB looks at no signal while more than one of its threads work on a query.
+    It is called again and again until the block ends. DuckDB looks at no signal while more than one
+    of its threads work on a query.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # signals are the main thread's
         return
 
     def listen() -> None:
-        while heard.recv(1):
+        while _stays_open(heard):
             act()
+            heard.settimeout(AGAIN_S)
 
     heard, told = socket.socketpair()
     told.setblocking(False)
@@ -56,3 +60,11 @@ def at_signals(act: Callable[[], object]) -> Iterator[None]:
         told.close()
         listener.join()
         heard.close()
+
+
+def _stays_open(heard: socket.socket) -> bool:
+    """Wait for a signal, or for as long as the socket waits."""
+    try:
+        return bool(heard.recv(1))
+    except TimeoutError:
+        return True
