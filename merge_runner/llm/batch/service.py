@@ -1,0 +1,169 @@
+"""What a batch mode is to a run: requests are submitted together, and their replies fetched."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal, Protocol
+
+from merge_runner.errors import MergeRunnerError
+from merge_runner.llm.http_outcome import RawReply
+from merge_runner.records import ChatRequest
+
+# What all providers take as the id of a request (Anthropic's rule is the narrowest).
+CUSTOM_ID = re.compile("[a-zA-Z0-9_-]{1,64}")
+
+FailureKind = Literal["again", "smaller", "single", "quota", "refused"]
+"""What to do after a failure.
+
+``again``: the same once more, after a while. ``smaller``: wait until other batches have ended, or
+submit fewer lines: too many tokens are enqueued. ``single``: ask the lines singly, since there is
+no batch mode for them. ``quota`` and ``refused``: nothing at this endpoint will be answered, as the
+same actions of an AttemptOutcome say.
+"""
+
+
+class BatchFailed(MergeRunnerError):
+    """A batch mode did not do what it was asked.
+
+    ``delay_s`` is how long the server asks to wait. ``sent`` is False where the request certainly
+    never reached the provider; where it is True and ``kind`` is ``again``, a batch may have been
+    created all the same: look for it with ``find`` before the lines are submitted once more.
+    """
+
+    def __init__(
+        self, kind: FailureKind, message: str, *, delay_s: float | None = None, sent: bool = True
+    ) -> None:
+        super().__init__(message)
+        self.kind = kind
+        self.delay_s = delay_s
+        self.sent = sent
+
+
+@dataclass(frozen=True, slots=True)
+class BatchLine:
+    """One request of a batch, known there by its key; ``attempt`` counts from 1, as for a call."""
+
+    request: ChatRequest
+    attempt: int = 1
+
+    @property
+    def key(self) -> str:
+        """The ``custom_id``."""
+        return self.request.key
+
+
+@dataclass(frozen=True, slots=True)
+class BatchLimits:
+    """The most that one batch takes: lines, and bytes as BatchService.size counts them."""
+
+    lines: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class BatchStatus:
+    """What became of a batch so far.
+
+    ``ended``: there are results to fetch, perhaps not of all lines; also of one that expired or was
+    cancelled. ``failed``: no line was asked and nothing is charged; ``failure`` says what to do.
+    ``done`` of ``total`` lines have ended, None where the provider does not say. ``word`` is the
+    provider's own for the state, ``message`` what it says beside it.
+    """
+
+    state: Literal["waiting", "ended", "failed"]
+    word: str
+    done: int | None = None
+    total: int | None = None
+    message: str = ""
+    failure: FailureKind | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LineResult:
+    """What became of one line.
+
+    ``raw`` is what the plain endpoint would have replied, an answer (status 200) or an error, to be
+    judged in the same way; None where the line was never asked and is not charged, since the batch
+    expired or was cancelled before, as ``message`` says.
+    """
+
+    key: str
+    raw: RawReply | None
+    message: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A batch that was submitted, and whose id was lost.
+
+    ``sure`` is False where the provider does not tell one batch from another before it ends: then
+    it may be somebody else's. It must not be cancelled; if none of its results has one of the keys
+    it was another one, and ``find`` is to be asked once more without it.
+    """
+
+    batch_id: str
+    sure: bool = True
+
+
+class BatchService(Protocol):
+    """The batch mode of one model at one endpoint; every method but ``size`` raises BatchFailed."""
+
+    limits: BatchLimits
+
+    def size(self, line: BatchLine) -> int:
+        """How many bytes of a batch a line takes."""
+        ...
+
+    async def submit(self, lines: Sequence[BatchLine], mark: str) -> str:
+        """Create a batch of lines with different keys, within the limits; returns its id.
+
+        ``mark`` (of the characters and the length of a custom id) is attached where the provider
+        takes a name.
+        """
+        ...
+
+    async def find(
+        self, mark: str, keys: Collection[str], *, since: datetime, known: Collection[str] = ()
+    ) -> Found | None:
+        """The batch that was submitted with a mark and keys, at ``since`` or later (UTC).
+
+        ``known`` are ids of batches that are others. None: there is none.
+        """
+        ...
+
+    async def status(self, batch_id: str) -> BatchStatus:
+        """How far a batch is."""
+        ...
+
+    def results(self, batch_id: str) -> AsyncIterator[LineResult]:
+        """The results of a batch that has ended, in any order, each key once.
+
+        It can be read again. Results that cannot be read are left out; after all others it raises
+        BatchFailed with the kind ``single`` that says what was wrong. With ``again`` the connection
+        was lost.
+        """
+        ...
+
+    async def cancel(self, batch_id: str) -> None:
+        """Ask for the end of a batch, which then ends with the results that it has."""
+        ...
+
+
+def in_batches(
+    lines: Iterable[BatchLine], limits: BatchLimits, size: Callable[[BatchLine], int]
+) -> Iterator[list[BatchLine]]:
+    """The lines in order, in as few batches as fit the limits."""
+    batch: list[BatchLine] = []
+    filled = 0
+    for line in lines:
+        taken = size(line)
+        if batch and (len(batch) == limits.lines or filled + taken > limits.size):
+            yield batch
+            batch, filled = [], 0
+        batch.append(line)
+        filled += taken
+    if batch:
+        yield batch
