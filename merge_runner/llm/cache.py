@@ -335,6 +335,11 @@ class ResponseCache:
         for each in (name, _AGAIN + name):
             self._disk.set(each, _behind_checksum(text))
 
+    def remove_twice(self, name: str) -> None:
+        """An operation: forget a text that is kept twice."""
+        for each in (name, _AGAIN + name):
+            self._disk.delete(each)
+
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
         """All entries, of the folder and of the overlay, each verified.
 

@@ -208,6 +208,7 @@ class Ledger:
 
     def __init__(self, cache: ResponseCache, scope: str) -> None:
         self.spending = Spending()
+        self.scope = scope
         self._cache = cache
         self._name = _SPENT + scope
         self._open = f"{_OPEN}{scope} "
@@ -224,21 +225,39 @@ class Ledger:
         asked: Asked,
     ) -> bool:
         """Set the worst case of a call's next attempt aside; False if that exceeds a cap."""
+        return await self._cache.write(
+            lambda: self.set_aside(key, attempts, worst_usd, caps, asked)
+        )
 
-        def operation() -> bool:
-            # Read within the transaction: another process may have spent since.
-            spending = self.read()
-            if not caps.pays(worst_usd, asked.model, spending):
-                return False
-            spending.reserved_usd += worst_usd
-            spending.part(asked.model).reserved_usd += worst_usd
-            spending.open_attempts += 1
-            self._write(spending)
-            self._write_open(key, [*self._opened(key), SetAside(worst_usd, asked, _now())])
-            self._cache.keep_unanswered(key, (*attempts, _begun(len(attempts) + 1)))
-            return True
+    def set_aside(
+        self,
+        key: str,
+        attempts: Sequence[Attempt],
+        worst_usd: float,
+        caps: Caps,
+        asked: Asked,
+    ) -> bool:
+        """An operation on the cache: what ``reserve`` does."""
+        # Read within the transaction: another process may have spent since.
+        spending = self.read()
+        if not caps.pays(worst_usd, asked.model, spending):
+            return False
+        spending.reserved_usd += worst_usd
+        spending.part(asked.model).reserved_usd += worst_usd
+        spending.open_attempts += 1
+        self._write(spending)
+        self._write_open(key, [*self._opened(key), SetAside(worst_usd, asked, _now())])
+        self._cache.keep_unanswered(key, (*attempts, _begun(len(attempts) + 1)))
+        return True
 
-        return await self._cache.write(operation)
+    def aside_usd(self, key: str) -> float:
+        """What is set aside for the last attempt at a call; 0 where nothing is."""
+        opened = self._opened(key)
+        return opened[-1].usd if opened else 0.0
+
+    def other(self, scope: str) -> Ledger:
+        """The ledger of this name in the same cache, which may be this one."""
+        return self if scope == self.scope else Ledger(self._cache, scope)
 
     async def settle(self, key: str, attempts: Sequence[Attempt], worst_usd: float) -> None:
         """The last of a call's attempts brought no answer; its cost may be unknown."""
