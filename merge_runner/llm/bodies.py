@@ -29,12 +29,50 @@ async def read_body(chunks: AsyncIterator[bytes], encoding: str, most_bytes: int
     async for piece in _unpacked(chunks, encoding):
         size += len(piece)
         if size > most_bytes:
-            raise refused(f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)")
+            raise refused(_too_long(most_bytes))
         pieces.append(piece)
-    text = b"".join(pieces).decode("utf-8-sig", errors="replace")
+    text = _decoded(pieces)
     if why := _why_refused(text):
         raise refused(why)
     return text
+
+
+async def read_lines(
+    chunks: AsyncIterator[bytes], encoding: str, most_bytes: int
+) -> AsyncIterator[str | TransportFailure]:
+    """The lines of a body that comes in chunks, or why one is refused; empty ones are left out.
+
+    Each is held to the bounds of a whole body. Raises TransportFailure where there is no going on.
+    """
+    pieces: list[bytes] = []
+    size = 0
+    async for chunk in _unpacked(chunks, encoding):
+        *ends, begun = chunk.split(b"\n")
+        for end in ends:
+            if size + len(end):
+                yield _line([*pieces, end], size + len(end), most_bytes)
+            pieces, size = [], 0
+        size += len(begun)
+        # Of a line that is too long nothing is kept.
+        pieces = [*pieces, begun] if size <= most_bytes else []
+    if size:
+        yield _line(pieces, size, most_bytes)
+
+
+def _line(pieces: list[bytes], size: int, most_bytes: int) -> str | TransportFailure:
+    if size > most_bytes:
+        return refused(_too_long(most_bytes))
+    text = _decoded(pieces)
+    why = _why_refused(text)
+    return refused(why) if why else text
+
+
+def _decoded(pieces: list[bytes]) -> str:
+    return b"".join(pieces).decode("utf-8-sig", errors="replace")
+
+
+def _too_long(most_bytes: int) -> str:
+    return f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)"
 
 
 def refused(why: str) -> TransportFailure:
