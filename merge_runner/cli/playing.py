@@ -96,9 +96,13 @@ def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
         return None
     expected = asyncio.run(prepared.estimate())
     cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
+    takes = f"{cost}, {expected.minutes} minutes or more"
+    if (batch := expected.batch) is not None:
+        halved = "" if batch.cost_usd is None else f"about {batch.cost_usd} USD in batches, "
+        takes = f"{halved}{cost} singly, at most {batch.most_rounds} rounds of batches"
     say(
         f"{expected.driver}: {expected.trials} trials, about {expected.calls} calls that are not "
-        f"recorded yet, {cost}, {expected.minutes} minutes or more"
+        f"recorded yet, {takes}"
     )
     if yes:
         return expected
@@ -134,6 +138,12 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         ("time", f"about {expected.minutes} minutes"),
     ):
         print_out(f"{name:<8}{text}")
+    if (batch := expected.batch) is not None:
+        usd = "unknown" if batch.cost_usd is None else f"{batch.cost_usd:.2f} USD"
+        print_out(
+            f"batch   about {usd} in about {batch.rounds} rounds, at most {batch.most_rounds}; a "
+            "round takes as long as its slowest batch: minutes, an hour, at most a day"
+        )
     if expected.trials_within_cap is not None:
         print_out(f"cap     buys about {expected.trials_within_cap} trials")
     if len(expected.cells) > 1:

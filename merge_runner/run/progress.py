@@ -40,6 +40,7 @@ CELL_EVERY_S = 0.5
 PULSE_S = 0.05
 NOTES_SHOWN = 10
 REASONS_SHOWN = 3
+CLOSE_IT = "you may close this: the same command goes on"
 
 
 @dataclass(slots=True)
@@ -65,6 +66,7 @@ class Progress:
     worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
     unstored: Callable[[], str] = str  # says why trials are not stored; empty: nothing is wrong
+    batches: Callable[[], list[str]] = list  # says which batches are waited for
 
     @property
     def title(self) -> str:
@@ -106,6 +108,7 @@ class Progress:
             ("calls", f"{self._calls_live} live, {self._calls_cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
             ("cost", f"{self._cost_usd:.2f} USD{self._spent()}"),
+            *(("batches", text) for text in self._batches()),
             *(("calls waiting", "; ".join(texts)) for texts in [self._waiting()] if texts),
             ("time", f"{elapsed:.0f} s{left}{self._until()}"),
         ]
@@ -133,7 +136,7 @@ class Progress:
             committed_usd=self.ledger.spending.committed_usd,
             left_s=self._left_s(),
             worst_stall_s=self.worst_stall_s,
-            waiting=tuple(map(printable, self._waiting())),
+            waiting=tuple(map(printable, [*self.batches(), *self._waiting()])),
             warnings=tuple(map(printable, self._warnings())),
         )
 
@@ -163,6 +166,13 @@ class Progress:
         if self.cap_usd is None:
             return ""
         return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+
+    def _batches(self) -> list[str]:
+        """What is pending where, and what to do about it: nothing."""
+        texts = self.batches()
+        more = [f"{len(texts) - REASONS_SHOWN} others"] * (len(texts) > REASONS_SHOWN)
+        shown = texts[:REASONS_SHOWN] + more
+        return [*shown, CLOSE_IT] if shown else []
 
     def _until(self) -> str:
         return "" if self.until is None else f", until {self.until:%a %H:%M}"

@@ -22,6 +22,7 @@ from merge_runner.errors import (
     TrialSuspended,
     UsageError,
 )
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.content_hashes import canonical_json, manner
 from merge_runner.llm.formats import FORMATS
@@ -37,7 +38,9 @@ from merge_runner.results.rows import factor_rows
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     EndpointPlan,
+    check_batches,
     live_clients,
+    open_rounds,
     open_services,
     sealed_clients,
     start_endpoints,
@@ -104,6 +107,7 @@ class Sweep:
 
     def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
         """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
+        check_batches(plan, options)
         self._options = options
         self._say = say
         recorded = partial(Spilled, options.recordings) if options.recordings else None
@@ -128,6 +132,7 @@ class Sweep:
         self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
         self._suspended: TrialSuspended | None = None
         self._out_of_time = False
+        self._rounds: Rounds | None = None
         self._progress = Progress(
             plan=plan,
             planned=Counter(spec.cell for spec in specs.values()),
@@ -346,6 +351,7 @@ class Sweep:
             if plan.endpoints[name] in self._cache.stats(entry.id).totals
         )
         endpoint_plan = EndpointPlan(urls, options.strict_model, known)
+        self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
         if options.dask is None:
             clients = live_clients(
                 plan,
@@ -355,8 +361,14 @@ class Sweep:
                 services.budget,
                 connections=options.connections,
                 stack=stack,
+                rounds=rounds,
             )
-            return LocalRunner(plan, clients, options.in_flight)
+            if rounds is not None:
+                stack.push_async_callback(rounds.close)
+                self._progress.batches = rounds.standing
+            # A trial that waits for a round takes up nobody's time.
+            in_flight = len(self._todo) if options.batch else options.in_flight
+            return LocalRunner(plan, clients, in_flight)
         from merge_runner.run.cluster.connect import connected
 
         client = await stack.enter_async_context(connected(options.dask))
@@ -390,11 +402,19 @@ class Sweep:
             )
             work.cancel()
 
-        clock = asyncio.create_task(self._stop_in_time(runner, interrupted))
+        beside = [asyncio.create_task(self._stop_in_time(runner, interrupted))]
+        if self._rounds is not None and isinstance(runner, LocalRunner):
+            watching = asyncio.create_task(self._rounds.watch(lambda: runner.is_idle))
+            watching.add_done_callback(lambda _: work.cancel())  # nobody would close a round
+            beside.append(watching)
         with on_interrupt(interrupted, drain.cancel):
             await asyncio.wait([drain])
             await asyncio.wait([work])
-        clock.cancel()
+        for task in beside:
+            task.cancel()
+        for error in await asyncio.gather(*beside, return_exceptions=True):
+            if isinstance(error, Exception):
+                raise error
         self._note_end(work, outcome)
 
     def _note_end(self, work: asyncio.Task[None], outcome: Outcome) -> None:

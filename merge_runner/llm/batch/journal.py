@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -18,7 +18,9 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import Attempt
 
 # Prefixes of names in the cache.
-_BATCH, _LINE = "batch ", "line "
+_BATCH, _LINE, _ENDED = "batch ", "line ", "ended batches"
+# How long an ended batch may be mistaken for one whose id was lost.
+REMEMBERED = timedelta(days=2)
 MARK_LENGTH = 32
 
 
@@ -61,6 +63,7 @@ class OpenBatch:
 
 
 _OPEN_BATCH, _OPEN_LINE = TypeAdapter(OpenBatch), TypeAdapter(OpenLine)
+_TIMES = TypeAdapter(dict[str, str])
 
 
 def mark_of(lines: Iterable[tuple[str, int]], salt: str = "") -> str:
@@ -143,19 +146,34 @@ class Journal:
 
     async def tidy(self, batches: Sequence[OpenBatch]) -> None:
         """Remove the rows of lines that have ended, and of these batches where all have."""
-
         ended, self._ended = self._ended, []
 
+        oldest = (datetime.now(UTC) - REMEMBERED).isoformat()
+
         def operation() -> None:
+            times = self._ended_at()
             for key, line in ended:
                 if self.line(key) == line:  # it may wait in another batch by now
                     self._cache.remove(_LINE + key)
             for batch in batches:
                 if not self.waiting(batch):
                     self._cache.remove_twice(_BATCH + batch.mark)
+                    times[batch.batch_id] = batch.submitted_at
+            recent = {each: at for each, at in times.items() if at >= oldest}
+            self._cache.replace(_ENDED, _TIMES.dump_json(recent).decode())
 
         if ended or batches:
             await self._cache.write(operation)
+
+    def ended_ids(self) -> set[str]:
+        """The ids of batches that have ended of late."""
+        return {*self._ended_at()}
+
+    def _ended_at(self) -> dict[str, str]:
+        try:
+            return _TIMES.validate_json(self._cache.read(_ENDED) or "{}")
+        except (RecordingError, ValidationError):
+            return {}
 
     def _is_open(self, key: str, line: OpenLine) -> bool:
         try:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -150,25 +150,30 @@ class BatchWays:
     """
 
     submits: bool
-    deadline_s: float = USUAL_DEADLINE_S
-    detach: bool = False
-    most_rounds: int = 1
+    deadline_s: float
+    detach: bool
+    most_rounds: int
 
 
 class Rounds:
-    """The rounds of a run; ``services`` are the batch modes of its models, by registered name."""
+    """The rounds of a run; ``services`` are the batch modes of its models, by registered name.
+
+    Those that are ``free`` cost nothing.
+    """
 
     def __init__(
         self,
         journal: Journal,
-        services: Mapping[str, BatchService],
+        services: dict[str, BatchService],
         ways: BatchWays,
         *,
+        free: Collection[str] = (),
         say: Callable[[str], None],
     ) -> None:
         self.ways = ways
+        self._free = free
         self._journal = journal
-        self._services = services
+        self.services = services
         self._say = say
         self._forming: list[Line] = []
         self._followed: dict[str, _Followed] = {}
@@ -178,7 +183,7 @@ class Rounds:
         self._tasks: set[asyncio.Task[None]] = set()
         self._submitting = 0
 
-    def open_line(self, key: str, attempts: Iterable[Attempt]) -> OpenLine | None:
+    def open_line(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenLine | None:
         """Where a call with these attempts waits already; None: nowhere that can be reached."""
         line = self._journal.line(key)
         if line is None or not line.goes_on(attempts):
@@ -236,10 +241,10 @@ class Rounds:
         if mark in self._followed:
             return self._followed[mark].batch
         batch = self._journal.batch(mark)
-        return batch if batch is not None and batch.model in self._services else None
+        return batch if batch is not None and batch.model in self.services else None
 
     def _service(self, batch: OpenBatch) -> BatchService:
-        return self._services[batch.model]
+        return self.services[batch.model]
 
     def _start(self, work: Coroutine[Any, Any, None], lines: Iterable[Line], name: str) -> None:
         """Do something in a task of its own; what it raises is raised for these lines."""
@@ -262,7 +267,7 @@ class Rounds:
         for line in forming:
             groups[line.model, line.ledger][line.key] = line
         for (model, _), lines in groups.items():
-            service = self._services[model]
+            service = self.services[model]
             limits = service.limits
             most = min(limits.lines, self._most_lines.get(model, limits.lines))
             waiting = [line.line for line in lines.values()]
@@ -322,25 +327,23 @@ class Rounds:
         return followed
 
     async def _create(self, followed: _Followed) -> None:
-        """Create a batch; where it is not clear whether it was, look for it first."""
+        """Create a batch; where it may have been created already, look for it first."""
         batch, service = followed.batch, self._service(followed.batch)
         lines = [line.line for line in followed.lines.values()]
-        began, tries = _loop_s(), 0
-        while True:
+        began_s = _loop_s()
+        for tries in itertools.count(1):
             try:
-                await self._identified(followed, await service.submit(lines, batch.mark))
+                if tries == 1 or not await self._found(followed):
+                    await self._identified(followed, await service.submit(lines, batch.mark))
             except BatchFailed as exc:
-                if exc.kind != "again":
-                    raise
                 nobody = not exc.sent and batch.model not in self._reached
-                if _loop_s() - began > (NOBODY_S if nobody else OUTAGE_S):
+                patience_s = NOBODY_S if nobody else OUTAGE_S
+                if exc.kind != "again" or _loop_s() - began_s > patience_s:
                     raise
-                tries += 1
                 await asyncio.sleep(max(exc.delay_s or 0.0, _backoff_s(tries)))
-                if not exc.sent or not await self._find(followed):
-                    continue
-            self._reached.add(batch.model)
-            return
+            else:
+                self._reached.add(batch.model)
+                return
 
     async def _identified(self, followed: _Followed, batch_id: str) -> None:
         followed.batch = replace(followed.batch, batch_id=batch_id)
@@ -374,9 +377,7 @@ class Rounds:
         others = any(f.created and f.is_open and f.batch.model == model for f in self._all())
         wait_s = delay_s or (LONGEST_POLL_S if others else 1.0)
         self._batch_ended.clear()
-        await asyncio.wait(
-            [asyncio.ensure_future(self._batch_ended.wait())], timeout=wait_s
-        )
+        await asyncio.wait([asyncio.ensure_future(self._batch_ended.wait())], timeout=wait_s)
 
     def _all(self) -> Iterable[_Followed]:
         return self._followed.values()
@@ -421,19 +422,14 @@ class Rounds:
             self._forming.append(line)
         else:
             line.ends(
-                LineEnd(
-                    None, outcome="not_created", message="the run ended before", singly=True
-                )
+                LineEnd(None, outcome="not_created", message="the run ended before", singly=True)
             )
 
-    async def _find(self, followed: _Followed) -> bool:
+    async def _found(self, followed: _Followed) -> bool:
         """Look for a batch whose id is not known; False: there is none."""
         batch = followed.batch
-        found = await self._patiently(
-            batch,
-            lambda: self._service(batch).find(
-                batch.mark, batch.keys, since=batch.since, known=self._known_ids(followed)
-            ),
+        found = await self._service(batch).find(
+            batch.mark, batch.keys, since=batch.since, known=self._known_ids(followed)
         )
         if found is None:
             return False
@@ -441,9 +437,13 @@ class Rounds:
         await self._identified(followed, found.batch_id)
         return True
 
+    async def _find(self, followed: _Followed) -> bool:
+        return await self._patiently(followed.batch, partial(self._found, followed))
+
     def _known_ids(self, followed: _Followed) -> set[str]:
         """The ids of batches that are others than this one."""
-        own = {batch.batch_id for batch in self._journal.batches() if batch.mark != followed.batch.mark}
+        others = (each for each in self._journal.batches() if each.mark != followed.batch.mark)
+        own = {batch.batch_id for batch in others} | self._journal.ended_ids()
         return (own | followed.others) - {""}
 
     async def _follow(self, followed: _Followed) -> None:
@@ -455,12 +455,23 @@ class Rounds:
                 if not await self._find(followed):
                     self._end_all(followed, LineEnd(None, outcome="not_created", singly=True))
         except BatchFailed as exc:
-            end = self._without_reply(followed.batch, exc.kind, str(exc), "no_result")
-            # Nobody knows what became of its lines: their money stays set aside.
-            for line in followed.lines.values():
-                line.fails(end.error or ProviderDown(f"{followed.batch.model}: {exc}"))
+            self._lost(followed, exc)
         finally:
             self._batch_ended.set()
+
+    def _lost(self, followed: _Followed, exc: BatchFailed) -> None:
+        """Nobody knows what became of a batch: what was set aside for it stays so."""
+        batch = followed.batch
+        if batch.model in self._free or self.ways.deadline_s == 0:
+            end = LineEnd(batch.batch_id, outcome="batch_lost", message=str(exc), unclear=True)
+            self._end_all(followed, end)
+            return
+        error = EndpointRefused(
+            f"{batch.model}: {batch.batch_id} is refused to this key ({exc}): set the key of the "
+            "account that has submitted it. If it is gone, --round-deadline 0 asks its calls anew"
+        )
+        for line in followed.lines.values():
+            line.fails(error)
 
     async def _has_ended(self, followed: _Followed) -> bool:
         """Wait for the end of a batch; False where it failed as a whole."""
