@@ -264,6 +264,8 @@ class LlmClient:
         deadline = Deadline(self.entry.deadline_s)
 
         async def sleep(seconds: float) -> None:
+            if self._goes_in_batch(call):
+                return  # the next round begins late enough
             until = datetime.now(UTC) + timedelta(seconds=seconds)
             with call.waiting(f"after {call.last_failure}", until) as wait:
                 if seconds >= LONG_WAIT_S:
@@ -288,7 +290,7 @@ class LlmClient:
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; returns its answer, which is kept, or raises what follows from it."""
-        if self.batches is not None and (call.open or self._goes_in_batch(call, self.batches)):
+        if self.batches is not None and (call.open or self._goes_in_batch(call)):
             return await self._attempt_in_batch(call, self.batches)
         async with self._permitted(call) as (paid, settle):
             await paid.begin(call.attempts)
@@ -309,10 +311,11 @@ class LlmClient:
         await paid.settle(call.attempts)  # before the error, which may end the whole run
         raise error
 
-    def _goes_in_batch(self, call: Call, batches: Batches) -> bool:
+    def _goes_in_batch(self, call: Call) -> bool:
         """Whether the next attempt at a call goes with the next round."""
-        lines = sum(attempt.batch_id is not None for attempt in call.own_attempts)
-        return batches.rounds.ways.submits and not call.singly and lines < MOST_LINES
+        if self.batches is None or not self.batches.rounds.ways.submits or call.singly:
+            return False
+        return sum(attempt.batch_id is not None for attempt in call.own_attempts) < MOST_LINES
 
     async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""

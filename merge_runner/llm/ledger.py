@@ -317,7 +317,8 @@ class Ledger:
         for sums in (spending, spending.part(one.asked.model)):
             sums.spent_usd += actual_usd
             sums.reserved_usd = max(0.0, sums.reserved_usd - worst_usd)
-        spending.open_attempts -= 1
+        # A batch may end after its money was released.
+        spending.open_attempts = max(0, spending.open_attempts - 1)
         if not spending.open_attempts:
             _nothing_aside(spending)  # what is left is rounding
         if actual_usd > worst_usd + TOLERANCE_USD:

@@ -277,9 +277,8 @@ def _trial_calls(plan: Plan, arm: Arm, parts: Mapping[str, float]) -> dict[str, 
     for name, number in sides.items():
         entry = arm.entries[name]
         worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
-        made = TrialCalls(
-            number * usual, number * most, (cost_usd(entry, worst) or 0.0) * parts[name]
-        )
+        worst_usd = (cost_usd(entry, worst) or 0.0) * parts[name]
+        made = TrialCalls(number * usual, number * most, worst_usd)
         other = calls.get(model := plan.registered[name])
         calls[model] = made if other is None else made.and_(other)
     return calls

@@ -107,7 +107,7 @@ class Progress:
             ("failed", str(self.ways["failed"])),
             ("calls", f"{self._calls_live} live, {self._calls_cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
-            ("cost", f"{self._cost_usd:.2f} USD{self._spent()}"),
+            ("cost", f"{self._cost_usd:.2f} USD{self._in_the_end()}{self._spent()}"),
             *(("batches", text) for text in self._batches()),
             *(("calls waiting", "; ".join(texts)) for texts in [self._waiting()] if texts),
             ("time", f"{elapsed:.0f} s{left}{self._until()}"),
@@ -161,6 +161,13 @@ class Progress:
         workers = self.runner.workers
         return "" if workers is None else f" on {workers or 'no'} worker{'s' * (workers != 1)}"
 
+    def _in_the_end(self) -> str:
+        """What a run in batches will cost, by the calls that are answered."""
+        part = self._part()
+        if not part or not self._cost_usd or not self.batches():
+            return ""
+        return f", about {self._cost_usd / part:.2f} in the end"
+
     def _spent(self) -> str:
         """What counts against the cap: spending of all runs of the sweep, and money set aside."""
         if self.cap_usd is None:
@@ -206,15 +213,19 @@ class Progress:
 
         Trials that run in step all end late, so early in a run the calls are a better basis.
         """
+        part = self._part()
+        elapsed = time.monotonic() - self.started
+        return elapsed / part - elapsed if part else None
+
+    def _part(self) -> float | None:
+        """What part of this run is done, by its trials or its calls; None: all or nothing is."""
         ended, total = self.ended, self.total
         if ended == total:
             return None
         calls = self._calls_live + self._calls_cached
         expected_calls = total * self.plan.calls_of_a_trial
         by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
-        part = max(ended / total, by_calls)
-        elapsed = time.monotonic() - self.started
-        return elapsed / part - elapsed if part else None
+        return max(ended / total, by_calls) or None
 
     def _waiting(self) -> list[str]:
         """How many calls wait, for what, and the latest time until when, if known."""

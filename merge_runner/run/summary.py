@@ -59,6 +59,7 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
         "overrun_usd": round(spending.overrun_usd, 6),
         "cache_cost_usd": round(outcome.cache_cost_usd, 6),
         "damaged_entries": meter.damaged,
+        "open_batches": outcome.batches,
         "playing_s": round(outcome.playing_s, 3),
         "worst_stall_s": round(outcome.worst_stall_s, 3),
         "decisions": facts.decisions if facts else None,
@@ -91,6 +92,7 @@ def as_lines(outcome: Outcome, options: Options, expected: Estimate | None) -> I
         yield ""
         yield from _failures(facts)
     yield from _costs(outcome, options, expected)
+    yield from (f"open batch: {text}" for text in outcome.batches)
     for key in outcome.meter.damaged:
         yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
     for pair, answers in _mismatches(facts).items():

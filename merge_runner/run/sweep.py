@@ -73,7 +73,8 @@ class Outcome:
     ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` what all replies in
     the cache cost when they were made. ``facts`` summarises what the database holds of the sweep,
     and ``audit`` the checks made there; both are None where nothing is stored, or its user
-    ``gave_up`` waiting for the database. ``playing_s`` is how
+    ``gave_up`` waiting for the database. ``batches`` are those that go on without this run.
+    ``playing_s`` is how
     long the trials took, ``worst_stall_s`` the longest delay of the event loop.
     """
 
@@ -89,6 +90,7 @@ class Outcome:
     facts: SweepFacts | None = None
     audit: Audit | None = None
     gave_up: bool = False
+    batches: list[str] = field(default_factory=list)
     playing_s: float = 0.0
     worst_stall_s: float = 0.0
 
@@ -415,6 +417,8 @@ class Sweep:
         for error in await asyncio.gather(*beside, return_exceptions=True):
             if isinstance(error, Exception):
                 raise error
+        if self._rounds is not None:
+            outcome.batches = self._rounds.standing()
         self._note_end(work, outcome)
 
     def _note_end(self, work: asyncio.Task[None], outcome: Outcome) -> None:

@@ -115,7 +115,8 @@ class Line:
 class _Followed:
     """An open batch of which this process waits for ``lines``, by key.
 
-    ``results`` are those that nobody has asked for yet. It is ``created`` once its id is known.
+    ``results`` are those that nobody has asked for yet. It is ``created`` once its id is known, and
+    ``looked`` at once the provider was asked for its state, in vain perhaps.
     ``gone`` is the end of all lines that join it from then on; a batch that ``never_was`` has none.
     ``others`` are ids of batches that were taken for it.
     """
@@ -127,6 +128,7 @@ class _Followed:
     status: BatchStatus | None = None
     created: bool = False
     looked: bool = False
+    fetching: bool = False
     sure: bool = True
     gone: LineEnd | None = None
     never_was: bool = False
@@ -218,12 +220,13 @@ class Rounds:
         """Close each round when nothing else goes on; ``is_idle`` says whether that is so."""
         while True:
             await asyncio.sleep(LOOK_S)
-            if not (self._forming or self.ways.detach) or not await _is_settled(is_idle):
+            if not (self._forming or self.ways.detach):
                 continue
-            if self._forming:
-                self._close_round()
-            elif not self._submitting:
-                self._detach()
+            if await _is_settled(lambda: is_idle() and not self._hands_out):
+                if self._forming:
+                    self._close_round()
+                elif not self._submitting:
+                    self._detach()
 
     def standing(self) -> list[str]:
         """Which batches are waited for, a line each."""
@@ -236,6 +239,11 @@ class Rounds:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._journal.tidy([each.batch for each in self._followed.values()])
+
+    @property
+    def _hands_out(self) -> bool:
+        """Whether results are on their way to lines: those of a batch, or of one not looked at."""
+        return any(not each.looked or each.fetching for each in self._all() if each.is_open)
 
     def _known(self, mark: str) -> OpenBatch | None:
         if mark in self._followed:
@@ -438,7 +446,7 @@ class Rounds:
         return True
 
     async def _find(self, followed: _Followed) -> bool:
-        return await self._patiently(followed.batch, partial(self._found, followed))
+        return await self._patiently(followed, partial(self._found, followed))
 
     def _known_ids(self, followed: _Followed) -> set[str]:
         """The ids of batches that are others than this one."""
@@ -479,7 +487,7 @@ class Rounds:
         while True:
             if not followed.looked or followed.status is not None:
                 followed.status = await self._patiently(
-                    batch, partial(self._service(batch).status, followed.batch.batch_id)
+                    followed, partial(self._service(batch).status, followed.batch.batch_id)
                 )
                 followed.looked = True
             else:
@@ -489,6 +497,7 @@ class Rounds:
             await self._cancel_in_time(followed)
             await asyncio.sleep(self._until_next_look_s(followed))
         if followed.status.state == "ended":
+            followed.fetching = True
             return True
         kind, why = followed.status.failure or "again", followed.status.message
         if kind == "smaller":
@@ -508,7 +517,7 @@ class Rounds:
         if followed.age_s < self.ways.deadline_s:
             return
         batch = followed.batch
-        await self._patiently(batch, partial(self._service(batch).cancel, batch.batch_id))
+        await self._patiently(followed, partial(self._service(batch).cancel, batch.batch_id))
         followed.batch = replace(batch, cancelled=True)
         await self._journal.note(followed.batch)
         self._say(
@@ -587,7 +596,7 @@ class Rounds:
             error=error,
         )
 
-    async def _patiently(self, batch: OpenBatch, ask: Callable[[], Awaitable[T]]) -> T:
+    async def _patiently(self, followed: _Followed, ask: Callable[[], Awaitable[T]]) -> T:
         """Ask until a provider answers that may only be down; raises BatchFailed for anything else.
 
         A batch waits for a day: whoever waits for it can wait for its provider.
@@ -598,8 +607,10 @@ class Rounds:
             except BatchFailed as exc:
                 if exc.kind != "again":
                     raise
+                followed.looked = True
                 if tries == 1:
-                    self._say(f"{batch.model}: {exc}; it is asked again until it answers")
+                    model = followed.batch.model
+                    self._say(f"{model}: {exc}; it is asked again until it answers")
                 await asyncio.sleep(max(exc.delay_s or 0.0, _backoff_s(tries)))
         raise AssertionError("unreachable: it counts for ever")
 
