@@ -28,7 +28,7 @@ MOST_BYTES = 256_000_000
 # What a server answers that has no batch mode, or none for the model.
 NO_BATCH_MODE = frozenset({404, 405, 501})
 TOO_MANY_TOKENS = frozenset({"token_limit_exceeded"})
-ID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_./-]{0,199}")
+ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,199}")
 # By how much a server's clock may be behind ours.
 CLOCK_SLACK = timedelta(hours=1)
 

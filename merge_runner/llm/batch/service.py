@@ -141,7 +141,7 @@ class BatchService(Protocol):
     def results(self, batch_id: str) -> AsyncIterator[LineResult]:
         """The results of a batch that has ended, in any order, each key once.
 
-        It can be read again. Results that cannot be read are left out; after all others it raises
+        A line without a result was not asked. They can be read again. Results that cannot be read are left out; after all others it raises
         BatchFailed with the kind ``single`` that says what was wrong. With ``again`` the connection
         was lost.
         """
