@@ -331,7 +331,7 @@ class Rounds:
             line.fails(TrialSuspended("another run spends from the same cap, and has used it up"))
         if not begun:
             return None
-        followed = self._followed[batch.mark] = _Followed(batch, begun)
+        followed = self._followed[batch.mark] = _Followed(batch, begun, looked=True)
         return followed
 
     async def _create(self, followed: _Followed) -> None:
