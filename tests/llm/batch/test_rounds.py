@@ -1,0 +1,479 @@
+"""Rounds through the client, over a batch mode in memory that misbehaves as told."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections import Counter
+
+import pytest
+
+from merge_runner.config import ModelEntry, Price
+from merge_runner.errors import (
+    CallFailed,
+    EndpointRefused,
+    ProviderDown,
+    QuotaExhausted,
+    WaitingForBatches,
+)
+from merge_runner.llm.batch.batches import Batches
+from merge_runner.llm.batch.journal import Journal
+from merge_runner.llm.batch.rounds import BatchWays, Rounds
+from merge_runner.llm.batch.service import (
+    BatchFailed,
+    BatchLimits,
+    BatchStatus,
+    Found,
+    LineResult,
+)
+from merge_runner.llm.budget import Budget
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.client import LlmClient
+from merge_runner.llm.http_outcome import RawReply
+from merge_runner.llm.ledger import Caps, Ledger
+from merge_runner.llm.limiter import Limiter
+from merge_runner.records import Slot
+from tests.virtual_time import in_virtual_time
+
+PRICE = Price(input=1.0, output=100.0, source="made up")
+USAGE = {"prompt_tokens": 10, "completion_tokens": 5}
+# Of the tokens above, in USD.
+ONE_USD = (10 * 1.0 + 5 * 100.0) / 1e6
+
+
+def answer(text):
+    choice = {"message": {"content": text}, "finish_reason": "stop"}
+    return RawReply(200, {}, json.dumps({"model": "m-1", "choices": [choice], "usage": USAGE}))
+
+
+def error(status, kind="server_error"):
+    told = {"error": {"message": "no", "type": kind, "code": None}}
+    return RawReply(status, {}, json.dumps(told))
+
+
+class Memory:
+    """A provider's batch mode, of which each batch ends at the first look.
+
+    ``fates`` are replies to lines by repetition, one after the other: None is an expiry, and what
+    is "missing" has no result. ``creations`` and ``states`` are raised or returned in their order
+    before the usual.
+    """
+
+    limits = BatchLimits(lines=1000, size=10**6)
+
+    def __init__(self):
+        self.batches = {}
+        self.marks = {}
+        self.fates = {}
+        self.creations = []
+        self.states = []
+        self.cancelled = []
+        self.answered = Counter()
+        self.hidden = set()
+        self.unsure = []
+
+    def size(self, line):
+        return 1
+
+    async def submit(self, lines, mark):
+        step = self.creations.pop(0) if self.creations else None
+        if isinstance(step, BatchFailed) and not step.sent:
+            raise step
+        batch_id = f"batch-{len(self.batches)}"
+        self.batches[batch_id] = list(lines)
+        self.marks[batch_id] = mark
+        if step is not None:
+            raise step
+        return batch_id
+
+    async def find(self, mark, keys, *, since, known=()):
+        for batch_id in self.unsure:
+            if batch_id not in known:
+                return Found(batch_id, sure=False)
+        for batch_id, its in self.marks.items():
+            if its == mark and batch_id not in known:
+                return Found(batch_id)
+        return None
+
+    async def status(self, batch_id):
+        if batch_id not in self.batches:
+            raise BatchFailed("single", "HTTP 404: no such batch", sent=False)
+        step = self.states.pop(0) if self.states else BatchStatus("ended", "completed")
+        if isinstance(step, BatchFailed):
+            raise step
+        return step
+
+    async def results(self, batch_id):
+        for line in reversed(self.batches[batch_id]):
+            repetition = line.request.slot.repetition
+            fates = self.fates.get(repetition, [])
+            fate = fates.pop(0) if fates else answer(f"batched {repetition}")
+            if fate == "missing":
+                continue
+            if fate is not None and fate.status == 200:
+                self.answered[line.key] += 1
+            yield LineResult(line.key, fate, "" if fate else "it has expired")
+
+    async def cancel(self, batch_id):
+        self.cancelled.append(batch_id)
+
+    @property
+    def sizes(self):
+        return [len(lines) for lines in self.batches.values()]
+
+
+class Alone:
+    """The plain endpoint."""
+
+    def __init__(self):
+        self.asked = []
+
+    async def send(self, request, *, attempt, timeout_s):
+        self.asked.append(request.slot.repetition)
+        return answer(f"alone {request.slot.repetition}")
+
+
+@pytest.fixture
+def cache(tmp_path):
+    cache = ResponseCache(tmp_path / "responses")
+    yield cache
+    cache.close()
+
+
+class Run:
+    """A run's client, and the rounds that it asks in."""
+
+    def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", **ways):
+        self.said = []
+        self.alone = Alone()
+        usual = {"submits": True, "deadline_s": 7200.0, "detach": False, "most_rounds": 30}
+        free = {"m"} if price == "free" else set()
+        self.rounds = Rounds(
+            Journal(cache),
+            {"m": service},
+            BatchWays(**{**usual, **ways}),
+            free=free,
+            say=self.said.append,
+        )
+        self.ledger = Ledger(cache, scope)
+        budget = Budget(self.ledger, Caps(cap))
+        entry = ModelEntry(
+            provider="openai", format="openai-chat", id="m-1", max_output_tokens=100, price=price
+        )
+        self.client = LlmClient(
+            name="m",
+            entry=entry,
+            endpoint="openai",
+            cache=cache,
+            transport=self.alone,
+            limiter=Limiter(),
+            budget=budget,
+            batches=Batches(self.rounds, "m", scope, budget, 0.5),
+        )
+
+    async def ask(self, repetitions=1, decision=0):
+        """The replies to several at once, or what each of them raised."""
+        async with contextlib.AsyncExitStack() as stack:
+            asks = [
+                asyncio.create_task(
+                    self.client.ask("prompt", Slot("A1", each, "left", decision, 0), order=each)
+                )
+                for each in range(1, repetitions + 1)
+            ]
+
+            def is_idle():
+                waiting = sum(not each.done() for each in asks)
+                return bool(waiting) and waiting == self.client.idle_askers
+
+            watching = asyncio.create_task(self.rounds.watch(is_idle))
+            stack.callback(watching.cancel)
+            return await asyncio.gather(*asks, return_exceptions=True)
+
+    async def end(self):
+        await self.client.drain()
+        await self.rounds.close()
+
+
+def texts(replies):
+    return [each.text for each in replies]
+
+
+def outcomes(reply):
+    return [(attempt.outcome, attempt.batch_id) for attempt in reply.attempts]
+
+
+@in_virtual_time
+async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
+    service = Memory()
+    run = Run(cache, service)
+    replies = await run.ask(20)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 21)]
+    assert service.sizes == [20]
+    assert {attempt.batch_id for reply in replies for attempt in reply.attempts} == {"batch-0"}
+    assert replies[0].attempts[0].cost_usd == pytest.approx(ONE_USD / 2)
+    assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
+    assert (run.ledger.read().reserved_usd, run.alone.asked) == (0.0, [])
+    await run.end()
+    assert Journal(cache).batches() == []
+
+
+@in_virtual_time
+async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
+    class Watching(Memory):
+        async def submit(self, lines, mark):
+            aside.append(run.ledger.read().reserved_usd)
+            self.size = len(lines[0].request.body.encode())
+            return await super().submit(lines, mark)
+
+    aside = []
+    service = Watching()
+    run = Run(cache, service)
+    await run.ask(3)
+    bytes_of_one = len(service.batches["batch-0"][0].request.body.encode())
+    assert aside == [pytest.approx(3 * (bytes_of_one + 100 * 100.0) / 1e6 / 2)]
+
+
+@in_virtual_time
+async def test_a_line_that_failed_goes_with_the_next_round_and_the_third_time_alone(cache):
+    service = Memory()
+    service.fates = {2: [error(500)], 3: [error(429), error(500), error(503)]}
+    run = Run(cache, service)
+    replies = await run.ask(3)
+    assert texts(replies) == ["batched 1", "batched 2", "alone 3"]
+    assert service.sizes == [3, 2, 1]
+    assert outcomes(replies[1]) == [("server_error", "batch-0"), ("ok", "batch-1")]
+    assert [attempt.cost_usd for attempt in replies[2].attempts[:3]] == [0.0] * 3
+    assert run.alone.asked == [3]
+    assert run.ledger.read().spent_usd == pytest.approx((0.5 + 0.5 + 1) * ONE_USD)
+    assert run.ledger.read().reserved_usd == 0.0
+
+
+@in_virtual_time
+async def test_a_line_that_expired_is_asked_alone_at_the_full_price(cache):
+    service = Memory()
+    service.fates = {1: [None]}
+    run = Run(cache, service)
+    (reply,) = await run.ask()
+    assert reply.text == "alone 1"
+    assert outcomes(reply) == [("expired", "batch-0"), ("ok", None)]
+    assert [attempt.cost_usd for attempt in reply.attempts] == [0.0, pytest.approx(ONE_USD)]
+
+
+@in_virtual_time
+async def test_a_request_that_is_refused_fails_its_call_alone(cache):
+    service = Memory()
+    service.fates = {1: [error(400, "invalid_request_error")]}
+    refused, other = await Run(cache, service).ask(2)
+    assert isinstance(refused, CallFailed)
+    assert other.text == "batched 2"
+
+
+@in_virtual_time
+async def test_a_line_without_a_result_may_have_been_charged_and_is_asked_alone(cache):
+    service = Memory()
+    service.fates = {1: ["missing"]}
+    run = Run(cache, service)
+    (reply,) = await run.ask()
+    assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
+    assert reply.attempts[0].cost_usd is None
+    assert run.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cache):
+    service = Memory()
+    service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 2
+    run = Run(cache, service)
+    assert texts(await run.ask(8)) == [f"batched {number}" for number in range(1, 9)]
+    assert service.sizes == [2, 2, 4]
+    await run.ask(8, decision=1)
+    assert max(service.sizes[3:]) == 2
+    assert not run.ledger.read().reserved_usd
+    await run.end()
+    assert Journal(cache).batches() == []
+
+
+@in_virtual_time
+async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
+    service = Memory()
+    service.states = [BatchStatus("failed", "failed", message="enqueued", failure="smaller")]
+    run = Run(cache, service)
+    replies = await run.ask(4)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
+    assert service.sizes == [4, 2, 2]
+    assert [len(reply.attempts) for reply in replies] == [1] * 4
+
+
+@in_virtual_time
+async def test_where_there_is_no_batch_mode_after_all_everything_is_asked_alone(cache):
+    service = Memory()
+    service.creations = [BatchFailed("single", "HTTP 404", sent=False)]
+    replies = await Run(cache, service).ask(3)
+    assert texts(replies) == ["alone 1", "alone 2", "alone 3"]
+    assert replies[0].attempts[0].cost_usd == 0.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "raised"),
+    [("quota", QuotaExhausted), ("refused", EndpointRefused), ("again", ProviderDown)],
+)
+@in_virtual_time
+async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothing(
+    cache, kind, raised
+):
+    service = Memory()
+    service.creations = [BatchFailed(kind, "no", sent=False)] * 1000
+    run = Run(cache, service)
+    assert {type(each) for each in await run.ask(3)} == {raised}
+    spending = run.ledger.read()
+    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.0, 0.0, 0)
+    await run.end()
+    assert Journal(cache).batches() == []
+
+
+@in_virtual_time
+async def test_a_batch_whose_creation_got_no_answer_is_found_and_not_created_again(cache):
+    service = Memory()
+    service.creations = [BatchFailed("again", "connection lost", sent=True)]
+    assert texts(await Run(cache, service).ask(3)) == ["batched 1", "batched 2", "batched 3"]
+    assert service.sizes == [3]
+
+
+@in_virtual_time
+async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
+    service = Memory()
+    service.states = [BatchFailed("again", "HTTP 503")] * 40
+    run = Run(cache, service)
+    assert texts(await run.ask()) == ["batched 1"]
+    assert run.said == ["m: HTTP 503; it is asked again until it answers"]
+
+
+@in_virtual_time
+async def test_a_batch_is_cancelled_at_the_deadline_and_what_it_has_is_taken(cache):
+    service = Memory()
+    service.states = [BatchStatus("waiting", "in_progress")] * 3
+    service.fates = {2: [None]}
+    run = Run(cache, service, deadline_s=0.0)
+    assert texts(await run.ask(2)) == ["batched 1", "alone 2"]
+    assert service.cancelled == ["batch-0"]
+
+
+async def killed(run, repetitions, when):
+    """Ask, and end the run as a kill does when ``when`` is set: nothing more is written."""
+    asking = asyncio.create_task(run.ask(repetitions))
+    await when.wait()
+    asking.cancel()
+    for task in run.rounds._tasks:
+        task.cancel()
+    await run.client.drain()
+
+
+@pytest.mark.parametrize("step", ["before the creation", "after it", "while it waits"])
+@in_virtual_time
+async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice(cache, step):
+    class Dying(Memory):
+        async def submit(self, lines, mark):
+            if step == "before the creation":
+                died.set()
+                await asyncio.Event().wait()
+            batch_id = await super().submit(lines, mark)
+            if step == "after it":
+                died.set()
+                await asyncio.Event().wait()
+            return batch_id
+
+        async def status(self, batch_id):
+            if not died.is_set():
+                died.set()
+                return BatchStatus("waiting", "in_progress")
+            return await super().status(batch_id)
+
+    died = asyncio.Event()
+    service = Dying()
+    first = Run(cache, service)
+    await killed(first, 5, died)
+    before = first.ledger.read()
+    assert before.open_attempts == 5
+    step = "over"
+    second = Run(cache, service)
+    replies = await second.ask(5)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 6)]
+    assert [outcomes(reply) for reply in replies] == [[("ok", "batch-0")]] * 5
+    assert service.sizes == [5]
+    assert set(service.answered.values()) == {1}
+    spending = second.ledger.read()
+    assert spending.spent_usd == pytest.approx(5 * ONE_USD / 2)
+    assert (spending.reserved_usd, spending.open_attempts) == (0.0, 0)
+    await second.end()
+    assert Journal(cache).batches() == []
+
+
+@in_virtual_time
+async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache):
+    service = Memory()
+    first = Run(cache, service, detach=True)
+    service.states = [BatchStatus("waiting", "in_progress")] * 2
+    (left, *_) = await asyncio.gather(first.ask(2), return_exceptions=True)
+    assert isinstance(left[0], WaitingForBatches)
+    await first.end()
+    later = Run(cache, service, submits=False)
+    assert texts(await later.ask(3)) == ["batched 1", "batched 2", "alone 3"]
+    assert later.alone.asked == [3]
+
+
+@in_virtual_time
+async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache):
+    service = Memory()
+    first = Run(cache, service, detach=True, scope="first")
+    service.states = [BatchStatus("waiting", "in_progress")]
+    await asyncio.wait([asyncio.create_task(first.ask(2))], timeout=5)
+    await first.end()
+    second = Run(cache, service, scope="second")
+    assert texts(await second.ask(2)) == ["batched 1", "batched 2"]
+    assert first.ledger.read().spent_usd == pytest.approx(ONE_USD)
+    assert first.ledger.read().open_attempts == second.ledger.read().open_attempts == 0
+    assert second.ledger.read().spent_usd == 0.0
+
+
+@in_virtual_time
+async def test_a_batch_that_is_gone_stops_the_run_unless_its_deadline_is_over(cache):
+    service = Memory()
+    service.states = [BatchStatus("waiting", "in_progress")]
+    first = Run(cache, service, detach=True)
+    await first.ask()
+    await first.end()
+    service.batches.clear()
+    (stopped,) = await Run(cache, service).ask()
+    assert isinstance(stopped, EndpointRefused)
+    assert "--round-deadline 0" in str(stopped)
+    anew = Run(cache, service, deadline_s=0.0)
+    (reply,) = await anew.ask()
+    assert [attempt.outcome for attempt in reply.attempts] == ["batch_lost", "ok"]
+    assert anew.ledger.read().open_attempts == 1  # nobody knows what it cost
+
+
+@in_virtual_time
+async def test_somebody_elses_batch_is_not_taken_for_ones_own(cache):
+    service = Memory()
+    other = Run(cache, service, scope="other")
+    await other.ask(3, decision=7)
+    await other.end()
+    service.unsure = ["batch-0"]
+    service.creations = [BatchFailed("again", "lost", sent=True)]
+    Journal(cache)._cache.run_now([lambda: cache.remove("ended batches")])
+    run = Run(cache, service)
+    replies = await run.ask(3)
+    assert {attempt.batch_id for reply in replies for attempt in reply.attempts} == {"batch-1"}
+    assert service.cancelled == []
+
+
+@in_virtual_time
+async def test_under_a_cap_a_round_takes_what_fits_and_the_next_ones_the_rest(cache):
+    service = Memory()
+    run = Run(cache, service, cap=0.06)
+    replies = await run.ask(20)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 21)]
+    assert len(service.sizes) > 1
+    assert max(service.sizes) * 0.005 <= 0.06
+    assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
