@@ -59,9 +59,7 @@ async def test_each_refusal_of_a_creation_says_what_to_do(
     failed = await failure(service_at(server.url, form), form)
     assert (failed.kind, failed.sent) == (kind, False)
     assert f"HTTP {status}" in str(failed)
-    assert failed.delay_s == (None if kind in ("refused", "quota", "single") else 7) or (
-        kind == "smaller"
-    )
+    assert kind != "again" or failed.delay_s == 7
 
 
 async def test_a_creation_without_an_id_may_have_created_a_batch(server, service_at, form):

@@ -54,12 +54,11 @@ def test_lines_are_parted_in_order_into_as_few_batches_as_fit(sizes, most_lines,
     numbered = list(enumerate(sizes))
     parts = list(in_batches(numbered, BatchLimits(most_lines, most_size), lambda line: line[1]))
     assert [line for part in parts for line in part] == numbered
-    for part, following in zip(parts, [*parts[1:], None], strict=True):
-        total = sum(size for _, size in part)
-        assert len(part) <= most_lines
-        assert total <= most_size
-        if following:
-            assert len(part) == most_lines or total + following[0][1] > most_size
+    totals = [sum(size for _, size in part) for part in parts]
+    assert all(len(part) <= most_lines for part in parts)
+    assert all(total <= most_size for total in totals)
+    for part, total, following in zip(parts, totals, parts[1:], strict=False):
+        assert len(part) == most_lines or total + following[0][1] > most_size
 
 
 @given(st.lists(st.text(alphabet="ab\u2028\u00e9", max_size=9)), st.data())
