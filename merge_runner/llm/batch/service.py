@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -11,9 +10,6 @@ from typing import Literal, Protocol
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.http_outcome import RawReply
 from merge_runner.records import ChatRequest
-
-# What all providers take as the id of a request (Anthropic's rule is the narrowest).
-CUSTOM_ID = re.compile("[a-zA-Z0-9_-]{1,64}")
 
 FailureKind = Literal["again", "smaller", "single", "quota", "refused"]
 """What to do after a failure.
@@ -51,7 +47,7 @@ class BatchLine:
 
     @property
     def key(self) -> str:
-        """The ``custom_id``."""
+        """Its id there: 64 hexadecimal digits, as many characters as Anthropic and OpenAI take."""
         return self.request.key
 
 
@@ -120,8 +116,7 @@ class BatchService(Protocol):
     async def submit(self, lines: Sequence[BatchLine], mark: str) -> str:
         """Create a batch of lines with different keys, within the limits; returns its id.
 
-        ``mark`` (of the characters and the length of a custom id) is attached where the provider
-        takes a name.
+        ``mark``, up to 64 letters, digits, _ and -, is attached where the provider takes a name.
         """
         ...
 
@@ -141,9 +136,9 @@ class BatchService(Protocol):
     def results(self, batch_id: str) -> AsyncIterator[LineResult]:
         """The results of a batch that has ended, in any order, each key once.
 
-        A line without a result was not asked. They can be read again. Results that cannot be read are left out; after all others it raises
-        BatchFailed with the kind ``single`` that says what was wrong. With ``again`` the connection
-        was lost.
+        A line without a result was not asked. Results that cannot be read are left out; after all
+        others it raises BatchFailed with the kind ``single`` that says what was wrong. With
+        ``again`` the connection was lost: they can be read from the beginning.
         """
         ...
 
