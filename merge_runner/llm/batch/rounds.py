@@ -183,6 +183,7 @@ class Rounds:
         self._reached: set[str] = set()
         self._batch_ended = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._resting: set[asyncio.Task[Any] | None] = set()
         self._submitting = 0
 
     def open_line(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenLine | None:
@@ -234,9 +235,9 @@ class Rounds:
 
     async def close(self) -> None:
         """End the waiting; batches that are being submitted get their ids noted first."""
-        polling = [task for task in self._tasks if task.get_name() == _POLLING]
-        for task in polling:
-            task.cancel()
+        for task in self._tasks:
+            if task.get_name() == _POLLING or task in self._resting:
+                task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._journal.tidy([each.batch for each in self._followed.values()])
 
@@ -266,6 +267,15 @@ class Rounds:
                 line.fails(error)  # type: ignore[arg-type] # it is one, or there are no lines
 
         task.add_done_callback(done)
+
+    async def _rest(self, seconds: float) -> None:
+        """Sleep, so that nothing is lost by the end of the run."""
+        task = asyncio.current_task()
+        self._resting.add(task)
+        try:
+            await asyncio.sleep(seconds)
+        finally:
+            self._resting.discard(task)
 
     # A round.
 
@@ -348,7 +358,7 @@ class Rounds:
                 patience_s = NOBODY_S if nobody else OUTAGE_S
                 if exc.kind != "again" or _loop_s() - began_s > patience_s:
                     raise
-                await asyncio.sleep(max(exc.delay_s or 0.0, _backoff_s(tries)))
+                await self._rest(max(exc.delay_s or 0.0, _backoff_s(tries)))
             else:
                 self._reached.add(batch.model)
                 return
@@ -361,7 +371,9 @@ class Rounds:
     async def _not_created(self, followed: _Followed, exc: BatchFailed) -> None:
         batch = followed.batch
         if exc.kind == "smaller":
-            await self._in_parts(followed, exc.delay_s, str(exc))
+            # Beside this: where a run is to detach, it does not wait for room.
+            work = self._in_parts(followed, exc.delay_s, str(exc))
+            self._start(work, list(followed.lines.values()), _SUBMITTING)
             return
         self._end_all(followed, self._without_reply(batch, exc.kind, str(exc), "not_created"))
 
@@ -383,9 +395,11 @@ class Rounds:
     async def _room(self, model: str, delay_s: float | None) -> None:
         """Wait until a batch of the model has ended, or for a while."""
         others = any(f.created and f.is_open and f.batch.model == model for f in self._all())
-        wait_s = delay_s or (LONGEST_POLL_S if others else 1.0)
         self._batch_ended.clear()
-        await asyncio.wait([asyncio.ensure_future(self._batch_ended.wait())], timeout=wait_s)
+        left_s = delay_s or (LONGEST_POLL_S if others else 1.0)
+        while left_s > 0 and not self._batch_ended.is_set():
+            await self._rest(min(left_s, 1.0))
+            left_s -= 1.0
 
     def _all(self) -> Iterable[_Followed]:
         return self._followed.values()
@@ -415,7 +429,7 @@ class Rounds:
         followed.created = bool(followed.batch.batch_id)
         if not followed.created and not await self._find(followed):
             # A creation that was under way when its process died may come into effect yet.
-            await asyncio.sleep(ARRIVAL_S)
+            await self._rest(ARRIVAL_S)
             if not await self._find(followed):
                 followed.never_was = True
                 for line in list(followed.lines.values()):
@@ -495,7 +509,7 @@ class Rounds:
             if followed.status.state != "waiting":
                 break
             await self._cancel_in_time(followed)
-            await asyncio.sleep(self._until_next_look_s(followed))
+            await self._rest(self._until_next_look_s(followed))
         if followed.status.state == "ended":
             followed.fetching = True
             return True
@@ -537,7 +551,7 @@ class Rounds:
                 break
             except BatchFailed as exc:
                 if exc.kind == "again":
-                    await asyncio.sleep(exc.delay_s or _backoff_s(next(tries)))
+                    await self._rest(exc.delay_s or _backoff_s(next(tries)))
                 elif exc.kind == "single":
                     left_out = str(exc)
                     self._say(f"{batch.model}: {exc}")
@@ -576,6 +590,10 @@ class Rounds:
         """The end of a line that the provider never took."""
         who = batch.model
         error: MergeRunnerError | None = None
+        if kind == "single":
+            self._say(
+                f"{who}: {len(batch.keys)} calls are asked singly, at the full price: {message}"
+            )
         if kind == "quota":
             error = QuotaExhausted(
                 f"{who}: the account's quota is exhausted ({message}). Every reply so far is "
@@ -611,7 +629,7 @@ class Rounds:
                 if tries == 1:
                     model = followed.batch.model
                     self._say(f"{model}: {exc}; it is asked again until it answers")
-                await asyncio.sleep(max(exc.delay_s or 0.0, _backoff_s(tries)))
+                await self._rest(max(exc.delay_s or 0.0, _backoff_s(tries)))
         raise AssertionError("unreachable: it counts for ever")
 
     # What a user sees.

@@ -5,9 +5,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import random
+import re
+import tempfile
 from collections import Counter
+from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import (
@@ -477,3 +483,61 @@ async def test_under_a_cap_a_round_takes_what_fits_and_the_next_ones_the_rest(ca
     assert len(service.sizes) > 1
     assert max(service.sizes) * 0.005 <= 0.06
     assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
+
+
+class Dear(Memory):
+    """Bills up to the worst case of each line, or what it did not cost, as the seed says."""
+
+    def __init__(self, seed):
+        super().__init__()
+        self.chance = random.Random(seed)
+        self.bill_usd = 0.0
+
+    async def results(self, batch_id):
+        async for result in super().results(batch_id):
+            read = 10
+            written = self.chance.randint(0, 100)
+            kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])
+            if kind != "ok":
+                yield LineResult(result.key, error(500) if kind == "failed" else None)
+                continue
+            body = json.loads(result.raw.body)
+            body["usage"] = {"prompt_tokens": read, "completion_tokens": written}
+            self.bill_usd += (read + 100 * written) / 1e6 / 2
+            yield LineResult(result.key, RawReply(200, {}, json.dumps(body)))
+
+
+@given(seed=st.integers(0, 1000), cents=st.integers(1, 12), runs=st.integers(1, 3))
+@settings(max_examples=25)
+def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
+    @in_virtual_time
+    async def sweep():
+        with tempfile.TemporaryDirectory() as folder:
+            cache = ResponseCache(Path(folder))
+            service, alone_usd = Dear(seed), 0.0
+            for number in range(runs):
+                run = Run(cache, service, cap=cents / 100)
+                await run.ask(12, decision=number)
+                await run.end()
+                alone_usd += len(run.alone.asked) * ONE_USD
+            assert service.bill_usd + alone_usd <= cents / 100 + 1e-9
+            assert run.ledger.read().spent_usd == pytest.approx(service.bill_usd + alone_usd)
+            cache.close()
+
+    sweep()
+
+
+@in_virtual_time
+async def test_what_is_pending_is_told_by_round_model_and_batch(cache):
+    service = Memory()
+    service.states = [BatchStatus("waiting", "in_progress", done=1, total=3)] * 10**4
+    run = Run(cache, service)
+    asking = asyncio.create_task(run.ask(3, decision=6))
+    while not (told := run.rounds.standing()) or "done" not in told[0]:
+        await asyncio.sleep(0.1)
+    (line,) = told
+    since = "[0-9]{2}:[0-9]{2}:[0-9]{2} UTC"
+    told = f"round 7 of at most 30: 3 calls of m in batch batch-0 since {since} .0 s., 1 of 3 done"
+    assert re.fullmatch(told, line)
+    asking.cancel()
+    await run.end()
