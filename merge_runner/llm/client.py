@@ -211,13 +211,13 @@ class LlmClient:
     async def _in_turn(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
         # Both before the claim: else another process would wait for a call that waits here.
+        opened = self.batches is not None and self.batches.takes_up(call)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
-            if self.batches is not None and self.batches.rounds.open_line(call.request.key):
-                self.batches.money.begin_anew(call.order)
             await self._money.admit(call.order)
         if self.sealed:
             return await self._make(call)
-        alone, stopped = await self._goes_alone(call), False
+        # Nobody waits for an answer that may take hours.
+        alone, stopped = not opened and await self._goes_alone(call), False
         try:
             return await self._claimed(call)
         except SweepStopped:

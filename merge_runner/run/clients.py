@@ -216,7 +216,8 @@ def open_rounds(
 ) -> Rounds | None:
     """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
     journal = Journal(cache)
-    left = [batch for batch in journal.batches() if batch.model in plan.registered.values()]
+    models = set(plan.registered.values())
+    left = [each for each in journal.batches() if each.model in models and journal.waiting(each)]
     if left and options.dask is not None:
         raise UsageError(
             f"calls wait in {len(left)} batches of an earlier run: run the same command without "

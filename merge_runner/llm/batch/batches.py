@@ -26,6 +26,13 @@ class Batches:
     money: Budget | Unpaid
     price_factor: float
 
+    def takes_up(self, call: Call) -> bool:
+        """Whether a call waits in a batch already, so that its trial has begun."""
+        if self.rounds.open_line(call.request.key) is None:
+            return False
+        self.money.begin_anew(call.order)
+        return True
+
     @asynccontextmanager
     async def attempt(
         self, call: Call, opened: OpenLine | None

@@ -7,7 +7,7 @@ and under which of its attempts each call waits there.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
@@ -144,8 +144,8 @@ class Journal:
         """The attempt has ended, and that is durable; the row goes with the next ``tidy``."""
         self._ended.append((key, line))
 
-    async def tidy(self, batches: Sequence[OpenBatch]) -> None:
-        """Remove the rows of lines that have ended, and of these batches where all have."""
+    async def tidy(self) -> None:
+        """Remove the rows of lines that have ended, and of batches where all have."""
         ended, self._ended = self._ended, []
 
         oldest = (datetime.now(UTC) - REMEMBERED).isoformat()
@@ -155,14 +155,14 @@ class Journal:
             for key, line in ended:
                 if self.line(key) == line:  # it may wait in another batch by now
                     self._cache.remove(_LINE + key)
-            for batch in batches:
+            for batch in self.batches():
                 if not self.waiting(batch):
                     self._cache.remove_twice(_BATCH + batch.mark)
                     times[batch.batch_id] = batch.submitted_at
             recent = {each: at for each, at in times.items() if at >= oldest}
             self._cache.replace(_ENDED, _TIMES.dump_json(recent).decode())
 
-        if ended or batches:
+        if ended or self.batches():
             await self._cache.write(operation)
 
     def ended_ids(self) -> set[str]:

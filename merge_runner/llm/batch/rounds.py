@@ -133,6 +133,10 @@ class _Followed:
     gone: LineEnd | None = None
     never_was: bool = False
     others: set[str] = field(default_factory=set)
+    keys: frozenset[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.keys = frozenset(self.batch.keys)
 
     @property
     def is_open(self) -> bool:
@@ -239,7 +243,7 @@ class Rounds:
             if task.get_name() == _POLLING or task in self._resting:
                 task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self._journal.tidy([each.batch for each in self._followed.values()])
+        await self._journal.tidy()
 
     @property
     def _hands_out(self) -> bool:
@@ -315,6 +319,8 @@ class Rounds:
     ) -> _Followed | None:
         """Note what is about to be submitted; None where no line of it may begin."""
         by_key = {line.key: line for line in lines if not line.end.done()}
+        if not by_key:
+            return None
         attempts = {key: line.line.attempt for key, line in by_key.items()}
         first = lines[0]
         batch = OpenBatch(
@@ -375,6 +381,16 @@ class Rounds:
             work = self._in_parts(followed, exc.delay_s, str(exc))
             self._start(work, list(followed.lines.values()), _SUBMITTING)
             return
+        if exc.kind == "again":
+            # It may be there all the same: the next run looks for it, and nothing is settled yet.
+            for line in followed.lines.values():
+                line.fails(
+                    ProviderDown(
+                        f"{batch.model}: no batch can be submitted ({exc}): nothing else is asked. "
+                        "When the service answers again, run the same command"
+                    )
+                )
+            return
         self._end_all(followed, self._without_reply(batch, exc.kind, str(exc), "not_created"))
 
     async def _in_parts(self, followed: _Followed, delay_s: float | None, why: str) -> None:
@@ -427,16 +443,24 @@ class Rounds:
     async def _take_up(self, followed: _Followed) -> None:
         """Go on with a batch that an earlier run has submitted, or was about to."""
         followed.created = bool(followed.batch.batch_id)
-        if not followed.created and not await self._find(followed):
-            # A creation that was under way when its process died may come into effect yet.
-            await self._rest(ARRIVAL_S)
-            if not await self._find(followed):
-                followed.never_was = True
-                for line in list(followed.lines.values()):
-                    self._form_anew(line)
-                followed.lines.clear()
+        try:
+            if followed.created or await self._find_in_time(followed):
+                await self._follow(followed)
                 return
-        await self._follow(followed)
+        except BatchFailed as exc:
+            self._lost(followed, exc)
+            return
+        followed.never_was = True
+        for line in list(followed.lines.values()):
+            self._form_anew(line)
+        followed.lines.clear()
+
+    async def _find_in_time(self, followed: _Followed) -> bool:
+        """Look for a batch twice: its creation may come into effect after its process died."""
+        if await self._find(followed):
+            return True
+        await self._rest(ARRIVAL_S)
+        return await self._find(followed)
 
     def _form_anew(self, line: Line) -> None:
         """A line whose batch was never created goes with the next round."""
@@ -473,6 +497,7 @@ class Rounds:
         try:
             while await self._has_ended(followed) and not await self._handed_out(followed):
                 # It was somebody else's.
+                followed.fetching = False
                 followed.others.add(followed.batch.batch_id)
                 if not await self._find(followed):
                     self._end_all(followed, LineEnd(None, outcome="not_created", singly=True))
@@ -568,7 +593,7 @@ class Rounds:
         return True
 
     def _hand_out(self, followed: _Followed, result: LineResult) -> None:
-        if result.key in followed.seen or result.key not in followed.batch.keys:
+        if result.key in followed.seen or result.key not in followed.keys:
             return
         followed.seen.add(result.key)
         line = followed.lines.pop(result.key, None)
@@ -601,11 +626,6 @@ class Rounds:
             )
         elif kind == "refused":
             error = EndpointRefused(f"{who}: its batch mode refuses: {message}")
-        elif kind == "again" and outcome == "not_created":
-            error = ProviderDown(
-                f"{who}: no batch can be submitted ({message}): nothing else is asked. When the "
-                "service answers again, run the same command"
-            )
         return LineEnd(
             batch.batch_id or None,
             outcome=outcome,
