@@ -24,7 +24,7 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.batch.batches import Batches
-from merge_runner.llm.batch.rounds import LineEnd
+from merge_runner.llm.batch.lines import LineEnd
 from merge_runner.llm.budget import Unpaid
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.call import Call, Wait, slot_text

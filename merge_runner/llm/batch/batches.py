@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from merge_runner.llm.batch.journal import OpenLine
-from merge_runner.llm.batch.rounds import Line, Rounds
+from merge_runner.llm.batch.lines import Line
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.service import BatchLine
 from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid, UnpaidAttempt
 

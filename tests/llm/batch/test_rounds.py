@@ -393,7 +393,7 @@ async def killed(run, repetitions, when):
     asking = asyncio.create_task(run.ask(repetitions))
     await when.wait()
     asking.cancel()
-    for task in run.rounds._tasks:
+    for task in run.rounds._background._tasks:
         task.cancel()
     await run.client.drain()
 
