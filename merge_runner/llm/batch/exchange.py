@@ -13,7 +13,7 @@ from merge_runner.config import Endpoint
 from merge_runner.llm.batch.service import BatchFailed, BatchLine, FailureKind, LineResult
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import ServerError, WireFormat, as_text
-from merge_runner.llm.http_outcome import RawReply, judge_error
+from merge_runner.llm.http_outcome import TOO_LATE, RawReply, judge_error
 from merge_runner.llm.transport import ErrorReply, TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER
 
@@ -113,7 +113,8 @@ class Exchange:
     def _refusal(self, raw: RawReply) -> BatchFailed:
         delay_s = judge_error(raw.error, self.wire).delay_s
         message = f"HTTP {raw.status}: {raw.error.message}"
-        return BatchFailed(self.failure_of(raw.error), message, delay_s=delay_s, sent=False)
+        maybe_done = raw.status >= 500 or raw.status in TOO_LATE
+        return BatchFailed(self.failure_of(raw.error), message, delay_s=delay_s, sent=maybe_done)
 
     def told(self, line: BatchLine) -> str:
         """What our own emulator alone is told of a line, as members of its JSON object."""

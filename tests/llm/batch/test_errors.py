@@ -57,8 +57,10 @@ async def test_each_refusal_of_a_creation_says_what_to_do(
 ):
     server.replies[CREATE[form]] = (status, body, {"retry-after": "7"})
     failed = await failure(service_at(server.url, form), form)
-    assert (failed.kind, failed.sent) == (kind, False)
+    assert failed.kind == kind
     assert f"HTTP {status}" in str(failed)
+    # A gateway may say that it waited for too long; OpenAI's file is no batch yet.
+    assert failed.sent == (status >= 500 and not form.startswith("openai"))
     assert kind != "again" or failed.delay_s == 7
 
 
