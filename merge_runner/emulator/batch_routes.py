@@ -21,7 +21,10 @@ from merge_runner.errors import UsageError
 MOST_BYTES = 2**29
 OPENAI, ANTHROPIC, GOOGLE = "batch_", "msgbatch_", "g"
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-ABORTED = web.Response(status=500)
+
+
+class NotThere(Exception):
+    """There is no such batch or file, or not yet."""
 
 
 class BatchRoutes:
@@ -83,7 +86,7 @@ class BatchRoutes:
                 return await handler(request.clone(client_max_size=MOST_BYTES))
             except UsageError as exc:
                 return _error(wire, 400, str(exc))
-            except KeyError:
+            except NotThere:
                 return _error(wire, 404, "There is no such thing.")
             except UNREADABLE:
                 return _error(wire, 400, "The body is not valid.")
@@ -100,11 +103,17 @@ class BatchRoutes:
         return _json(body)
 
     def _polled(self, request: web.Request) -> Batch:
-        """The batch of a path; raises KeyError."""
+        """The batch of a path; raises NotThere."""
         batch = self._batches.poll(request.match_info["id"])
         if batch is None:
-            raise KeyError(request.path)
+            raise NotThere
         return batch
+
+    def _uploaded(self, file_id: str) -> bytes:
+        """The bytes of an input file; raises NotThere."""
+        if file_id not in self._files:
+            raise NotThere
+        return self._files[file_id]
 
     # OpenAI
 
@@ -135,13 +144,13 @@ class BatchRoutes:
         )
 
     def _content(self, file_id: str) -> bytes:
-        """The bytes of a file; raises KeyError."""
-        if file_id in self._files:
-            return self._files[file_id]
+        """The bytes of a file; raises NotThere."""
         named = re.fullmatch(r"file-(batch_\w+)-(output|error)", file_id)
-        batch = self._batches.poll(named[1]) if named else None
-        if named is None or batch is None or not batch.ended:
-            raise KeyError(file_id)
+        if named is None:
+            return self._uploaded(file_id)
+        batch = self._batches.poll(named[1])
+        if batch is None or not batch.ended:
+            raise NotThere
         return formats.openai_results(batch, answered=named[2] == "output")
 
     async def _openai_file(self, request: web.Request) -> web.StreamResponse:
@@ -152,6 +161,7 @@ class BatchRoutes:
 
     async def _delete_file(self, request: web.Request) -> web.StreamResponse:
         file_id = request.match_info["id"]
+        self._uploaded(file_id)
         del self._files[file_id]
         return _json(marked({"id": file_id, "object": "file", "deleted": True}))
 
@@ -165,7 +175,7 @@ class BatchRoutes:
             "input_file_id": file_id,
             "metadata": asked.get("metadata"),
         }
-        lines = formats.openai_lines(self._files[file_id], endpoint)
+        lines = formats.openai_lines(self._uploaded(file_id), endpoint)
         batch = self._batches.create(OPENAI, "", lines, details)
         if batch.refused:
             self._batches.keep(batch)
@@ -209,7 +219,7 @@ class BatchRoutes:
     async def _anthropic_results(self, request: web.Request) -> web.StreamResponse:
         batch = self._polled(request)
         if not batch.ended:
-            raise KeyError(batch.id)
+            raise NotThere
         return _lines(formats.anthropic_results(batch))
 
     # Gemini
@@ -219,7 +229,7 @@ class BatchRoutes:
         source = asked["inputConfig"]
         from_file = "fileName" in source
         if from_file:
-            content = self._files[source["fileName"].removeprefix("files/")]
+            content = self._uploaded(source["fileName"].removeprefix("files/"))
             requests = [json.loads(line) for line in filter(None, content.splitlines())]
         else:
             requests = source["requests"]["requests"]
@@ -252,7 +262,7 @@ class BatchRoutes:
             url = f"{_own_url(request)}{request.path}?upload_id={file_id}&upload_protocol=resumable"
             return _json(marked({}), {"x-goog-upload-url": url, "x-goog-upload-status": "active"})
         file_id = request.query["upload_id"]
-        self._files[file_id] += await request.read()
+        self._files[file_id] = self._uploaded(file_id) + await request.read()
         if "finalize" not in command:
             return _json(marked({}), {"x-goog-upload-status": "active"})
         size = str(len(self._files[file_id]))
@@ -262,7 +272,7 @@ class BatchRoutes:
     async def _gemini_content(self, request: web.Request) -> web.StreamResponse:
         batch = self._batches.poll(request.match_info["id"].removeprefix("batch-"))
         if batch is None or not batch.ended:
-            raise KeyError(request.path)
+            raise NotThere
         return _lines(formats.gemini_results(batch))
 
 

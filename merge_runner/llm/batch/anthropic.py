@@ -8,10 +8,11 @@ from typing import Any
 
 from merge_runner.llm.batch.exchange import (
     Exchange,
+    Listing,
     Unreadable,
     as_reply,
+    id_if_more,
     id_of,
-    is_older,
     moment_of,
     read_results,
     text_at,
@@ -24,10 +25,9 @@ from merge_runner.llm.batch.service import (
     Found,
     LineResult,
 )
-from merge_runner.llm.formats.base import as_count, as_dict, as_dicts, as_text
+from merge_runner.llm.formats.base import as_count, as_dict, as_text
 
 BATCHES = "/v1/messages/batches"
-PAGE = 100
 # The status with which the plain endpoint sends an error, by its type: a result has none.
 STATUSES = {
     "invalid_request_error": 400,
@@ -42,6 +42,13 @@ STATUSES = {
     "timeout_error": 504,
     "overloaded_error": 529,
 }
+
+
+def _created(batch: dict[str, Any]) -> datetime | None:
+    return moment_of(batch.get("created_at"))
+
+
+LISTING = Listing(f"{BATCHES}?limit=100", "data", "after_id", id_if_more, _created)
 
 
 class AnthropicBatches:
@@ -69,7 +76,7 @@ class AnthropicBatches:
         Nothing that the service tells of a batch in progress names its requests.
         """
         possible = None
-        async for batch in self._newest(since):
+        async for batch in self._exchange.newest(LISTING, since):
             batch_id = id_of(batch)
             if batch_id in known or sum(_counts(batch).values()) != len(keys):
                 continue
@@ -101,20 +108,6 @@ class AnthropicBatches:
     async def cancel(self, batch_id: str) -> None:
         """See BatchService."""
         await self._exchange.post(f"{BATCHES}/{batch_id}/cancel")
-
-    async def _newest(self, since: datetime) -> AsyncIterator[dict[str, Any]]:
-        """The batches that may have been created since a moment, the newest first."""
-        after = ""
-        while True:
-            page = await self._exchange.get(f"{BATCHES}?limit={PAGE}{after}")
-            batches = as_dicts(page.get("data"))
-            for batch in batches:
-                if is_older(moment_of(batch.get("created_at")), since):
-                    return
-                yield batch
-            if not (page.get("has_more") and batches):
-                return
-            after = f"&after_id={id_of(batches[-1])}"
 
     async def _has_one_of(self, keys: Collection[str], batch_id: str) -> bool:
         """Whether the first result of a batch, which stands for all, is of one of the keys."""

@@ -8,12 +8,13 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.batch.service import BatchFailed, BatchLine, FailureKind, LineResult
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.llm.formats.base import ServerError, WireFormat, as_text
-from merge_runner.llm.http_outcome import RawReply, judge_error
+from merge_runner.llm.formats.base import ServerError, WireFormat, as_dicts, as_text
+from merge_runner.llm.http_outcome import TOO_LATE, RawReply, judge_error
 from merge_runner.llm.transport import ErrorReply, TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER
 
@@ -35,6 +36,20 @@ CLOCK_SLACK = timedelta(hours=1)
 
 class Unreadable(ValueError):
     """A result that cannot be used; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """How batches are listed: at ``path``, a page in ``member``, the next by the query ``after``.
+
+    ``cursor`` is what stands for the next page, by a page and its last batch; None: it is the last.
+    """
+
+    path: str
+    member: str
+    after: str
+    cursor: Callable[[dict[str, Any], dict[str, Any]], str | None]
+    created: Callable[[dict[str, Any]], datetime | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +108,23 @@ class Exchange:
         except TransportFailure as exc:
             raise _unanswered(exc) from exc
 
+    async def newest(self, listing: Listing, since: datetime) -> AsyncIterator[dict[str, Any]]:
+        """The batches created since a moment, as they are listed: the newest first."""
+        following, seen = "", set()
+        while following not in seen:  # not for ever where a server knows no pages
+            seen.add(following)
+            page = await self.get(listing.path + following)
+            batches = as_dicts(page.get(listing.member))
+            for batch in batches:
+                created = listing.created(batch)
+                if created is not None and created < since - CLOCK_SLACK:
+                    return
+                yield batch
+            cursor = listing.cursor(page, batches[-1]) if batches else None
+            if cursor is None:
+                return
+            following = f"&{listing.after}={quote(cursor)}"
+
     def failure_of(self, error: ServerError) -> FailureKind:
         """What to do after an error that a batch mode reports."""
         if error.names & TOO_MANY_TOKENS or "enqueued" in error.message.lower():
@@ -113,7 +145,8 @@ class Exchange:
     def _refusal(self, raw: RawReply) -> BatchFailed:
         delay_s = judge_error(raw.error, self.wire).delay_s
         message = f"HTTP {raw.status}: {raw.error.message}"
-        return BatchFailed(self.failure_of(raw.error), message, delay_s=delay_s, sent=False)
+        maybe_done = raw.status >= 500 or raw.status in TOO_LATE
+        return BatchFailed(self.failure_of(raw.error), message, delay_s=delay_s, sent=maybe_done)
 
     def told(self, line: BatchLine) -> str:
         """What our own emulator alone is told of a line, as members of its JSON object."""
@@ -163,15 +196,15 @@ def text_at(value: dict[str, Any], member: str) -> str:
 
 def id_of(reply: dict[str, Any], member: str = "id") -> str:
     """An id, which can stand in a path; raises BatchFailed."""
-    told = str(reply.get(member))
-    if not ID.fullmatch(told):
+    told = reply.get(member)
+    if not isinstance(told, str) or not ID.fullmatch(told):
         raise BatchFailed("again", f"the reply cannot be used: it has no {member} of a known form")
     return told
 
 
-def is_older(moment: datetime | None, since: datetime) -> bool:
-    """Whether a batch was certainly created before a moment; not where nobody says when."""
-    return moment is not None and moment < since - CLOCK_SLACK
+def id_if_more(page: dict[str, Any], last: dict[str, Any]) -> str | None:
+    """The last id of a page that is not the last one."""
+    return id_of(last) if page.get("has_more") else None
 
 
 def moment_of(text: object) -> datetime | None:

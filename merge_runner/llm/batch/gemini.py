@@ -9,10 +9,10 @@ from urllib.parse import urlsplit
 
 from merge_runner.llm.batch.exchange import (
     Exchange,
+    Listing,
     Unreadable,
     as_reply,
     id_of,
-    is_older,
     moment_of,
     read_results,
     text_at,
@@ -29,10 +29,9 @@ from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import as_count, as_dict, as_dicts, as_text, read_error
 
 API = "/v1beta"
-PAGE = 100
 METHOD, BATCH_METHOD = ":generateContent", ":batchGenerateContent"
-# The whole request may have 20 MB.
-MOST_INLINE = 19_000_000
+# The whole request may have 20 MB, and all its results come in one body, which has bounds too.
+MOST_INLINE, MOST_INLINE_LINES = 19_000_000, 1000
 ENDED = frozenset({"SUCCEEDED", "PARTIALLY_SUCCEEDED", "CANCELLED", "EXPIRED"})
 # The HTTP status of an error by its code (google/rpc/code.proto), and its name.
 CODES = {
@@ -52,6 +51,17 @@ CODES = {
 NOT_ASKED = frozenset({"CANCELLED"})
 
 
+def _created(batch: dict[str, Any]) -> datetime | None:
+    return moment_of(as_dict(batch.get("metadata")).get("createTime"))
+
+
+def _next_page(page: dict[str, Any], last: dict[str, Any]) -> str | None:
+    return as_text(page.get("nextPageToken")) or None
+
+
+LISTING = Listing(f"{API}/batches?pageSize=100", "operations", "pageToken", _next_page, _created)
+
+
 class GeminiBatches:
     """``models/MODEL:batchGenerateContent`` and ``batches``; see BatchService."""
 
@@ -68,7 +78,7 @@ class GeminiBatches:
     async def submit(self, lines: Sequence[BatchLine], mark: str) -> str:
         """See BatchService."""
         inline = b",".join(map(self._inline, lines))
-        if len(inline) <= MOST_INLINE:
+        if len(inline) <= MOST_INLINE and len(lines) <= MOST_INLINE_LINES:
             source = b'{"requests":{"requests":[' + inline + b"]}}"
         else:
             source = canonical_json({"fileName": await self._uploaded(lines, mark)}).encode()
@@ -80,23 +90,16 @@ class GeminiBatches:
         self, mark: str, keys: Collection[str], *, since: datetime, known: Collection[str] = ()
     ) -> Found | None:
         """By the mark, which is its display name."""
-        after = ""
-        while True:
-            page = await self._exchange.get(f"{API}/batches?pageSize={PAGE}{after}")
-            batches = as_dicts(page.get("operations"))
-            for batch in batches:
-                if as_dict(batch.get("metadata")).get("displayName") == mark:
-                    return Found(_number(id_of(batch, "name")))
-            following = as_text(page.get("nextPageToken"))
-            if not (following and batches) or is_older(_created(batches[-1]), since):
-                return None
-            after = f"&pageToken={following}"
+        async for batch in self._exchange.newest(LISTING, since):
+            if as_dict(batch.get("metadata")).get("displayName") == mark:
+                return Found(_number(id_of(batch, "name")))
+        return None
 
     async def status(self, batch_id: str) -> BatchStatus:
         """See BatchService."""
         batch = await self._batch(batch_id)
         metadata, error = as_dict(batch.get("metadata")), as_dict(batch.get("error"))
-        word = (as_text(metadata.get("state")) or "unknown").rpartition("_STATE_")[2]
+        word = _state(metadata)
         stats = as_dict(metadata.get("batchStats"))
         total, pending = _count(stats, "requestCount"), _count(stats, "pendingRequestCount")
         failed = word == "FAILED"
@@ -152,8 +155,10 @@ class GeminiBatches:
 
     async def _lines(self, batch_id: str) -> AsyncIterator[dict[str, Any] | Unreadable]:
         batch = await self._batch(batch_id)
-        output = as_dict(as_dict(batch.get("metadata")).get("output"))
-        output = output or as_dict(batch.get("response"))
+        metadata = as_dict(batch.get("metadata"))
+        output = as_dict(metadata.get("output")) or as_dict(batch.get("response"))
+        if not output and _state(metadata).endswith("SUCCEEDED"):
+            raise BatchFailed("again", "the results are not there yet")
         for result in as_dicts(as_dict(output.get("inlinedResponses")).get("inlinedResponses")):
             yield {"key": as_dict(result.get("metadata")).get("key"), **result}
         if output.get("responsesFile"):
@@ -176,14 +181,15 @@ def _number(name: str) -> str:
     return name.rpartition("/")[2]
 
 
+def _state(metadata: dict[str, Any]) -> str:
+    """The provider's word, whether it says JOB_STATE_ or BATCH_STATE_ before it."""
+    return (as_text(metadata.get("state")) or "unknown").rpartition("_STATE_")[2]
+
+
 def _count(stats: dict[str, Any], name: str) -> int | None:
     """A count, which is a text, as 64-bit numbers are in JSON of protobuf; 0 is left out."""
     text = str(stats.get(name, "0"))
     return as_count(int(text)) if stats and text.isdecimal() else None
-
-
-def _created(batch: dict[str, Any]) -> datetime | None:
-    return moment_of(as_dict(batch.get("metadata")).get("createTime"))
 
 
 def _read(line: dict[str, Any]) -> LineResult:

@@ -9,10 +9,11 @@ from uuid import uuid4
 
 from merge_runner.llm.batch.exchange import (
     Exchange,
+    Listing,
     Unreadable,
     as_reply,
+    id_if_more,
     id_of,
-    is_older,
     read_results,
     text_at,
 )
@@ -25,16 +26,23 @@ from merge_runner.llm.batch.service import (
     LineResult,
 )
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.llm.formats.base import as_count, as_dict, as_dicts, as_text, first_of, read_error
+from merge_runner.llm.formats.base import as_count, as_dict, as_text, first_of, read_error
 
 # Where the files of a batch stand, whatever the base URL of the server is.
 API = "/v1"
-PAGE = 100
 MARK = "merge_runner_mark"
 # What OpenAI itself does with input files.
 KEPT_S = 30 * 86400
 ENDED = frozenset({"completed", "expired", "cancelled"})
 NOT_ASKED = frozenset({"batch_expired", "batch_cancelled"})
+
+
+def _created(batch: dict[str, Any]) -> datetime | None:
+    created_s = as_count(batch.get("created_at"))
+    return None if created_s is None else datetime.fromtimestamp(created_s, UTC)
+
+
+LISTING = Listing("/batches?limit=100", "data", "after", id_if_more, _created)
 
 
 class OpenAIBatches:
@@ -70,16 +78,10 @@ class OpenAIBatches:
         self, mark: str, keys: Collection[str], *, since: datetime, known: Collection[str] = ()
     ) -> Found | None:
         """By the mark among its metadata."""
-        after = ""
-        while True:
-            page = await self._exchange.get(f"/batches?limit={PAGE}{after}")
-            batches = as_dicts(page.get("data"))
-            for batch in batches:
-                if as_dict(batch.get("metadata")).get(MARK) == mark:
-                    return Found(id_of(batch))
-            if not (page.get("has_more") and batches) or is_older(_created(batches[-1]), since):
-                return None
-            after = f"&after={id_of(batches[-1])}"
+        async for batch in self._exchange.newest(LISTING, since):
+            if as_dict(batch.get("metadata")).get(MARK) == mark:
+                return Found(id_of(batch))
+        return None
 
     async def status(self, batch_id: str) -> BatchStatus:
         """See BatchService."""
@@ -88,6 +90,7 @@ class OpenAIBatches:
         counts = as_dict(batch.get("request_counts"))
         done = [as_count(counts.get(name)) for name in ("completed", "failed")]
         error = first_of(as_dict(batch.get("errors")).get("data"))
+        why = read_error(400, {}, "", {"error": error})
         failed = word == "failed"
         return BatchStatus(
             state="failed" if failed else "ended" if word in ENDED else "waiting",
@@ -95,7 +98,7 @@ class OpenAIBatches:
             done=sum(each or 0 for each in done) if counts else None,
             total=as_count(counts.get("total")) or None,
             message=as_text(error.get("message")) or "",
-            failure=self._exchange.failure_of(_as_error(error)) if failed else None,
+            failure=self._exchange.failure_of(why) if failed else None,
         )
 
     def results(self, batch_id: str) -> AsyncIterator[LineResult]:
@@ -131,6 +134,9 @@ class OpenAIBatches:
 
     async def _lines(self, batch_id: str) -> AsyncIterator[dict[str, Any] | Unreadable]:
         batch = await self._batch(batch_id)
+        answered = as_count(as_dict(batch.get("request_counts")).get("completed"))
+        if answered and not batch.get("output_file_id"):
+            raise BatchFailed("again", f"the results of {answered} requests are not there yet")
         for name in ("output_file_id", "error_file_id"):
             if batch.get(name):
                 path = f"/files/{id_of(batch, name)}/content"
@@ -160,12 +166,3 @@ def _read(line: dict[str, Any]) -> LineResult:
     if error:
         return LineResult(key, as_reply(500, {"error": error}), message)
     raise Unreadable(f"the result of {key} has neither a response nor an error")
-
-
-def _as_error(error: dict[str, Any]) -> Any:  # noqa: ANN401
-    return read_error(400, {}, "", {"error": error})
-
-
-def _created(batch: dict[str, Any]) -> datetime | None:
-    created_s = as_count(batch.get("created_at"))
-    return None if created_s is None else datetime.fromtimestamp(created_s, UTC)

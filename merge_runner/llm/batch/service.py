@@ -24,9 +24,9 @@ same actions of an AttemptOutcome say.
 class BatchFailed(MergeRunnerError):
     """A batch mode did not do what it was asked.
 
-    ``delay_s`` is how long the server asks to wait. ``sent`` is False where the request certainly
-    never reached the provider; where it is True and ``kind`` is ``again``, a batch may have been
-    created all the same: look for it with ``find`` before the lines are submitted once more.
+    ``delay_s`` is how long the server asks to wait. ``sent`` is False where certainly no batch was
+    created; where it is True and ``kind`` is ``again``, there may be one all the same: look for it
+    with ``find`` before the lines are submitted once more.
     """
 
     def __init__(

@@ -164,9 +164,7 @@ async def test_a_batch_is_found_behind_many_later_ones_but_not_for_ever(emulator
     for number in range(120):
         await service.submit(lines(form, 2, first=number), f"other-{number}")
     assert (await service.find(MARK, keys(mine), since=since)).batch_id == created
-    if form != "anthropic":  # which has looked at each page's first batches before
-        # Of a time after all of them only the first page is read.
-        assert await service.find(MARK, keys(mine), since=since + timedelta(hours=2)) is None
+    assert await service.find(MARK, keys(mine), since=since + timedelta(hours=2)) is None
 
 
 async def test_a_batch_of_anthropic_that_has_not_ended_may_be_somebody_elses(emulator, service_at):
@@ -200,11 +198,19 @@ async def test_too_many_enqueued_tokens_ask_for_smaller_batches(emulator, servic
     assert (await service.status(third)).state == "waiting"
 
 
-async def test_gemini_sends_more_than_fits_the_request_as_a_file(emulator, service_at, monkeypatch):
+@pytest.mark.parametrize(
+    ("bound", "most"),
+    [
+        ("MOST_INLINE", lambda size, count: size - 2),
+        ("MOST_INLINE_LINES", lambda size, count: count - 1),
+    ],
+)
+async def test_gemini_sends_more_than_fits_the_request_as_a_file(
+    emulator, service_at, monkeypatch, bound, most
+):
     service, batch = service_at(await emulator(plan(delay_s=0.05)), "gemini"), lines("gemini")
     inline = await results_of(service, await service.submit(batch, "inline"))
-    most = sum(map(service.size, batch)) - 2
-    monkeypatch.setattr(gemini, "MOST_INLINE", most)
+    monkeypatch.setattr(gemini, bound, most(sum(map(service.size, batch)), len(batch)))
     by_file = await results_of(service, await service.submit(batch, "file"))
     assert keys(by_file) != keys(inline) == keys(batch)
 
