@@ -137,7 +137,7 @@ def _costs(outcome: Outcome, options: Options, expected: Estimate | None) -> Ite
         + (f" and {unknown} calls of unknown cost" if unknown else "")
     )
     if expected is not None:
-        cost = expected.cost_usd
+        cost = (expected.batch or expected).cost_usd
         yield (
             f"estimated before: {expected.calls} calls, "
             + ("an unknown price" if cost is None else f"{cost:.2f} USD")
