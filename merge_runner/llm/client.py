@@ -324,6 +324,7 @@ class LlmClient:
             with call.waiting(f"for batches of {batches.model}", idle=True):
                 end = await batches.rounds.ask(line)
             record, outcome = self._line_record(call, end, batches.price_factor)
+            record = replace(record, started_at=batches.rounds.submitted_at(line))
             call.attempts.append(record)
             call.singly |= end.singly
             self.meter.count_attempt(record)

@@ -245,8 +245,9 @@ def check_batches(plan: Plan, options: Options) -> None:
         raise UsageError("--batch plays in this process: leave --dask out")
     if not plan.entries:
         raise UsageError("no language model is asked: leave --batch out")
+    registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
-        require_batch(plan.registered[name], entry, load_models(plan.study.path.parent))
+        require_batch(plan.registered[name], entry, registry)
         if options.detach and entry.provider == "emulator" and running_emulator_url() is None:
             raise UsageError(
                 "an emulator that a sweep starts ends with it: for --detach start `merge-runner "

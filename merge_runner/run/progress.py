@@ -218,7 +218,7 @@ class Progress:
         return elapsed / part - elapsed if part else None
 
     def _part(self) -> float | None:
-        """What part of this run is done, by its trials or its calls; None: all or nothing is."""
+        """What part of this run is done, by its trials or its calls; None: none of it, or all."""
         ended, total = self.ended, self.total
         if ended == total:
             return None

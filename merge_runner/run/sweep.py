@@ -74,8 +74,8 @@ class Outcome:
     the cache cost when they were made. ``facts`` summarises what the database holds of the sweep,
     and ``audit`` the checks made there; both are None where nothing is stored, or its user
     ``gave_up`` waiting for the database. ``batches`` are those that go on without this run.
-    ``playing_s`` is how
-    long the trials took, ``worst_stall_s`` the longest delay of the event loop.
+    ``playing_s`` is how long the trials took, ``worst_stall_s`` the longest delay of the event
+    loop.
     """
 
     plan: Plan

@@ -31,7 +31,7 @@ from merge_runner.records import Attempt
 
 USUAL_DEADLINE_S = 7200.0
 # How often it is looked whether a round can be closed: what is seen then decides, not the time.
-LOOK_S = 0.02
+LOOK_S = 0.05
 # A task that can go on shows that when the loop has come round once; a chain of them, soon after.
 LOOKS = 5
 # How long a first creation is tried where nobody listens, and any other.
@@ -112,6 +112,11 @@ class Rounds:
         finally:
             if line in self._forming:
                 self._forming.remove(line)
+
+    def submitted_at(self, line: Line) -> str | None:
+        """When the batch of a line was submitted, in UTC; None: it was in none."""
+        known = None if line.open is None else self._known(line.open.mark)
+        return None if known is None else known.submitted_at
 
     def ended(self, line: Line) -> None:
         """What came of a line is durable."""

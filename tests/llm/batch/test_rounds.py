@@ -9,6 +9,7 @@ import random
 import re
 import tempfile
 from collections import Counter
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -217,7 +218,10 @@ async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
     assert texts(replies) == [f"batched {number}" for number in range(1, 21)]
     assert service.sizes == [20]
     assert {attempt.batch_id for reply in replies for attempt in reply.attempts} == {"batch-0"}
-    assert replies[0].attempts[0].cost_usd == pytest.approx(ONE_USD / 2)
+    (attempt,) = replies[0].attempts
+    assert attempt.cost_usd == pytest.approx(ONE_USD / 2)
+    assert datetime.now(UTC) - datetime.fromisoformat(attempt.started_at) < timedelta(minutes=5)
+    assert attempt.latency_s is None
     assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
     assert (run.ledger.read().reserved_usd, run.alone.asked) == (0.0, [])
     await run.end()
