@@ -8,6 +8,8 @@ RECORDING ?= $(wildcard cache/recordings/$(or $(MODEL),emulator)-$(SWEEP).parque
 Q ?= select model_left, variant, status, count(*) as trials from trials group by all order by all
 PYTHON ?= python3
 RUN := .venv/bin/merge-runner
+# The compiled tests are kept, or each of its processes would compile them anew each time.
+PYTEST := env -u PYTHONDONTWRITEBYTECODE .venv/bin/pytest
 export Q
 # A make that a recipe runs, as the tests do, is another one: it inherits neither words nor variables.
 unexport MODEL SWEEP ARGS RECORDING PYTHON MAKEFLAGS MFLAGS MAKEOVERRIDES
@@ -32,8 +34,8 @@ view: .venv/runtime ## the explorer in a browser: ARGS=
 sql: .venv/runtime ## a query over the results: Q="select ...", ARGS=
 	@$(RUN) sql "$$Q" $(ARGS)
 
-test: .venv/dev ## the tests
-	@.venv/bin/pytest $(ARGS)
+test: .venv/dev ## the quick tests, or those of ARGS=
+	@$(PYTEST) $(or $(ARGS),-m "not slow")
 
 lint: .venv/dev ## formatting, lint, types, import contract
 	@.venv/bin/ruff format --check .
@@ -41,7 +43,8 @@ lint: .venv/dev ## formatting, lint, types, import contract
 	@.venv/bin/mypy
 	@.venv/bin/lint-imports
 
-check: lint test ## formatting, lint, types, import contract and tests
+check: lint ## formatting, lint, types, import contract and all tests
+	@$(PYTEST) $(ARGS)
 
 bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/reference/performance.md
 	@.venv/bin/python -m benchmarks $(ARGS)

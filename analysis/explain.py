@@ -96,7 +96,7 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
             if group.measured or not row.note
             else Source(group.id, f"published: {row.note}", "", ())
         )
-        for group in study.groups
+        for group in (*study.groups, *study.asked)
         if group.id in groups
     )
 
@@ -116,10 +116,12 @@ def _published(group: Group, row: Row, column: Column | None) -> Source | None:
 def query_of(group: Group, predicate: str) -> str:
     """The query that lists the trials of a group which a value rests on, with their measures."""
     for metric in METRICS.values():
+        # A predicate may name the column of a metric, which no table of the database has.
+        if not re.search(named := rf"\b{metric.counts}", predicate):
+            continue
         judged = metric.value in JUDGED
         stored = _decided(group, metric.column) if judged else metric.counts_in_database
-        # A predicate may name the column of a metric, which no table of the database has.
-        predicate = re.sub(rf"\b{metric.counts}", stored.replace("\\", r"\\"), predicate)
+        predicate = re.sub(named, stored.replace("\\", r"\\"), predicate)
     variant = f" AND variant = '{group.setting}'" if group.setting else ""
     narrowed = f" AND {group.narrowed}" if group.narrowed else ""
     return (

@@ -27,6 +27,7 @@ from merge_runner.run import summary
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
 from merge_runner.run.recorded_plan import replayed
+from merge_runner.run.seat import first_situations, grid_conditions
 from merge_runner.run.sweep import Sweep
 from merge_runner.run.unsent import unsent
 from merge_runner.study.crossing import level_text
@@ -116,8 +117,8 @@ class Study:
 
     ``models``, ``repetitions``, ``conditions`` and ``prompts`` take the place of what the file
     says; ``only`` names a level, or a list of levels, by factor; ``mirror`` plays two different
-    drivers both ways round. ``arun``, ``areplay`` and ``adry_run`` are awaited, as in a notebook;
-    ``run``, ``replay`` and ``dry_run`` are for scripts.
+    drivers both ways round. ``arun``, ``aseat_first``, ``areplay`` and ``adry_run`` are awaited, as
+    in a notebook; ``run``, ``seat_first``, ``replay`` and ``dry_run`` are for scripts.
 
     All of them raise UsageError for what cannot be run as it is asked for. What goes wrong on the
     way is in the outcome, beside the trials that ended: the same call goes on from there.
@@ -189,16 +190,29 @@ class Study:
     async def arun(self, *, yes: bool = False, **how: Unpack[RunOptions]) -> StudyOutcome:
         """See ``run``."""
         with _alone():
-            plan = self.plan()
-            options = self._options(plan, **how)
-            prepared = Sweep(plan, options, say=_say)
-            if prepared.trials_to_play:
-                try:
-                    await _check(plan, prepared, may_spend=yes)
-                except MergeRunnerError:
-                    prepared.close()
-                    raise
-            return await _played(prepared, options)
+            return await self._run(self.plan(), yes=yes, **how)
+
+    def seat_first(
+        self, grid: str | None = None, *, yes: bool = False, **how: Unpack[RunOptions]
+    ) -> StudyOutcome:
+        """Ask only what drivers do first, as ``merge-runner seat first``; ``grid`` is its --grid.
+
+        Each situation is asked as often as the study has repetitions.
+        """
+        return _now(self.aseat_first(grid, yes=yes, **how), "aseat_first")
+
+    async def aseat_first(
+        self, grid: str | None = None, *, yes: bool = False, **how: Unpack[RunOptions]
+    ) -> StudyOutcome:
+        """See ``seat_first``."""
+        wanted = dict(self._wanted)
+        if grid is not None:
+            if wanted["conditions"] is not None:
+                raise UsageError("a grid takes the place of the conditions: give one of them")
+            wanted["conditions"] = grid_conditions(grid)
+        with _alone():
+            plan = first_situations(make_plan(self.file, db=self.db, **wanted))
+            return await self._run(plan, yes=yes, **how)
 
     def replay(self, *recordings: Path | str) -> StudyOutcome:
         """Play all trials from recorded replies alone, those of the files first; sends nothing."""
@@ -215,6 +229,18 @@ class Study:
             for note in notes:
                 _say(note)
             return await _played(Sweep(plan, options, say=_say), options)
+
+    async def _run(self, plan: Plan, *, yes: bool, **how: Unpack[RunOptions]) -> StudyOutcome:
+        """Play what is not stored yet of a plan; ``yes`` lets it spend money."""
+        options = self._options(plan, **how)
+        prepared = Sweep(plan, options, say=_say)
+        if prepared.trials_to_play:
+            try:
+                await _check(plan, prepared, may_spend=yes)
+            except MergeRunnerError:
+                prepared.close()
+                raise
+        return await _played(prepared, options)
 
     def _options(self, plan: Plan, **how: Unpack[RunOptions]) -> Options:
         return plan.within_budget(Options(self.db, self.cache, **how))

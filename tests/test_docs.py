@@ -156,7 +156,7 @@ async def test_every_command_of_the_docs_does_what_it_says(folder, here):
         account = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": at, "LOCAL_BASE_URL": at}
         for page in PAGES:
             for command in commands(page):
-                if command in {"make test", *done}:
+                if command in {"make test", "make check", *done}:
                     continue
                 words = shlex.split(command)
                 if words[0] == "merge-runner" and words[1] in HERE:
@@ -202,11 +202,19 @@ def test_commands_that_run_in_the_tests_own_process_are_ours_and_start_no_event_
 
 
 @NEEDS_MAKE
-def test_make_test_runs_the_tests():
+@pytest.mark.parametrize(
+    ("words", "ending"),
+    [
+        (["test"], '.venv/bin/pytest -m "not slow"\n'),
+        (["test", "ARGS=-k name"], ".venv/bin/pytest -k name\n"),
+        (["check"], ".venv/bin/pytest \n"),
+    ],
+)
+def test_make_test_runs_the_quick_tests_or_those_that_are_named_and_make_check_all(words, ending):
     run = subprocess.run(
-        ["make", "--dry-run", "test"], cwd=PROJECT, capture_output=True, text=True, check=True
+        ["make", "--dry-run", *words], cwd=PROJECT, capture_output=True, text=True, check=True
     )
-    assert ".venv/bin/pytest" in run.stdout
+    assert run.stdout.endswith(ending)
 
 
 def test_every_command_and_every_make_target_is_in_the_docs():

@@ -62,6 +62,7 @@ def _afterwards():
             registry.drop(f"{registry.kind} {name}")
 
 
+@pytest.mark.slow
 async def test_trials_have_a_typed_column_for_each_factor_and_their_measures(folder):
     outcome = await Study("study.toml", only={"memory_s": 2.0}).arun()
     assert (outcome.ok, outcome.messages) == (True, [])
@@ -81,12 +82,14 @@ async def test_trials_have_a_typed_column_for_each_factor_and_their_measures(fol
     assert "left first" in repr(outcome)
 
 
+@pytest.mark.slow
 async def test_a_factor_of_numbers_and_other_levels_is_of_texts(folder):
     (folder / "study.toml").write_text(STUDY.replace("[0.2, 1.0]", '["default", 1]'))
     outcome = await Study("study.toml", only={"opponent": "constant", "memory_s": 1.0}).arun()
     assert set(outcome.trials()["temperature"]) == {"default", "1"}
 
 
+@pytest.mark.slow
 async def test_an_outcome_holds_the_trials_of_its_own_sweep(folder):
     first = await Study("study.toml", only={"temperature": 0.2, "memory_s": 2.0}).arun()
     second = await Study("baseline", models="constant", repetitions=1).arun()
@@ -94,6 +97,17 @@ async def test_an_outcome_holds_the_trials_of_its_own_sweep(folder):
     assert len(first.trials()) == 4
     again = await Study("study.toml", only={"temperature": 0.2, "memory_s": 2.0}).arun()
     assert (again.facts["trials"]["stored_before"], len(again.trials())) == (4, 4)
+
+
+async def test_first_situations_are_asked_alone_in_the_conditions_or_on_a_grid(folder):
+    wanted = {"temperature": 0.2, "memory_s": 2.0, "opponent": "self"}
+    outcome = await Study("study.toml", only=wanted).aseat_first()
+    assert set(outcome.trials()["source"]) == {"seat"}
+    assert sum(look["asked"] for look in outcome.facts["first_looks"]) == 4
+    gridded = await Study("study.toml", only=wanted).aseat_first("h=2,dv=0:0.8:0.4")
+    assert set(gridded.trials()["relative_velocity_mps"]) == {0.0, 0.4, 0.8}
+    with pytest.raises(UsageError, match="a grid takes the place of the conditions"):
+        await Study("study.toml", conditions=["N_0_0"]).aseat_first("usual")
 
 
 async def test_a_replay_gives_the_same_results_without_a_call(folder):
@@ -115,6 +129,7 @@ async def test_a_running_loop_is_told_what_to_await(folder):
             getattr(Study("study.toml"), call)()
 
 
+@pytest.mark.slow
 async def test_money_is_spent_only_with_leave(folder):
     study = Study("study.toml", models="dear", only={"opponent": "self", "memory_s": 2.0})
     with pytest.raises(UsageError, match=r"spends about .* USD for 4 trials: yes=True"):
@@ -148,6 +163,7 @@ async def test_trials_that_failed_are_in_the_outcome(folder):
     assert f"error: {outcome.messages[0]}" in repr(outcome)
 
 
+@pytest.mark.slow
 async def test_two_studies_do_not_run_at_the_same_time_in_one_process(folder):
     runs = [Study("study.toml", db=f"{n}.duckdb").arun() for n in (1, 2)]
     first, second = await asyncio.gather(*runs, return_exceptions=True)

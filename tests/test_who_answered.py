@@ -47,6 +47,7 @@ def marks(db):
         ).fetchall()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", POINTED)
 async def test_the_emulator_behind_a_models_name_is_stored_as_what_it_is(
     merge_runner, emulator_url, tmp_path, model
@@ -121,6 +122,7 @@ def estimated(merge_runner):
     return estimate
 
 
+@pytest.mark.slow
 async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
     merge_runner, emulator_url, estimated
 ):
@@ -137,6 +139,7 @@ async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
     assert 0.9 * before[0] < there < before[0]
 
 
+@pytest.mark.slow
 async def test_answers_at_another_effort_or_place_do_not_change_it_either(
     merge_runner, estimated, tmp_path
 ):
@@ -156,6 +159,7 @@ async def test_answers_at_another_effort_or_place_do_not_change_it_either(
     assert (await estimated(**there))[1] == []
 
 
+@pytest.mark.slow
 async def test_a_summary_says_who_answered_and_where(merge_runner, emulator_url, tmp_path):
     host = emulator_url.removeprefix("http://").removesuffix("/v1")
     sweep = ("sweep", "baseline", "--model", "o3+constant", *SMALL[:-1], *FAST, "--yes")
@@ -169,6 +173,7 @@ async def test_a_summary_says_who_answered_and_where(merge_runner, emulator_url,
     assert f"driver  o3 at {host}+constant\n" in dry.out
 
 
+@pytest.mark.slow
 async def test_the_emulator_by_its_own_name_is_said_to_be_one(merge_runner):
     run = await merge_runner("sweep", "baseline", *SMALL[:-1])
     assert "The model `emulator` is a scripted stand-in, no language model.\n" in run.out
@@ -190,6 +195,7 @@ urls = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(st.none() | st.sampled_from(["openai", "emulator", "emulator#faults-1-{}"]) | urls)
 def test_the_program_and_the_database_name_a_driver_alike(endpoint):
     with in_memory({}) as connection:

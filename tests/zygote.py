@@ -196,6 +196,10 @@ def _run_to_its_end(main) -> None:
     os._exit(code)
 
 
+def _folders(env) -> list[str]:
+    return list(filter(None, env.get("PYTHONPATH", "").split(os.pathsep)))
+
+
 def _become_the_program(request, streams) -> None:
     os.setsid()
     for number, stream in enumerate((os.open(os.devnull, os.O_RDONLY), *streams)):
@@ -203,6 +207,8 @@ def _become_the_program(request, streams) -> None:
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])
+    # As the interpreter does that starts with these variables: there may be packages of the test.
+    sys.path[:0] = [folder for folder in _folders(request["env"]) if folder not in sys.path]
     sys.argv = ["merge-runner", *request["arguments"]]
     sys.modules["__main__"].__file__ = str(PROGRAM)  # what processes import that it starts
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from merge_runner.cli.options import DbOption
 from merge_runner.cli.output import print_out, say
+from merge_runner.config import Resistance
 from merge_runner.drivers.cei.parameters import SETS, ThresholdSet
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
@@ -26,15 +27,15 @@ app = typer.Typer(
 )
 SetArgument = Annotated[str, typer.Argument(metavar="SET", help=f"{', '.join(SETS)}.")]
 ResistanceOption = Annotated[
-    Literal["human", "none"],
-    typer.Option("--resistance", help="That of the human simulator, or none."),
+    Resistance | None,
+    typer.Option("--resistance", help="Not the one that the set was calibrated for."),
 ]
 
 
 @app.command()
 def check(
     name: SetArgument,
-    resistance: ResistanceOption = "human",
+    resistance: ResistanceOption = None,
     sets: Annotated[int, typer.Option("--sets", help="How many times 990 trials.", min=1)] = 5,
     tunnel: Annotated[
         bool, typer.Option("--tunnel", help="Start in the tunnels, as the published model did.")
@@ -43,8 +44,10 @@ def check(
     """Simulate 990 trials of each sample set from 0 on, and compare with what is published."""
     from analysis.calibration.design import experiment
     from analysis.calibration.search import compared, numbers_of
+    from analysis.calibration.searches import SEARCHES
 
-    thresholds, scenario = require(SETS, "set", name), experiment(resistance)
+    thresholds = require(SETS, "set", name)
+    scenario = experiment(resistance or SEARCHES[name].resistance)
     found = [numbers_of(thresholds, scenario, n, tunnel=tunnel) for n in range(sets)]
     print_out(_text(compared(found)))
 
@@ -52,34 +55,25 @@ def check(
 @app.command()
 def search(
     name: SetArgument,
-    resistance: ResistanceOption = "human",
-    first_action: Annotated[
-        bool, typer.Option(help="Whether the humans' first action is a target, too.")
-    ] = True,
-    generations: Annotated[int, typer.Option(min=1)] = 12,
-    size: Annotated[int, typer.Option(help="Candidates of a generation.", min=4)] = 12,
+    generations: Annotated[int | None, typer.Option(min=1)] = None,
+    size: Annotated[int | None, typer.Option(help="Candidates of a generation.", min=4)] = None,
     trials: Annotated[
-        int,
+        int | None,
         typer.Option(help="Of each synthetic pair in each condition; 10 are 990 in all.", min=2),
-    ] = 10,
-    seed: int = 1,
+    ] = None,
+    seed: int | None = None,
 ) -> None:
-    """Look for thresholds that come nearer to what is published, from those of a set."""
-    from analysis.calibration.design import experiment
-    from analysis.calibration.search import search as generations_of
-    from analysis.calibration.search import targets
+    """Search for a set anew, from where its search began; with other numbers, for a better one."""
+    from analysis.calibration.searches import SEARCHES
 
-    start = require(SETS, "set", name)
-    wanted = [one for one in targets() if first_action or one.origin == "model"]
-    for found in generations_of(
-        start,
-        experiment(resistance),
-        wanted,
-        generations=generations,
-        size=size,
-        trials_of_a_pair=trials,
-        seed=seed,
-    ):
+    changes = {
+        "generations": generations,
+        "size": size,
+        "trials_of_a_pair": trials,
+        "seed": seed,
+    }
+    given: dict[str, Any] = {key: value for key, value in changes.items() if value is not None}
+    for found in replace(require(SEARCHES, "set", name), **given).run():
         say(f"generation {found.number}: cost {found.cost:.1f} at best; {_line(found.thresholds)}")
     print_out(_line(found.thresholds))
 

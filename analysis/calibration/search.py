@@ -13,7 +13,7 @@ from analysis.calibration.outcomes import measured, summary
 from analysis.data.reference_data import published
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.cei.batch import simulate
-from merge_runner.drivers.cei.parameters import ThresholdSet
+from merge_runner.drivers.cei.parameters import RISKS, ThresholdSet
 
 # How far the first candidates are from the start: one standard deviation of each number.
 STEPS = ThresholdSet(
@@ -138,6 +138,8 @@ def search(
     for number in range(generations):
         candidates = mean + spread * random.standard_normal((size, mean.size))
         candidates[0] = mean
+        risks = candidates[:, : len(RISKS)]
+        risks.clip(0, 1, out=risks)
         costs = [
             cost(
                 numbers_of(

@@ -32,12 +32,12 @@ _PUBLISHED = ", ".join(
     f"({quoted(name)}, {one.projected_headway_m!r}::DOUBLE, {one.relative_velocity_mps!r}::DOUBLE)"
     for name, one in HUMAN_CONDITIONS.items()
 )
-TRIALS = f"""
+_TRIALS = f"""
 WITH placed AS (
     SELECT trials.*, driver, ego, ego = 'right' AS turned,
         (spec->>'$.mean_speed_mps')::DOUBLE AS mean_mps
     FROM trials JOIN trial_drivers USING (trial_id, spec_hash) LEFT JOIN specs USING (spec_hash)
-    WHERE source <> 'seat'
+    WHERE {{which}}
 ), known (image, headway_m, velocity_mps, mean_mps, own) AS (
     SELECT *, NULL::DOUBLE, false FROM (VALUES {_PUBLISHED})
     UNION SELECT condition, projected_headway_m, relative_velocity_mps, mean_mps, true FROM placed
@@ -71,6 +71,9 @@ LEFT JOIN images ON turned AND headway_m = 0 - projected_headway_m
     AND images.mean_mps IS NOT DISTINCT FROM placed.mean_mps
 ORDER BY trial_id, spec_hash
 """  # noqa: S608 # constants
+TRIALS = _TRIALS.format(which="source <> 'seat'")
+# First situations that were only asked: equal columns, of trials that end before a second decision.
+ASKED_TRIALS = _TRIALS.format(which="source = 'seat'")
 # Of each driven trial that ended a hash of its states, as its ego sees them: equal ones went the
 # same way.
 TRACES = """

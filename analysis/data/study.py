@@ -20,6 +20,7 @@ from analysis.data.first_actions import FIRST_ACTIONS, HUMAN_FIRST_ACTIONS
 from analysis.data.imported_humans import RECORDINGS, Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
+    ASKED_TRIALS,
     DEVIATIONS,
     EGO_SPEEDS,
     PLANS,
@@ -34,7 +35,7 @@ from analysis.data.load import (
 )
 from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
 from merge_runner.drivers.human_replay import unresponsive
-from merge_runner.drivers.registry import stand_in
+from merge_runner.drivers.registry import language_models, stand_in
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json, spec_hash
 from merge_runner.paths import DEFAULT_DB
@@ -56,6 +57,7 @@ MEAN_SPEED = "mean_speed_mps"
 # Factors that every study has, and levels that others are compared with.
 FIRST = (MODEL, PROMPT)
 USUAL = (BASELINE, DEFAULT, SELF)
+ONLY_ASKED = " [asked]"  # ends the name of a driver that was only asked
 # One row a trial and factor of drivers that were only asked.
 ASKED = f"""
 SELECT trial_id, spec_hash, driver, factor, value FROM ({LEVELS})
@@ -228,6 +230,21 @@ class Study:
         )
         self.groups = [self.human, *self.models] if HUMAN in wanted else self.models
 
+    @cached_property
+    def asked(self) -> list[Group]:
+        """The drivers that were only asked what they do first, each marked so by its name."""
+        trials = self._read(ASKED_TRIALS).merge(
+            self._read(TRACES), on=["trial_id", "spec_hash"], how="left"
+        )
+        if self.chosen is not None:
+            trials = trials[trials["driver"].isin(self.chosen)]
+        levels = self._read(LEVELS)
+        groups = _model_groups(trials.assign(driver=trials["driver"] + ONLY_ASKED), self.specs)
+        return _kept(
+            self.where or {},
+            [replace(group, levels=_levels(levels, group)) for group in groups],
+        )
+
     @property
     def calibrated(self) -> bool:
         """Whether there are human traces enough of every condition to compare others with."""
@@ -394,15 +411,20 @@ def _at(
         known = require(there, "factor", factor)
         for level in levels:
             require(dict.fromkeys(known), f"level of {factor}", level)
-    kept = [
-        group
-        for group in groups
-        if all(group.levels.get(factor) in levels for factor, levels in where.items())
-    ]
+    kept = _kept(where, groups)
     if where and not kept and not _asked_at(where, asked):
         named = " and ".join(f"{factor}={'|'.join(levels)}" for factor, levels in where.items())
         raise UsageError(f"{db} holds no trial with {named}: there are some with each alone")
     return kept
+
+
+def _kept(where: Mapping[str, Sequence[str]], groups: Iterable[Group]) -> list[Group]:
+    """The groups that have one of these levels of each factor."""
+    return [
+        group
+        for group in groups
+        if all(group.levels.get(factor) in levels for factor, levels in where.items())
+    ]
 
 
 def _asked_at(where: Mapping[str, Sequence[str]], asked: pd.DataFrame) -> bool:
@@ -506,8 +528,9 @@ def _model_group(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> 
     scripted = bool(first["scripted"])
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
-    posing = stand_in(models, sides or SIDES) if scripted else ""
-    caution = unresponsive(specs.get(first["image"], {}))
+    spec = specs.get(first["image"], {})
+    posing = stand_in(language_models(models, spec), sides or SIDES) if scripted else ""
+    caution = unresponsive(spec)
     said = "; ".join(filter(None, (posing, caution)))
     seats = rows["ego"].value_counts()
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))

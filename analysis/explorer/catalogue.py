@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 import threading
 from dataclasses import dataclass, field, fields
@@ -12,7 +13,8 @@ import duckdb
 
 from analysis.explorer.query_worker import csv_cell
 from analysis.explorer.reading import PATIENCE_S, Row, reading, records
-from merge_runner.drivers.registry import stand_in
+from merge_runner.drivers.human_replay import HUMAN_REPLAY, unresponsive
+from merge_runner.drivers.registry import language_models, stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, schema_sql, spill_folder
@@ -45,7 +47,7 @@ CREATE TABLE listed (
     condition VARCHAR, projected_headway_m DOUBLE, relative_velocity_mps DOUBLE, rep INTEGER,
     pair VARCHAR,
     status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
-    error VARCHAR, scripted BOOLEAN, stand_in VARCHAR,
+    error VARCHAR, scripted BOOLEAN, stand_in VARCHAR, caution VARCHAR,
     time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
     joint BOOLEAN, decisions BIGINT, invalid BIGINT, fallbacks BIGINT, attempts BIGINT,
     cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[], left_range_mps FLOAT[],
@@ -162,10 +164,15 @@ INSERT INTO levels SELECT number, factor, value FROM new_levels
     JOIN listed USING (trial_id, spec_hash) WHERE factor <> 'prompt';
 TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states; TRUNCATE decided; TRUNCATE called;
 """
-# Trials that a stand-in drove, without a note on it yet: by the models asked for, and its sides.
+# Trials that a stand-in drove, without a note on it yet: by their drivers and spec, and its sides.
 UNNAMED = """
-SELECT model_left, model_right, posed, list(number)
-FROM listed WHERE scripted AND stand_in IS NULL GROUP BY ALL
+SELECT model_left, model_right, spec::VARCHAR, posed, list(number)
+FROM listed LEFT JOIN specs USING (spec_hash) WHERE scripted AND stand_in IS NULL GROUP BY ALL
+"""
+# The specs of trials with a human who may be replayed, without a note on it yet.
+UNCAUTIONED = """
+SELECT spec_hash, spec::VARCHAR FROM specs
+SEMI JOIN (FROM listed WHERE caution IS NULL) USING (spec_hash) WHERE contains(spec::VARCHAR, ?)
 """
 # Before the name of a factor: its facet.
 FACTOR = "factor."
@@ -287,6 +294,7 @@ class Catalogue:
                 self._stamp, self.held = stamp, False
             self._note_others()
             self._name_stand_ins()
+            self._name_replayed()
             self._memory.execute(GROUPED)
             return not self.held
 
@@ -454,10 +462,19 @@ class Catalogue:
     def _name_stand_ins(self) -> None:
         """Note for each trial that a stand-in drove which model it stood in for."""
         unnamed = self._memory.execute(UNNAMED).fetchall()
-        for left, right, sides, numbers in unnamed:
+        for left, right, spec, sides, numbers in unnamed:
+            models = language_models({"left": left, "right": right}, json.loads(spec or "{}"))
             self._memory.execute(
                 "UPDATE listed SET stand_in = ? WHERE number IN (SELECT unnest(?))",
-                [stand_in({"left": left, "right": right}, sides or SIDES), numbers],
+                [stand_in(models, sides or SIDES), numbers],
+            )
+
+    def _name_replayed(self) -> None:
+        """Note for each trial with a replayed human that this one does not react."""
+        for spec_hash, spec in self._memory.execute(UNCAUTIONED, [HUMAN_REPLAY]).fetchall():
+            self._memory.execute(
+                "UPDATE listed SET caution = ? WHERE spec_hash = ?",
+                [unresponsive(json.loads(spec)), spec_hash],
             )
 
     def _note_others(self) -> None:

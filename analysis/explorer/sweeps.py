@@ -103,6 +103,12 @@ class Config(BaseModel):
     study: dict[str, JsonValue] = {}
 
     @property
+    def registered(self) -> set[str]:
+        """The names of its language models in the registry, whatever their parameters."""
+        named = {arm.asked[side]: name for arm in self.arms for side, name in arm.sides.items()}
+        return {named.get(asked, asked) for asked in self.models}
+
+    @property
     def drivers(self) -> tuple[str, ...]:
         """Who drives but for opponents."""
         return tuple(self.model.split(","))
@@ -145,7 +151,12 @@ class ListedSweep:
         asked = {model.provider for model in self.config.models.values()}
         if EMULATOR not in asked or trials:
             return ""
-        return "; ".join(stand_in(both_sides(name)) for name in self.config.drivers)
+        models = self.config.registered
+        pairs = map(both_sides, self.config.drivers)
+        return "; ".join(
+            stand_in({side: name for side, name in pair.items() if name in models})
+            for pair in pairs
+        )
 
     @property
     def notes(self) -> list[str]:

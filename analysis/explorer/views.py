@@ -118,7 +118,9 @@ def facts(row: Row) -> list[str]:
     text = condition_text(row["projected_headway_m"], row["relative_velocity_mps"])
     found = [f"{row['condition']}: {text}."]
     if row["variant"] is not None:
-        found.append(f"{row['variant']}: {prompt_text(row['variant'])}.")
+        programs = row["source"] == "driver"
+        said = "no prompt, since only programs drive" if programs else prompt_text(row["variant"])
+        found.append(f"{row['variant']}: {said}.")
     if row["levels"]:
         found.append(f"{', '.join(row['levels'])}.")
     if row["rmse_mps"] is not None:

@@ -30,7 +30,7 @@ from analysis.stats.first_look import (
     skill,
 )
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
-from analysis.tables.notes import sample_notes
+from analysis.tables.notes import repeated_note, sample_notes
 
 ENDED = "status <> 'failed'"
 FILE = "human_first_actions"
@@ -77,12 +77,13 @@ def first_action(study: Study) -> Table:
             Column("velocity", "own velocity"),
             *(replace(column, counts=ENDED, optional=True) for column in VALUES),
         ),
-        [row for group in study.groups for row in _rows(study, group)],
+        [row for group in (*study.groups, *study.asked) for row in _rows(study, group)],
         (
             "the first action is the net acceleration of the first step under control, drag "
             "included; own velocity is relative to the other vehicle's",
             *_human_notes(study),
             *sample_notes(study, study.models, pooled=False, whole=False),
+            *_asked_notes(study),
             *_left_out_notes(study),
         ),
     )
@@ -91,7 +92,7 @@ def first_action(study: Study) -> Table:
 def first_action_faults(study: Study) -> Table:
     """A row per driver and fault that its first actions may have, tested beside the humans."""
     known = humans(study)
-    drivers = [seat for group in study.models for seat in seats(group)]
+    drivers = [seat for group in (*study.models, *study.asked) for seat in seats(group)]
     return Table(
         "first-action-faults",
         "Faults of the first action, beside the humans",
@@ -114,6 +115,7 @@ def first_action_faults(study: Study) -> Table:
             "driver that is late the others are not called shown",
             *_human_notes(study),
             *sample_notes(study, study.models, pooled=False, whole=False),
+            *_asked_notes(study),
             *_left_out_notes(study),
         ),
     )
@@ -148,9 +150,20 @@ def _human_notes(study: Study) -> list[str]:
     ]
 
 
+def _asked_notes(study: Study) -> Iterator[str]:
+    """Which of the drivers were only asked."""
+    for group in study.asked:
+        yield (
+            f"{group.id}: asked without the loop (`merge-runner seat first`), in "
+            f"{len(group.ended)} trials that end before a second decision"
+        )
+        if group.repeated:
+            yield f"{group.id}: {repeated_note(group)}"
+
+
 def _left_out_notes(study: Study) -> Iterator[str]:
     """Which of the trials have no first action, and which repeat one."""
-    for group in study.models:
+    for group in (*study.models, *study.asked):
         scenario = study.specs.get(group.spec_hash or "", {}).get("scenario", {})
         if scenario.get("control_start") == "own_exit":
             yield (

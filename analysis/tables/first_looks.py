@@ -10,10 +10,12 @@ from analysis.data.first_looks import POINT, FirstLooks, first_looks
 from analysis.data.reference_data import citation
 from analysis.data.study import HUMAN, Study
 from analysis.stats.exchange import Exchange, of_humans, weighed
+from analysis.stats.first_look import published_humans
 from analysis.stats.intervals import Estimate, mean, proportion
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value
 from merge_runner.text_safety import quoted
 
+ACTIONS = "human_first_actions"
 NOTES = (
     "at: the driver's own projected headway in m and own relative velocity in m/s, own minus "
     "other; both sides are pooled",
@@ -21,7 +23,8 @@ NOTES = (
     "(log-odds), and of the first action by least squares (m/s^2), errors clustered by trial. "
     "Exchange rate: minus the slope on velocity by that on headway, with Fieller's interval: so "
     "much headway makes up for 1 m/s more",
-    f"human: by who merged first, left minus right: {citation('human_outcomes')}",
+    f"human: exchange rate by who merged first, left minus right: {citation('human_outcomes')}. "
+    f"Slope of the first action by velocity alone, not at equal headway: {citation(ACTIONS)}",
 )
 HEADWAY, VELOCITY, RATE = "per m of headway", "per m/s of velocity", "exchange rate (m per m/s)"
 
@@ -29,7 +32,7 @@ HEADWAY, VELOCITY, RATE = "per m of headway", "per m/s of velocity", "exchange r
 def first_look_surface(study: Study) -> Table:
     """A row per driver, prompt and point, and for each the slopes and the exchange rate."""
     found = first_looks(study)
-    human = [_human()] if study.human in study.groups else []
+    human = [_human_slope(), _human()] if study.human in study.groups else []
     return Table(
         "first-look-surface",
         "First situations asked without the loop, by headway and relative velocity",
@@ -143,6 +146,16 @@ def _query(looks: FirstLooks, where: str) -> str:
         f"({specs}) AND variant = {quoted(looks.setting)} AND "
         f"if(side = 'left', model_left, model_right) = {quoted(looks.model)}{where} ORDER BY ALL"
     )
+
+
+def _human_slope() -> Row:
+    """The published slope of the first action, on the own relative velocity alone."""
+    known = published_humans()
+    low, high = known.slope.bounds() or (None, None)
+    slope = Estimate(known.slope.value, low, high, sum(known.n.values()))
+    values: dict[str, Value] = {"driver": HUMAN, "setting": "", "at": VELOCITY, "asked": slope.n}
+    values |= _cells("action", slope, sampled=True)
+    return Row(f"{HUMAN}/{VELOCITY}", (HUMAN,), values, published=tuple(values), cited=ACTIONS)
 
 
 def _human() -> Row:

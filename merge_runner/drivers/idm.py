@@ -30,6 +30,8 @@ SETS = {
         "exponent": 4.0,
     },
 }
+# Of all parameters: within these no power of a speed's share or of a gap's is out of range.
+LEAST, MOST, MOST_EXPONENT = 0.001, 1000, 40
 SHORTEST_GAP_M = 0.1  # a virtual leader may be beside its follower
 SLOWEST_MPS = 0.1
 TIE_S = 1e-6
@@ -86,8 +88,9 @@ class IdmDriver:
 
 def _check(parameters: Mapping[str, Parameter]) -> None:
     for name, value in parameters.items():
-        if not isinstance(value, str) and value <= 0:
-            raise UsageError(f"{name} of idm must be above 0")
+        most = MOST_EXPONENT if name == "exponent" else MOST
+        if not isinstance(value, str) and not LEAST <= value <= most:
+            raise UsageError(f"{name} of idm must be from {LEAST} to {most}")
 
 
 PROGRAMS.register(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from math import inf, isfinite
 from pkgutil import iter_modules
-from typing import Protocol
+from typing import Any, Protocol
 
 from merge_runner import drivers
 from merge_runner.config import ScenarioConfig
@@ -195,11 +195,22 @@ def _like(values: Mapping[str, Parameter], program: str, name: str, value: objec
 PROGRAMS = Registry[Program]("driver")
 
 
-def stand_in(names: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:
-    """What is said of trials of these models in which a stand-in answered on these sides."""
-    models = {side: name for side, name in names.items() if name not in {EMULATOR, *PROGRAMS}}
-    posing = "+".join(dict.fromkeys(name for side, name in models.items() if side in sides))
-    real = [side for side in models if side not in sides]
+def language_models(names: Mapping[Side, str], spec: Mapping[str, Any]) -> dict[Side, str]:
+    """Of the drivers' names those of language models, as the spec of their trials tells them.
+
+    It knows the programs of a study, too, which may not be registered here.
+    """
+    return {side: name for side, name in names.items() if "program" not in (spec.get(side) or {})}
+
+
+def stand_in(models: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:
+    """What is said of trials of these language models in which a stand-in answered on these sides.
+
+    A side that a program drives has no model.
+    """
+    named = {side: name for side, name in models.items() if name != EMULATOR}
+    posing = "+".join(dict.fromkeys(name for side, name in named.items() if side in sides))
+    real = [side for side in named if side not in sides]
     where = f" on the {'left' if real == ['right'] else 'right'}" if real else ""
     return f"scripted stand-in{where}, {f'not {posing}' if posing else 'no language model'}"
 

@@ -93,7 +93,7 @@ def openai_batch(batch: Batch, now_s: float) -> dict[str, Any]:
         "object": "list",
         "data": [
             {
-                "code": batch.details.get("code", "token_limit_exceeded"),
+                "code": "token_limit_exceeded",
                 "message": batch.refused,
                 "param": None,
                 "line": None,

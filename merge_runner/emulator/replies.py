@@ -102,8 +102,9 @@ class Replies:
         which = f"{asked.path} {asked.where} {attempt}".encode()
         reply_id = hashlib.sha256(asked.raw + which).hexdigest()[:24]
         said = Said(reply_id, question.model, question.prompt, text, fault == "refused")
-        told = {"body_sha256": asked.body_sha256, "slot": slot and slot.as_dict()}
-        self._answered[asked.body_sha256, asked.slot, asked.custom_id] += 1
+        body_sha256 = asked.body_sha256
+        told = {"body_sha256": body_sha256, "slot": slot and slot.as_dict()}
+        self._answered[body_sha256, asked.slot, asked.custom_id] += 1
         return marked({**asked.wire.answer(said), ANSWERED_FIELD: told})
 
     def count(self) -> list[dict[str, Any]]:

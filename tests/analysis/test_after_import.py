@@ -50,6 +50,7 @@ def imported(tmp_path_factory):
     return Study(db)
 
 
+@pytest.mark.slow
 def test_human_rows_come_from_the_traces(imported):
     tables = {table.name: table for table in make_tables(imported)}
     human = imported.human

@@ -28,6 +28,7 @@ def value(table, row_id, column):
     return row.values[column]
 
 
+@pytest.mark.slow
 def test_the_summary_of_a_sweep_counts_by_model_and_by_each_factor(played):
     blocks = [block.splitlines() for block in played.out.split("\n\n")]
     by_factor = {block[0].split()[0]: [row.split()[:2] for row in block[1:]] for block in blocks}
@@ -69,6 +70,7 @@ def test_two_mean_speeds_of_one_condition_are_never_pooled(played, tmp_path):
         assert (group.trials.groupby("condition")["spec_hash"].nunique() == 1).all(), group.id
 
 
+@pytest.mark.slow
 def test_where_keeps_the_trials_of_these_levels_and_names_the_valid_ones(played):
     kept = Study(played.db, where={"temperature": ["0.2"], "model": ["cheap"]})
     assert [group.driver for group in kept.models] == ["cheap [temperature=0.2]", CHEAP_COLD]
@@ -81,6 +83,7 @@ def test_where_keeps_the_trials_of_these_levels_and_names_the_valid_ones(played)
         Study(played.db, where={"model": ["dear"], "opponent": ["sleepy"]})
 
 
+@pytest.mark.slow
 def test_tables_that_are_kept_are_those_of_their_levels(played):
     for level, other in (("0.2", "1.0"), ("1.0", "0.2")) * 2:
         asked = ("tables", "ablation-quantitative", "--where", f"temperature={level}")
@@ -137,6 +140,7 @@ def test_means_are_compared_within_the_cells_that_both_levels_have(study):
     assert abs(pooled[1] - pooled[0]) > 0.1
 
 
+@pytest.mark.slow
 def test_a_difference_leads_to_the_trials_of_both_levels(study):
     (table,) = make_tables(study, ["factors"])
     found = explain(study, table, "opponent=sleepy/collided_percent:difference")
@@ -160,6 +164,7 @@ def test_stand_ins_are_never_pooled_with_models(played, tmp_path):
         assert level.id.endswith(" [scripted]") == level.pooled.scripted
 
 
+@pytest.mark.slow
 def test_a_metric_of_the_studys_plug_in_is_shown_only_where_the_study_is_named(played):
     plain = played.run("tables", "factors")
     assert "duration" not in plain.out
@@ -172,6 +177,7 @@ def test_a_metric_of_the_studys_plug_in_is_shown_only_where_the_study_is_named(p
     assert "whole time (s)" in again.out, "what was kept before the edit is not shown"
 
 
+@pytest.mark.slow
 def test_an_audit_derives_a_studys_prompts_and_conditions_without_its_file_but_runs_no_plug_in(
     played,
 ):

@@ -135,6 +135,7 @@ def test_a_mean_of_published_outcomes_is_compared_with_these_after_a_part_of_an_
     assert found.value != contrast_means(o3.trials, human.trials, left.column).value
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 def test_a_sentence_on_published_outcomes_does_not_call_them_imported(added, partly):
     added(name="left_first_mean", shown=frozenset({"conclusions"}), **LEFT_AS_MEAN)

@@ -68,6 +68,7 @@ def test_every_kind_is_looked_at():
     assert list(SAID) == list(KINDS)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_report_of_an_odd_database_says_what_is_true_of_it(kind, tmp_path):

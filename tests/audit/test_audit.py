@@ -130,6 +130,7 @@ def test_whole_sweeps_pass_and_what_was_checked_is_counted(made):
     assert found.notes == ""
 
 
+@pytest.mark.slow
 def test_identical_requests_of_two_variants_are_listed_and_no_finding(made):
     sharings = audit("--db", made / "results/merge.duckdb").audits[-1]["sharings"]
     names = {(s["what"], s["first"], s["second"]) for s in sharings}
@@ -137,6 +138,7 @@ def test_identical_requests_of_two_variants_are_listed_and_no_finding(made):
     assert all(sharing["count"] > 0 for sharing in sharings)
 
 
+@pytest.mark.slow
 async def test_the_command_says_what_it_checked_and_fails_with_the_findings(merge_runner, made, db):
     whole = await merge_runner("audit", "--db", made / "results/merge.duckdb")
     assert whole.code == 0
@@ -212,6 +214,7 @@ TRIALS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_each_damage_of_a_trial_is_found_there_and_nothing_else(db):
     with duckdb.connect(str(db)) as connection:
         trials = connection.execute(
@@ -274,6 +277,7 @@ WIDER = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", WIDER)
 def test_each_wider_damage_is_found_and_nothing_else(db, what):
     statements, expected = WIDER[what]
@@ -418,6 +422,7 @@ INVALID = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damages", "slots"),
     [(VALID, "trial_id LIKE 'emulator/A1/%'"), (INVALID, "failure = 'no_array' AND decision > 0")],
@@ -472,6 +477,7 @@ def statuses(db: Path) -> dict[str, str]:
         return dict(connection.execute("SELECT trial_id, status FROM trials").fetchall())
 
 
+@pytest.mark.slow
 def test_a_view_with_another_vehicle_length_than_the_spec_is_found(long_vehicles, tmp_path):
     db = shutil.copy(long_vehicles, tmp_path / "copy.duckdb")
     assert audit("--db", db).code == 0
@@ -487,6 +493,7 @@ def test_a_view_with_another_vehicle_length_than_the_spec_is_found(long_vehicles
         assert float(stated) - float(computed) == pytest.approx(3.5, abs=0.002)
 
 
+@pytest.mark.slow
 def test_a_status_that_the_states_contradict_is_found(long_vehicles, tmp_path):
     db = shutil.copy(long_vehicles, tmp_path / "copy.duckdb")
     ended = statuses(db)
@@ -514,6 +521,7 @@ def test_a_status_that_the_states_contradict_is_found(long_vehicles, tmp_path):
     } <= told
 
 
+@pytest.mark.slow
 def test_a_finding_names_sweep_trial_side_and_decision(db):
     damage(db, f"UPDATE decisions SET prompt_hash = 'x' WHERE {SLOT}")
     (finding,) = audit("--db", db).findings
@@ -521,6 +529,7 @@ def test_a_finding_names_sweep_trial_side_and_decision(db):
     assert (finding["trial"], finding["side"], finding["decision"]) == (MIXED, "left", 2)
 
 
+@pytest.mark.slow
 def test_one_sweep_can_be_audited_alone(db):
     damage(db, f"UPDATE decisions SET prompt_hash = 'x' WHERE {SLOT}")
     for trial, kinds in ((PAIR, set()), (MIXED, {"prompt"})):
@@ -533,6 +542,7 @@ def test_one_sweep_can_be_audited_alone(db):
         assert [told["subject"] for told in found.audits] == [sweep]
 
 
+@pytest.mark.slow
 def test_what_an_unfinished_sweep_lacks_is_a_note(db):
     damage(
         db,
@@ -548,6 +558,7 @@ def test_what_an_unfinished_sweep_lacks_is_a_note(db):
     assert (finding.kind, finding.trial) == ("missing", PAIR)
 
 
+@pytest.mark.slow
 def test_what_another_sweep_has_played_since_is_not_missing(db):
     with duckdb.connect(str(db)) as connection:
         connection.execute(
@@ -569,6 +580,7 @@ def test_what_another_sweep_has_played_since_is_not_missing(db):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_one_id_of_all_replies_of_earlier_emulators_tells_nothing(db):
     damage(
         db,
@@ -593,6 +605,7 @@ def caching(kept: dict[str, dict], **changes: object):
     return middle
 
 
+@pytest.mark.slow
 async def test_a_proxy_that_caches_is_found_in_repetitions_and_in_a_fresh_set_of_samples(
     merge_runner, tmp_path
 ):
@@ -622,6 +635,7 @@ IDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", IDS)
 async def test_ids_that_a_server_gives_to_different_answers_are_a_note(
     merge_runner, tmp_path, what
@@ -648,6 +662,7 @@ async def test_ids_that_a_server_gives_to_different_answers_are_a_note(
         assert ("gave to different answers" in found.notes) == repeats
 
 
+@pytest.mark.slow
 def test_one_id_of_two_answers_does_not_hide_one_answer_of_two_samples(db):
     slots = [f"{OF_PAIR} AND side = 'left' AND decision = {n}" for n in range(4)]
     (one, other) = (f"(SELECT reply FROM calls WHERE {slot})" for slot in slots[:2])
@@ -664,6 +679,7 @@ def test_one_id_of_two_answers_does_not_hide_one_answer_of_two_samples(db):
     assert "2 replies of scripted-driver at " in found.notes
 
 
+@pytest.mark.slow
 async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tmp_path):
     numbers = count()
     new_ids = caching({}, id=lambda: f"new-{next(numbers)}")
@@ -676,6 +692,7 @@ async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tm
     assert "word for word as before: are they samples?" in found.notes
 
 
+@pytest.mark.slow
 async def test_another_models_answers_end_an_audit_with_1_and_no_sweep(merge_runner):
     async def other(request, handler):
         return web.json_response(json.loads((await handler(request)).body) | {"model": "gpt-0"})
@@ -859,6 +876,7 @@ def test_a_cache_that_holds_every_reply_passes(db, cache):
     assert found.audits[-1]["counts"]["calls"] > 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -883,6 +901,7 @@ def test_a_table_that_is_not_ours_is_an_error_and_no_traceback(db):
         audit_database(db)
 
 
+@pytest.mark.slow
 def test_another_reply_in_the_cache_than_in_the_database_is_found(db, cache):
     damage(db, f"UPDATE calls SET reply = replace(reply::VARCHAR, 'stop', 'halt') WHERE {SLOT}")
     (finding,) = audit("--db", db, "--cache", cache).findings

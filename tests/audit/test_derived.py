@@ -123,6 +123,7 @@ def test_a_format_that_there_is_not_is_a_finding_and_switches_nothing_off_in_sil
     assert "has the format 'zz', which there is not" in finding.text
 
 
+@pytest.mark.slow
 def test_what_is_not_derived_is_listed_in_the_docs_and_by_the_command(made, prepare):
     page = (PROJECT / "docs/reference/audit.md").read_text()
     known = {f"{table}.{column}" for table, column, _ in COLUMNS}
@@ -209,6 +210,7 @@ POINTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", POINTED)
 async def test_each_format_is_read_anew_as_it_was_read(merge_runner, tmp_path, model):
     variable, path = POINTED[model]
@@ -228,6 +230,7 @@ async def test_each_format_is_read_anew_as_it_was_read(merge_runner, tmp_path, m
     assert any("trials.scripted" in finding.text for finding in findings(db))
 
 
+@pytest.mark.slow
 async def test_answers_that_were_exchanged_before_they_were_kept_are_found(
     merge_runner, tmp_path, made
 ):

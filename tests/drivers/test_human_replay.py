@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import duckdb
 import pytest
+from starlette.testclient import TestClient
 
-from analysis.explorer.details import read_trial
+from analysis.explorer.app import explorer
+from analysis.explorer.site import Site
 from analysis.human.load import import_trials, sort_files
 from merge_runner.audit.sweeps import audit_database
 from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials
@@ -188,9 +190,13 @@ async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
     assert not [note for note in first.notes if "derived" in note]
     tables = await merge_runner("tables", "ablation-quantitative", "--format", "csv")
     assert "(the human on the left is replayed and does not react)" in tables.out
-    ((spec_hash,),) = query(db, "SELECT spec_hash FROM trials WHERE source = 'driver'")[1]
-    shown = read_trial(db, "human-replay+idm/baseline/L_4_0/rep01", spec_hash)
-    assert shown.caution == "the human on the left is replayed and does not react"
+    explored = TestClient(explorer(Site(db), {"127.0.0.1:1"}), base_url="http://127.0.0.1:1")
+    said = "the human on the left is replayed and does not react"
+    assert explored.get("/trials").text.count(said) == 1, "of five trials one"
+    assert f",{said}," in explored.get("/trials.csv").text
+    page = explored.get("/trials/human-replay+idm/baseline/L_4_0/rep01").text
+    assert f"Note: {said}." in page
+    assert "baseline: no prompt, since only programs drive." in page
     with duckdb.connect(str(db)) as connection:
         connection.execute("DELETE FROM trials WHERE source = 'human'")
     (first, *_) = audit_database(db)

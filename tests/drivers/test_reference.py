@@ -7,6 +7,8 @@ from dataclasses import replace
 from math import exp, sqrt
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from analysis.data.reference_data import HUMAN_GAP_SD_M, published
 from merge_runner.config import ScenarioConfig
@@ -120,6 +122,23 @@ async def test_idm_brakes_by_its_published_equation():
     assert await accelerates(driver, ahead) == pytest.approx(expected)
 
 
+IDM_NUMBERS = {
+    name: st.floats(0.001, 40 if name == "exponent" else 1000)
+    for name in PROGRAMS["idm"].values
+    if name != "set"
+}
+
+
+@given(st.fixed_dictionaries(IDM_NUMBERS), *[st.floats(0, 100)] * 3, st.floats(-100, 100))
+async def test_an_idm_finds_an_acceleration_whatever_its_parameters(
+    numbers, first_mps, own_mps, other_mps, ahead_m
+):
+    driver = changed("idm", **numbers).make(FINE, spec_of("N_0_0"), "left")
+    await driver.decide(seen(own_mps=first_mps), 0)
+    now = seen(own_mps, other_mps, distance_m=-1.0, other_ahead_m=ahead_m)
+    assert abs(await accelerates(driver, now, 1)) <= FINE.max_acceleration_mps2
+
+
 async def test_of_two_idm_on_a_tie_exactly_one_yields_and_not_always_the_same():
     first = Counter()
     for repetition in range(1, 21):
@@ -215,7 +234,8 @@ async def test_a_clock_changes_no_more_than_when_a_program_decides(name):
 @pytest.mark.parametrize(
     ("name", "parameters", "said"),
     [
-        ("idm", {"headway_s": 0}, "headway_s of idm must be above 0"),
+        ("idm", {"headway_s": 0}, "headway_s of idm must be from 0.001 to 1000"),
+        ("idm", {"exponent": 1e5}, "exponent of idm must be from 0.001 to 40"),
         ("idm", {"set": "mobil"}, "valid: highway-env, treiber-kesting"),
         ("human-odds", {"gap_sd_m": -1}, "gap_sd_m of human-odds cannot be below 0"),
         ("quantal", {"precision": -1}, "precision of quantal cannot be below 0"),

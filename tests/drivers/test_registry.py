@@ -1,5 +1,7 @@
 """The two drivers that need no model, from the first to the last step of every condition."""
 
+import subprocess
+import sys
 from functools import partial
 
 import pytest
@@ -108,3 +110,23 @@ class Undecided:
 def test_what_can_be_no_driver_is_refused(made, said):
     with pytest.raises(UsageError, match=said):
         made()
+
+
+@pytest.mark.parametrize("first", ["registry", "idm", "cei.batch", "base"])
+def test_programs_are_listed_in_one_order_whichever_is_imported_first(first):
+    listed = (
+        f"import merge_runner.drivers.{first}\n"
+        "from merge_runner.drivers.registry import PROGRAMS\n"
+        "print(*PROGRAMS)"
+    )
+    command = [sys.executable, "-c", listed]
+    found = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == [
+        "cei",
+        "constant",
+        "human-odds",
+        "human-replay",
+        "idm",
+        "projected-order",
+        "quantal",
+    ]

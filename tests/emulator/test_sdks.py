@@ -70,6 +70,7 @@ async def ask_gemini(url, prompt, api_version="v1beta"):
         return await client.models.generate_content(model=MODEL, contents=prompt)
 
 
+@pytest.mark.slow
 async def test_openai_reads_a_chat_completion(emulator, driving_prompt):
     reply = await ask_openai_chat(await emulator(), driving_prompt)
     (choice,) = reply.choices
@@ -92,6 +93,7 @@ async def test_openai_reads_a_response(emulator, driving_prompt):
     assert 0 < reasoning < reply.usage.output_tokens
 
 
+@pytest.mark.slow
 async def test_anthropic_reads_a_message(emulator, driving_prompt):
     reply = await ask_anthropic(await emulator(), driving_prompt)
     (block,) = reply.content

@@ -18,6 +18,13 @@ HERE = ("http://127.0.0.1:", "file:", "data:", "blob:")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
+def pytest_collection_modifyitems(items):
+    """Tests in a browser are slow: each waits for its pages, and every module starts one."""
+    for item in items:
+        if "browser" in item.fixturenames:
+            item.add_marker(pytest.mark.slow)
+
+
 def pytest_runtest_setup(item):
     """Without a browser the tests of pages are skipped, but not where they are required."""
     if "page" in item.fixturenames and CHROMIUM is None:
@@ -55,8 +62,9 @@ def site(study):
 @pytest.fixture(scope="module")
 def browser():
     """Chromium without a window; while it is there an event loop runs, and no other test's can."""
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import expect, sync_playwright
 
+    expect.set_options(timeout=60_000)  # ms: a busy machine is slow, not wrong
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield chromium

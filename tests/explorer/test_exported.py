@@ -97,6 +97,7 @@ def test_a_page_of_its_own_leads_nowhere_else_and_is_accessible(page, study, tmp
     expect(page.locator("#track")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_an_earlier_export_in_the_folder_goes_and_nothing_else(study, tmp_path):
     (tmp_path / "mine.html").write_text("<title>mine</title>")
     list(export_folder(study, tmp_path, ["emulator/baseline/*"]))
@@ -108,6 +109,7 @@ def test_an_earlier_export_in_the_folder_goes_and_nothing_else(study, tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_packed_trials_are_not_taken_for_paths(study, tmp_path, monkeypatch):
     file = tmp_path / "one.html"
     list(export_page(study, file, ["emulator/baseline/N_0_0/*"]))

@@ -41,6 +41,7 @@ def test_a_trials_page_names_its_levels(client):
     assert "opponent=sleepy, temperature=0.2." in page
 
 
+@pytest.mark.slow
 def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, tmp_path):
     page = client.get("/").text
     assert "mine: cheap, dear drives" in page
@@ -82,6 +83,7 @@ print(said["tables"][0])
 """
 
 
+@pytest.mark.slow
 def test_what_the_pages_compute_knows_the_study_that_the_explorer_was_given(played):
     told = subprocess.run(
         [sys.executable, "-c", ASK, played.db, played.folder / "mine.toml"],

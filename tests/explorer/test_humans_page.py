@@ -75,6 +75,7 @@ def notes_of(db):
     return sample_notes(study, study.baselines)
 
 
+@pytest.mark.slow
 def test_the_page_has_the_notes_of_its_rows_and_is_made_anew_after_an_import(ask, db, tmp_path):
     before = ask()
     assert "The recordings of the humans are not imported" in before
@@ -89,6 +90,7 @@ def test_the_page_has_the_notes_of_its_rows_and_is_made_anew_after_an_import(ask
     assert all(note in after for note in notes)
 
 
+@pytest.mark.slow
 def test_the_page_says_what_counts_as_a_collision_for_whom(ask):
     text = ask()
     assert (
@@ -109,6 +111,7 @@ def test_a_driver_looks_as_in_the_figures_and_no_other_driver_does():
     assert len({marker(shape, 7, 7) for shape in shapes}) == len(shapes)
 
 
+@pytest.mark.slow
 def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
     content = Numbers(db).answer(["humans"])
     gap, rmse = (

@@ -121,6 +121,7 @@ def test_a_name_that_hides_something_is_neutral(client, address):
     assert not {"\u202e", "\u200b"} & set(said)
 
 
+@pytest.mark.slow
 def test_a_name_that_hides_something_is_neutral_in_an_export(db, tmp_path):
     list(export_folder(db, tmp_path / "pages", ["*"]))
     for page in tmp_path.glob("pages/*.html"):

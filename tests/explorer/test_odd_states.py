@@ -91,6 +91,7 @@ def test_a_trial_that_failed_again_shows_its_new_error(db):
     assert site.catalogue.state() != state
 
 
+@pytest.mark.slow
 def test_while_another_program_holds_the_database_the_last_list_is_shown(db):
     site = Site(db)
     assert "holds the database" not in ask(site, "/trials").text

@@ -41,6 +41,7 @@ async def begun(db):
             await asyncio.sleep(0.1)
 
 
+@pytest.mark.slow
 async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_tidies_up(
     merge_runner, tmp_path, emulator_url
 ):

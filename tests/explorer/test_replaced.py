@@ -62,6 +62,7 @@ def client(db):
     return TestClient(application, base_url=f"http://{HOST}", raise_server_exceptions=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["garbage", "empty", "half", "zeros", "foreign"])
 @pytest.mark.parametrize("back_in_place", [True, False])
 @pytest.mark.parametrize("in_place", [True, False])
@@ -78,6 +79,7 @@ def test_the_good_one_is_shown_again_after_a_plain_message(
     assert [client.get(page).status_code for page in PAGES] == [200] * 4
 
 
+@pytest.mark.slow
 def test_nobody_who_asks_meanwhile_gets_an_error_page(client, db, good, bad):
     codes, done = [], threading.Event()
 

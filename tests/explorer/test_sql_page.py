@@ -202,6 +202,7 @@ def test_the_page_holds_no_style_and_no_script_of_its_own(client, asked):
     assert "style-src 'self'" in client.get("/sql").headers["content-security-policy"]
 
 
+@pytest.mark.slow
 def test_a_download_is_a_file_or_says_why_not(client):
     reply = client.get("/sql.csv", params={"q": "select 1 as x, 'a' as y"})
     assert (reply.status_code, reply.text) == (200, "x,y\n1,a\n")

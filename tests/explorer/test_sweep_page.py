@@ -271,6 +271,7 @@ def test_a_sweep_that_slept_goes_on_on_the_same_page(study):
     assert "<span>Running: 2 of 33" in client.get(news_of(shown)).text
 
 
+@pytest.mark.slow
 def test_a_sweep_is_not_said_to_be_lost_while_its_end_cannot_be_read(study):
     file = running(study)
     client = browser(study)

@@ -115,6 +115,7 @@ def listed(text):
     return int(re.search(r"<strong>(\d+)</strong> trials", text)[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "every"), [("ablation-quantitative", 3), ("contrasts", 9)])
 def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, every):
     study = Study(db)
@@ -189,6 +190,7 @@ def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_
     computing.close()
 
 
+@pytest.mark.slow
 def test_the_trials_of_a_rate_that_are_in_no_pair_are_counted(tmp_path):
     """A baseline of two repetitions, the second with collisions, and a variant of one."""
     baseline = [
@@ -354,6 +356,7 @@ def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
     computing.close()
 
 
+@pytest.mark.slow
 def test_a_process_of_its_own_answers_alike_and_another_one_takes_its_place(db):
     computing = Computing(db)
     request = ("tables", "attempts")

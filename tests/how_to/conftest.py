@@ -2,39 +2,27 @@
 
 from __future__ import annotations
 
-import subprocess
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from tests.harness import PROGRAM, Run, environment
+from tests.harness import Run
 
 
 @dataclass
 class Study:
-    """A folder with some trials; ``run`` takes the variables that a command gets beside the usual.
-
-    Each command is a process of its own, with its own imports.
-    """
+    """A folder with some trials; ``run`` takes variables that a command gets beside the usual."""
 
     folder: Path
-    emulator_url: str
+    prepare: Callable[..., Run]
 
     def run(self, *arguments: object, **changes: str) -> Run:
-        done = subprocess.run(
-            [PROGRAM, *map(str, arguments)],
-            cwd=self.folder,
-            env=environment(**{"EMULATOR_BASE_URL": self.emulator_url, **changes}),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        return Run(done.returncode, done.stdout, done.stderr)
+        return self.prepare(self.folder, *arguments, **changes)
 
 
 @pytest.fixture(scope="module")
-def study(emulator_url, tmp_path_factory):
+def study(prepare, tmp_path_factory):
     """One for all tests of a page."""
-    return Study(tmp_path_factory.mktemp("study"), emulator_url)
+    return Study(tmp_path_factory.mktemp("study"), prepare)

@@ -38,6 +38,7 @@ def played(study, installed):
     return installed
 
 
+@pytest.mark.slow
 def test_a_driver_decides_at_its_own_rate_and_is_drawn_from_its_seed(study, played):
     with duckdb.connect(str(study.folder / "results/merge.duckdb"), read_only=True) as connection:
         rows = connection.execute(
@@ -66,6 +67,7 @@ def test_a_driver_decides_at_its_own_rate_and_is_drawn_from_its_seed(study, play
     assert digests.pop().strip()
 
 
+@pytest.mark.slow
 def test_it_is_in_every_command_that_reads(study, played):
     audit = study.run("audit", "--json", **played)
     assert (audit.code, "not derived" in audit.out) == (0, False), audit.out
@@ -77,6 +79,7 @@ def test_it_is_in_every_command_that_reads(study, played):
     assert "hesitant+impulsive" in (study.folder / "trials.html").read_text()
 
 
+@pytest.mark.slow
 def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
     audit = study.run("audit", "--json")
     assert audit.code == 0

@@ -85,6 +85,7 @@ def test_the_report_shows_and_tells_it(report):
     assert (files / "distributions.pdf").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_the_exported_pages_show_it(study, installed):
     run = study.run("view", "--export", "pages", **installed)
     assert run.code == 0, run.err
@@ -95,6 +96,7 @@ def test_the_exported_pages_show_it(study, installed):
     assert all(HEADING in pages[f"table-{name}.html"] for name in ("indicators", "contrasts"))
 
 
+@pytest.mark.slow
 def test_kept_tables_are_of_the_package_that_is_installed(study, installed):
     """The package comes, changes and goes between two looks at a table of the same results."""
     table = ("tables", "ablation-quantitative")

@@ -33,12 +33,13 @@ WHERE before_m < 120 AND position_m >= 120 GROUP BY ALL ORDER BY ALL
 MEASURED = "SELECT trial_id, time_to_merge_s FROM trial_metrics ORDER BY ALL"
 
 
+@pytest.mark.slow
 async def test_a_scenario_from_outside_goes_through_every_command(merge_runner, tmp_path):
     env = plugin(tmp_path / "installed", how_to("add-a-scenario"))
     (tmp_path / "long.toml").write_text(FILE)
 
     async def installed(*arguments):
-        process = await merge_runner.start(*arguments, **env)
+        process = await merge_runner.fork(*arguments, **env)
         out, err = await process.communicate()
         assert process.returncode == 0, err.decode()
         return out.decode()
@@ -80,11 +81,12 @@ SCENARIOS.register("mine", replace(SCENARIOS["merge"], make_world=Mine))
 """
 
 
+@pytest.mark.slow
 async def test_trials_of_a_world_whose_source_is_edited_are_other_trials(merge_runner, tmp_path):
     (tmp_path / "mine.toml").write_text(FILE.replace("long-merge", "mine"))
 
     async def installed(folder, source, *arguments):
-        process = await merge_runner.start(*arguments, **plugin(tmp_path / folder, source))
+        process = await merge_runner.fork(*arguments, **plugin(tmp_path / folder, source))
         return (await process.communicate())[0].decode()
 
     played = ("sweep", "mine.toml", "--model", "constant", "--json")

@@ -499,6 +499,7 @@ def model_folder(tmp_path_factory):
 FULL = [entry(number, cost_usd=1.0, reply=said("\u00e4" * 9)) for number in (1, 2)]
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(st.data())
 def test_any_one_changed_byte_of_any_row_never_blocks_the_rest(model_folder, data):
@@ -547,6 +548,7 @@ def change_a_byte(folder, data):
     return name
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=100)
 @given(st.data())
 def test_any_one_changed_byte_of_the_file_is_harmless_or_an_error_of_ours(model_folder, data):

@@ -461,6 +461,7 @@ async def test_a_client_gets_its_answers_from_the_emulator(emulator, tmp_path, w
         assert last.usage.output_tokens == last.usage.reasoning_tokens + visible
 
 
+@pytest.mark.slow
 async def test_transient_faults_do_not_change_any_answer(emulator, tmp_path):
     plan = next(filter(is_quick, (transient_faults(0.5, seed) for seed in itertools.count())))
     url = await emulator(plan)

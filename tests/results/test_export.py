@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 
 import duckdb
+import pytest
 
 from merge_runner.results.data_dictionary import tables
 from merge_runner.results.recording import COLUMNS, MEANINGS
@@ -16,6 +17,7 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 async def test_every_table_and_view_is_written_as_parquet_and_csv(merge_runner, tmp_path):
     part = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
     assert (await merge_runner(*part)).code == 0
@@ -40,6 +42,7 @@ async def test_every_table_and_view_is_written_as_parquet_and_csv(merge_runner, 
     assert gap["meaning"].startswith("net gap, ")
 
 
+@pytest.mark.slow
 async def test_a_folder_with_anything_else_is_left_as_it_is(merge_runner, tmp_path):
     part = ("sweep", "baseline", "--model", "constant", "--reps", 1, "--conditions", "N_0_0")
     assert (await merge_runner(*part)).code == 0

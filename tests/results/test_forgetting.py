@@ -32,6 +32,7 @@ async def audited(merge_runner):
     return json.loads(run.out)
 
 
+@pytest.mark.slow
 async def test_a_forgotten_sweep_takes_only_the_trials_that_no_other_sweep_has(
     merge_runner, tmp_path, two_sweeps
 ):
@@ -46,6 +47,7 @@ async def test_a_forgotten_sweep_takes_only_the_trials_that_no_other_sweep_has(
     assert (await audited(merge_runner))["ok"]
 
 
+@pytest.mark.slow
 async def test_a_forgotten_trial_leaves_every_sweep_and_is_played_again_without_a_call(
     merge_runner, tmp_path, two_sweeps
 ):

@@ -59,6 +59,7 @@ def models_asked(folder):
     return [name for (name,) in found]
 
 
+@pytest.mark.slow
 async def test_the_one_model_that_a_server_lists_is_asked_and_found_again_in_a_replay(
     merge_runner, tmp_path
 ):
@@ -82,6 +83,7 @@ async def test_the_one_model_that_a_server_lists_is_asked_and_found_again_in_a_r
         assert (await merge_runner("digest", "--db", db)).out == played.out
 
 
+@pytest.mark.slow
 async def test_of_several_models_one_must_be_chosen(merge_runner, tmp_path):
     async with watched(serving("qwen3-8b", "llama3.2:latest")) as server:
         at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
@@ -111,6 +113,7 @@ async def test_a_name_that_is_not_listed_is_refused(merge_runner, registry, swee
     assert not any(server.asked), "no prompt was sent"
 
 
+@pytest.mark.slow
 async def test_a_server_without_a_list_needs_a_name(merge_runner, registry):
     async with watched(serving(status=404)) as server:
         at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
@@ -133,6 +136,7 @@ async def test_where_nothing_listens_the_run_ends_within_seconds_with_what_to_st
     assert "or set LOCAL_BASE_URL" in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [(), ("--dask", "local:1")])
 async def test_no_trial_has_failed_where_nothing_was_ever_answered(
     merge_runner, registry, tmp_path, where

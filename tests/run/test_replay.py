@@ -70,6 +70,7 @@ async def test_the_committed_recording_replays_to_its_digest(merge_runner):
     assert (await merge_runner("digest")).out == GOLDEN["emulator"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["smollm2", "smollm2-free"])
 async def test_the_recordings_of_a_real_small_model_replay_to_what_their_page_says(
     merge_runner, model
@@ -86,6 +87,7 @@ async def test_the_recordings_of_a_real_small_model_replay_to_what_their_page_sa
     assert f"\n{model}: 135 million parameters, " in said.out
 
 
+@pytest.mark.slow
 async def test_the_first_screen_of_the_readme_shows_what_is_printed(merge_runner):
     shown = re.search(r"```text\n(.*?)```", (PROJECT / "README.md").read_text(), re.DOTALL)[1]
     printed = (await merge_runner("replay", "baseline")).out
@@ -95,6 +97,7 @@ async def test_the_first_screen_of_the_readme_shows_what_is_printed(merge_runner
         assert part in printed
 
 
+@pytest.mark.slow
 async def test_a_replay_asks_nothing_about_money(merge_runner, tmp_path):
     budget = "[budget]\nsplit = { o3 = 1 }\n"
     text = 'repetitions = 1\nconditions = ["N_0_0"]\n' + budget
@@ -104,6 +107,7 @@ async def test_a_replay_asks_nothing_about_money(merge_runner, tmp_path):
     assert (await merge_runner("replay", "mine.toml", "--recording", RECORDING)).code == 0
 
 
+@pytest.mark.slow
 async def test_without_replies_of_its_own_a_replay_takes_the_recording_that_ships(
     merge_runner, tmp_path
 ):
@@ -117,6 +121,7 @@ async def test_without_replies_of_its_own_a_replay_takes_the_recording_that_ship
     assert (await merge_runner("replay", "own.toml", "--reps", 1)).code == 4
 
 
+@pytest.mark.slow
 async def test_replies_of_ones_own_are_not_mixed_with_those_that_ship(merge_runner):
     part = ("baseline", "--reps", 1, "--conditions")
     assert (await merge_runner("sweep", *part, "N_0_0")).code == 0
@@ -125,6 +130,7 @@ async def test_replies_of_ones_own_are_not_mixed_with_those_that_ship(merge_runn
     assert (await merge_runner("replay", *part, "L_4_8", "--db", "other")).code == 4
 
 
+@pytest.mark.slow
 async def test_the_recording_is_what_the_emulator_answers_today(merge_runner, tmp_path):
     part = ("--reps", 1, "--json")
     live = await merge_runner("sweep", "baseline", *part)
@@ -155,6 +161,7 @@ def test_a_replay_imports_no_http_library():
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 async def test_missing_replies_are_counted_with_what_differs_and_the_rest_finishes(
     merge_runner, small
 ):
@@ -177,6 +184,7 @@ async def test_missing_replies_are_counted_with_what_differs_and_the_rest_finish
     assert "sample_set (recorded 0, wanted 2)" in other.err
 
 
+@pytest.mark.slow
 async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, small, tmp_path):
     for folder in ("analysis", "merge_runner", "experiments"):
         shutil.copytree(PROJECT / folder, tmp_path / "edited" / folder)
@@ -195,6 +203,7 @@ async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, s
     assert told.endswith("; 22 calls of 11 trials differ like this")
 
 
+@pytest.mark.slow
 async def test_a_replay_that_finds_nothing_stores_nothing_and_says_what_is_recorded(
     merge_runner, tmp_path
 ):
@@ -212,6 +221,7 @@ async def test_a_replay_that_finds_nothing_stores_nothing_and_says_what_is_recor
     assert "the cache holds no call at all" in cached.err
 
 
+@pytest.mark.slow
 async def test_a_replay_plays_what_a_smaller_recording_holds_and_says_so(merge_runner, tmp_path):
     part = ("--reps", 2, "--conditions", "N_0_0,R_-4_8")
     assert (await merge_runner("sweep", "baseline", *part)).code == 0
@@ -228,6 +238,7 @@ async def test_a_replay_plays_what_a_smaller_recording_holds_and_says_so(merge_r
     assert asked.summary["trials"]["planned"] == 33
 
 
+@pytest.mark.slow
 async def test_several_sweeps_go_into_one_file_and_several_files_into_one_replay(
     merge_runner, tmp_path
 ):
@@ -260,6 +271,7 @@ async def test_several_sweeps_go_into_one_file_and_several_files_into_one_replay
     assert f"holds no sweep nobody; valid: {', '.join(sweeps)}" in unknown.err
 
 
+@pytest.mark.slow
 async def test_recordings_that_contradict_each_other_are_not_replayed_together(
     merge_runner, tmp_path
 ):
@@ -281,6 +293,7 @@ async def test_recordings_that_contradict_each_other_are_not_replayed_together(
     assert f"other.parquet holds another reply to the call {good.request.key}" in run.err
 
 
+@pytest.mark.slow
 async def test_an_exported_sweep_goes_round_through_a_file(merge_runner, tmp_path):
     part = ("baseline", "--reps", 1, "--conditions", "N_0_0,R_-4_8")
     assert (await merge_runner("sweep", *part)).code == 0
@@ -321,6 +334,7 @@ def test_a_rewritten_recording_that_is_not_changed_is_whole(small, tmp_path, who
     assert len(conditions) == 2054 if whole else len(conditions) > 150
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -377,6 +391,7 @@ def test_a_recording_that_says_something_else_of_its_origin_is_refused(told, tmp
     assert list(cache.entries()) == []
 
 
+@pytest.mark.slow
 async def test_a_recording_of_the_first_format_is_taken_and_what_its_hash_lacks_is_said(
     merge_runner, told, tmp_path
 ):
@@ -396,6 +411,7 @@ async def test_a_recording_of_the_first_format_is_taken_and_what_its_hash_lacks_
     assert "has the format 'merge-runner recording 3'" in later.err
 
 
+@pytest.mark.slow
 async def test_a_recording_holds_no_secret(merge_runner, tmp_path):
     async with watched() as server:
         env = {"OPENAI_API_KEY": "sk-very-secret-1", "OPENAI_BASE_URL": f"{server.url}/v1"}
@@ -410,6 +426,7 @@ async def test_a_recording_holds_no_secret(merge_runner, tmp_path):
     assert "sk-very-secret" not in str(rows)
 
 
+@pytest.mark.slow
 async def test_a_named_recording_comes_before_what_the_cache_holds(merge_runner, tmp_path):
     part = ("baseline", "--reps", 1, "--conditions", "L_4_0", "--model", "o3", "--json")
     digests = []
@@ -427,6 +444,7 @@ async def test_a_named_recording_comes_before_what_the_cache_holds(merge_runner,
     assert results_digest(tmp_path / "r.duckdb") == digests[0]
 
 
+@pytest.mark.slow
 async def test_a_replay_into_stored_trials_names_each_column_that_differs(merge_runner, tmp_path):
     part = ("--reps", 1, "--conditions", "N_0_0,L_4_0")
     assert (await merge_runner(*REPLAY, *part)).code == 0
@@ -445,6 +463,7 @@ async def test_a_replay_into_stored_trials_names_each_column_that_differs(merge_
     assert "emulator/baseline/L_4_0/rep01 (decisions.rationale)" in line
 
 
+@pytest.mark.slow
 async def test_a_damaged_reply_fails_its_trial_alone(merge_runner, tmp_path):
     part = ("--reps", 1, "--conditions", "N_0_0,L_4_0", "--json")
     assert (await merge_runner("sweep", "baseline", *part)).code == 0

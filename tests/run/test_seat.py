@@ -36,6 +36,7 @@ price = { input = 0.0, output = 1000.0, source = "test" }
 """
 
 
+@pytest.mark.slow
 async def test_22_situations_are_asked_as_often_as_wanted_and_nothing_else_is(merge_runner):
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
@@ -53,6 +54,7 @@ async def test_22_situations_are_asked_as_often_as_wanted_and_nothing_else_is(me
     assert "66 live" in run.err
 
 
+@pytest.mark.slow
 async def test_a_sweep_answers_the_situations_and_they_answer_its_first_decisions(merge_runner):
     sweep = ("sweep", "baseline", "--reps", 2, *TWO, "--json")
     first = ("seat", "first", "--samples", 2, *TWO, "--json")
@@ -69,6 +71,7 @@ async def test_a_sweep_answers_the_situations_and_they_answer_its_first_decision
         assert (audit.code, audit.out.count("all holds")) == (0, 3), audit.out
 
 
+@pytest.mark.slow
 async def test_a_situation_is_driven_for_a_second_as_its_trial_begins(merge_runner):
     await merge_runner("sweep", "baseline", "--reps", 1, *TWO)
     await merge_runner("seat", "first", "--samples", 1, *TWO)
@@ -87,6 +90,7 @@ async def test_a_situation_is_driven_for_a_second_as_its_trial_begins(merge_runn
     assert (await merge_runner("sql", last, "--format", "csv")).out.split()[1] == "1.0"
 
 
+@pytest.mark.slow
 async def test_the_trials_that_were_driven_are_shown_as_before(merge_runner, tmp_path):
     await merge_runner("sweep", "baseline", "--reps", 1, *TWO)
     shown = ("tables", "ablation-quantitative", "robustness", "attempts", "--format", "csv")
@@ -96,6 +100,7 @@ async def test_the_trials_that_were_driven_are_shown_as_before(merge_runner, tmp
     assert (after.code, after.out) == (0, before.out)
 
 
+@pytest.mark.slow
 async def test_what_is_forgotten_is_asked_again_without_a_call(merge_runner):
     await merge_runner("seat", "first", "--samples", 1, *TWO)
     stored = await merge_runner("digest")
@@ -109,6 +114,7 @@ async def test_what_is_forgotten_is_asked_again_without_a_call(merge_runner):
     assert (await merge_runner("digest")).out == stored.out
 
 
+@pytest.mark.slow
 async def test_a_killed_run_goes_on_without_asking_anything_again(merge_runner, tmp_path):
     async def slow(request, handler):
         await asyncio.sleep(0.05)
@@ -134,6 +140,7 @@ async def test_a_killed_run_goes_on_without_asking_anything_again(merge_runner, 
     assert results_digest(tmp_path / DB) == results_digest(tmp_path / "whole.duckdb")
 
 
+@pytest.mark.slow
 async def test_a_sealed_replay_and_an_imported_recording_give_the_same_digest(
     merge_runner, tmp_path
 ):
@@ -152,12 +159,14 @@ async def test_a_sealed_replay_and_an_imported_recording_give_the_same_digest(
     assert len(digests) == 1
 
 
+@pytest.mark.slow
 async def test_a_replay_without_a_number_plays_the_repetitions_that_a_sweep_recorded(merge_runner):
     run = await merge_runner("seat", "first", "--replay", "--recording", RECORDING, "--json")
     assert run.code == 0, run.err
     assert run.summary["calls"] == {"live": 0, "cached": 220}
 
 
+@pytest.mark.slow
 async def test_a_recording_of_situations_is_no_recording_of_the_sweep(merge_runner):
     await merge_runner("seat", "first", "--samples", 1, *TWO)
     await merge_runner("recording", "export", "asked.parquet")
@@ -202,6 +211,7 @@ async def test_an_estimate_counts_one_call_a_situation(merge_runner):
     assert (run.summary["trials"], run.summary["calls"]) == (22, 44)
 
 
+@pytest.mark.slow
 async def test_a_program_is_asked_too_and_has_no_word(merge_runner):
     run = await merge_runner("seat", "first", "--model", "constant", "--samples", 1, "--json")
     assert run.code == 0, run.err
@@ -210,6 +220,7 @@ async def test_a_program_is_asked_too_and_has_no_word(merge_runner):
     assert (await merge_runner("audit")).code == 0
 
 
+@pytest.mark.slow
 async def test_the_two_drivers_of_a_pair_are_summed_up_apart(merge_runner):
     pair = ("--model", "emulator+constant", "--mirror", "--samples", 1, "--conditions", "N_0_0")
     run = await merge_runner("seat", "first", *pair, "--json")
@@ -227,6 +238,7 @@ async def test_the_two_drivers_of_a_pair_are_summed_up_apart(merge_runner):
         assert f"{model} of emulator+constant/baseline: share of M" in again.out
 
 
+@pytest.mark.slow
 async def test_factors_and_prompts_of_a_study_are_asked(merge_runner, tmp_path):
     (tmp_path / "mine.toml").write_text(
         'repetitions = 1\nmodels = ["emulator"]\nconditions = ["N_0_0"]\n'
@@ -326,6 +338,7 @@ def test_a_scenario_whose_trials_do_not_end_in_time_is_refused(tmp_path):
         unregister("scenario endless")
 
 
+@pytest.mark.slow
 async def test_a_sweep_plays_the_points_of_a_grid_and_takes_what_was_asked(merge_runner):
     point = ("--conditions", "h2_dv-1.2")
     assert (await merge_runner("seat", "first", "--samples", 1, *point)).code == 0
@@ -341,6 +354,7 @@ async def wordless(request: web.Request, handler) -> web.StreamResponse:
     return web.json_response(body)
 
 
+@pytest.mark.slow
 async def test_no_question_depends_on_an_answer_and_replies_without_a_plan_are_counted(
     merge_runner,
 ):

@@ -21,6 +21,7 @@ FIVE = ("--conditions", "N_0_0,L_4_8,R_-4_0,L_0_-8,R_-4_8")
 DB = "results/merge.duckdb"
 
 
+@pytest.mark.slow
 async def test_a_sweep_stores_every_trial_and_prints_outcomes_and_the_database(merge_runner):
     run = await merge_runner("sweep", "baseline", "--reps", 1)
     assert run.code == 0, run.err
@@ -83,6 +84,7 @@ async def test_the_digest_depends_on_no_schedule_and_no_transient_fault(merge_ru
     assert digests[0][1] == 5
 
 
+@pytest.mark.slow
 async def test_another_sample_set_and_another_prompt_are_other_samples(merge_runner):
     base = (await merge_runner(*SMALL, *TWO)).summary
     other = (await merge_runner(*SMALL, *TWO, "--sample-set", 1)).summary
@@ -101,6 +103,7 @@ async def test_another_sample_set_and_another_prompt_are_other_samples(merge_run
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "variables", "path"),
     [
@@ -139,6 +142,7 @@ async def test_a_real_model_runs_against_any_server_of_its_format_and_replays_wi
     assert results_digest(tmp_path / DB) == results_digest(tmp_path / "replay.duckdb")
 
 
+@pytest.mark.slow
 async def test_a_stub_never_answers_for_the_real_endpoint(merge_runner):
     async with watched() as one, watched() as other:
         for server in (one, other):
@@ -178,6 +182,7 @@ async def test_a_failed_trial_is_a_row_and_the_same_command_plays_it_anew(merge_
     assert json.loads(rows.out) == [{"n": 2}]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("status", "error", "code", "says"),
     [

@@ -58,13 +58,14 @@ async def test_at_its_time_a_sweep_begins_no_trial_and_the_same_command_goes_on(
     merge_runner, where
 ):
     async def middle(request, handler):
-        if started.done():
+        if started.done() and not stopped:
             await asyncio.sleep(0.2)
-        else:
+        elif not started.done():
             started.set_result(None)
         return await handler(request)
 
     started = asyncio.get_running_loop().create_future()
+    stopped = []
     sweep = ("sweep", "baseline", "--reps", 3, "--json", "--in-flight", 2, *FAST)
     async with watched(middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
@@ -77,6 +78,7 @@ async def test_at_its_time_a_sweep_begins_no_trial_and_the_same_command_goes_on(
         assert ended < 33
         assert "Stopping:" not in run.err, "what had begun was finished"
         asked = server.requests
+        stopped.append(True)  # nothing slows the rest down
         done = await merge_runner(*sweep, **env)
         assert done.code == 0, done.err
         assert done.summary["trials"]["stored_before"] == ended

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 
+import pytest
 from aiohttp import web
 from rich.console import Console
 
@@ -18,6 +19,7 @@ ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202e"
 ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0")
 
 
+@pytest.mark.slow
 async def test_strange_characters_and_counts_are_stored_and_shown_harmlessly(merge_runner):
     async def middle(request, handler):
         body = json.loads((await handler(request)).body)
@@ -42,6 +44,7 @@ async def test_strange_characters_and_counts_are_stored_and_shown_harmlessly(mer
     assert (n, counted, replies) == (str(server.requests), "0", str(server.requests))
 
 
+@pytest.mark.slow
 async def test_an_error_in_a_servers_words_speaks_to_no_terminal(merge_runner):
     async def middle(request, handler):
         if server.requests == answered_first:

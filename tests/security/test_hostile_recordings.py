@@ -252,6 +252,7 @@ def test_what_is_no_parquet_file_is_refused(file, cache, tmp_path):
         assert "there is no recording" in refusal(nothing, cache)
 
 
+@pytest.mark.slow
 def test_no_damage_to_a_file_ends_otherwise_than_with_a_refusal_or_unchanged_content(file):
     chance = random.Random(1)
     whole = file.read_bytes()

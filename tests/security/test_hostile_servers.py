@@ -333,6 +333,7 @@ async def test_an_environment_that_cannot_be_used_is_told_before_anything_is_ask
     assert "Traceback" not in run.err
 
 
+@pytest.mark.slow
 async def test_a_proxy_that_cannot_be_used_does_not_matter_on_loopback(merge_runner):
     run = await merge_runner("sweep", *ONE, "--model", "emulator", ALL_PROXY="socks5://a:1")
     assert run.code == 0, run.err
@@ -347,6 +348,7 @@ async def test_a_503_that_asks_for_an_hour_is_told_as_such(merge_runner):
     assert "the server asks to wait 3600 s, longer than a call's deadline of 1200 s" in run.err
 
 
+@pytest.mark.slow
 async def test_a_refused_reply_fails_its_call_and_is_not_asked_again(merge_runner, tmp_path):
     (tmp_path / "experiments").mkdir()
     (tmp_path / "experiments/models.toml").write_text(

@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 from typing import TYPE_CHECKING
 
 from merge_runner.config import Resistance, whole_steps
-from merge_runner.drivers.cei.parameters import OFFSETS, SETS, TICK_S, ThresholdSet
+from merge_runner.drivers.cei.parameters import OFFSETS, RISKS, SETS, TICK_S, ThresholdSet
 from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, SET, Program
 from merge_runner.errors import UsageError
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 BY_RESISTANCE = "by-resistance"
 USUAL_SETS: dict[Resistance, str] = {"human": "K0", "none": "drag-free"}
 PAIR = "pair"
-RISKS = {"lower_mean", "upper_mean", "lower_spread", "upper_spread"}
 
 
 class CeiDriver:
@@ -54,7 +53,7 @@ def check(parameters: Mapping[str, Parameter]) -> None:
             f"the driver cei has no pair {parameters[PAIR]}: 1 to {len(OFFSETS)} can be chosen, "
             "and 0 takes turns by the repetition"
         )
-    for name in sorted(RISKS & parameters.keys()):
+    for name in sorted(parameters.keys() & RISKS):
         if not 0 <= float(parameters[name]) <= 1:
             raise UsageError(f"{name} of cei is a risk: from 0 to 1, not {parameters[name]}")
 

@@ -99,21 +99,23 @@ class ThresholdSet:
         return Base(lower, max(upper, lower + NARROWEST_BAND))
 
 
-# K0 and F1 were found by a short search: K0 for the published outcomes and the humans' first
-# action, F1 for the outcomes alone. `python -m analysis.calibration.cei search` found the others
-# from there; docs/reference/cei.md has the commands with their seeds.
+RISKS = ("lower_mean", "upper_mean", "lower_spread", "upper_spread")
+"""The first numbers of a set: each is a risk, from 0 to 1."""
+
+# `python -m analysis.calibration.cei search` finds them again: K0 and drag-free for the published
+# outcomes and the humans' first action, F1 for the outcomes alone.
 SETS: dict[str, ThresholdSet] = {
     "K0": ThresholdSet(
-        *(0.4188, 0.3511, 0.1371, 0.0227),
-        *(0.0158, -0.0721, -0.0130, 0.0434, 0.0616, 0.0109),
+        *(0.4218, 0.3586, 0.1412, 0.0076),
+        *(0.0170, -0.0678, -0.0057, 0.0508, 0.0609, 0.0091),
     ),
     "F1": ThresholdSet(
-        *(0.0839, 0.8586, 0.0589, 0.0768),
-        *(-0.0186, -0.0319, 0.0156, 0.0725, 0.1169, -0.0414),
+        *(0.0957, 0.8409, 0.0537, 0.1318),
+        *(-0.0190, -0.0361, 0.0167, 0.0681, 0.1063, -0.0357),
     ),
     "drag-free": ThresholdSet(
-        *(0.4038, 0.3510, 0.1184, 0.0129),
-        *(0.0127, -0.0696, -0.0089, 0.0407, 0.0521, 0.0085),
+        *(0.4136, 0.3505, 0.1197, 0.0143),
+        *(0.0052, -0.0601, -0.0034, 0.0378, 0.0523, 0.0037),
     ),
 }
 

@@ -17,7 +17,7 @@ from tests.analysis.calibration.synthetic import write_humans
 
 @pytest.fixture(scope="module")
 def humans(tmp_path_factory):
-    return write_humans(tmp_path_factory.mktemp("humans") / "merge.duckdb", SETS["K0"], 2)
+    return write_humans(tmp_path_factory.mktemp("humans") / "merge.duckdb", SETS["K0"], 5)
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_the_order_of_the_drivers_is_found_again(humans):
             for side, offset in zip(("left", "right"), offsets, strict=True)
         }
         found = estimates.groupby("driver")[threshold].mean()
-        assert spearmanr(found, [planted[name] for name in found.index])[0] > 0.7
+        assert spearmanr(found, [planted[name] for name in found.index])[0] > 0.8
 
 
 @pytest.mark.slow

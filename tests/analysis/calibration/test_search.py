@@ -1,9 +1,13 @@
 """The search can be repeated, and looks where its targets are."""
 
+from dataclasses import asdict, replace
+
 import pytest
 
 from analysis.calibration.design import design, experiment
 from analysis.calibration.search import MISSING, cost, search, targets
+from analysis.calibration.searches import SEARCHES
+from merge_runner.drivers.cei.driver import check
 from merge_runner.drivers.cei.parameters import SETS
 from tests.drivers.cei.trials import scenario, simulated
 
@@ -25,13 +29,21 @@ def test_a_miss_by_its_tolerance_costs_one_and_a_number_without_a_fit_much():
 
 
 @pytest.mark.slow
-def test_a_search_finds_the_same_thresholds_again():
+def test_a_search_looks_only_for_thresholds_that_a_study_may_set():
+    edge = replace(SETS["K0"], lower_spread=0.0, upper_spread=0.0, upper_mean=1.0)
+    for found in search(
+        edge, experiment(), targets(), generations=2, size=6, seed=1, trials_of_a_pair=1
+    ):
+        check({"pair": 0, **asdict(found.thresholds)})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SETS)
+def test_the_search_for_a_set_can_be_repeated(name):
     def last():
-        *_, found = search(
-            SETS["K0"], experiment(), targets(), generations=1, size=4, seed=1, trials_of_a_pair=1
-        )
+        *_, found = replace(SEARCHES[name], generations=1, size=4, trials_of_a_pair=2).run()
         return found
 
     found = last()
     assert found == last()
-    assert found.thresholds != SETS["K0"]
+    assert found.thresholds != SEARCHES[name].start

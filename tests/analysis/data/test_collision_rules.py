@@ -70,6 +70,7 @@ def test_the_rules_are_those_of_the_scenario():
     assert (*RULES, "rectangle at 20 Hz") == READINGS
 
 
+@pytest.mark.slow
 def test_a_sweeps_trials_have_their_stored_outcomes_under_their_own_rule(in_process, tmp_path):
     assert in_process("replay", "baseline", "--recording", RECORDING, "--reps", 1) == 0
     db = tmp_path / "results/merge.duckdb"
@@ -87,6 +88,7 @@ def test_a_sweeps_trials_have_their_stored_outcomes_under_their_own_rule(in_proc
     assert same(found["shared_lane"][finished], expected[finished])
 
 
+@pytest.mark.slow
 def test_constant_drivers_collide_under_every_rule_and_failed_trials_are_left_out(
     in_process, tmp_path
 ):
@@ -100,6 +102,7 @@ def test_constant_drivers_collide_under_every_rule_and_failed_trials_are_left_ou
     assert set(outcomes(db, failed)["trial_id"]) == set(trials["trial_id"][1:])
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_came_out_later_cruised_before(in_process, tmp_path):
     """Under own_exit the drivers' first decisions lie apart."""
     (tmp_path / "own.toml").write_text(OWN_EXIT)

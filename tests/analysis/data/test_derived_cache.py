@@ -80,6 +80,7 @@ def test_a_table_reads_the_same_after_it_was_a_text(tables, name, form):
     assert to_text(again) == to_text(tables[name])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 def test_tables_are_made_once_and_then_read(db, made):
     first = finished_tables(db, None, ["gap", "attempts"])
@@ -91,6 +92,7 @@ def test_tables_are_made_once_and_then_read(db, made):
     assert made[3:] == ["gap"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", CHANGES)
 def test_after_any_change_of_the_results_tables_are_made_anew(db, made, what):
     finished_tables(db, None, ["attempts"])
@@ -103,6 +105,7 @@ def test_after_any_change_of_the_results_tables_are_made_anew(db, made, what):
     assert made == ["attempts", "attempts"]
 
 
+@pytest.mark.slow
 def test_another_program_makes_tables_anew(db, made, monkeypatch):
     for name in ("one", "one", "other", "other"):
         monkeypatch.setattr("analysis.data.derived_cache.program", lambda name=name: name)
@@ -123,6 +126,7 @@ def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, 
     assert len(found) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 def test_what_is_kept_is_no_result(db):
     before = results_digest(db)
@@ -150,6 +154,7 @@ def test_tables_of_a_study_that_was_read_before_a_change_are_not_kept(db):
     assert finished(db, present_state(db), options_text(db, None), ["attempts"]) == {}
 
 
+@pytest.mark.slow
 def test_a_study_that_was_read_before_a_change_takes_no_table_of_the_later_state(db, made):
     study = Study(db)
     change(db, CHANGES["an outcome"])
@@ -158,6 +163,7 @@ def test_a_study_that_was_read_before_a_change_takes_no_table_of_the_later_state
     assert made == ["attempts", "attempts"]
 
 
+@pytest.mark.slow
 def test_beside_another_program_tables_are_made_and_not_kept(db, made, caplog):
     with subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(db)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -172,6 +178,7 @@ def test_beside_another_program_tables_are_made_and_not_kept(db, made, caplog):
     assert to_text(held[0]) == to_text(free[0])
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
     drawn = []
     monkeypatch.setattr("analysis.report.writer.FIGURES", {"figure2": None, "distributions": None})
@@ -201,6 +208,7 @@ def test_a_warm_table_waits_for_no_heavy_library(db, tmp_path):
         assert (done.returncode == 0) == warm, done.stderr
 
 
+@pytest.mark.slow
 def test_unknown_names_are_refused_also_beside_kept_tables(db):
     finished_tables(db, None, ["attempts"])
     with pytest.raises(UsageError, match="no table 'gaps'"):

@@ -11,6 +11,9 @@ from analysis.data.load import load
 from analysis.data.provenance import provenance
 from analysis.data.study import Study
 from analysis.explain import explain
+from analysis.explorer.catalogue import Filter
+from analysis.explorer.site import Site
+from analysis.explorer.sweeps import list_sweeps
 from analysis.report.alarms import alarms
 from analysis.tables import make_tables
 from analysis.tables.formats import value_rows
@@ -72,6 +75,7 @@ def test_a_bracket_in_a_drivers_name_is_no_mark(tmp_path):
     assert "Several settings under one name" not in titles
 
 
+@pytest.mark.slow
 def test_stand_ins_stand_last_and_every_row_of_theirs_says_so(db):
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%'")
     assert [group.label for group in study.models] == ["other", "o3 (scripted stand-in, not o3)"]
@@ -88,6 +92,7 @@ def test_the_emulator_is_a_stand_in_for_no_model(tmp_path):
     assert alarms(Study(db), provenance(db)) == [], "nobody takes it for a model"
 
 
+@pytest.mark.slow
 def test_trials_of_a_stand_in_are_never_pooled_with_those_of_the_model(db):
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%/rep01'")
     sizes = {group.driver: len(group.trials) for group in study.models}
@@ -137,6 +142,7 @@ def test_two_equal_trials_of_a_driver_that_samples_are_two_samples(db):
     assert study.models[0].repeated == 0
 
 
+@pytest.mark.slow
 def test_equal_trials_of_a_driver_that_samples_are_told_and_count(db):
     study = changed(db, *same_each_time(db, "trial_id LIKE 'o3/baseline/N_0_0/%'"))
     (alarm,) = alarms(study, provenance(db))
@@ -159,7 +165,26 @@ def test_equal_trials_of_a_driver_that_samples_are_told_and_count(db):
     ],
 )
 def test_a_stand_in_stands_for_the_models_on_whose_sides_it_answered(model, sides, words):
-    assert stand_in(both_sides(model), sides) == words
+    models = {side: name for side, name in both_sides(model).items() if name != "constant"}
+    assert stand_in(models, sides) == words
+
+
+def test_a_driver_of_a_study_is_a_program_also_where_the_study_is_not_at_hand(prepare, tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        'models = ["emulator+slow"]\nrepetitions = 1\nconditions = ["N_0_0"]\n'
+        '[drivers.slow]\nprogram = "idm"\nclock = 1.0\n[factors]\nx_noise = [0.5]\n'
+    )
+    db = tmp_path / "results/merge.duckdb"
+    assert prepare(tmp_path, "sweep", "mine.toml").code == 0
+    site = Site(db)
+    site.catalogue.refresh()
+    (group,) = Study(db).models
+    (trial,) = site.catalogue.every(Filter())
+    (sweep,) = list_sweeps(site.catalogue)
+    said = "scripted stand-in, no language model"
+    assert (group.posing, trial["stand_in"], sweep.stand_in) == (said, said, said)
+    assert sweep.config.registered == {"emulator"}
+    assert replace(sweep, row=sweep.row | {"trials": 0, "scripted": 0}).stand_in == said
 
 
 def test_the_sides_are_those_of_the_scripted_calls(tmp_path):

@@ -163,6 +163,7 @@ def test_a_partial_import_has_both_numbers_of_trials_in_its_row(stored):
     assert "published human collisions are boxes that overlap" in row.note
 
 
+@pytest.mark.slow
 def test_another_data_set_is_named_in_every_table_with_humans(stored):
     more = changed(published_trials(), "N_0_0", LEFT, CRASH, 8)
     study = Study(stored(more[::2]))

@@ -85,6 +85,7 @@ def least(v, degree, shortest) -> dict[int, float]:
     return found
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(st.integers(5, 15), st.integers(0, 2**32))
 def test_no_way_to_cut_a_profile_is_better(n, seed):

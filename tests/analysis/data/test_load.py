@@ -8,12 +8,14 @@ from pkgutil import iter_modules
 
 import numpy as np
 import pandas as pd
+import pytest
 
 import analysis
 from analysis import Study, load, load_trials, table
 from merge_runner.results.store import Store
 
 
+@pytest.mark.slow
 def test_a_notebook_gets_one_row_a_trial_with_its_metrics(in_process, tmp_path):
     assert in_process("sweep", "baseline", "--model", "projected-order", "--reps", 1) == 0
     frame = load_trials(tmp_path / "results/merge.duckdb")
@@ -22,6 +24,7 @@ def test_a_notebook_gets_one_row_a_trial_with_its_metrics(in_process, tmp_path):
     assert set(frame["merged_first"]) == {"left", "right"}
 
 
+@pytest.mark.slow
 def test_a_notebook_gets_the_tables_at_full_precision(study):
     frame = table(Study(study.db), "ablation-quantitative")
     assert list(frame.index) == ["human", "o3/baseline", "o3/A1", "o3/A2", "other/baseline"]

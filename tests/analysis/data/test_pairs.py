@@ -98,6 +98,7 @@ def rounded(value):
     return round(value, 6) if isinstance(value, float) else value
 
 
+@pytest.mark.slow
 def test_a_study_and_its_mirror_image_give_the_same_rows(played, tmp_path):
     """One way round, the other way round, and both at once, where equal trials count once."""
     both = played("mirror = true", "both")
@@ -126,6 +127,7 @@ def part(db, folder, side):
     return Study(copy)
 
 
+@pytest.mark.slow
 def test_who_goes_first_is_told_of_the_ego_on_either_side(played):
     study = played("mirror = true", "both")
     trials = load_trials(study.db)
@@ -141,6 +143,7 @@ def test_who_goes_first_is_told_of_the_ego_on_either_side(played):
     assert "on the left in 11 trials, and on the right in 11, mirrored" in note
 
 
+@pytest.mark.slow
 def test_mirrored_trials_stand_in_the_condition_that_their_ego_saw(played):
     study = played("mirror = true\nconditions = ['L_4_-8']", "both")
     seen = load_trials(study.db).set_index("trial_id")
@@ -152,6 +155,7 @@ def test_mirrored_trials_stand_in_the_condition_that_their_ego_saw(played):
     assert numbers.tolist() == [-4.0, 0.8]
 
 
+@pytest.mark.slow
 def test_a_condition_that_has_no_mirror_image_is_named_after_itself(played):
     own = (
         "{{name = '{}', projected_headway_m = {}, relative_velocity_mps = 0, mean_speed_mps = 15}}"
@@ -167,6 +171,7 @@ def test_a_condition_that_has_no_mirror_image_is_named_after_itself(played):
     assert set(load_trials(studies["both"].db)["condition"]) == {"fast", "tsaf"}
 
 
+@pytest.mark.slow
 def test_the_trials_behind_a_cell_are_found_in_the_database(played):
     study = played("mirror = true", "both")
     (table,) = make_tables(study, ["conflict-resolution"])
@@ -176,6 +181,7 @@ def test_the_trials_behind_a_cell_are_found_in_the_database(played):
     assert load(source.query, study.db)["trial_id"].tolist() == list(source.trials)
 
 
+@pytest.mark.slow
 def test_a_pair_that_sits_one_way_alone_is_told_as_confounded(played):
     one_way, both = played("", "one"), played("mirror = true", "both")
     (table,) = make_tables(one_way, ["gap"])

@@ -39,6 +39,7 @@ def written(small, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_equal_results_give_equal_files(small, written):
     again = Study(small.db)
     for name, form in (("figure2", "pdf"), ("distributions", "png")):
@@ -138,6 +139,7 @@ def test_where_no_human_drove_no_human_line_is_drawn_and_none_is_missed(tmp_path
     assert ["not imported" in text for text in texts] == [True, True, True, False]
 
 
+@pytest.mark.slow
 def test_panels_reach_as_far_as_the_conditions_and_the_published_line_as_the_humans(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1))
     for study, farthest in ((Study(db), 4), (changed(db, OWN), 8)):
@@ -147,6 +149,7 @@ def test_panels_reach_as_far_as_the_conditions_and_the_published_line_as_the_hum
     assert published_gap_line(0)[0][[0, -1]] == pytest.approx([-4, 4])
 
 
+@pytest.mark.slow
 def test_no_two_relative_velocities_look_alike(tmp_path):
     study = changed(write_study(tmp_path / "t.duckdb", yielding("o3", reps=7)), OWN)
     keys = figure_2_variants(study).legends[0].legend_handles[:-1]
@@ -224,6 +227,7 @@ def rows_of(figure):
     return [figure.axes[i : i + 5] for i in range(0, len(figure.axes), 5)]
 
 
+@pytest.mark.slow
 def test_each_group_has_a_row_of_its_own_with_its_trials(study):
     figure = figure_2_variants(study)
     rows = rows_of(figure)
@@ -242,6 +246,7 @@ def test_each_group_has_a_row_of_its_own_with_its_trials(study):
                 )
 
 
+@pytest.mark.slow
 def test_variants_are_shown_by_the_same_scales_and_before_an_import_humans_as_published(study):
     rows = rows_of(figure_2_variants(study))
     for row in rows:
@@ -255,6 +260,7 @@ def test_variants_are_shown_by_the_same_scales_and_before_an_import_humans_as_pu
     assert sum(len(c.lines[0].get_xdata()) for c in human[2].containers) == len(CONDITIONS)
 
 
+@pytest.mark.slow
 def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
     """Two trials of a condition that differ by 10 m have an interval of 130 m."""
     drives = [*yielding("o3", reps=10), *yielding("o3", "A1", reps=4)]
@@ -270,6 +276,7 @@ def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
     assert sum(low < one.low and one.high < high for one in found) >= 0.8 * len(found)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     "drives",

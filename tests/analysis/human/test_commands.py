@@ -23,6 +23,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 def test_a_zip_is_imported_once_and_the_status_counts_it(human, tmp_path):
     path = write_zip(tmp_path / "download.zip", GOOD)
     run = human("import", path)

@@ -70,6 +70,7 @@ def test_the_pages_are_named_as_in_the_publications():
     assert condition_of("experiment_4_iter_1.csv") is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [list, packed])
 def test_a_page_gives_the_trials_that_the_recordings_give(tmp_path, form):
     one, other = tmp_path / "pages.duckdb", tmp_path / "recordings.duckdb"
@@ -85,6 +86,7 @@ def test_a_page_gives_the_trials_that_the_recordings_give(tmp_path, form):
     assert np.abs(left - right).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_the_source_of_a_trial_is_told_and_none_is_stored_twice(human, tmp_path):
     folder = write_folder(tmp_path / "both", pages() | recordings())
     run = human("import", folder)
@@ -99,6 +101,7 @@ def test_the_source_of_a_trial_is_told_and_none_is_stored_twice(human, tmp_path)
     assert (len(study.human.trials), study.imported.from_pages) == (33, 30)
 
 
+@pytest.mark.slow
 def test_recordings_after_pages_leave_these_as_they_are(tmp_path):
     db = tmp_path / "t.duckdb"
     imported(db, pages())

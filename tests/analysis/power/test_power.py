@@ -89,6 +89,7 @@ def test_the_chances_of_humans_are_their_ceiling():
         assert search.chance(question, arms, 10) == pytest.approx(shares[name], abs=0.06)
 
 
+@pytest.mark.slow
 def test_the_chance_to_find_nothing_is_that_of_a_false_alarm():
     search, truth = Search(HUMANS, 1000, 2), without_relative_speed()
     # Two-sided tests at 5 %, of which one side counts; between two arms both do.
@@ -154,6 +155,7 @@ def powered(tmp_path, study, model=(), simulations=60, seed=0):
     return power(plan, expected, simulations=simulations, seed=seed)
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_chances_and_other_seeds_others(tmp_path):
     one, same, other = (
         powered(tmp_path, "baseline", simulations=20, seed=seed) for seed in (0, 0, 1)
@@ -162,6 +164,7 @@ def test_equal_seeds_give_equal_chances_and_other_seeds_others(tmp_path):
     assert one.chances != other.chances
 
 
+@pytest.mark.slow
 def test_a_planted_study_is_told_by_what_is_planted(tmp_path):
     (tmp_path / "planted.toml").write_text(PLANTED)
     found = powered(tmp_path, str(tmp_path / "planted.toml"))
@@ -199,6 +202,7 @@ def test_a_usual_study_takes_less_than_20_seconds_of_one_core_and_costs_what_it_
     assert {each.truth for each in found.chances if each.table == "gap"} == {"human", "cei"}
 
 
+@pytest.mark.slow
 async def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(
     merge_runner, tmp_path
 ):
@@ -256,6 +260,7 @@ def test_a_planted_persona_is_supposed_where_the_prompt_contains_it(tmp_path):
     assert between.effect == pytest.approx(2.0)
 
 
+@pytest.mark.slow
 def test_a_program_is_free_and_supposed_to_go_like_any_driver(tmp_path):
     found = powered(tmp_path, "baseline", ("projected-order",), simulations=20)
     assert found.free

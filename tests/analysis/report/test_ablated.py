@@ -89,6 +89,7 @@ def test_without_variants_nothing_is_said(drives, tmp_path):
         assert ablation_sentences(Study(tmp_path / "t.duckdb")) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     ("change", "expected"),

@@ -47,6 +47,7 @@ def test_a_difference_that_chance_seldom_makes_is_called_so(tmp_path):
     assert "p < 0.001: a difference that chance alone seldom makes" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robust", "paper", "strength"),
     [(0.99, 0.83, "strong"), (0.9, 0.5, "some"), (0.3, 0.39, "weak")],
@@ -69,6 +70,7 @@ def test_a_missing_mark_weighs_by_how_often_humans_have_it(
     )
 
 
+@pytest.mark.slow
 def test_a_missing_mark_weighs_by_as_many_human_trials_as_lie_in_the_humans_conditions(tmp_path):
     db = write_study(tmp_path / "t.duckdb", level("o3"))
     said, _ = texts(Study(db))
@@ -78,6 +80,7 @@ def test_a_missing_mark_weighs_by_as_many_human_trials_as_lie_in_the_humans_cond
     assert "of this size" not in said
 
 
+@pytest.mark.slow
 def test_nothing_is_said_of_a_ceiling_where_no_human_drove(tmp_path):
     db = write_study(tmp_path / "t.duckdb", level("o3"))
     said, limits = texts(changed(db, "UPDATE trials SET condition = 'own_' || condition"))
@@ -103,6 +106,7 @@ def test_the_human_gap_is_that_of_the_reference_in_use(small):
     )
 
 
+@pytest.mark.slow
 def test_what_was_sent_is_named_and_a_default_only_where_nothing_was(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1))
 
@@ -122,6 +126,7 @@ def test_what_was_sent_is_named_and_a_default_only_where_nothing_was(tmp_path):
     assert "temperature = 1.0, thinkingBudget = -1." in nested
 
 
+@pytest.mark.slow
 def test_a_program_has_no_wording_and_no_temperature(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("projected-order", reps=1))
     _, limits = texts(changed(db, "UPDATE trials SET source = 'driver'"))
@@ -133,6 +138,7 @@ def test_a_program_has_no_wording_and_no_temperature(tmp_path):
     assert "wording" not in limits
 
 
+@pytest.mark.slow
 def test_a_separated_fit_is_not_judged_and_the_robust_verdict_stands(tmp_path):
     drives = [d for d in yielding("o3", reps=4) if d.condition != "N_0_0"]
     study = Study(write_study(tmp_path / "t.duckdb", drives))
@@ -144,6 +150,7 @@ def test_a_separated_fit_is_not_judged_and_the_robust_verdict_stands(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_a_stand_in_is_in_no_conclusion_whatever_name_it_answered_in(tmp_path):
     db = write_study(tmp_path / "t.duckdb", [*yielding("o3", reps=1), *yielding("other", reps=1)])
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%'")

@@ -138,6 +138,7 @@ def test_another_served_model_is_loud_and_its_name_is_shown_as_text(tmp_path):
     assert "o3 was asked for, <script>alert(1)</script> answered: 6 answers" in page.text
 
 
+@pytest.mark.slow
 def test_an_alias_that_the_sweep_declares_is_no_other_model(tmp_path):
     db = asking(tmp_path, Said(served="o3-2025")).db
     for models, found in (
@@ -152,6 +153,7 @@ def test_an_alias_that_the_sweep_declares_is_no_other_model(tmp_path):
         assert tally(study, study.models[0]).others == 6 * len(found)
 
 
+@pytest.mark.slow
 def test_the_fallbacks_of_a_group_are_unusual_above_one_in_twenty(tmp_path):
     study = asking(tmp_path, Said(failure="no_array"))
     found = tally(study, study.models[0])
@@ -201,6 +203,7 @@ def test_a_call_that_several_trials_used_was_made_and_paid_once(tmp_path):
     assert (row.calls, row.retries, row.cost_usd) == (1, 1, 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 def test_the_report_can_write_all_its_parts_as_files(small, tmp_path):
     db = Path(shutil.copy(small.db, tmp_path / "t.duckdb"))

@@ -125,6 +125,7 @@ def summed(trials: pd.DataFrame) -> Draws:
     return Draws(n, left, gap, squared_gap)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(data_sets())
 def test_of_any_trials_the_fits_at_once_are_those_one_by_one(trials):

@@ -109,6 +109,7 @@ def test_humans_have_no_rate_by_the_drivers_rule_before_an_import_and_the_row_sa
     assert "coll. (%): published human collisions are boxes that overlap" in human.note
 
 
+@pytest.mark.slow
 def test_longer_boxes_touch_where_shorter_ones_do_not(tmp_path):
     drives = [Drive("o3", "baseline", "L_4_0", 1, (0.1, 0.1), ())]
     for length_m, touching in ((4.5, False), (8.0, True)):

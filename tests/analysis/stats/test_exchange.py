@@ -29,6 +29,7 @@ def test_the_published_human_rate_is_that_of_the_published_coefficients():
     assert 0.3 < found.bounds[1] - found.bounds[0] < 1.2
 
 
+@pytest.mark.slow
 def test_intervals_of_words_cover_the_planted_rate_as_often_as_they_say():
     rng = np.random.default_rng(1)
     fits = [of_words(POINTS, said(rng), ALONE) for _ in range(150)]
@@ -38,6 +39,7 @@ def test_intervals_of_words_cover_the_planted_rate_as_often_as_they_say():
     assert LOW <= np.mean(slopes) <= HIGH
 
 
+@pytest.mark.slow
 def test_two_answers_of_a_trial_that_depend_on_each_other_are_not_counted_as_two():
     """The other side says the opposite at the mirrored point: nothing new is learnt from it."""
     rng = np.random.default_rng(2)

@@ -96,6 +96,7 @@ def test_the_published_slope_is_that_of_the_published_means():
     assert published_humans().slope.bounds() == pytest.approx((-0.375, -0.301), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_copy_of_the_humans_is_called_different_in_at_most_8_percent_of_studies():
     named = studies(1, lambda rng: drawn(rng, SITUATIONS // 2))
     assert sum(map(bool, named)) <= 0.08 * STUDIES
@@ -116,6 +117,7 @@ def test_a_planted_fault_is_named_and_no_other(fault, make):
     assert sum(map(bool, others)) <= 0.08 * STUDIES
 
 
+@pytest.mark.slow
 def test_a_driver_that_accelerates_less_in_every_situation_is_named_for_its_level():
     named = studies(3, lambda rng: lower(drawn(rng, SITUATIONS // 2)))
     assert sum(one == {LEVEL} for one in named) >= 0.9 * STUDIES

@@ -297,6 +297,7 @@ def pooled(human, own):
 
 
 # The other outcome is left out, which saves its fits.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("terms", "count", "kept"), [(4, 60, {"merged_first": "left"}), (3, 20, {"gap_m": np.nan})]
 )
@@ -306,5 +307,6 @@ def test_copies_of_the_humans_are_seldom_said_to_differ(terms, count, kept):
     assert max(found) <= stats.binom.ppf(0.995, count, 0.05)
 
 
+@pytest.mark.slow
 def test_with_pooled_trials_copies_of_the_humans_are_often_said_to_differ():
     assert alarms(pooled, 60)[0] > 12

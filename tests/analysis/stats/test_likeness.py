@@ -163,6 +163,7 @@ def test_a_model_that_drives_against_the_resistance_is_measured_as_without(tmp_p
     assert (study.profiles["gain"] > 0).all()
 
 
+@pytest.mark.slow
 def test_a_trial_without_action_neither_passes_nor_fails_and_is_told(tmp_path):
     study = driving(tmp_path)
     with duckdb.connect(str(study.db)) as connection:
@@ -180,6 +181,7 @@ def test_a_trial_without_action_neither_passes_nor_fails_and_is_told(tmp_path):
     assert row.values["value"] == mean_gain(study, group).value
 
 
+@pytest.mark.slow
 def test_a_driver_that_never_acts_has_no_number_and_it_is_said_why(tmp_path):
     study = driving(tmp_path)
     with duckdb.connect(str(study.db)) as connection:

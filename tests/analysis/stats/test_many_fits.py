@@ -120,6 +120,7 @@ def test_penalised_fits_at_once_are_those_one_by_one_to_a_millionth(tables):
         assert found.p[i, 1:] == pytest.approx([term.p for term in alone][1:], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_differences_at_once_are_those_of_one_model_of_both_groups(tables):
     rng = np.random.default_rng(2)
     others = [trials(rng, 5, 0.5) for _ in range(SETS)]

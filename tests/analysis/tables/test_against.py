@@ -94,6 +94,7 @@ def differences(table, row_id):
     return [name for name in row.values if name.endswith("_difference")]
 
 
+@pytest.mark.slow
 def test_published_human_values_stand_there_and_are_not_compared_with_themselves(met):
     tables = [against(table, "paper") for table in make_tables(met) if in_paper(table)]
     assert len(tables) == 5

@@ -137,6 +137,7 @@ def test_the_two_drivers_of_a_mixed_pair_have_rows_of_their_own(db, tmp_path):
     assert "side" not in named
 
 
+@pytest.mark.slow
 def test_a_pair_that_changed_its_sides_is_as_its_ego_saw_it(tmp_path):
     drives = following("alike", -0.34)
     turned = [
@@ -180,6 +181,7 @@ def test_a_driver_without_chance_in_a_mixed_pair_counts_once_in_each_situation(t
     assert note.startswith("zero of alike+zero: it does the same first")
 
 
+@pytest.mark.slow
 def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
     pair = ("--model", "emulator+projected-order", "--reps", 1)
     assert prepare(tmp_path, "sweep", "baseline", *pair, "--conditions", "N_0_0").code == 0
@@ -191,6 +193,37 @@ def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
     }
 
 
+def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_actions(
+    prepare, tmp_path
+):
+    pair = ("--model", "emulator+idm", "--mirror", "--conditions", "L_4_8,R_-4_-8,N_0_0")
+    for played in (("sweep", "baseline", "--reps"), ("seat", "first", "--samples")):
+        for models in ((), pair):
+            run = prepare(tmp_path, *played, 2, *models)
+            assert run.code == 0, run.err
+    study = Study(tmp_path / "results/merge.duckdb")
+    first, faults = make_tables(study, ["first-action", "first-action-faults"])
+    for table in (first, faults):
+        driven = {row.id: row for row in table.rows if "human" not in row.id}
+        asked = {name: row for name, row in driven.items() if " [asked]/" in name}
+        assert len(asked) == len(driven) / 2
+        for name, row in asked.items():
+            twin = driven[name.replace(" [asked]", "")]
+            assert " [asked]" in row.values["driver"]
+            assert row.values | {"driver": twin.values["driver"]} == twin.values
+        (note, _) = [note for note in table.notes if "asked without the loop" in note]
+        assert note.startswith("emulator [asked]/baseline: ")
+        assert "in 22 trials" in note
+    (source,) = explain(study, first, "emulator [asked]/baseline/0.8:mean").sources
+    assert len(source.trials) == len(load(source.query, study.db)) == 16
+    assert all(trial.startswith("seat/") for trial in source.trials)
+    narrowed = make_tables(Study(study.db, ["emulator"]), ["first-action"])[0].rows
+    assert {row.groups[0] for row in narrowed} == {"emulator/baseline", "emulator [asked]/baseline"}
+    of_model = Study(study.db, where={"model": ["emulator"]})
+    assert [group.id for group in of_model.asked] == ["emulator [asked]/baseline"]
+
+
+@pytest.mark.slow
 def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(prepare, tmp_path):
     (tmp_path / "mine.toml").write_text(
         'repetitions = 2\nconditions = ["L_4_8", "R_-4_-8"]\n'
@@ -217,6 +250,7 @@ def test_of_a_driver_that_does_not_look_this_fault_alone_is_shown(tmp_path):
     assert says["relative velocity"] == "it responds less to the relative velocity"
 
 
+@pytest.mark.slow
 def test_a_relative_velocity_that_no_human_had_has_a_row_and_is_not_compared(db, tmp_path):
     own = tmp_path / "t.duckdb"
     own.write_bytes(db.read_bytes())
@@ -241,6 +275,7 @@ def spoken(drives, tmp_path, words):
     return Study(db)
 
 
+@pytest.mark.slow
 def test_words_that_are_kept_and_that_are_broken_are_counted(tmp_path):
     study = spoken(yielding("o3", reps=2), tmp_path, "if(applied[1] > 0, 'M', 'Y')")
     (table,) = make_tables(study, ["words"])
@@ -286,6 +321,7 @@ def test_what_the_first_word_follows_is_told(cue, follows, tmp_path):
     assert values["follows"] == follows, values
 
 
+@pytest.mark.slow
 def test_the_words_of_two_models_of_a_pair_are_not_pooled(tmp_path):
     study = spoken(yielding("o3", reps=1), tmp_path, "if(side = 'left', 'M', 'Y')")
     with duckdb.connect(str(study.db)) as connection:
@@ -299,6 +335,7 @@ def test_the_words_of_two_models_of_a_pair_are_not_pooled(tmp_path):
     assert "it is Y in all 11 decisions" in right.note
 
 
+@pytest.mark.slow
 def test_one_word_alone_and_no_word_say_so(tmp_path):
     study = spoken(yielding("o3", reps=1), tmp_path, "'M'")
     (table,) = make_tables(study, ["words"])

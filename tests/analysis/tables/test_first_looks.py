@@ -56,6 +56,10 @@ def test_the_planted_exchange_rate_of_the_emulator_is_found_beside_the_humans(ta
     assert own["m_ci"][0] < 3.30 / 1.11 < own["m_ci"][1]
     assert own["asked"] == 7 * 5 * 2 * 4
     assert (round(human["m"], 2), human["asked"]) == (2.97, 962)
+    slope = rows(table, "human")["per m/s of velocity"].values
+    assert (slope["action"], slope["asked"]) == (-0.338, 1898)
+    assert slope["action_ci"] == pytest.approx((-0.375, -0.301))
+    assert "m" not in slope
 
 
 def test_a_point_counts_both_sides_by_their_own_headway_and_velocity(table, asked):
@@ -111,6 +115,7 @@ def test_rows_have_the_ids_of_other_tables(table):
     assert {f"emulator+constant/baseline/{side}/h=+0 dv=+0" for side in ("left", "right")} <= ids
 
 
+@pytest.mark.slow
 def test_the_answers_of_a_driver_from_both_seats_are_one(prepare, tmp_path):
     pair = ("--model", "emulator+constant", "--mirror", "--samples", 2, "--grid", "h=2,dv=0")
     run = prepare(tmp_path, "seat", "first", *pair)
@@ -138,12 +143,14 @@ def test_the_figure_has_a_panel_for_words_and_one_for_actions(asked):
     figure.canvas.draw()
 
 
+@pytest.mark.slow
 def test_models_and_factors_restrict_it(asked):
     assert [looks.label for looks in first_looks(Study(asked.db, ["emulator"]))] == [EMULATOR]
     none = Study(asked.db, where={"prompt": ["baseline"], "model": ["emulator"]})
     assert [looks.label for looks in first_looks(none)] == [EMULATOR]
 
 
+@pytest.mark.slow
 def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
     study = Study(asked.db, ["projected-order"], where={"model": ["projected-order"]})
     assert [looks.label for looks in first_looks(study)] == ["projected-order"]
@@ -152,6 +159,7 @@ def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
         Study(asked.db, ["idm"])
 
 
+@pytest.mark.slow
 def test_a_reply_without_a_plan_is_counted_and_is_no_action(prepare, tmp_path):
     assert prepare(tmp_path, "seat", "first", "--samples", 1).code == 0
     with duckdb.connect(str(tmp_path / "results/merge.duckdb")) as connection:
@@ -167,6 +175,7 @@ def test_a_reply_without_a_plan_is_counted_and_is_no_action(prepare, tmp_path):
     assert values["action"] == right["action_mps2"].iloc[0]
 
 
+@pytest.mark.slow
 def test_a_first_second_is_told_only_of_trials_that_lasted_one(prepare, tmp_path):
     (tmp_path / "mine.toml").write_text(
         'repetitions = 1\nconditions = ["N_0_0"]\n[factors]\nprompt_rate_hz = [2.5, 1.0, 0.5]\n'

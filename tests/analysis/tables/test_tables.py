@@ -241,6 +241,7 @@ def test_where_no_human_drove_there_is_no_ceiling_but_a_note(tmp_path):
     assert "no ceiling" not in rows["o3/baseline/I5"].note + rows["human"].note
 
 
+@pytest.mark.slow
 def test_a_model_under_two_specs_makes_two_rows_that_tell_themselves_apart(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
     other = write_study(tmp_path / "u.duckdb", yielding("o3", reps=1))
@@ -255,6 +256,7 @@ def test_a_model_under_two_specs_makes_two_rows_that_tell_themselves_apart(tmp_p
     assert [len(group.trials) for group in study.models] == [22, 11]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 def test_another_task_leaves_a_baseline_and_its_variants_together(tmp_path):
     """A baseline that was also run with drag must not tear the ablation study apart."""
@@ -277,6 +279,7 @@ def test_another_task_leaves_a_baseline_and_its_variants_together(tmp_path):
     assert cell(beside, f"{study.models[2].id}", "gap_m_in_paper") == 9.28
 
 
+@pytest.mark.slow
 def test_models_can_be_chosen_and_an_unknown_one_names_the_valid(study):
     chosen = Study(study.db, ["other"])
     assert [group.id for group in chosen.groups] == ["other/baseline"]

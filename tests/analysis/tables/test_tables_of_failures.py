@@ -175,6 +175,7 @@ def test_the_two_sides_of_a_measure_explain_their_own_trials(biased):
                 assert explain(biased, table, f"{row}:{other}").sources[0].trials == found
 
 
+@pytest.mark.slow
 def test_only_failed_trials_leave_nothing_to_compare_and_say_why(tmp_path):
     lost = Said(("timeout", "timeout"), lost=True)
     drives = [replace(drive, said={0: lost}) for drive in yielding("o3", reps=1)]

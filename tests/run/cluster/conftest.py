@@ -8,7 +8,7 @@ import psutil
 import pytest
 
 from tests.harness import environment
-from tests.run.cluster.gate import SWEEP
+from tests.run.cluster.workers import SWEEP
 from tests.zygote import Zygote
 
 

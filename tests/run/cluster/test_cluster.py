@@ -80,6 +80,7 @@ async def test_a_replay_needs_no_cluster(merge_runner):
     assert "a replay needs no cluster" in run.err
 
 
+@pytest.mark.slow
 async def test_without_the_extra_it_says_what_to_install(merge_runner, tmp_path, emulator_url):
     (tmp_path / "distributed.py").write_text("raise ModuleNotFoundError('no distributed')")
     process = await merge_runner.start(

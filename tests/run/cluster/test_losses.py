@@ -9,8 +9,9 @@ import signal
 import psutil
 import pytest
 
+from tests.gate import HANGS_S, Gate
 from tests.harness import watched
-from tests.run.cluster.gate import SWEEP, Gate, held_from, workers_of
+from tests.run.cluster.workers import SWEEP, held_from, workers_of
 
 pytestmark = pytest.mark.slow
 
@@ -21,20 +22,20 @@ ON_TWO = (*SWEEP, "--dask", "local:2")
 async def ended(process) -> tuple[int, str, str]:
     """How a sweep ended, of which no process may be left."""
     family = psutil.Process(process.pid).children(recursive=True)
-    async with asyncio.timeout(40):
+    async with asyncio.timeout(HANGS_S):
         out, err = await process.communicate()
-    _, alive = psutil.wait_procs(family, timeout=5)
+    _, alive = psutil.wait_procs(family, timeout=HANGS_S)
     assert not alive
     return process.returncode, out.decode(), err.decode()
 
 
 async def test_a_worker_that_is_killed_costs_its_calls_in_flight_and_nothing_else(
-    merge_runner, started, quiet_digest
+    merge_runner, started, quiet_digest, tmp_path
 ):
     gate = Gate(40)
     async with watched(gate.middle) as server:
         process = await started(*ON_THREE, EMULATOR_BASE_URL=f"{server.url}/v1")
-        await gate.quiet(held=3)
+        await gate.quiet(tmp_path / "cache/responses", trials=4)
         victim = next(w for w in workers_of(process.pid) if held_from(gate, w))
         lost = held_from(gate, victim)
         victim.kill()
@@ -49,18 +50,18 @@ async def test_a_worker_that_is_killed_costs_its_calls_in_flight_and_nothing_els
 
 
 async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
-    merge_runner, started, quiet_digest
+    merge_runner, started, quiet_digest, tmp_path
 ):
     gate = Gate(40)
     async with watched(gate.middle) as server:
         process = await started(*ON_THREE, "--in-flight", 3, EMULATOR_BASE_URL=f"{server.url}/v1")
-        await gate.quiet(held=6)
+        await gate.quiet(tmp_path / "cache/responses", trials=3)
         still = next(w for w in workers_of(process.pid) if held_from(gate, w))
         own = held_from(gate, still)
         still.suspend()
         gate.open()
         # Each worker has one trial of 19 calls at a time; all others of the 114 calls are made.
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(HANGS_S):
             while len(gate.asked) < 95:
                 await asyncio.sleep(0.1)
         still.resume()
@@ -72,19 +73,19 @@ async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
 
 
 async def test_a_coordinator_that_is_killed_loses_the_calls_in_flight(
-    merge_runner, started, quiet_digest
+    merge_runner, started, quiet_digest, tmp_path
 ):
     gate = Gate(40)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)
-        await gate.quiet(held=3)
+        await gate.quiet(tmp_path / "cache/responses", trials=4)
         workers = workers_of(process.pid)
         family = psutil.Process(process.pid).children(recursive=True)
         lost = set(gate.held)
         process.kill()
         await process.wait()
-        _, alive = psutil.wait_procs(family, timeout=10)
+        _, alive = psutil.wait_procs(family, timeout=HANGS_S)
         assert (len(workers), alive) == (2, [])
         gate.open()
         run = await merge_runner(*SWEEP, **env)
@@ -94,12 +95,12 @@ async def test_a_coordinator_that_is_killed_loses_the_calls_in_flight(
     assert (await merge_runner("digest")).out == quiet_digest
 
 
-async def test_ctrl_c_saves_what_the_workers_have_in_flight(merge_runner, started):
+async def test_ctrl_c_saves_what_the_workers_have_in_flight(merge_runner, started, tmp_path):
     gate = Gate(40)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)
-        await gate.quiet(held=3)
+        await gate.quiet(tmp_path / "cache/responses", trials=4)
         process.send_signal(signal.SIGINT)
         for worker in workers_of(process.pid):
             worker.send_signal(signal.SIGINT)  # as a terminal does

@@ -1,15 +1,17 @@
-"""A server that can hold its answers, and the processes of a cluster."""
+"""A server that holds its answers, so that a test can do something in the midst of a sweep."""
 
 from __future__ import annotations
 
 import asyncio
+import json
+from contextlib import closing
+from pathlib import Path
 
-import psutil
-
+from merge_runner.llm.cache_db import open_read_only
 from merge_runner.records import SLOT_HEADER
 
-# Six trials of 19 calls each.
-SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "L_4_0,N_0_0,R_-4_8", "--json")
+# Only what never ends takes so long, however loaded the machine is.
+HANGS_S = 300
 
 
 class Gate:
@@ -32,10 +34,14 @@ class Gate:
     def open(self) -> None:
         self._open.set()
 
-    async def quiet(self, held: int = 1) -> None:
-        """Wait until so many requests are held and none comes any more: all others are saved."""
-        async with asyncio.timeout(30):
-            while len(self.held) < held:
+    async def quiet(self, cache: Path, trials: int) -> None:
+        """Wait until so many trials are held, none asks any more, and what passed is saved.
+
+        How the answers that pass are spread over the trials is chance: a trial may wait for one
+        of its drivers alone.
+        """
+        async with asyncio.timeout(HANGS_S):
+            while len(set(map(_trial, self.held))) < trials or _saved(cache) < self.passing:
                 await asyncio.sleep(0.05)
             before = -1
             while before != len(self.asked):
@@ -47,14 +53,11 @@ class Gate:
         return {slot for slot in self.asked if self.asked.count(slot) > 1}
 
 
-def workers_of(pid: int) -> list[psutil.Process]:
-    """The workers that a coordinator has started: what is forked from a process of its own."""
-    children = psutil.Process(pid).children()
-    servers = [child for child in children if "forkserver" in " ".join(child.cmdline())]
-    return [worker for server in servers for worker in server.children()]
+def _trial(slot: str) -> tuple[str, int]:
+    told = json.loads(slot)
+    return told["condition"], told["repetition"]
 
 
-def held_from(gate: Gate, worker: psutil.Process) -> set[str]:
-    """The slots that wait for an answer on a worker's connections."""
-    ports = {c.laddr.port for c in worker.net_connections("tcp")}
-    return {slot for slot, port in gate.held.items() if port in ports}
+def _saved(cache: Path) -> int:
+    with closing(open_read_only(cache)) as disk:
+        return sum(1 for _ in disk.calls())
