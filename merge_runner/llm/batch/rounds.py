@@ -27,6 +27,7 @@ from merge_runner.llm.batch.following import (
 from merge_runner.llm.batch.journal import Journal, OpenBatch, OpenLine, mark_of, now
 from merge_runner.llm.batch.lines import Line, LineEnd
 from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus, in_batches
+from merge_runner.llm.first_call import NOBODY_S
 from merge_runner.records import Attempt
 
 USUAL_DEADLINE_S = 7200.0
@@ -34,8 +35,8 @@ USUAL_DEADLINE_S = 7200.0
 LOOK_S = 0.05
 # A task that can go on shows that when the loop has come round once; a chain of them, soon after.
 LOOKS = 5
-# How long a first creation is tried where nobody listens, and any other.
-NOBODY_S, OUTAGE_S = 5.0, 600.0
+# How long a creation is tried again, once the provider has answered any.
+OUTAGE_S = 600.0
 
 
 @dataclass(frozen=True, slots=True)
