@@ -59,7 +59,7 @@ def run(
             process = subprocess.Popen(
                 argv,
                 cwd=PROJECT,
-                env={**os.environ, **(environment or {})},
+                env={**_usual_environment(), **(environment or {})},
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=errors,
@@ -83,6 +83,11 @@ def run(
     ours_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     peak_kb = usage.ru_maxrss if usage.ru_maxrss > ours_kb else 0
     return Run(wall_s, cpu_s, peak_kb / 1024, texts[0])
+
+
+def _usual_environment() -> dict[str, str]:
+    """That of this process, but that Python keeps what it compiles, as it does for users."""
+    return {name: v for name, v in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 
 
 @contextmanager

@@ -19,7 +19,7 @@ Temperature = Annotated[float, Field(strict=True, ge=0, le=10)]
 class Persona(BaseModel):
     """What changes where a prompt contains the ``text``: each number is added to its namesake."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     text: Annotated[str, Field(min_length=1)]
     x_left_first: Number = 0.0
@@ -38,7 +38,7 @@ class PlantedEffect(BaseModel):
     added to the gap that both aim at.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     x_left_first: Number = -0.30
     x_headway: Number = 1.11

@@ -27,15 +27,22 @@ from merge_runner.scenarios.registry import new_world
 
 
 async def play_trial(
-    spec: TrialSpec, scenario: ScenarioConfig, drivers: Mapping[Side, Driver]
+    spec: TrialSpec,
+    scenario: ScenarioConfig,
+    drivers: Mapping[Side, Driver],
+    *,
+    in_turn: bool = False,
 ) -> TrialRecord:
-    """Play a trial to its end, or until a call fails."""
+    """Play a trial to its end, or until a call fails.
+
+    Drivers are asked at once, or ``in_turn`` where their answers are there already.
+    """
     world = new_world(scenario, spec.condition, _starts(drivers))
     seats = {side: _seated(drivers[side], world) for side in SIDES}
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}
     while world.status is None:
-        answers = await _decide(world, seats)
+        answers = await _decide(world, seats, in_turn)
         failures = {s: a for s, a in answers.items() if isinstance(a, CallFailed)}
         for side, answer in answers.items():
             if isinstance(answer, Decision):
@@ -139,23 +146,23 @@ def _seated(driver: Driver, world: World) -> _Seated:
     return _Seated(driver, Eyes(perception, seat.seed, seat.scenario.step_s, start))
 
 
-async def _decide(world: World, seats: Mapping[Side, _Seated]) -> dict[Side, Decision | CallFailed]:
-    """Ask at once all who are due; where one call fails, the other's answer is still awaited."""
+async def _decide(
+    world: World, seats: Mapping[Side, _Seated], in_turn: bool
+) -> dict[Side, Decision | CallFailed]:
+    """Ask all who are due; where one call fails, the other's answer is still awaited."""
     asked = {
-        side: seated
+        side: (seated, seated.observe(world), world.step)
         for side, seated in seats.items()
         if seated.is_due(world.step) and world.in_control(side)
     }
-    if not asked:
-        return {}
-
-    async def answer(seated: _Seated, observation: Observation) -> Decision | CallFailed:
-        try:
-            return await seated.driver.decide(observation, seated.number(world.step))
-        except CallFailed as failure:
-            return failure
-
-    answers = await asyncio.gather(
-        *(answer(seated, seated.observe(world)) for seated in asked.values())
-    )
+    if in_turn or not asked:
+        return {side: await _answer(*told) for side, told in asked.items()}
+    answers = await asyncio.gather(*(_answer(*told) for told in asked.values()))
     return dict(zip(asked, answers, strict=True))
+
+
+async def _answer(seated: _Seated, observation: Observation, step: int) -> Decision | CallFailed:
+    try:
+        return await seated.driver.decide(observation, seated.number(step))
+    except CallFailed as failure:
+        return failure

@@ -12,6 +12,7 @@ import typer.main
 
 import merge_runner as package
 from analysis.commands import app
+from merge_runner.cli.app import alone
 
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
@@ -34,6 +35,20 @@ def test_the_menu_is_what_was_promised():
     assert set(command.commands["recording"].commands) == {"export", "import", "verify", "info"}
     assert package.__all__ == ["Study", "StudyOutcome", "__version__"]
     assert [e.value for e in entry_points(name="merge-runner")] == ["merge_runner.__main__:main"]
+
+
+def help_of(command: typer.main.TyperCommand) -> str:
+    return command.get_help(command.make_context("merge-runner", [], resilient_parsing=True))
+
+
+def test_a_command_has_its_options_where_those_of_the_others_are_left_out():
+    whole = typer.main.get_command(app)
+    for name, command in whole.commands.items():
+        light = typer.main.get_command(alone(name))
+        assert help_of(light.commands[name]) == help_of(command)
+        assert help_of(light) == help_of(whole)
+        others = [each for other, each in light.commands.items() if other != name]
+        assert not any(p.name != "help" for each in others for p in each.params)
 
 
 @pytest.mark.parametrize(

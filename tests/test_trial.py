@@ -42,14 +42,14 @@ def spec_of(condition):
     )
 
 
-async def play(left, right, condition="N_0_0", **scenario):
+async def play(left, right, condition="N_0_0", *, in_turn=False, **scenario):
     """A trial; a driver with a ``rate_hz`` keeps it."""
     drivers, task = {"left": left, "right": right}, ScenarioConfig(**scenario)
     for side, driver in drivers.items():
         rate_hz = getattr(driver, "rate_hz", None)
         pace = program_pace(task, rate_hz) if rate_hz else model_pace(task)
         driver.seat = Seat(task, side, pace, 0)
-    return await play_trial(spec_of(condition), task, drivers)
+    return await play_trial(spec_of(condition), task, drivers, in_turn=in_turn)
 
 
 async def play_constant(condition="N_0_0", **scenario):
@@ -116,6 +116,15 @@ async def test_both_drivers_are_asked_before_either_has_answered():
     trial = await play(left, right)
     assert trial.status == "finished"
     assert left.met == right.met == [True] * 10
+
+
+async def test_in_turn_the_trial_is_the_same_without_a_task_for_each_driver():
+    at_once = await play(Holding(0.3), Holding(-0.6), "R_-4_8")
+    left, right = Meeting(0.3), Meeting(-0.6)
+    left.other, right.other = right, left
+    assert await play(left, right, "R_-4_8", in_turn=True) == at_once
+    assert not any(left.met)
+    assert all(right.met)
 
 
 async def test_both_drivers_observe_the_same_state():

@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import gc
 import sys
-from typing import Annotated
+from collections.abc import Callable
+from copy import copy
+from typing import Annotated, Any
 
 import typer
 
@@ -59,14 +61,41 @@ app.add_typer(recording_app, name="recording")
 app.add_typer(seat_app, name="seat")
 
 
+def alone(command: str | None) -> typer.Typer:
+    """The program with the options of one command, since making those of all takes as long again.
+
+    The others are there by their names and by what they say of themselves.
+    """
+    light = copy(app)
+    light.registered_commands = [copy(info) for info in app.registered_commands]
+    for info in light.registered_commands:
+        if info.callback is not None and command != (info.name or info.callback.__name__):
+            info.callback = _without_options(info.callback)
+    light.registered_groups = [copy(info) for info in app.registered_groups]
+    for group in light.registered_groups:
+        if group.typer_instance is not None and command != group.name:
+            group.typer_instance = copy(group.typer_instance)
+            group.typer_instance.registered_commands = []
+    return light
+
+
+def _without_options(command: Callable[..., Any]) -> Callable[[], None]:
+    def bare() -> None:
+        raise AssertionError("unreachable: the command that runs has its options")
+
+    bare.__name__, bare.__doc__ = command.__name__, command.__doc__
+    return bare
+
+
 def main() -> None:
     """Run the command line and exit with the contract's code."""
     # A trial's objects live until it ends, so frequent garbage collections would find almost none.
     gc.set_threshold(20_000, 10, 100)
     debug = "--debug" in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != "--debug"]
+    words = (argument for argument in sys.argv[1:] if not argument.startswith("-"))
     try:
-        app()
+        alone(next(words, None))()
     except MergeRunnerError as exc:
         if debug:
             raise

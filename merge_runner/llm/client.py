@@ -6,14 +6,12 @@ What an attempt means for its call is decided in consequences.py.
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
-from typing import Any
 
 from merge_runner.config import ModelEntry
 from merge_runner.errors import (
@@ -52,6 +50,7 @@ from merge_runner.llm.shared_services import (
     Settle,
 )
 from merge_runner.llm.transport import Transport, TransportFailure
+from merge_runner.llm.verify import reply_object
 from merge_runner.records import (
     SCRIPTED_HEADER,
     Attempt,
@@ -472,7 +471,7 @@ class LlmClient:
     def _read(self, entry: CachedCall, earlier: int | None = None) -> ChatReply:
         """A recorded reply; without ``earlier`` all its attempts were made by earlier runs."""
         last = entry.attempts[-1]
-        payload: Any = json.loads(last.reply or "{}") if last.http_status == 200 else {}
+        payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
         return ChatReply(
             text=self._format.read(payload).text,
             outcome=last.outcome,

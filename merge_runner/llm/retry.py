@@ -10,11 +10,12 @@ import asyncio
 import random
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from typing import NoReturn
-
-from tenacity import AsyncRetrying, RetryCallState, retry_if_exception_type
+from typing import TYPE_CHECKING, NoReturn
 
 from merge_runner.errors import MergeRunnerError
+
+if TYPE_CHECKING:
+    from tenacity import AsyncRetrying, RetryCallState
 
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
 
@@ -48,6 +49,8 @@ def retries(
 
     Raises OutOfTime when the deadline would pass before the next one.
     """
+    from tenacity import AsyncRetrying, retry_if_exception_type  # a replay needs none of it
+
     # Looped over, since to wrap a function for each call would take twice the processor time.
     return AsyncRetrying(
         retry=retry_if_exception_type(TryAgain),

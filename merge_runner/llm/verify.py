@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from datetime import datetime
+from functools import lru_cache
+from typing import Any
 
 from merge_runner.llm.content_hashes import call_key, canonical_json
 from merge_runner.records import Attempt, ChatRequest
@@ -43,7 +45,16 @@ def check_attempts(attempts: tuple[Attempt, ...]) -> None:
             datetime.fromisoformat(attempt.started_at)
         is_answer = attempt.outcome != "bad_body" or attempt is attempts[-1]
         if attempt.http_status == 200 and is_answer:
-            _check_reply(attempt.reply or "{}")
+            reply_object(attempt.reply or "{}")
+
+
+@lru_cache(maxsize=1)  # who checks a reply reads it next
+def reply_object(text: str) -> dict[str, Any]:
+    """The JSON object that a reply is, not to be changed; raises one of DAMAGED for another."""
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise ValueError("a reply is not a JSON object")
+    return value
 
 
 def _check_numbers(attempt: Attempt) -> None:
@@ -57,8 +68,3 @@ def _check_numbers(attempt: Attempt) -> None:
         for count in counts:
             if count is not None and not 0 <= count <= most:
                 raise ValueError("an attempt has a number that no attempt can have")
-
-
-def _check_reply(text: str) -> None:
-    if not isinstance(json.loads(text), dict):
-        raise ValueError("a reply is not a JSON object")

@@ -93,6 +93,8 @@ def _plan(places: Iterable[str], plan_actions: int) -> tuple[tuple[float, ...] |
 
 def _failure(array: tuple[float | str, ...], plan_actions: int) -> str | None:
     """Why an array is no plan; None: it is one."""
+    if len(array) == plan_actions and all(map(_is_action, array)):
+        return None
     numbers = [entry for entry in array if isinstance(entry, float)]
     words = [entry for entry in array if isinstance(entry, str)]
     # A literal can be too large for a float.
@@ -100,14 +102,17 @@ def _failure(array: tuple[float | str, ...], plan_actions: int) -> str | None:
         return "not_finite"
     if words:
         return "not_a_number"
-    if len(numbers) != plan_actions:
-        return "wrong_length"
-    return None if all(-1 <= number <= 1 for number in numbers) else "out_of_range"
+    return "wrong_length" if len(numbers) != plan_actions else "out_of_range"
+
+
+def _is_action(entry: float | str) -> bool:
+    return isinstance(entry, float) and -1 <= entry <= 1
 
 
 def _entries(inside: str) -> tuple[float | str, ...]:
     """The entries of an array: numbers, and as it is spelled what is not a number."""
-    inside = inside.translate(_MINUSES)
+    if not inside.isascii():
+        inside = inside.translate(_MINUSES)
     if _NUMBERS.fullmatch(inside):
         return tuple(map(float, inside.rstrip().removesuffix(",").split(",")))
     entries = [_SIGN_APART.sub(r"\1", entry.strip()) for entry in inside.split(",")]

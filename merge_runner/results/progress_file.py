@@ -10,11 +10,13 @@ import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Literal
 from urllib.parse import quote
 
 from pydantic import AwareDatetime, NonNegativeInt, TypeAdapter, ValidationError
+from pydantic_core import to_json
 
 EVERY_S = 1.0
 STALE_S = 10.0
@@ -90,7 +92,9 @@ class Standing:
         return age_s < (CHECKING_STALE_S if self.doing == "checking" else STALE_S)
 
 
-_STANDING = TypeAdapter(Standing)
+@cache  # a sweep only writes its file
+def _standing() -> TypeAdapter[Standing]:
+    return TypeAdapter(Standing)
 
 
 @dataclass(slots=True)
@@ -115,7 +119,7 @@ class ProgressFile:
             self._newest = standing.updated_at
             try:
                 path.parent.mkdir(exist_ok=True)
-                made.write_bytes(_STANDING.dump_json(standing))
+                made.write_bytes(to_json(standing))
                 os.replace(made, path)
             except OSError as exc:
                 if not self._told:
@@ -175,7 +179,7 @@ def _read(path: Path) -> Standing | None:
         return None  # reading a pipe might never end
     try:
         with path.open("rb") as file:
-            return _STANDING.validate_json(file.read(MOST_BYTES))
+            return _standing().validate_json(file.read(MOST_BYTES))
     except (OSError, ValidationError):
         return None
 

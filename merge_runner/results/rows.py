@@ -183,10 +183,15 @@ def _as_json(attempt: Attempt) -> str | None:
     any honest reply. An answer was read as JSON already.
     """
     text = attempt.reply
-    if text is None or (attempt.answered and not _SURROGATE.search(text)):
+    if text is None or (attempt.answered and not _has_half_a_pair(text)):
         return text
     try:
         json.dumps(json.loads(text), ensure_ascii=False).encode()
     except (ValueError, RecursionError):
         return json.dumps(text.encode(errors="replace").decode())
     return text
+
+
+def _has_half_a_pair(text: str) -> bool:
+    """Whether half of a surrogate pair may be in a text; most have nothing that needs a search."""
+    return not (text.isascii() and "\\u" not in text) and bool(_SURROGATE.search(text))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Collection, Iterator, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -387,6 +388,13 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
             "FROM decisions",
             "",
         )[0]
+        attempts = rows(
+            f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
+            "if(outcome = 'ok', coalesce(failure, outcome), outcome), model, provider, "
+            "count(*) FILTER (scripted), count(*) FROM attempts LEFT JOIN specs USING (spec_hash)",
+            "GROUP BY ALL ORDER BY ALL",
+        )
+        asked = rows("SELECT 1 FROM trials", "WHERE source = 'seat' LIMIT 1")
         return SweepFacts(
             outcomes=rows(
                 "SELECT variant, condition, status, merged_first, coalesce(fallen_back, false), "
@@ -400,12 +408,7 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 f"FROM trials JOIN ({LEVELS}) USING (trial_id, spec_hash)",
                 "GROUP BY ALL ORDER BY ALL",
             ),
-            ledger=rows(
-                f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
-                "if(outcome = 'ok', coalesce(failure, outcome), outcome), count(*) "
-                "FROM attempts LEFT JOIN specs USING (spec_hash)",
-                "GROUP BY ALL ORDER BY ALL",
-            ),
+            ledger=_ledger(attempts),
             failed=rows(
                 "SELECT trial_id, error FROM trials", "WHERE status = 'failed' ORDER BY ALL"
             ),
@@ -414,14 +417,9 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 f"WHERE http_status = 200 AND {sql_of(other_models(connection))} "
                 "GROUP BY ALL ORDER BY ALL",
             ),
-            stand_ins=rows(
-                f"SELECT {DRIVER}, model, provider, "  # noqa: S608 # constants
-                "count(*) FILTER (scripted), count(*) "
-                "FROM attempts LEFT JOIN specs USING (spec_hash)",
-                "WHERE fate IN ('driven', 'fallback') GROUP BY ALL HAVING bool_or(scripted) "
-                "ORDER BY ALL",
-            ),
-            first_looks=rows(
+            stand_ins=_stand_ins(attempts),
+            first_looks=asked
+            and rows(
                 "SELECT driver, variant, model, side, velocity_mps, count(*), "  # noqa: S608 # constants
                 "count(*) FILTER (NOT valid), count(tactical), count(*) FILTER (tactical = 'M'), "
                 f"avg(action_mps2) FILTER (valid) FROM ({FIRST_LOOKS}) "
@@ -432,6 +430,25 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
             invalid=decisions[1],
             fallbacks=decisions[2],
         )
+
+
+def _ledger(attempts: Iterable[Row]) -> list[tuple[str, str, str, str, int]]:
+    """How many attempts a driver made with a prompt, by what became of them; see SweepFacts."""
+    counts: Counter[tuple[str, str, str, str]] = Counter()
+    for driver, variant, fate, outcome, *_, count in attempts:
+        counts[driver, variant, fate, outcome] += count
+    return [(*group, count) for group, count in counts.items()]
+
+
+def _stand_ins(attempts: Iterable[Row]) -> list[tuple[str, str, str, int, int]]:
+    """Who answered in whose name, of the answers that were driven; see SweepFacts."""
+    scripted: Counter[tuple[str, str, str]] = Counter()
+    answers: Counter[tuple[str, str, str]] = Counter()
+    for driver, _, fate, _, model, provider, by_stand_ins, count in attempts:
+        if fate in ("driven", "fallback"):
+            scripted[driver, model, provider] += by_stand_ins
+            answers[driver, model, provider] += count
+    return [(*who, count, answers[who]) for who, count in sorted(scripted.items()) if count]
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:

@@ -17,6 +17,8 @@ from merge_runner.run.spill import Spill
 EVERY_S = 1.0
 BATCH = 64
 """Trials in one transaction: few enough that a reader gets its turn soon."""
+BATCH_OF_REPLAY = 4 * BATCH
+"""Of trials that take no time: a transaction costs as much as storing dozens of them."""
 MOST_PENDING = 4 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
 # While storing fails, as when another program holds the file: how many bytes may wait in memory
@@ -49,11 +51,14 @@ class Flusher:
     maps trials that were already stored with other values to the columns that differ.
     """
 
-    def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, store: Store, sweep_id: str, say: Callable[[str], None], batch: int = BATCH
+    ) -> None:
         self.differing: dict[str, list[str]] = {}
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
+        self._batch = batch
         self._pending: list[TrialRecord] = []
         self._bytes = 0
         self._spill = Spill()
@@ -67,7 +72,7 @@ class Flusher:
         """Store this trial with the next batch."""
         self._pending.append(record)
         self._bytes += size_of(record)
-        if len(self._pending) >= BATCH or self._bytes >= BATCH_BYTES:
+        if len(self._pending) >= self._batch or self._bytes >= BATCH_BYTES:
             self._awake.set()
 
     async def room(self) -> None:
@@ -135,7 +140,7 @@ class Flusher:
             taken = await asyncio.to_thread(self._spill.take)
             self._bytes += sum(map(size_of, taken))
             self._pending = taken + self._pending
-        sizes = accumulate(map(size_of, self._pending[:BATCH]))
+        sizes = accumulate(map(size_of, self._pending[: self._batch]))
         # At least one: a single trial may be larger than a batch should be.
         number = max(1, sum(size <= BATCH_BYTES for size in sizes))
         batch, self._pending = self._pending[:number], self._pending[number:]

@@ -107,6 +107,11 @@ class LocalRunner:
         models = {name: LanguageModel(partial(self._ask, name)) for name in self.clients}
         return {**PROGRAMS, **models}
 
+    @cached_property
+    def _sealed(self) -> frozenset[str]:
+        """The models whose answers are there, or nowhere."""
+        return frozenset(name for name, client in self.clients.items() if client.sealed)
+
     @property
     def running(self) -> int:
         """How many trials are being played."""
@@ -166,7 +171,8 @@ class LocalRunner:
         }
         self.playing[spec.cell] += 1
         try:
-            return spec, await play_trial(spec, arm.scenario, drivers)
+            recorded = all(name in self._sealed for name in arm.asked.values())
+            return spec, await play_trial(spec, arm.scenario, drivers, in_turn=recorded)
         except TrialSuspended as exc:
             return spec, exc
         finally:

@@ -46,7 +46,7 @@ from merge_runner.run.clients import (
     start_endpoints,
 )
 from merge_runner.run.estimate import Estimate, Todo, estimate
-from merge_runner.run.flusher import AGAIN, Flusher
+from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
 from merge_runner.run.plan import Options, Plan, usual_prompts
@@ -60,7 +60,7 @@ GO_ON = "Run the same command again to go on."
 SHOWN = 5
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
-FROM_RECORDINGS = 16
+FROM_PROGRAMS = 16
 LOOK_AT_CLOCK_S = 1.0
 
 
@@ -169,10 +169,13 @@ class Sweep:
 
     async def run(self) -> Outcome:
         """Play what is missing and store it; what goes wrong is in the outcome."""
+        # Git is another process, and takes as long as it takes to make a database.
+        source = asyncio.get_running_loop().run_in_executor(None, git_state)
         if self._options.replay and (misses := await self._all_missing()):
             return self._not_recorded(misses)
         with unreadable_is_usage():
-            sweep_id = self._begin()
+            store = self._store
+            sweep_id = self._begin(store, *await source)
         file = ProgressFile(self._options.db, sweep_id)
         async with publish_progress(self._progress, file):
             outcome = await self._run(sweep_id)
@@ -219,7 +222,8 @@ class Sweep:
             stack.callback(self._cache.close)
             runner = await self._runner(stack)
             self._progress.runner = runner
-            flusher = Flusher(self._store, outcome.sweep_id, self._say)
+            batch = BATCH_OF_REPLAY if self._options.replay else BATCH
+            flusher = Flusher(self._store, outcome.sweep_id, self._say, batch)
             self._progress.unstored = lambda: flusher.problem
             began = time.perf_counter()
             try:
@@ -316,13 +320,12 @@ class Sweep:
                 f"{len(left_out)} rows of the cache are left out of this, the first: {left_out[0]}"
             )
 
-    def _begin(self) -> str:
+    def _begin(self, store: Store, commit: str, dirty: bool | None) -> str:
         """Add the sweep to the database, with the trials that are stored already."""
         started_at = datetime.now(UTC).replace(tzinfo=None)
         sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
-        commit, dirty = git_state()
         config = {**self._plan.config(), "max_cost_usd": self._options.max_cost_usd}
-        self._store.begin_sweep(
+        store.begin_sweep(
             SweepRow(
                 sweep_id=sweep_id,
                 name=self._plan.name,
@@ -343,8 +346,9 @@ class Sweep:
         plan, options = self._plan, self._options
         if options.replay or not self._todo or not plan.entries:
             clients = sealed_clients(plan, self._cache)
-            # Recorded replies come at once: more trials in flight would only take more memory.
-            return LocalRunner(plan, clients, min(options.in_flight, FROM_RECORDINGS))
+            # Recorded replies come at once: more trials in flight would only wait for each other.
+            in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
+            return LocalRunner(plan, clients, in_flight)
         services = open_services(plan, options, self._cache, self._ledger, self._measured(), stack)
         urls = await start_endpoints(plan.entries, options.emulator_options, stack)
         known = frozenset(

@@ -18,6 +18,8 @@ from merge_runner.records import (
     TrialSpec,
 )
 from merge_runner.run.flusher import (
+    BATCH,
+    BATCH_OF_REPLAY,
     MOST_PENDING,
     MOST_PENDING_BYTES,
     MOST_STUCK_BYTES,
@@ -86,6 +88,17 @@ async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     assert sum(store.written) == MOST_PENDING_BYTES // (10 * MB) + 1
     assert max(store.written) == 3
     assert flusher._bytes == 0
+
+
+@pytest.mark.parametrize(("batch", "written"), [(BATCH, [64, 46]), (BATCH_OF_REPLAY, [110])])
+async def test_trials_that_take_no_time_are_stored_in_fewer_transactions(batch, written):
+    store = Slow()
+    store.go_on.set()
+    flusher = Flusher(store, "sweep", lambda line: None, batch)
+    for _ in range(110):
+        flusher.add(trial(0))
+    await flusher.close()
+    assert store.written == written
 
 
 class Held(Slow):
