@@ -15,6 +15,7 @@ class Background:
     def __init__(self) -> None:
         self._tasks: set[asyncio.Task[None]] = set()
         self._resting: set[asyncio.Task[Any] | None] = set()
+        self._closing = False
 
     def start(
         self, work: Coroutine[Any, Any, None], lines: Iterable[Line], *, reads: bool = False
@@ -39,7 +40,9 @@ class Background:
         task.add_done_callback(done)
 
     async def rest(self, seconds: float) -> None:
-        """Sleep, as a part of a task that can be dropped meanwhile."""
+        """Sleep, as a part of a task that can be dropped meanwhile, and from then on."""
+        if self._closing:
+            raise asyncio.CancelledError
         task = asyncio.current_task()
         was_resting = task in self._resting
         self._resting.add(task)
@@ -50,7 +53,8 @@ class Background:
                 self._resting.discard(task)
 
     async def close(self) -> None:
-        """Drop what can be dropped, and wait for the end of all else."""
+        """Drop what can be dropped, and wait until all else rests or has ended."""
+        self._closing = True
         for task in self._tasks & self._resting:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from merge_runner.errors import EndpointRefused, MergeRunnerError, QuotaExhausted
 from merge_runner.llm.batch.background import Background
-from merge_runner.llm.batch.journal import Journal, OpenBatch
+from merge_runner.llm.batch.journal import Journal, OpenBatch, now
 from merge_runner.llm.batch.lines import Line, LineEnd
 from merge_runner.llm.batch.service import (
     BatchFailed,
@@ -23,8 +23,10 @@ from merge_runner.llm.batch.service import (
 )
 
 SHORTEST_POLL_S, LONGEST_POLL_S, POLL_SHARE = 0.25, 60.0, 0.1
-# A request that a process sent right before it died may be in effect only after this.
-ARRIVAL_S = 3.0
+# A creation whose answer was lost may be in effect only after this: gateways keep requests.
+ARRIVAL_S = 30.0
+# How long a batch that was asked to end may take for that.
+CANCEL_S = 3600.0
 T = TypeVar("T")
 
 
@@ -35,7 +37,6 @@ class Followed:
     ``results`` are those that nobody has asked for yet. It is ``created`` once its id is known, and
     ``looked`` at once the provider was asked for its state, in vain perhaps.
     ``gone`` is the end of all lines that join it from then on; a batch that ``never_was`` has none.
-    ``others`` are ids of batches that were taken for it.
     """
 
     batch: OpenBatch
@@ -46,10 +47,8 @@ class Followed:
     created: bool = False
     looked: bool = False
     fetching: bool = False
-    sure: bool = True
     gone: LineEnd | None = None
     never_was: bool = False
-    others: set[str] = field(default_factory=set)
     keys: frozenset[str] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -99,9 +98,9 @@ class Following:
         self._split = split
         self._say = say
 
-    async def identified(self, followed: Followed, batch_id: str) -> None:
+    async def identified(self, followed: Followed, batch_id: str, *, sure: bool = True) -> None:
         """Note the id of a batch, which is known now."""
-        followed.batch = replace(followed.batch, batch_id=batch_id)
+        followed.batch = replace(followed.batch, batch_id=batch_id, sure=sure)
         followed.created = True
         await self._journal.note(followed.batch)
 
@@ -113,8 +112,7 @@ class Following:
         )
         if found is None:
             return False
-        followed.sure = found.sure
-        await self.identified(followed, found.batch_id)
+        await self.identified(followed, found.batch_id, sure=found.sure)
         return True
 
     async def follow(self, followed: Followed) -> None:
@@ -123,35 +121,56 @@ class Following:
             while await self._has_ended(followed) and not await self._handed_out(followed):
                 # It was somebody else's.
                 followed.fetching, followed.status = False, None
-                followed.others.add(followed.batch.batch_id)
-                if not await self._find(followed):
+                batch = followed.batch
+                followed.batch = replace(batch, others=(*batch.others, batch.batch_id))
+                if not await self.found_patiently(followed):
                     followed.end(LineEnd(None, outcome="not_created", singly=True))
         except BatchFailed as exc:
             self.lost(followed, exc)
         finally:
             self.batch_ended.set()
 
-    async def _find(self, followed: Followed) -> bool:
+    async def found_patiently(self, followed: Followed) -> bool:
+        """Look for a batch, as ``found`` does, until its provider answers."""
         return await self._patiently(followed, partial(self.found, followed))
 
-    async def find_in_time(self, followed: Followed) -> bool:
-        """Look for a batch twice: its creation may come into effect after its process died."""
-        if await self._find(followed):
-            return True
-        await self._background.rest(ARRIVAL_S)
-        return await self._find(followed)
+    async def arrived(
+        self, followed: Followed, find: Callable[[Followed], Awaitable[bool]]
+    ) -> bool:
+        """Look for a batch until its creation, if it was ever sent, must be in effect."""
+        waited_s = 0.0
+        while not await find(followed):
+            if waited_s >= ARRIVAL_S:
+                return False
+            pause_s = min(max(1.0, waited_s), ARRIVAL_S - waited_s)
+            await self._background.rest(pause_s)
+            waited_s += pause_s
+        return True
 
     def _known_ids(self, followed: Followed) -> set[str]:
         """The ids of batches that are others than this one."""
-        others = (each for each in self._journal.batches() if each.mark != followed.batch.mark)
-        own = {batch.batch_id for batch in others} | self._journal.ended_ids()
-        return (own | followed.others) - {""}
+        batch = followed.batch
+        others = (each for each in self._journal.batches() if each.mark != batch.mark)
+        own = {each.batch_id for each in others if each.sure} | self._journal.ended_ids()
+        return (own | {*batch.others}) - {""}
 
     async def _has_ended(self, followed: Followed) -> bool:
         """Wait for the end of a batch; False where it failed as a whole."""
         status = followed.status or await self._look(followed)
         while status.state == "waiting":
             await self._cancel_in_time(followed)
+            if _takes_too_long(followed.batch):
+                batch = followed.batch
+                followed.end(
+                    LineEnd(
+                        batch.batch_id,
+                        outcome="no_result",
+                        message=f"the batch was cancelled at {batch.cancelled_at} and does not end",
+                        unclear=True,
+                        singly=True,
+                    )
+                )
+                return False
             await self._background.rest(self._until_next_look_s(followed))
             status = await self._look(followed)
         if status.state == "ended":
@@ -175,16 +194,18 @@ class Following:
     def _until_next_look_s(self, followed: Followed) -> float:
         usual_s = min(LONGEST_POLL_S, max(SHORTEST_POLL_S, POLL_SHARE * followed.age_s))
         left_s = self._deadline_s - followed.age_s
-        return usual_s if followed.batch.cancelled else max(SHORTEST_POLL_S, min(usual_s, left_s))
+        if followed.batch.cancelled_at or not followed.batch.sure:
+            return usual_s
+        return max(SHORTEST_POLL_S, min(usual_s, left_s))
 
     async def _cancel_in_time(self, followed: Followed) -> None:
-        if followed.batch.cancelled or not followed.sure:
+        if followed.batch.cancelled_at or not followed.batch.sure:
             return
         if followed.age_s < self._deadline_s:
             return
         batch = followed.batch
         await self._patiently(followed, partial(self._services[batch.model].cancel, batch.batch_id))
-        followed.batch = replace(batch, cancelled=True)
+        followed.batch = replace(batch, cancelled_at=now())
         await self._journal.note(followed.batch)
         self._say(
             f"{batch.model}: batch {batch.batch_id} has waited for "
@@ -203,22 +224,22 @@ class Following:
                 break
             except BatchFailed as exc:
                 if exc.kind == "again":
-                    await self._background.rest(exc.delay_s or backoff_s(next(tries)))
+                    await self._rest_after(followed, exc, next(tries))
                 elif exc.kind == "single":
                     left_out = str(exc)
                     self._say(f"{batch.model}: {exc}")
                     break
                 else:
                     raise
-        if not followed.sure and not followed.seen:
+        if not followed.batch.sure and not followed.seen:
             return False
         followed.end(
             LineEnd(
                 followed.batch.batch_id,
                 outcome="no_result",
                 message=left_out or "the batch has ended without a result for it",
-                # What a cancelled batch does not tell of was not asked.
-                unclear=not followed.batch.cancelled,
+                # What a cancelled batch does not tell of was not asked, if all was read.
+                unclear=bool(left_out) or not followed.batch.cancelled_at,
                 singly=True,
             )
         )
@@ -237,7 +258,8 @@ class Following:
     def lost(self, followed: Followed, exc: BatchFailed) -> None:
         """Nobody knows what became of a batch: what was set aside for it stays so."""
         batch = followed.batch
-        if batch.model in self._free or self._deadline_s == 0:
+        gives_up = self._deadline_s == 0
+        if batch.model in self._free or gives_up:
             end = LineEnd(batch.batch_id, outcome="batch_lost", message=str(exc), unclear=True)
             followed.end(end)
             return
@@ -255,9 +277,8 @@ class Following:
         who = batch.model
         error: MergeRunnerError | None = None
         if kind == "single":
-            self._say(
-                f"{who}: {len(batch.keys)} calls are asked singly, at the full price: {message}"
-            )
+            told = counted(len(batch.keys))
+            self._say(f"{who}: asked singly, at the full price: {told} ({message})")
         if kind == "quota":
             error = QuotaExhausted(
                 f"{who}: the account's quota is exhausted ({message}). Every reply so far is "
@@ -284,12 +305,17 @@ class Following:
             except BatchFailed as exc:
                 if exc.kind != "again":
                     raise
-                followed.looked = True
-                if tries == 1:
-                    model = followed.batch.model
-                    self._say(f"{model}: {exc}; it is asked again until it answers")
-                await self._background.rest(max(exc.delay_s or 0.0, backoff_s(tries)))
+                await self._rest_after(followed, exc, tries)
         raise AssertionError("unreachable: it counts for ever")
+
+    async def _rest_after(self, followed: Followed, exc: BatchFailed, tries: int) -> None:
+        """Rest before a provider is asked again; meanwhile nothing of the batch is on its way."""
+        followed.looked = True
+        fetching, followed.fetching = followed.fetching, False
+        if tries == 1:
+            self._say(f"{followed.batch.model}: {exc}; it is asked again until it answers")
+        await self._background.rest(max(exc.delay_s or 0.0, backoff_s(tries)))
+        followed.fetching = fetching
 
 
 def answered(followed: Followed, result: LineResult) -> LineEnd:
@@ -300,9 +326,22 @@ def answered(followed: Followed, result: LineResult) -> LineEnd:
     return LineEnd(batch_id, result.raw, message=result.message)
 
 
+def _takes_too_long(batch: OpenBatch) -> bool:
+    """Whether a batch that was asked to end should have done so by now."""
+    if not batch.cancelled_at:
+        return False
+    ago = datetime.now(UTC) - datetime.fromisoformat(batch.cancelled_at)
+    return ago.total_seconds() > CANCEL_S
+
+
 def backoff_s(tries: int) -> float:
     """How long to wait after so many tries."""
     return min(LONGEST_POLL_S, 0.5 * 2.0 ** min(tries, 10))
+
+
+def counted(calls: int) -> str:
+    """So many calls, for a reader."""
+    return "1 call" if calls == 1 else f"{calls} calls"
 
 
 def duration(seconds: float) -> str:

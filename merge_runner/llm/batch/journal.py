@@ -6,7 +6,7 @@ and under which of its attempts each call waits there.
 
 from __future__ import annotations
 
-import hashlib
+import secrets
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -21,7 +21,7 @@ from merge_runner.records import Attempt
 _BATCH, _LINE, _ENDED = "batch ", "line ", "ended batches"
 # How long an ended batch may be mistaken for one whose id was lost.
 REMEMBERED = timedelta(days=2)
-MARK_LENGTH = 32
+MARK_BYTES = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +40,11 @@ class OpenLine:
 class OpenBatch:
     """A batch that was submitted, or is about to be.
 
-    ``mark`` is a hash of what is in it, and its name at the provider. ``batch_id`` is empty until
-    the provider has told it. ``model`` is its name in the registry, ``ledger`` that of the money.
-    ``number`` is the round: which decision its trials wait for at most, counted from 1.
-    ``submitted_at`` is UTC in ISO 8601. The batch was asked to end where it is ``cancelled``.
+    ``mark`` is its name at the provider. ``batch_id`` is empty until the provider has told it, and
+    may be somebody else's while it is not ``sure``; ``others`` are ids that turned out to be so.
+    ``model`` is its name in the registry, ``ledger`` that of the money. ``number`` is the round:
+    which decision its trials wait for at most, counted from 1. ``submitted_at`` and
+    ``cancelled_at`` are UTC in ISO 8601; empty: it was not asked to end.
     """
 
     mark: str
@@ -54,7 +55,9 @@ class OpenBatch:
     submitted_at: str
     keys: tuple[str, ...]
     batch_id: str = ""
-    cancelled: bool = False
+    sure: bool = True
+    others: tuple[str, ...] = ()
+    cancelled_at: str = ""
 
     @property
     def since(self) -> datetime:
@@ -66,10 +69,9 @@ _OPEN_BATCH, _OPEN_LINE = TypeAdapter(OpenBatch), TypeAdapter(OpenLine)
 _TIMES = TypeAdapter(dict[str, str])
 
 
-def mark_of(lines: Iterable[tuple[str, int]], salt: str = "") -> str:
-    """The name of a batch of such attempts, by key and number; another ``salt``, another name."""
-    told = "\n".join([salt, *sorted(f"{key} {attempt}" for key, attempt in lines)])
-    return hashlib.sha256(told.encode()).hexdigest()[:MARK_LENGTH]
+def new_mark() -> str:
+    """A name for a batch that no other one has, of whatever run, at whatever provider."""
+    return secrets.token_hex(MARK_BYTES)
 
 
 class Journal:
@@ -141,7 +143,7 @@ class Journal:
         await self._cache.write(lambda: self._write(batch))
 
     def line_ended(self, key: str, line: OpenLine) -> None:
-        """The attempt has ended, and that is durable; the row goes with the next ``tidy``."""
+        """The attempt has ended; once that is durable, the row goes with the next ``tidy``."""
         self._ended.append((key, line))
 
     async def tidy(self) -> None:
@@ -153,12 +155,14 @@ class Journal:
         def operation() -> None:
             times = self._ended_at()
             for key, line in ended:
-                if self.line(key) == line:  # it may wait in another batch by now
+                # It may wait in another batch by now, or what came of it could not be kept.
+                if self.line(key) == line and not self._is_open(key, line):
                     self._cache.remove(_LINE + key)
             for batch in self.batches():
                 if not self.waiting(batch):
                     self._cache.remove_twice(_BATCH + batch.mark)
-                    times[batch.batch_id] = batch.submitted_at
+                    if batch.sure:
+                        times[batch.batch_id] = batch.submitted_at
             recent = {each: at for each, at in times.items() if at >= oldest}
             self._cache.replace(_ENDED, _TIMES.dump_json(recent).decode())
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from merge_runner.errors import ProviderDown, TrialSuspended, WaitingForBatches
+from merge_runner.errors import EndpointRefused, ProviderDown, TrialSuspended, WaitingForBatches
 from merge_runner.llm.batch.background import Background
 from merge_runner.llm.batch.following import (
     LONGEST_POLL_S,
@@ -22,9 +22,10 @@ from merge_runner.llm.batch.following import (
     Following,
     answered,
     backoff_s,
+    counted,
     duration,
 )
-from merge_runner.llm.batch.journal import Journal, OpenBatch, OpenLine, mark_of, now
+from merge_runner.llm.batch.journal import Journal, OpenBatch, OpenLine, new_mark, now
 from merge_runner.llm.batch.lines import Line, LineEnd
 from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus, in_batches
 from merge_runner.llm.first_call import NOBODY_S
@@ -37,6 +38,8 @@ LOOK_S = 0.05
 LOOKS = 5
 # How long a creation is tried again, once the provider has answered any.
 OUTAGE_S = 600.0
+# How often a line that is alone in its batch may be refused for its size before it is asked singly.
+MOST_REFUSALS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +88,8 @@ class Rounds:
         self._forming: list[Line] = []
         self._followed: dict[str, Followed] = {}
         self._most_lines: dict[str, int] = {}
+        self._too_large: set[str] = set()  # models of which the last batch was too large
+        self._refusals: Counter[str] = Counter()  # of lines alone in their batches, by key
         self._reached: set[str] = set()
         self._submitting = 0
 
@@ -120,7 +125,7 @@ class Rounds:
         return None if known is None else known.submitted_at
 
     def ended(self, line: Line) -> None:
-        """What came of a line is durable."""
+        """A line has ended, and what came of it was given to the cache to keep."""
         if line.open is not None:
             self._journal.line_ended(line.key, line.open)
 
@@ -170,12 +175,10 @@ class Rounds:
                 together = [lines[each.key] for each in part]
                 self._background.start(self._submit(together), together)
 
-    async def _submit(
-        self, lines: Sequence[Line], *, salt: str = "", instead_of: Sequence[str] = ()
-    ) -> None:
+    async def _submit(self, lines: Sequence[Line], *, instead_of: Sequence[str] = ()) -> None:
         self._submitting += 1
         try:
-            followed = await self._noted(lines, salt, instead_of)
+            followed = await self._noted(lines, instead_of)
             if followed is None:
                 return
             try:
@@ -188,9 +191,7 @@ class Rounds:
         work = self._following.follow(followed)
         self._background.start(work, followed.lines.values(), reads=True)
 
-    async def _noted(
-        self, lines: Sequence[Line], salt: str, instead_of: Sequence[str]
-    ) -> Followed | None:
+    async def _noted(self, lines: Sequence[Line], instead_of: Sequence[str]) -> Followed | None:
         """Note what is about to be submitted; None where no line of it may begin."""
         by_key = {line.key: line for line in lines if not line.end.done()}
         if not by_key:
@@ -198,7 +199,7 @@ class Rounds:
         attempts = {key: line.line.attempt for key, line in by_key.items()}
         first = lines[0]
         batch = OpenBatch(
-            mark=mark_of(attempts.items(), salt),
+            mark=new_mark(),
             model=first.model,
             endpoint=first.line.request.endpoint,
             ledger=first.ledger,
@@ -228,13 +229,15 @@ class Rounds:
         """Create a batch; where it may have been created already, look for it first."""
         batch, service = followed.batch, self.services[followed.batch.model]
         lines = [line.line for line in followed.lines.values()]
-        began_s = _loop_s()
+        began_s, sent = _loop_s(), False
         for tries in itertools.count(1):
             try:
-                if tries == 1 or not await self._following.found(followed):
+                if not (sent and await self._following.arrived(followed, self._following.found)):
+                    sent = False
                     batch_id = await service.submit(lines, batch.mark)
                     await self._following.identified(followed, batch_id)
             except BatchFailed as exc:
+                sent = sent or exc.sent
                 nobody = not exc.sent and batch.model not in self._reached
                 patience_s = NOBODY_S if nobody else OUTAGE_S
                 if exc.kind != "again" or _loop_s() - began_s > patience_s:
@@ -242,15 +245,22 @@ class Rounds:
                 await self._background.rest(max(exc.delay_s or 0.0, backoff_s(tries)))
             else:
                 self._reached.add(batch.model)
+                self._fits(batch.model, len(lines))
                 followed.status = BatchStatus("waiting", "submitted")
                 return
+
+    def _fits(self, model: str, lines: int) -> None:
+        """A batch of so many lines was taken: the next one may have twice as many."""
+        self._too_large.discard(model)
+        if model in self._most_lines:
+            self._most_lines[model] = max(self._most_lines[model], 2 * lines)
 
     async def _not_created(self, followed: Followed, exc: BatchFailed) -> None:
         batch = followed.batch
         if exc.kind == "smaller":
             self._split(followed, str(exc), exc.delay_s)
             return
-        if exc.kind == "again":
+        if exc.kind in ("again", "lost"):
             # It may be there all the same: the next run looks for it, and nothing is settled yet.
             for line in followed.lines.values():
                 line.fails(
@@ -260,15 +270,27 @@ class Rounds:
                     )
                 )
             return
-        end = self._following.without_reply(batch, exc.kind, str(exc), "not_created")
+        if exc.kind == "single" and batch.model not in self._reached:
+            why = f"{batch.model}: there is no batch mode there ({exc}): leave --batch out"
+            end = LineEnd(None, outcome="not_created", message=why, error=EndpointRefused(why))
+        else:
+            end = self._following.without_reply(batch, exc.kind, str(exc), "not_created")
         followed.end(end)
 
     def _split(self, followed: Followed, why: str, delay_s: float | None = None) -> None:
         """Submit the lines of a batch again, in halves, when there may be room for them."""
         batch, lines = followed.batch, list(followed.lines.values())
+        if len(lines) == 1 and not self._has_open(batch.model):
+            self._refusals[lines[0].key] += 1
+            if self._refusals[lines[0].key] == MOST_REFUSALS:
+                end = self._following.without_reply(batch, "single", why, "not_created")
+                followed.end(end)
+                return
         followed.lines.clear()
         followed.never_was = True
-        self._say(f"{batch.model}: {len(lines)} calls go in smaller batches: {why}")
+        if batch.model not in self._too_large:
+            self._too_large.add(batch.model)
+            self._say(f"{batch.model}: {counted(len(lines))} go in smaller batches: {why}")
         # Beside what calls this: where a run is to detach, it does not wait for room.
         self._background.start(self._in_halves(batch, lines, delay_s), lines)
 
@@ -277,18 +299,21 @@ class Rounds:
     ) -> None:
         half = max(1, len(lines) // 2)
         self._most_lines[batch.model] = half
-        await self._room(batch.model, delay_s)
+        await self._room(batch.model, delay_s, self._refusals[lines[0].key])
         parts = [part for part in (lines[:half], lines[half:]) if part]
         for part in parts:
             # The row of the whole goes with the last part: until then it tells of the rest.
             old = [batch.mark] if part is parts[-1] else []
-            await self._submit(part, salt=batch.mark, instead_of=old)
+            await self._submit(part, instead_of=old)
 
-    async def _room(self, model: str, delay_s: float | None) -> None:
+    def _has_open(self, model: str) -> bool:
+        """Whether a batch of the model takes room at its provider."""
+        return any(f.created and f.is_open and f.batch.model == model for f in self._all())
+
+    async def _room(self, model: str, delay_s: float | None, refusals: int) -> None:
         """Wait until a batch of the model has ended, or for a while."""
-        others = any(f.created and f.is_open and f.batch.model == model for f in self._all())
         self._following.batch_ended.clear()
-        left_s = delay_s or (LONGEST_POLL_S if others else 1.0)
+        left_s = delay_s or (LONGEST_POLL_S if self._has_open(model) else backoff_s(refusals))
         while left_s > 0 and not self._following.batch_ended.is_set():
             await self._background.rest(min(left_s, 1.0))
             left_s -= 1.0
@@ -319,7 +344,8 @@ class Rounds:
         """Go on with a batch that an earlier run has submitted, or was about to."""
         followed.created = bool(followed.batch.batch_id)
         try:
-            if followed.created or await self._following.find_in_time(followed):
+            following = self._following
+            if followed.created or await following.arrived(followed, following.found_patiently):
                 await self._following.follow(followed)
                 return
         except BatchFailed as exc:
@@ -345,11 +371,11 @@ class Rounds:
         lines = [line for each in waiting for line in each.lines.values()]
         if not lines or not all(each.looked for each in waiting):
             return
-        batches = f"{len(waiting)} batch{'es' * (len(waiting) > 1)}"
-        told = "; ".join(map(self._described, waiting))
+        batches = "1 batch" if len(waiting) == 1 else f"{len(waiting)} batches"
+        wait = "waits" if len(lines) == 1 else "wait"
         lines[0].fails(
             WaitingForBatches(
-                f"{len(lines)} calls wait in {batches}: {told}. Nothing is lost: the same command "
+                f"{counted(len(lines))} {wait} in {batches}. Nothing is lost: the same command "
                 "goes on"
             )
         )
@@ -364,7 +390,7 @@ class Rounds:
         )
         where = f"in batch {batch.batch_id}" if batch.batch_id else "in a batch that is submitted"
         return (
-            f"round {batch.number} of at most {most}: {len(batch.keys)} calls of {batch.model} "
+            f"round {batch.number} of at most {most}: {counted(len(batch.keys))} of {batch.model} "
             f"{where} since {batch.since:%H:%M:%S} UTC ({duration(followed.age_s)}){done}"
         )
 

@@ -9,6 +9,7 @@ import random
 import re
 import tempfile
 from collections import Counter
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import (
+    CacheFailed,
     CallFailed,
     EndpointRefused,
     ProviderDown,
@@ -41,7 +43,7 @@ from merge_runner.llm.http_outcome import RawReply
 from merge_runner.llm.ledger import Caps, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot
-from tests.virtual_time import in_virtual_time
+from tests.virtual_time import in_virtual_time, now_s
 
 PRICE = Price(input=1.0, output=100.0, source="made up")
 USAGE = {"prompt_tokens": 10, "completion_tokens": 5}
@@ -297,8 +299,9 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cac
     run = Run(cache, service)
     assert texts(await run.ask(8)) == [f"batched {number}" for number in range(1, 9)]
     assert sorted(service.sizes) == [2, 2, 4]
+    assert len(run.said) == 1
     await run.ask(8, decision=1)
-    assert max(service.sizes[3:]) == 2
+    assert service.sizes[3:] == [8]  # there is room again
     assert not run.ledger.read().reserved_usd
     await run.end()
     assert Journal(cache).batches() == []
@@ -316,12 +319,223 @@ async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves
 
 
 @in_virtual_time
-async def test_where_there_is_no_batch_mode_after_all_everything_is_asked_alone(cache):
+async def test_where_no_batch_mode_is_at_the_first_creation_the_run_ends(cache):
     service = Memory()
     service.creations = [BatchFailed("single", "HTTP 404", sent=False)]
-    replies = await Run(cache, service).ask(3)
+    run = Run(cache, service)
+    (first, *_) = await run.ask(3)
+    assert (type(first), first.exit_code) == (EndpointRefused, 2)
+    assert "leave --batch out" in str(first)
+    assert (run.alone.asked, run.ledger.read().committed_usd) == ([], 0.0)
+
+
+@in_virtual_time
+async def test_where_the_batch_mode_is_gone_later_everything_is_asked_alone(cache):
+    service = Memory()
+    service.creations = [None, BatchFailed("single", "HTTP 404", sent=False)]
+    run = Run(cache, service)
+    await run.ask(3)
+    replies = await run.ask(3, decision=1)
     assert texts(replies) == ["alone 1", "alone 2", "alone 3"]
     assert replies[0].attempts[0].cost_usd == 0.0
+
+
+@in_virtual_time
+async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache, monkeypatch):
+    async def is_full(*_):
+        raise CacheFailed("the disk is full")
+
+    service = Memory()
+    run = Run(cache, service)
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "put", is_full)
+        assert {type(each) for each in await run.ask(2)} == {CacheFailed}
+        await run.end()
+    later = Run(cache, service)
+    assert texts(await later.ask(2)) == ["batched 1", "batched 2"]
+    assert (service.sizes, later.alone.asked) == ([2], [])
+    await later.end()
+    assert Journal(cache).batches() == []
+
+
+async def left_with(cache, service, repetitions=1, **ways):
+    """What a --detach run ends with that leaves a batch behind."""
+    service.states = [BatchStatus("waiting", "in_progress")] * 1000
+    run = Run(cache, service, detach=True, **ways)
+    (left, *_) = await run.ask(repetitions)
+    await run.end()
+    service.states = []
+    return left
+
+
+@pytest.mark.parametrize("deadline_s", [0.0, 7200.0])
+@in_virtual_time
+async def test_a_batch_that_may_be_a_strangers_is_no_ones_own_in_the_next_run_either(
+    cache, deadline_s
+):
+    class Dying(Memory):
+        async def submit(self, lines, mark):
+            await super().submit(lines, mark)
+            created.set()
+            await asyncio.Event().wait()
+
+    created = asyncio.Event()
+    dying = Dying()
+    await killed(Run(cache, dying), 1, created)
+    service = Memory()
+    service.batches = {"stranger": [], **dying.batches}
+    service.unsure = ["stranger", "batch-0"]
+    assert isinstance(await left_with(cache, service), WaitingForBatches)
+    service.states = [BatchStatus("waiting", "in_progress")] * 2
+    run = Run(cache, service, deadline_s=deadline_s)
+    (reply,) = await run.ask()
+    assert outcomes(reply) == [("ok", "batch-0")]
+    assert (service.cancelled, run.alone.asked, len(service.batches)) == ([], [], 2)
+
+
+@in_virtual_time
+async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
+    class Slow(Memory):
+        async def status(self, batch_id):
+            ended = batch_id in self.cancelled
+            return BatchStatus("ended" if ended else "waiting", "its word")
+
+    service = Slow()
+    service.creations = [None, BatchFailed("again", "HTTP 504")]
+    with contextlib.closing(ResponseCache(tmp_path / "other")) as other:
+        one, two = Run(cache, service), Run(other, service, deadline_s=0.0)
+        asking = asyncio.create_task(one.ask())
+        await asyncio.sleep(10)
+        (reply,) = await two.ask()
+        assert outcomes(reply) == [("ok", "batch-1")]
+        assert service.cancelled == ["batch-1"]
+        asking.cancel()
+        await one.end()
+        await two.end()
+
+
+@in_virtual_time
+async def test_a_creation_that_comes_into_effect_late_is_not_repeated(cache):
+    class Late(Memory):
+        async def submit(self, lines, mark):
+            service.tasks.append(asyncio.create_task(self.arrive(lines, mark)))
+            raise BatchFailed("again", "HTTP 504")
+
+        async def arrive(self, lines, mark):
+            await asyncio.sleep(20)
+            await super().submit(lines, mark)
+
+    service = Late()
+    service.tasks = []
+    assert texts(await Run(cache, service).ask(2)) == ["batched 1", "batched 2"]
+    assert service.sizes == [2]
+
+
+@in_virtual_time
+async def test_a_single_line_that_finds_no_room_is_asked_alone_after_a_few_tries(cache):
+    service = Memory()
+    service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 1000
+    run = Run(cache, service)
+    (reply,) = await asyncio.wait_for(run.ask(), 120)
+    assert reply.text == "alone 1"
+    assert len(service.creations) > 990
+    assert len(run.said) == 2
+
+
+@in_virtual_time
+async def test_what_a_cancelled_batch_answered_unreadably_stays_set_aside(cache):
+    class Unreadable(Memory):
+        async def results(self, batch_id):
+            raise BatchFailed("single", "a result of the batch cannot be used")
+            yield
+
+    service = Unreadable()
+    service.states = [BatchStatus("waiting", "in_progress")]
+    run = Run(cache, service, deadline_s=0.0)
+    (reply,) = await run.ask()
+    assert service.cancelled == ["batch-0"]
+    assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
+    assert run.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
+    class Down(Memory):
+        async def submit(self, lines, mark):
+            self.creations.append(mark)
+            await asyncio.sleep(30)
+            raise BatchFailed("again", "HTTP 502")
+
+    service = Down()
+    run = Run(cache, service)
+    asking = asyncio.create_task(run.ask())
+    await asyncio.sleep(5)
+    asking.cancel()
+    began_s = now_s()
+    await run.end()
+    assert now_s() - began_s < 31
+    assert len(service.creations) == 1
+
+
+class WithoutResults(Memory):
+    async def results(self, batch_id):
+        raise BatchFailed("again", "HTTP 503")
+        yield
+
+
+@in_virtual_time
+async def test_a_detached_run_ends_while_the_results_cannot_be_fetched(cache):
+    service = WithoutResults()
+    await left_with(cache, service)
+    run = Run(cache, service, detach=True)
+    (left,) = await asyncio.wait_for(run.ask(), 60)
+    assert isinstance(left, WaitingForBatches)
+    assert run.said == ["m: HTTP 503; it is asked again until it answers"]
+    await run.end()
+
+
+async def note(cache, **known):
+    """Change what the journal knows of its only batch."""
+    journal = Journal(cache)
+    (batch,) = journal.batches()
+    await journal.note(replace(batch, **known))
+
+
+HOURS_AGO = (datetime.now(UTC) - timedelta(hours=5)).isoformat()
+
+
+class Endless(Memory):
+    looks = 0
+
+    async def status(self, batch_id):
+        self.looks += 1
+        return BatchStatus("waiting", "in_progress")
+
+
+@in_virtual_time
+async def test_a_cancelled_batch_that_does_not_end_is_waited_for_in_bounds(cache):
+    service = Endless()
+    await left_with(cache, service)
+    await note(cache, cancelled_at=HOURS_AGO)
+    run = Run(cache, service)
+    (reply,) = await run.ask()
+    assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
+    assert run.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_a_batch_that_may_be_a_strangers_is_looked_at_as_any_other_after_its_deadline(cache):
+    service = Endless()
+    await left_with(cache, service)
+    await note(cache, submitted_at=HOURS_AGO, sure=False)
+    run = Run(cache, service, deadline_s=3600.0)
+    asking = asyncio.create_task(run.ask())
+    service.looks = 0
+    await asyncio.sleep(3600)
+    assert 50 < service.looks < 70  # once a minute
+    assert service.cancelled == []
+    asking.cancel()
+    await run.end()
 
 
 @pytest.mark.parametrize(
