@@ -125,6 +125,7 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         print_out(json.dumps(asdict(expected)))
         return
     cost = "unknown" if expected.cost_usd is None else f"{expected.cost_usd:.2f} USD"
+    singly = ", asked singly" if expected.batch is not None else ""
     for name, text in (
         ("driver", expected.driver),
         ("trials", f"{expected.trials} that have not ended yet"),
@@ -134,8 +135,8 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
             f"about {expected.input_tokens} in, {expected.output_tokens} out"
             + (", as measured before" if expected.measured else ""),
         ),
-        ("cost", f"about {cost}"),
-        ("time", f"about {expected.minutes} minutes"),
+        ("cost", f"about {cost}{singly}"),
+        ("time", f"about {expected.minutes} minutes{singly}"),
     ):
         print_out(f"{name:<8}{text}")
     if (batch := expected.batch) is not None:
@@ -147,7 +148,8 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
     if expected.trials_within_cap is not None:
         print_out(f"cap     buys about {expected.trials_within_cap} trials")
     if len(expected.cells) > 1:
-        headings = ["cell", "trials", "calls", "tokens in", "tokens out", "USD", "minutes"]
+        headings = ["cell", "trials", "calls", "tokens in", "tokens out"]
+        headings += [f"{what}{singly}" for what in ("USD", "minutes")]
         write_table(
             [*headings, "trials within the cap"],
             [tuple("" if v is None else v for v in astuple(c)) for c in expected.cells],

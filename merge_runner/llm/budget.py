@@ -89,12 +89,12 @@ class PaidAttempt:
 
     async def settle(self, attempts: Sequence[Attempt]) -> None:
         """The attempt, the last of these, brought no answer; its cost may be unknown."""
-        await self.ledger.settle(self.key, attempts, self.aside_usd)
+        await self.ledger.settle(self.key, attempts, self.aside_usd, self.asked)
         self._cost_usd = attempts[-1].cost_usd
 
     async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer that the attempt brought, and what it cost, in one transaction."""
-        kept = await self.ledger.keep(entry, self.aside_usd)
+        kept = await self.ledger.keep(entry, self.aside_usd, self.asked)
         self._cost_usd = entry.attempts[-1].cost_usd
         if self._cost_usd is not None:
             self.budget.costs.learn(self.trial, self.asked.model, self._cost_usd)

@@ -90,7 +90,7 @@ class CallTotals:
     """Sums over entries of one model, at one endpoint, asked in one manner (see content_hashes.py).
 
     ``measured`` counts the answers that state their tokens and are the model's own, no stand-in's:
-    tokens and latencies are theirs.
+    tokens and latencies are theirs. So many of them are ``untimed``: a batch tells no latency.
     """
 
     cost_usd: float = 0.0
@@ -98,6 +98,13 @@ class CallTotals:
     input_tokens: int = 0
     output_tokens: int = 0
     latency_s: float = 0.0
+    untimed: int = 0
+
+    @property
+    def mean_latency_s(self) -> float | None:
+        """The mean over the answers that have one; None: none has."""
+        timed = self.measured - self.untimed
+        return self.latency_s / timed if timed else None
 
     def add(self, entry: CachedCall) -> None:
         """Count an entry."""
@@ -106,9 +113,8 @@ class CallTotals:
         if entry.request.provider != "emulator" and is_scripted(entry.request, last):
             return
         if last.usage.input_tokens is not None and last.usage.output_tokens is not None:
-            if last.latency_s is None and self.measured:  # a line of a batch tells of no latency
-                self.latency_s += self.latency_s / self.measured
             self.measured += 1
+            self.untimed += last.latency_s is None
             self.input_tokens += last.usage.input_tokens
             self.output_tokens += last.usage.output_tokens
             self.latency_s += last.latency_s or 0.0

@@ -406,7 +406,8 @@ class LlmClient:
 
     def _tell_overrun(self, call: Call, aside_usd: float) -> None:
         spent_usd = call.attempts[-1].cost_usd or 0.0
-        if spent_usd <= aside_usd + TOLERANCE_USD:
+        released = aside_usd == 0  # by a user, while a batch was waited for
+        if released or spent_usd <= aside_usd + TOLERANCE_USD:
             return
         self.meter.notes.append(
             f"{self.driver}: {call.asked.slot}: the reply cost {spent_usd:.4f} USD, and "

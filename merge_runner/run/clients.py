@@ -218,13 +218,18 @@ def open_rounds(
     journal = Journal(cache)
     models = set(plan.registered.values())
     left = [each for each in journal.batches() if each.model in models and journal.waiting(each)]
-    if left and options.dask is not None:
-        raise UsageError(
-            f"calls wait in {len(left)} batches of an earlier run: run the same command without "
-            "--dask until they have ended"
-        )
-    if left and not options.batch:
-        say(f"calls that wait in {len(left)} batches of an earlier run are not asked again")
+    own = [each for each in left if each.ledger == plan.ledger]
+    if options.dask is not None:
+        if own:
+            raise UsageError(
+                "calls wait in batches of an earlier run: run the same command without --dask "
+                "until they have ended"
+            )
+        return None
+    if own and not options.batch:
+        say("calls that wait in batches of an earlier run are not asked again")
+    if others := sorted({each.ledger for each in left} - {plan.ledger}):
+        say(f"calls that wait in batches of {', '.join(others)} are not asked again")
     if not options.batch and not left:
         return None
     most = max((most_prompts(arm) for arm in plan.arms), default=1)
@@ -241,6 +246,8 @@ def check_batches(plan: Plan, options: Options) -> None:
         return
     if options.replay:
         raise UsageError("a replay asks nothing: leave --batch out")
+    if options.round_deadline_s == 0:
+        raise UsageError("--round-deadline 0 ends batches: leave --batch out, or give it longer")
     if options.dask is not None:
         raise UsageError("--batch plays in this process: leave --dask out")
     if not plan.entries:

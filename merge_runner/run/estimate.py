@@ -89,12 +89,16 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class _Calls:
-    """How many calls a model of the registry has yet to answer in one cell, and what one takes."""
+    """How many calls a model of the registry has yet to answer in one cell, and what one takes.
+
+    A run pays a ``part`` of their price: less than all of it in batches.
+    """
 
     model: str
     entry: ModelEntry
     number: int
     each: _PerCall
+    part: float
 
     @property
     def usage(self) -> Usage:
@@ -106,9 +110,14 @@ class _Calls:
 
     @property
     def cost_usd(self) -> float | None:
-        """What they cost together."""
+        """What they cost together, asked singly."""
         price = cost_usd(self.entry, self.usage)
         return None if price is None else self.number * price
+
+    @property
+    def paid_usd(self) -> float | None:
+        """What the run pays for them."""
+        return None if self.cost_usd is None else self.cost_usd * self.part
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +142,10 @@ def estimate(
     endpoint, ``spending`` what counts against the caps already.
     """
     arms = plan.by_label()
-    calls = {label: _calls(plan, arms[label], cell.calls, facts) for label, cell in todo.items()}
+    calls = {
+        label: _calls(plan, arms[label], cell.calls, facts, batch=options.batch)
+        for label, cell in todo.items()
+    }
     whole = [made for cell in calls.values() for made in cell]
     shares = {
         label: _share_within(options.caps, spending, cell, whole) for label, cell in calls.items()
@@ -171,9 +183,8 @@ def price_factor(entry: ModelEntry) -> float:
 
 
 def _in_batches(plan: Plan, calls: Sequence[_Calls]) -> BatchEstimate:
-    costs = [each.cost_usd for each in calls]
-    factors = [price_factor(each.entry) for each in calls]
-    known = [cost * factor for cost, factor in zip(costs, factors, strict=True) if cost is not None]
+    costs = [each.paid_usd for each in calls]
+    known = [cost for cost in costs if cost is not None]
     return BatchEstimate(
         cost_usd=round(sum(known), 2) if len(known) == len(costs) else None,
         rounds=max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0),
@@ -182,7 +193,12 @@ def _in_batches(plan: Plan, calls: Sequence[_Calls]) -> BatchEstimate:
 
 
 def _calls(
-    plan: Plan, arm: Arm, calls: Mapping[str, float], facts: Mapping[str, CallTotals]
+    plan: Plan,
+    arm: Arm,
+    calls: Mapping[str, float],
+    facts: Mapping[str, CallTotals],
+    *,
+    batch: bool,
 ) -> list[_Calls]:
     return [
         _Calls(
@@ -190,6 +206,7 @@ def _calls(
             entry,
             round(calls[name]),
             _per_call(plan, arm, entry, facts[name]),
+            price_factor(entry) if batch else 1.0,
         )
         for name, entry in arm.entries.items()
     ]
@@ -226,7 +243,7 @@ def _share_within(
 
 def _usd(calls: Sequence[_Calls], model: str | None) -> float:
     """What calls cost a cap: that of one model, or None, that of all."""
-    return sum(each.cost_usd or 0.0 for each in calls if model in (None, each.model))
+    return sum(each.paid_usd or 0.0 for each in calls if model in (None, each.model))
 
 
 def _within(shares: Mapping[str, float | None], todo: Mapping[str, Todo]) -> int | None:
@@ -294,7 +311,7 @@ def _measured_usage(totals: CallTotals) -> Usage:
 
 def _per_call(plan: Plan, arm: Arm, entry: ModelEntry, facts: CallTotals) -> _PerCall:
     if facts.measured:
-        latency_s = facts.latency_s / facts.measured or entry.typical_latency_s
+        latency_s = facts.mean_latency_s or entry.typical_latency_s
         return _PerCall(_measured_usage(facts), latency_s)
     # English has about 4 bytes a token.
     prompt_tokens = len(typical_prompt(plan, arm).encode()) // 4

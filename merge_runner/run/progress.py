@@ -211,8 +211,11 @@ class Progress:
     def _left_s(self) -> float | None:
         """The estimated time left in s; None while there is nothing to estimate it from.
 
+        How long a batch takes nobody knows.
         Trials that run in step all end late, so early in a run the calls are a better basis.
         """
+        if self.batches():
+            return None
         part = self._part()
         elapsed = time.monotonic() - self.started
         return elapsed / part - elapsed if part else None

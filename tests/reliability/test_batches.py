@@ -257,6 +257,7 @@ async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
         (("--batch", "--model", "constant"), "no language model is asked: leave --batch out"),
         (("--batch", "--model", "local"), "local has no batch mode that is known; valid with"),
         (("--batch", "--round-deadline", "2"), "is no duration: write 2h, 90m, 30s or 0"),
+        (("--batch", "--round-deadline", "0"), "ends batches: leave --batch out"),
     ],
 )
 async def test_what_cannot_go_in_batches_is_refused_in_one_line(merge_runner, options, says):
@@ -277,7 +278,8 @@ async def test_a_dry_run_says_what_batches_cost_beside_single_calls(merge_runner
         "sweep", "baseline", *TWO, "--model", "o3", "--batch", "--dry-run", OPENAI_API_KEY="k"
     )
     lines = run.out.splitlines()
-    assert lines[4] == "cost    about 0.55 USD"
+    assert lines[4] == "cost    about 0.55 USD, asked singly"
+    assert lines[5].endswith("minutes, asked singly")
     assert lines[6] == (
         "batch   about 0.27 USD in about 11 rounds, at most 30; a round takes as long as its "
         "slowest batch: minutes, an hour, at most a day"

@@ -265,7 +265,8 @@ class Following:
             return
         error = EndpointRefused(
             f"{batch.model}: {batch.batch_id} is refused to this key ({exc}): set the key of the "
-            "account that has submitted it. If it is gone, --round-deadline 0 asks its calls anew"
+            "account that has submitted it. If it is gone, --round-deadline 0 without --batch asks "
+            "its calls anew"
         )
         for line in followed.lines.values():
             line.fails(error)

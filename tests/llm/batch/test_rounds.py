@@ -494,6 +494,25 @@ async def test_a_detached_run_ends_while_the_results_cannot_be_fetched(cache):
     await run.end()
 
 
+@in_virtual_time
+async def test_an_answer_whose_money_was_released_is_spent_on_its_model_and_is_no_overrun(cache):
+    service = Memory()
+    left = Run(cache, service, cap=10)
+    service.states = [BatchStatus("waiting", "in_progress")] * 1000
+    asking = asyncio.create_task(left.ask())
+    await asyncio.sleep(1)
+    asking.cancel()
+    await left.end()
+    left.ledger.release()
+    service.states = []
+    run = Run(cache, service, cap=10)
+    await run.ask()
+    spending = run.ledger.read()
+    assert spending.by_model["m"].spent_usd == spending.spent_usd == pytest.approx(ONE_USD / 2)
+    assert (spending.overruns, spending.overrun_usd, spending.open_attempts) == ({}, 0.0, 0)
+    assert not run.client.meter.notes
+
+
 async def note(cache, **known):
     """Change what the journal knows of its only batch."""
     journal = Journal(cache)
