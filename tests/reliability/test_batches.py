@@ -188,7 +188,7 @@ async def test_detached_runs_bring_a_sweep_to_its_end(merge_runner, priced):
     assert [run.code for run in runs[-2:]] == [3, 0], runs[-1].err
     (told,) = runs[0].summary["open_batches"]
     assert "round 1 of at most 4: 4 calls of priced in batch batch_" in told
-    assert told not in runs[0].err
+    assert told not in runs[0].err.splitlines()[-1]
     assert runs[-1].summary["open_batches"] == []
     assert len(runs) == 5  # a decision each, and the end
 

@@ -49,3 +49,4 @@ def test_batches_are_shown_with_their_cost_in_the_end_and_that_nobody_need_wait(
     assert (
         dict(shown.fields())["cost"] == "1.50 USD, about 4.50 in the end, 4.25 of 20 over all runs"
     )
+    assert "left" not in dict(shown.fields())["time"]  # nobody knows how long a batch takes
