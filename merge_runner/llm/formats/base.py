@@ -83,6 +83,9 @@ class WireFormat(ABC):
     members: ClassVar[frozenset[str]]
     """Members of a body: an answer has at least one of them, whatever it says."""
 
+    headers: ClassVar[Mapping[str, str]] = {}
+    """Headers of every request that change its meaning, also of those to a batch mode."""
+
     retries_empty: ClassVar[bool] = False
     """Whether an empty answer is a known fault of the service that asking again may mend."""
 
