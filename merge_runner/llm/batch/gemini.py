@@ -84,7 +84,7 @@ def _listed_id(batch: dict[str, Any]) -> str | None:
 
 # A page has few batches, since one may come with all its results.
 LISTING = Listing(
-    f"{API}/batches?pageSize=20", "operations", "pageToken", _next_page, _listed_id, _created
+    f"{API}/batches?pageSize=10", "operations", "pageToken", _next_page, _listed_id, _created
 )
 
 

@@ -546,6 +546,16 @@ async def test_nobody_looks_behind_a_page_from_which_a_list_goes_back_in_time(
 
 
 @pytest.mark.parametrize("form", BATCH)
+async def test_a_batch_is_found_behind_a_page_of_later_ones(server, service_at, form):
+    told = [listed(form, "other", NOW + timedelta(days=n), f"b{n}") for n in (3, 2, 1, 0)]
+    mine = listed(form, "mark", NOW, "mine")
+    server.replies[LISTS[form]] = paged(form, told[:2], told[2:], [mine])
+    service = service_at(server.url, form)
+    known = [f"b{n}" for n in range(4)]
+    assert (await service.find("mark", ["a"], since=NOW, known=known)).batch_id == "mine"
+
+
+@pytest.mark.parametrize("form", BATCH)
 async def test_a_list_without_end_leaves_open_whether_there_is_a_batch(server, service_at, form):
     server.replies[LISTS[form]] = paged(form, *[[]] * 200)
     failed = await used(service_at(server.url, form), "find")
