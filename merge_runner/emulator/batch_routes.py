@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections import Counter
@@ -33,6 +34,7 @@ class BatchRoutes:
     def __init__(self, batches: Batches) -> None:
         self._batches = batches
         self._files: dict[str, bytes] = {}
+        self._file_number = itertools.count()
         self._requests: Counter[str] = Counter()
 
     def routes(self) -> list[web.RouteDef]:
@@ -115,6 +117,18 @@ class BatchRoutes:
             raise NotThere
         return self._files[file_id]
 
+    def _shown(self, name: str, results: bytes) -> bytes:
+        """What is there of a file of results; raises NotThere."""
+        plan = self._batches.faults.batch
+        self._requests[name] += 1
+        times = self._requests[name]
+        if times <= plan.late_results:
+            raise NotThere
+        if times > plan.late_results + plan.short_results:
+            return results
+        lines = results.splitlines(keepends=True)
+        return b"".join(lines[: len(lines) // 2])
+
     # OpenAI
 
     async def _upload_openai(self, request: web.Request) -> web.StreamResponse:
@@ -125,7 +139,7 @@ class BatchRoutes:
         return _json(self._openai_file_object(self._keep_file(upload.file.read())))
 
     def _keep_file(self, content: bytes) -> str:
-        name = f"file-{len(self._files):06x}"
+        name = f"file-{next(self._file_number):06x}"
         self._files[name] = content
         return name
 
@@ -157,7 +171,9 @@ class BatchRoutes:
         return _json(self._openai_file_object(request.match_info["id"]))
 
     async def _openai_content(self, request: web.Request) -> web.StreamResponse:
-        return _lines(self._content(request.match_info["id"]))
+        file_id = request.match_info["id"]
+        content = self._content(file_id)
+        return _lines(content if file_id in self._files else self._shown(file_id, content))
 
     async def _delete_file(self, request: web.Request) -> web.StreamResponse:
         file_id = request.match_info["id"]
@@ -182,7 +198,7 @@ class BatchRoutes:
         return self._answered(request, formats.openai_batch(batch, self._batches.now_s()))
 
     async def _list_openai(self, request: web.Request) -> web.StreamResponse:
-        page, more = _page(self._batches.newest(OPENAI), request, "after", "limit", 20)
+        page, more = _page(self._batches.listed(OPENAI), request, "after", "limit", 20)
         data = [formats.openai_batch(batch, self._batches.now_s()) for batch in page]
         return _json(marked({"object": "list", "data": data, "has_more": more, **_ends(page)}))
 
@@ -204,7 +220,7 @@ class BatchRoutes:
         return self._answered(request, formats.anthropic_batch(batch, _own_url(request)))
 
     async def _list_anthropic(self, request: web.Request) -> web.StreamResponse:
-        page, more = _page(self._batches.newest(ANTHROPIC), request, "after_id", "limit", 20)
+        page, more = _page(self._batches.listed(ANTHROPIC), request, "after_id", "limit", 20)
         data = [formats.anthropic_batch(batch, _own_url(request)) for batch in page]
         return _json(marked({"data": data, "has_more": more, **_ends(page)}))
 
@@ -220,7 +236,7 @@ class BatchRoutes:
         batch = self._polled(request)
         if not batch.ended:
             raise NotThere
-        return _lines(formats.anthropic_results(batch))
+        return _lines(self._shown(batch.id, formats.anthropic_results(batch)))
 
     # Gemini
 
@@ -242,7 +258,7 @@ class BatchRoutes:
         return self._answered(request, formats.gemini_batch(batch, self._batches.now_s()))
 
     async def _list_gemini(self, request: web.Request) -> web.StreamResponse:
-        page, more = _page(self._batches.newest(GOOGLE), request, "pageToken", "pageSize", 50)
+        page, more = _page(self._batches.listed(GOOGLE), request, "pageToken", "pageSize", 50)
         listed = [formats.gemini_batch(batch, self._batches.now_s()) for batch in page]
         following = {"nextPageToken": page[-1].id} if more else {}
         return _json(marked({"operations": listed, **following}))
@@ -273,7 +289,7 @@ class BatchRoutes:
         batch = self._batches.poll(request.match_info["id"].removeprefix("batch-"))
         if batch is None or not batch.ended:
             raise NotThere
-        return _lines(formats.gemini_results(batch))
+        return _lines(self._shown(batch.id, formats.gemini_results(batch)))
 
 
 def _page(

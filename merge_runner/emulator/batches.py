@@ -115,10 +115,11 @@ class Batches:
         """Keep one that was refused, as OpenAI does."""
         self._all[batch.id] = batch
 
-    def newest(self, prefix: str) -> list[Batch]:
-        """All of an API, the newest first."""
+    def listed(self, prefix: str) -> list[Batch]:
+        """All of an API, as it lists them."""
         self.settle()
-        return [batch for batch in reversed(self._all.values()) if batch.id.startswith(prefix)]
+        own = [batch for batch in self._all.values() if batch.id.startswith(prefix)]
+        return own if self.faults.batch.oldest_first else own[::-1]
 
     def poll(self, batch_id: str) -> Batch | None:
         """A batch whose state is asked for."""

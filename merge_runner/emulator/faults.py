@@ -59,7 +59,9 @@ class BatchPlan(BaseModel):
     late; a batch ends with its last line, but not before its state was asked for ``polls`` times.
     A share ``failed`` of the lines ends with a 429, 500 or 503 and ``expired`` without being asked.
     Of a share ``lost`` of the creations the answer is lost. While more than ``enqueued_tokens``
-    would wait, a batch is refused.
+    would wait, a batch is refused. Whoever asks for a file of results is told ``late_results``
+    times that there is none, and then gets half of it ``short_results`` times. Lists have the
+    newest batch first, or with ``oldest_first`` the oldest.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -72,6 +74,9 @@ class BatchPlan(BaseModel):
     expired: Rate = 0.0
     lost: Rate = 0.0
     enqueued_tokens: Annotated[int, Field(gt=0)] | None = None
+    late_results: Annotated[int, Field(ge=0)] = 0
+    short_results: Annotated[int, Field(ge=0)] = 0
+    oldest_first: bool = False
 
 
 class FaultPlan(BaseModel):

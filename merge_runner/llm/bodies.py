@@ -16,6 +16,8 @@ PIECE = 2**18
 # No provider's reply has ten levels, and each program that reads one has a limit of its own.
 MOST_LEVELS = 100
 MOST_VALUES = 1_000_000
+# One that may be longer may hold more values in proportion.
+BYTES_PER_VALUE = 16
 # Strings, in which brackets are none, and all other characters.
 _NO_BRACKETS = re.compile(r'"[^"]*"|[^][{}"]+')
 
@@ -32,7 +34,7 @@ async def read_body(chunks: AsyncIterator[bytes], encoding: str, most_bytes: int
             raise refused(_too_long(most_bytes))
         pieces.append(piece)
     text = _decoded(pieces)
-    if why := _why_refused(text):
+    if why := _why_refused(text, most_bytes):
         raise refused(why)
     return text
 
@@ -49,21 +51,25 @@ async def read_lines(
     async for chunk in _unpacked(chunks, encoding):
         *ends, begun = chunk.split(b"\n")
         for end in ends:
-            if size + len(end):
-                yield _line([*pieces, end], size + len(end), most_bytes)
+            pieces.append(end)
+            if line := _line(pieces, size + len(end), most_bytes):
+                yield line
             pieces, size = [], 0
         size += len(begun)
-        # Of a line that is too long nothing is kept.
-        pieces = [*pieces, begun] if size <= most_bytes else []
-    if size:
-        yield _line(pieces, size, most_bytes)
+        if size <= most_bytes:
+            pieces.append(begun)
+        else:  # of a line that is too long nothing is kept
+            pieces.clear()
+    if line := _line(pieces, size, most_bytes):
+        yield line
 
 
 def _line(pieces: list[bytes], size: int, most_bytes: int) -> str | TransportFailure:
+    """A line without its end, which may be CRLF, or why it is refused."""
     if size > most_bytes:
         return refused(_too_long(most_bytes))
-    text = _decoded(pieces)
-    why = _why_refused(text)
+    text = _decoded(pieces).removesuffix("\r")
+    why = _why_refused(text, most_bytes)
     return refused(why) if why else text
 
 
@@ -109,12 +115,13 @@ async def _unpacked(chunks: AsyncIterator[bytes], encoding: str) -> AsyncIterato
         raise TransportFailure("connection_lost", f"the reply is cut within its {encoding}")
 
 
-def _why_refused(text: str) -> str | None:
+def _why_refused(text: str, most_bytes: int) -> str | None:
     """Why a text is too much JSON to be read in little time and memory; None if it is not."""
     if text.lstrip()[:1] not in ("[", "{"):
         return None
-    if sum(map(text.count, "[{,")) > MOST_VALUES:
-        return f"it holds more than {MOST_VALUES:,} values"
+    most_values = max(MOST_VALUES, most_bytes // BYTES_PER_VALUE)
+    if sum(map(text.count, "[{,")) > most_values:
+        return f"it holds more than {most_values:,} values"
     if text.count("[") + text.count("{") <= MOST_LEVELS:
         return None
     unescaped = text.replace(r"\\", "").replace(r"\"", "")

@@ -221,18 +221,24 @@ class HttpTransport:
         return f"{self._endpoint.base_url} cannot be reached ({reason})"
 
     def _url(self, path: str) -> httpx.URL:
+        """The URL of a path, which is never at another host: the key goes to the configured one."""
         if path not in self._urls:
             try:
-                self._urls[path] = httpx.URL(self._endpoint.base_url + path)
+                url = httpx.URL(self._endpoint.base_url + path)
             except httpx.InvalidURL as exc:
-                raise UsageError(
-                    f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml"
-                ) from exc
+                raise _no_path(path) from exc
+            if url.netloc != httpx.URL(self._endpoint.base_url).netloc:
+                raise _no_path(path)
+            self._urls[path] = url
         return self._urls[path]
 
     async def close(self) -> None:
         """Close all connections."""
         await self._client.aclose()
+
+
+def _no_path(path: str) -> UsageError:
+    return UsageError(f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml")
 
 
 async def _within(seconds: float, awaited: Awaitable[T]) -> T:

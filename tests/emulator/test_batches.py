@@ -124,6 +124,19 @@ async def test_the_emulator_counts_its_answers_singly_and_in_batches(emulator, d
     ]
 
 
+async def test_a_file_has_an_id_that_no_other_has_had(emulator):
+    async def upload():
+        form = aiohttp.FormData({"purpose": "batch"})
+        form.add_field("file", b"{}", filename="in.jsonl")
+        async with session.post("/v1/files", data=form) as reply:
+            return (await reply.json())["id"]
+
+    async with aiohttp.ClientSession(await emulator()) as session:
+        first, second = await upload(), await upload()
+        await session.delete(f"/v1/files/{first}")
+        assert await upload() not in (first, second)
+
+
 async def test_the_command_says_how_long_batches_take(driving_prompt):
     body = {"model": "m", "messages": [{"role": "user", "content": driving_prompt}]}
     requests = {"requests": [{"custom_id": "k", "params": body}]}

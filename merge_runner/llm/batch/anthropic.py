@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Collection, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Collection, Sequence
+from contextlib import aclosing
 from datetime import datetime
+from functools import partial
 from typing import Any
 
 from merge_runner.llm.batch.exchange import (
     Exchange,
+    Line,
     Listing,
-    Unreadable,
     as_reply,
-    id_if_more,
+    as_word,
+    check_size,
+    counted,
     id_of,
+    last_if_more,
     moment_of,
+    own_id,
     read_results,
     text_at,
+    unreadable,
 )
 from merge_runner.llm.batch.service import (
     BatchFailed,
@@ -28,6 +35,7 @@ from merge_runner.llm.batch.service import (
 from merge_runner.llm.formats.base import as_count, as_dict, as_text
 
 BATCHES = "/v1/messages/batches"
+OPENING, CLOSING = b'{"requests":[', b"]}"
 # The status with which the plain endpoint sends an error, by its type: a result has none.
 STATUSES = {
     "invalid_request_error": 400,
@@ -48,13 +56,14 @@ def _created(batch: dict[str, Any]) -> datetime | None:
     return moment_of(batch.get("created_at"))
 
 
-LISTING = Listing(f"{BATCHES}?limit=100", "data", "after_id", id_if_more, _created)
+LISTING = Listing(f"{BATCHES}?limit=100", "data", "after_id", last_if_more, own_id, _created)
 
 
 class AnthropicBatches:
     """``/v1/messages/batches``, with all requests in the body; see BatchService."""
 
-    limits = BatchLimits(lines=100_000, size=256_000_000)
+    # What stands around the lines counts as well.
+    limits = BatchLimits(lines=100_000, size=256_000_000 - len(OPENING + CLOSING))
 
     def __init__(self, exchange: Exchange) -> None:
         self._exchange = exchange
@@ -65,8 +74,9 @@ class AnthropicBatches:
 
     async def submit(self, lines: Sequence[BatchLine], mark: str) -> str:
         """See BatchService; a batch takes no name, so that the mark is not sent."""
-        body = b'{"requests":[' + b",".join(map(self._line, lines)) + b"]}"
-        return id_of(await self._exchange.post(BATCHES, body))
+        check_size(lines, self)
+        body = OPENING + b",".join(map(self._line, lines)) + CLOSING
+        return id_of(await self._exchange.create(BATCHES, body, lines=lines))
 
     async def find(
         self, mark: str, keys: Collection[str], *, since: datetime, known: Collection[str] = ()
@@ -76,9 +86,8 @@ class AnthropicBatches:
         Nothing that the service tells of a batch in progress names its requests.
         """
         possible = None
-        async for batch in self._exchange.newest(LISTING, since):
-            batch_id = id_of(batch)
-            if batch_id in known or sum(_counts(batch).values()) != len(keys):
+        async for batch_id, batch in self._exchange.listed(LISTING, since, known):
+            if sum(_counts(batch).values()) != len(keys):
                 continue
             if not batch.get("results_url"):
                 possible = possible or Found(batch_id, sure=False)
@@ -90,32 +99,43 @@ class AnthropicBatches:
         """See BatchService."""
         batch = await self._exchange.get(f"{BATCHES}/{batch_id}")
         counts = _counts(batch)
-        word = as_text(batch.get("processing_status")) or "unknown"
+        word = as_word(batch.get("processing_status"))
+        ended = word.lower() == "ended"
         total = sum(counts.values())
         return BatchStatus(
-            state="ended" if word == "ended" else "waiting",
+            state="ended" if ended else "waiting",
             word=word,
             # While a batch is in progress all its requests count as such.
-            done=total - counts.get("processing", 0) if word == "ended" else None,
+            done=total - counts.get("processing", 0) if ended else None,
             total=total or None,
         )
 
-    def results(self, batch_id: str) -> AsyncIterator[LineResult]:
+    def results(self, batch_id: str) -> AsyncGenerator[LineResult, None]:
         """See BatchService."""
-        # Not at the URL that the batch names: the key goes to the configured host alone.
-        return read_results(self._exchange.lines(f"{BATCHES}/{batch_id}/results"), _read)
+        return read_results(partial(self._lines, batch_id), _read)
 
     async def cancel(self, batch_id: str) -> None:
         """See BatchService."""
-        await self._exchange.post(f"{BATCHES}/{batch_id}/cancel")
+        await self._exchange.cancel(f"{BATCHES}/{batch_id}/cancel")
+
+    async def _lines(self, batch_id: str) -> AsyncIterator[Line]:
+        batch = await self._exchange.get(f"{BATCHES}/{batch_id}")
+        if batch.get("archived_at"):
+            raise BatchFailed("lost", "the results of the batch are no longer kept")
+        total = sum(_counts(batch).values())
+        # Not at the URL that the batch names: the key goes to the configured host alone.
+        lines = self._exchange.lines(f"{BATCHES}/{batch_id}/results")
+        async for line in counted(lines, least=total, most=total or self.limits.lines):
+            yield line
 
     async def _has_one_of(self, keys: Collection[str], batch_id: str) -> bool:
         """Whether the first result of a batch, which stands for all, is of one of the keys."""
         try:
-            async for result in self.results(batch_id):
-                return result.key in keys
+            async with aclosing(self.results(batch_id)) as results:
+                async for result in results:
+                    return result.key in keys
         except BatchFailed as exc:
-            if exc.kind != "single":
+            if exc.kind not in ("single", "lost"):
                 raise
         return False
 
@@ -137,8 +157,8 @@ def _read(line: dict[str, Any]) -> LineResult:
             return LineResult(key, as_reply(200, as_dict(result.get("message"))))
         case "errored":
             error = as_dict(result.get("error"))
-            kind = str(as_dict(error.get("error")).get("type"))
+            kind = as_text(as_dict(error.get("error")).get("type")) or ""
             return LineResult(key, as_reply(STATUSES.get(kind, 500), error))
         case "expired" | "canceled" as why:
             return LineResult(key, None, f"the batch {'has expired' if why == 'expired' else why}")
-    raise Unreadable(f"the result of {key} is of no known type")
+    raise unreadable(key, "is of no known type")

@@ -25,8 +25,8 @@ from merge_runner.llm.batch.service import (
 SHORTEST_POLL_S, LONGEST_POLL_S, POLL_SHARE = 0.25, 60.0, 0.1
 # A creation whose answer was lost may be in effect only after this: gateways keep requests.
 ARRIVAL_S = 30.0
-# How long a batch that was asked to end may take for that.
-CANCEL_S = 3600.0
+# How long a batch may take to end once it was asked to, and then to show its results.
+ENDING_S = 3600.0
 T = TypeVar("T")
 
 
@@ -216,16 +216,19 @@ class Following:
     async def _handed_out(self, followed: Followed) -> bool:
         """Hand the results of a batch out; False where it was somebody else's."""
         batch, left_out = followed.batch, ""
-        tries = itertools.count(1)
-        while True:
+        began_s, is_last = asyncio.get_running_loop().time(), False
+        for tries in itertools.count(1):
             try:
                 async for result in self._services[batch.model].results(followed.batch.batch_id):
                     self._hand_out(followed, result)
                 break
             except BatchFailed as exc:
-                if exc.kind == "again":
-                    await self._rest_after(followed, exc, next(tries))
-                elif exc.kind == "single":
+                if exc.kind == "again" and not is_last:
+                    await self._rest_after(followed, exc, tries)
+                    if asyncio.get_running_loop().time() - began_s > ENDING_S:
+                        await self._look(followed)  # after an outage all is asked for once more
+                        is_last = True
+                elif exc.kind in ("again", "single"):
                     left_out = str(exc)
                     self._say(f"{batch.model}: {exc}")
                     break
@@ -332,7 +335,7 @@ def _takes_too_long(batch: OpenBatch) -> bool:
     if not batch.cancelled_at:
         return False
     ago = datetime.now(UTC) - datetime.fromisoformat(batch.cancelled_at)
-    return ago.total_seconds() > CANCEL_S
+    return ago.total_seconds() > ENDING_S
 
 
 def backoff_s(tries: int) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from merge_runner.config import PROVIDERS, BatchTerms, Endpoint, ModelEntry
+from merge_runner.config import PROVIDERS, BatchTerms, Endpoint, ModelEntry, endpoint_identity
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.anthropic import AnthropicBatches
 from merge_runner.llm.batch.exchange import Exchange
@@ -13,7 +13,6 @@ from merge_runner.llm.batch.gemini import GeminiBatches
 from merge_runner.llm.batch.openai import OpenAIBatches
 from merge_runner.llm.batch.service import BatchService
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.anthropic import VERSION
 from merge_runner.registry import Registry
 
 if TYPE_CHECKING:
@@ -25,7 +24,6 @@ BATCH_MODES.register("openai-chat", OpenAIBatches)
 BATCH_MODES.register("openai-responses", OpenAIBatches)
 BATCH_MODES.register("gemini", GeminiBatches)
 BATCH_MODES.register("anthropic", AnthropicBatches)
-HEADERS = {"anthropic": {"anthropic-version": VERSION}}
 
 
 def batch_terms(entry: ModelEntry) -> BatchTerms | None:
@@ -35,7 +33,9 @@ def batch_terms(entry: ModelEntry) -> BatchTerms | None:
         return None
     if isinstance(entry.batch, BatchTerms):
         return entry.batch
-    return PROVIDERS.require(entry.provider).batch
+    # A provider's price holds at its own address.
+    is_its_own = endpoint_identity(entry) == entry.provider
+    return PROVIDERS.require(entry.provider).batch if is_its_own else None
 
 
 def require_batch(name: str, entry: ModelEntry, entries: Mapping[str, ModelEntry]) -> BatchTerms:
@@ -43,15 +43,16 @@ def require_batch(name: str, entry: ModelEntry, entries: Mapping[str, ModelEntry
     terms = batch_terms(entry)
     if terms is None:
         valid = ", ".join(each for each, its in entries.items() if batch_terms(its))
+        where = endpoint_identity(entry)
+        at = "" if where == entry.provider else f" at {where}"
         raise UsageError(
-            f"{name} has no batch mode that is known; valid with --batch: {valid}. Leave --batch "
-            "out, or give the entry in experiments/models.toml `batch = { price_factor = 0.5, "
-            "source = ... }` where its server has one in the same format"
+            f"{name} has no batch mode that is known{at}; valid with --batch: {valid}. Leave "
+            "--batch out, or give the entry in experiments/models.toml `batch = "
+            "{ price_factor = 0.5, source = ... }` where its server has one in the same format"
         )
     return terms
 
 
 def batch_service(entry: ModelEntry, endpoint: Endpoint, transport: HttpTransport) -> BatchService:
     """The batch mode of a model that has one."""
-    headers = HEADERS.get(entry.format, {})
-    return BATCH_MODES[entry.format](Exchange(transport, endpoint, FORMATS[entry.format], headers))
+    return BATCH_MODES[entry.format](Exchange(transport, endpoint, FORMATS[entry.format]))

@@ -11,19 +11,22 @@ from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.http_outcome import RawReply
 from merge_runner.records import ChatRequest
 
-FailureKind = Literal["again", "smaller", "single", "quota", "refused"]
+FailureKind = Literal["again", "smaller", "single", "quota", "refused", "lost"]
 """What to do after a failure.
 
 ``again``: the same once more, after a while. ``smaller``: wait until other batches have ended, or
 submit fewer lines: too many tokens are enqueued. ``single``: ask the lines singly, since there is
 no batch mode for them. ``quota`` and ``refused``: nothing at this endpoint will be answered, as the
-same actions of an AttemptOutcome say.
+same actions of an AttemptOutcome say. ``lost``: what became of the batch cannot be known, since its
+server no longer has it, or answers with what cannot be read; its lines may have been charged.
 """
 
 
 class BatchFailed(MergeRunnerError):
     """A batch mode did not do what it was asked.
 
+    ``smaller`` and ``single`` come from ``submit`` and as the ``failure`` of a status (``single``
+    also after results), ``lost`` from all other methods alone.
     ``delay_s`` is how long the server asks to wait. ``sent`` is False where certainly no batch was
     created; where it is True and ``kind`` is ``again``, there may be one all the same: look for it
     with ``find`` before the lines are submitted once more.
@@ -47,7 +50,7 @@ class BatchLine:
 
     @property
     def key(self) -> str:
-        """Its id there: 64 hexadecimal digits, as many characters as Anthropic and OpenAI take."""
+        """Its id there: 64 hexadecimal digits, as many characters as Anthropic takes."""
         return self.request.key
 
 
@@ -125,7 +128,8 @@ class BatchService(Protocol):
     ) -> Found | None:
         """The batch that was submitted with a mark and keys, at ``since`` or later (UTC).
 
-        ``known`` are ids of batches that are others. None: there is none.
+        ``known`` are ids of batches that are others. None: there is none. Raises BatchFailed with
+        the kind ``lost`` where nobody can say.
         """
         ...
 
@@ -136,14 +140,19 @@ class BatchService(Protocol):
     def results(self, batch_id: str) -> AsyncIterator[LineResult]:
         """The results of a batch that has ended, in any order, each key once.
 
-        A line without a result was not asked. Results that cannot be read are left out; after all
-        others it raises BatchFailed with the kind ``single`` that says what was wrong. With
-        ``again`` the connection was lost: they can be read from the beginning.
+        A line without a result was not asked. Results that cannot be read, not the second time
+        either, are left out; after all others it raises BatchFailed with the kind ``single`` that
+        says what was wrong. With ``again`` the connection was lost, or there are fewer results than
+        the provider counts, a whole file of them perhaps: they can be read from the beginning. A
+        provider may never show the others, so that the caller has to bound how long it asks.
         """
         ...
 
     async def cancel(self, batch_id: str) -> None:
-        """Ask for the end of a batch, which then ends with the results that it has."""
+        """Ask for the end of a batch, which then ends with the results that it has.
+
+        One that has ended already stays as it is.
+        """
         ...
 
 

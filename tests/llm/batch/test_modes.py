@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_runner.config import BatchTerms
+from merge_runner.config import PROVIDERS, BatchTerms
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.modes import BATCH_MODES, batch_terms, require_batch
 from merge_runner.llm.batch.service import BatchLimits, in_batches
@@ -35,6 +35,21 @@ def test_an_entry_may_have_terms_of_its_own_or_no_batch_mode():
     assert batch_terms(entry_of("openai-chat", batch="none")) is None
     # One deployment's path, which no batch can name.
     assert batch_terms(entry_of("openai-chat", path="/deployments/x/chat/completions")) is None
+
+
+def test_the_price_of_a_provider_holds_at_its_own_address(form, monkeypatch):
+    elsewhere = {"base_url": "http://127.0.0.1:8000"}
+    entry = entry_of(form, **elsewhere)
+    assert batch_terms(entry) is None
+    assert batch_terms(entry_of(form, **elsewhere, batch=OWN)) == OWN
+    with pytest.raises(UsageError, match=r"known at http://127\.0\.0\.1:8000; valid.*batch = \{"):
+        require_batch("mine", entry, {"mine": entry})
+    variable = PROVIDERS[entry.provider].base_url_env
+    monkeypatch.setenv(variable, "http://127.0.0.1:8000")
+    assert batch_terms(entry_of(form)) is None
+    monkeypatch.delenv(variable)
+    assert batch_terms(entry_of(form)).price_factor == 0.5
+    assert batch_terms(entry_of(form, "emulator")).price_factor == 0.5
 
 
 def test_a_model_without_a_batch_mode_is_refused_with_the_valid_ones():

@@ -532,6 +532,14 @@ class Endless(Memory):
 
 
 @in_virtual_time
+async def test_results_that_never_come_are_waited_for_in_bounds_and_may_have_been_charged(cache):
+    run = Run(cache, WithoutResults())
+    (reply,) = await run.ask()
+    assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
+    assert run.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
 async def test_a_cancelled_batch_that_does_not_end_is_waited_for_in_bounds(cache):
     service = Endless()
     await left_with(cache, service)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import re
 from collections import Counter
 from datetime import UTC, datetime, timedelta
 
 import httpx
 import pytest
+from aiohttp import web
 
 from merge_runner.emulator.faults import BatchPlan, FaultPlan
-from merge_runner.llm.batch import gemini
 from merge_runner.llm.batch.service import BatchFailed
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import judge
@@ -66,8 +65,7 @@ async def test_results_come_in_another_order_each_once(emulator, service_at, for
     batch, service = lines(form), service_at(url, form)
     results = await results_of(service, await service.submit(batch, MARK))
     assert sorted(keys(results)) == sorted(keys(batch))
-    # Inline results of Gemini alone are promised in order.
-    assert (keys(results) == keys(batch)) == (form == "gemini")
+    assert keys(results) != keys(batch)
 
 
 async def test_a_status_tells_how_many_lines_have_ended(emulator, service_at, form):
@@ -157,11 +155,15 @@ async def test_a_batch_whose_creation_was_not_answered_is_found(emulator, servic
     assert {each["answered"] for each in await answered_by(url)} == {1}
 
 
-async def test_a_batch_is_found_behind_many_later_ones_but_not_for_ever(emulator, service_at, form):
-    service, since = service_at(await emulator(), form), now()
+@pytest.mark.parametrize("oldest_first", [False, True])
+async def test_a_batch_is_found_among_many_in_any_order_but_not_for_ever(
+    emulator, service_at, form, oldest_first
+):
+    service, since = service_at(await emulator(plan(oldest_first=oldest_first)), form), now()
     mine = lines(form, 1, first=500)
-    created = await service.submit(mine, MARK)
-    for number in range(120):
+    for number in range(110):
+        if number == (100 if oldest_first else 5):
+            created = await service.submit(mine, MARK)
         await service.submit(lines(form, 2, first=number), f"other-{number}")
     assert (await service.find(MARK, keys(mine), since=since)).batch_id == created
     assert await service.find(MARK, keys(mine), since=since + timedelta(hours=2)) is None
@@ -198,26 +200,40 @@ async def test_too_many_enqueued_tokens_ask_for_smaller_batches(emulator, servic
     assert (await service.status(third)).state == "waiting"
 
 
-@pytest.mark.parametrize(
-    ("bound", "most"),
-    [
-        ("MOST_INLINE", lambda size, count: size - 2),
-        ("MOST_INLINE_LINES", lambda size, count: count - 1),
-    ],
-)
-async def test_gemini_sends_more_than_fits_the_request_as_a_file(
-    emulator, service_at, monkeypatch, bound, most
+async def test_results_that_come_late_and_in_part_are_read_until_all_are_there(
+    emulator, service_at, form
 ):
-    service, batch = service_at(await emulator(plan(delay_s=0.05)), "gemini"), lines("gemini")
-    inline = await results_of(service, await service.submit(batch, "inline"))
-    monkeypatch.setattr(gemini, bound, most(sum(map(service.size, batch)), len(batch)))
-    by_file = await results_of(service, await service.submit(batch, "file"))
-    assert keys(by_file) != keys(inline) == keys(batch)
+    service = service_at(await emulator(plan(late_results=2, short_results=1)), form)
+    batch = lines(form)
+    batch_id = await service.submit(batch, MARK)
+    await ended(service, batch_id)
 
-    def answers(results):
-        return {each.key: re.sub('"responseId": "[^"]*"', "", each.raw.body) for each in results}
+    async def read():
+        async for result in service.results(batch_id):
+            seen.append(result.key)
 
-    assert answers(by_file) == answers(inline)
+    for there in (0, 0, 5):
+        seen = []
+        with pytest.raises(BatchFailed) as failed:
+            await read()
+        assert (failed.value.kind, len(seen)) == ("again", there)
+    seen = []
+    await read()
+    assert sorted(seen) == sorted(keys(batch))
+
+
+async def test_a_batch_with_all_around_its_lines_keeps_to_the_limit(server, service_at):
+    sent = []
+
+    async def keep(request):
+        sent.append(int(request.headers["content-length"]))
+        return web.json_response({"id": "b1"})
+
+    server.replies["POST /v1/messages/batches"] = keep
+    service, batch = service_at(server.url, "anthropic"), lines("anthropic", 3)
+    await service.submit(batch, MARK)
+    around = sent[0] - sum(map(service.size, batch))
+    assert service.limits.size + around <= 256_000_000
 
 
 async def test_a_size_is_that_of_the_line_as_it_is_sent(emulator, service_at, form, server):
@@ -228,11 +244,9 @@ async def test_a_size_is_that_of_the_line_as_it_is_sent(emulator, service_at, fo
         raise RuntimeError
 
     # Two batches that differ by a line differ by its size.
-    for path in (
-        "/v1/files",
-        "/v1/messages/batches",
-        "/v1beta/models/some-model:batchGenerateContent",
-    ):
+    begun = (200, {}, {"x-goog-upload-url": f"{server.url}/up"})
+    server.replies["POST /upload/v1beta/files"] = begun
+    for path in ("/v1/files", "/v1/messages/batches", "/up"):
         server.replies[f"POST {path}"] = keep
     service = service_at(server.url, form)
     for part in (batch[:2], batch):
