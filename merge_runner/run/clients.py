@@ -191,7 +191,7 @@ def live_clients(
             strict=endpoint_plan.strict,
             model=model,
             first=FirstCall(
-                # A round finds the same faults as a first call, at half its price.
+                # A round is asked at once: no call of it waits for another one's answer.
                 passed=name in endpoint_plan.passed or (rounds is not None and rounds.ways.submits),
                 known=name in endpoint_plan.known,
             ),

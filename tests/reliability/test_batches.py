@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import random
+import re
 import shutil
 import signal
 from collections import Counter
@@ -51,6 +52,16 @@ def priced(tmp_path):
     (tmp_path / "short.toml").write_text("[repetitions]\nbaseline = 1\n[scenario]\ntimeout_s = 4\n")
 
 
+def with_terms(folder, model):
+    """A study whose registry gives a model terms of its own, wherever it is asked."""
+    terms = 'batch = { price_factor = 0.5, source = "as at its provider" }'
+    told = (PROJECT / "experiments/models.toml").read_text()
+    (folder / "models.toml").write_text(
+        re.sub(rf'^\["?{re.escape(model)}"?\]$', rf"\g<0>\n{terms}", told, flags=re.MULTILINE)
+    )
+    shutil.copy(PROJECT / "experiments/baseline.toml", folder)
+
+
 async def answered(server):
     """How often each slot was answered: in batches, and singly."""
     async with httpx.AsyncClient() as client:
@@ -69,7 +80,8 @@ async def rows(merge_runner, query, db="results/merge.duckdb"):
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["o3", "gpt-6-sol", "claude-sonnet-4-6", "gemini-3.8-flash"])
 async def test_a_sweep_in_batches_has_the_digest_of_a_plain_one(merge_runner, tmp_path, model):
-    sweep = ("sweep", "baseline", *TWO, "--model", model, "--yes")
+    with_terms(tmp_path, model)
+    sweep = ("sweep", "baseline.toml", *TWO, "--model", model, "--yes")
     async with watched(faults=FaultPlan(batch=BatchPlan(delay_s=0.1))) as server:
         env = account(server)
         plain = await merge_runner(*sweep, *FAST, "--db", "plain", "--cache", "a", **env)
@@ -84,7 +96,7 @@ async def test_a_sweep_in_batches_has_the_digest_of_a_plain_one(merge_runner, tm
     (decisions,) = await rows(merge_runner, "select max(decision) + 1 as n from calls", "batch")
     assert (once["batches"], half["batches"]) == (0, decisions["n"])
     assert run.summary["sweep_cost_usd"] == pytest.approx(half["usd"], abs=1e-6)
-    replay = await merge_runner("replay", "baseline", *TWO, "--model", model, "--db", "replay",
+    replay = await merge_runner("replay", "baseline.toml", *TWO, "--model", model, "--db", "replay",
                                 "--cache", "b")  # fmt: skip
     assert replay.code == 0, replay.err
     assert results_digest(tmp_path / "replay") == results_digest(tmp_path / "plain")
@@ -106,7 +118,9 @@ async def test_a_sweep_that_is_killed_at_20_instants_pays_nothing_twice(
             process.kill()
         return reply
 
-    sweep = ("sweep", "short.toml", "--reps", 2, "--model", "priced", "--batch", "--yes", "--json")
+    study = "[repetitions]\nbaseline = 1\n[scenario]\ntimeout_s = 8\n"  # enough rounds to die in
+    (tmp_path / "long.toml").write_text(study)
+    sweep = ("sweep", "long.toml", "--reps", 2, "--model", "priced", "--batch", "--yes", "--json")
     chance, killed = random.Random(5), 0
     plan = BatchPlan(delay_s=0.5, failed=0.1, expired=0.05)
     async with watched(middle, FaultPlan(seed=3, batch=plan)) as server:
@@ -131,7 +145,7 @@ async def test_a_sweep_that_is_killed_at_20_instants_pays_nothing_twice(
     (lost,) = await rows(merge_runner, query)
     assert len(batched.keys() & alone.keys()) <= lost["n"] <= 4
     assert last.summary["trials"]["failed"] == 0
-    quiet = ("sweep", "short.toml", "--reps", 2, "--model", "priced", "--yes")
+    quiet = ("sweep", "long.toml", "--reps", 2, "--model", "priced", "--yes")
     async with watched() as server:
         plain = await merge_runner(*quiet, "--db", "quiet", "--cache", "new", **account(server))
     assert plain.code == 0, plain.err
