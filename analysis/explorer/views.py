@@ -148,11 +148,13 @@ def summary(row: Row, trial: Trial) -> list[str]:
     for side in SIDES:
         mine = [d for d in trial.decisions if d["side"] == side]
         if mine:
-            letters = " ".join(d["tactical"] or "–" for d in mine)
+            words = [d["tactical"] for d in mine]
+            letters = " ".join(word or "–" for word in words)
+            said = letters if any(words) else f"{len(words)}, none in words"
             bad = [str(d["decision"]) for d in mine if not d["valid"] and not d["lost"]]
             lost = [str(d["decision"]) for d in mine if not d["driven"]]
             lines.append(
-                f"Decisions of the {side} driver: {letters}"
+                f"Decisions of the {side} driver: {said}"
                 + (f"; without a valid plan: {', '.join(bad)}" if bad else "")
                 + (f"; the trial ended before {', '.join(lost)} was driven." if lost else ".")
             )

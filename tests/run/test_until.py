@@ -12,6 +12,7 @@ from merge_runner.errors import UsageError
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.sweep import INTERRUPTED, Sweep
 from merge_runner.run.until import deadline
+from tests.gate import Gate
 from tests.harness import FAST, watched
 
 
@@ -86,19 +87,35 @@ async def test_at_its_time_a_sweep_begins_no_trial_and_the_same_command_goes_on(
         assert done.summary["calls"]["live"] == server.requests - asked
 
 
+class Clock:
+    """The time, and as much later as a test says."""
+
+    perf_counter = staticmethod(time.perf_counter)
+    ahead_s = 0.0
+
+    def time(self):
+        return time.time() + self.ahead_s
+
+
 async def test_what_does_not_end_in_a_while_is_stopped_as_by_ctrl_c(tmp_path, monkeypatch):
-    async def middle(request, handler):
-        await asyncio.sleep(0.5)  # so that no trial can end in time
-        return await handler(request)
+    gate, clock, said = Gate(passing=2), Clock(), []
+
+    def say(line):
+        said.append(line)
+        if "Stopping:" in line:
+            gate.open()
 
     monkeypatch.setattr("merge_runner.run.sweep.GRACE_S", 0.3)
-    said = []
-    async with watched(middle) as server:
+    monkeypatch.setattr("merge_runner.run.sweep.time", clock)
+    async with watched(gate.middle) as server:
         monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
         plan = make_plan("baseline", "emulator", repetitions=1, conditions=["N_0_0", "L_4_0"])
-        until = datetime.now().astimezone() + timedelta(seconds=2)
+        until = datetime.now().astimezone() + timedelta(days=1)
         options = Options(tmp_path / "m.duckdb", tmp_path / "c", until=until)
-        outcome = await Sweep(plan, options, say=said.append).run()
+        sweep = asyncio.create_task(Sweep(plan, options, say=say).run())
+        await gate.quiet(tmp_path / "c", trials=2)
+        clock.ahead_s = 86_400
+        outcome = await sweep
         assert outcome.exit_code == INTERRUPTED
         assert "2 trials have not ended" in outcome.messages[0]
         assert "Stopping:" in said[-1]
