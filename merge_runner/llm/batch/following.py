@@ -161,13 +161,11 @@ class Following:
             await self._cancel_in_time(followed)
             if _takes_too_long(followed.batch):
                 batch = followed.batch
+                why = f"the batch was cancelled at {batch.cancelled_at} and does not end"
+                self._say(f"{batch.model}: {why}: its calls are asked singly")
                 followed.end(
                     LineEnd(
-                        batch.batch_id,
-                        outcome="no_result",
-                        message=f"the batch was cancelled at {batch.cancelled_at} and does not end",
-                        unclear=True,
-                        singly=True,
+                        batch.batch_id, outcome="no_result", message=why, unclear=True, singly=True
                     )
                 )
                 return False
@@ -234,7 +232,7 @@ class Following:
                     break
                 else:
                     raise
-        if not followed.batch.sure and not followed.seen:
+        if not (followed.batch.sure or followed.seen or left_out):
             return False
         followed.end(
             LineEnd(
