@@ -235,6 +235,13 @@ class Price(Frozen):
     source: str
 
 
+class BatchTerms(Frozen):
+    """What a batch mode costs, as a factor of what single calls cost, and where that was read."""
+
+    price_factor: Annotated[Positive, Field(le=1)]
+    source: str
+
+
 class ModelEntry(Frozen):
     """One model of ``experiments/models.toml``.
 
@@ -247,10 +254,11 @@ class ModelEntry(Frozen):
     a model that has no parameter of this name. ``price`` is ``free``, ``genai-prices`` (the table
     of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a minute.
     ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of ``--dry-run`` alone. A
-    reply longer than ``max_reply_mb`` (unpacked) is refused.
+    reply longer than ``max_reply_mb`` (unpacked) is refused. ``batch`` is the batch mode: the
+    ``provider``'s, ``none``, or one on the terms of another server that speaks the format.
     """
 
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {"price": Price}
+    nested: ClassVar[Mapping[str, type[BaseModel]]] = {"price": Price, "batch": BatchTerms}
 
     provider: str
     format: str
@@ -273,6 +281,7 @@ class ModelEntry(Frozen):
     timeout_s: Positive = 600.0
     deadline_s: Positive = 1200.0
     max_reply_mb: Positive = 16.0
+    batch: Literal["provider", "none"] | BatchTerms = "provider"
     typical_output_tokens: Count = 1000
     typical_latency_s: Positive = 10.0
     note: str = ""
@@ -284,7 +293,8 @@ class Provider:
 
     ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are the members that
     every error of the provider has, by its documentation: one without them may be a gateway's.
-    ``parameters`` are those that its servers take beside those of the wire format.
+    ``parameters`` are those that its servers take beside those of the wire format. ``batch`` are
+    the terms of its batch mode; None: it has none.
     ``model_env`` is the variable that names the model of an entry without a name; a provider with
     one also lists its models at ``/models``. ``if_nobody`` says what to do where nobody answers.
     """
@@ -296,6 +306,7 @@ class Provider:
     key_needed: bool = True
     error_members: frozenset[str] = frozenset()
     parameters: frozenset[str] = frozenset()
+    batch: BatchTerms | None = None
     model_env: str | None = None
     if_nobody: str = "check the network"
 
@@ -308,6 +319,7 @@ PROVIDERS.register(
         "OPENAI_BASE_URL",
         ("OPENAI_API_KEY",),
         error_members=frozenset({"message", "type", "code"}),
+        batch=BatchTerms(price_factor=0.5, source="platform.openai.com/docs/guides/batch, 2026-11"),
     ),
 )
 PROVIDERS.register(
@@ -319,6 +331,9 @@ PROVIDERS.register(
         ("GOOGLE_API_KEY", "GEMINI_API_KEY"),
         auth="x-goog-api-key",
         error_members=frozenset({"message", "code", "status"}),
+        batch=BatchTerms(
+            price_factor=0.5, source="ai.google.dev/gemini-api/docs/batch-api, 2026-11"
+        ),
     ),
 )
 PROVIDERS.register(
@@ -329,6 +344,10 @@ PROVIDERS.register(
         ("ANTHROPIC_API_KEY",),
         auth="x-api-key",
         error_members=frozenset({"message", "type"}),
+        batch=BatchTerms(
+            price_factor=0.5,
+            source="platform.claude.com/docs/en/build-with-claude/batch-processing, 2026-11",
+        ),
     ),
 )
 PROVIDERS.register(
@@ -363,6 +382,7 @@ PROVIDERS.register(
         "EMULATOR_BASE_URL",
         key_needed=False,
         parameters=PLANTED,
+        batch=BatchTerms(price_factor=0.5, source="as the providers that it stands in for"),
         if_nobody="start it with `merge-runner emulate`",
     ),
 )

@@ -50,6 +50,9 @@ class RunOptions(TypedDict, total=False):
     tpm: int | None
     max_cost_usd: float | None
     strict_model: bool
+    batch: bool
+    round_deadline_s: float
+    detach: bool
 
 
 @dataclass(frozen=True, repr=False)

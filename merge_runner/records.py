@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 Side = Literal["left", "right"]
 Road = Literal["merge", "straight"]
@@ -105,6 +107,8 @@ class Attempt:
     nobody knows what became of the attempt, else the named reason of the failure. ``reply`` is
     the body as received, None if there was none.
     ``started_at`` is UTC in ISO 8601. ``scripted`` says that a scripted stand-in answered.
+    ``batch_id`` names the provider's batch that the request was a line of; None: it was sent alone.
+    A line has no latency.
     """
 
     number: int
@@ -119,6 +123,8 @@ class Attempt:
     error: str | None = None
     cost_usd: float | None = None
     scripted: bool = False
+    # Left out where there is none, so that what is kept of other attempts stays as it was.
+    batch_id: Annotated[str | None, Field(exclude_if=lambda value: value is None)] = None
 
     @property
     def answered(self) -> bool:

@@ -139,6 +139,24 @@ async def test_money_is_spent_only_with_leave(folder):
     assert (await study.arun(yes=True)).facts["cost_usd"] > 0
 
 
+async def test_a_study_is_asked_in_batches_for_half_the_price(folder):
+    study = Study("study.toml", models="dear", only={"opponent": "self", "memory_s": 2.0})
+    whole, half = (
+        await study.arun(yes=True),
+        await Study(
+            "study.toml",
+            models="dear",
+            only={"opponent": "self", "memory_s": 2.0},
+            db="batched.duckdb",
+            cache="batched",
+        ).arun(yes=True, batch=True),
+    )
+    assert half.facts["cost_usd"] == pytest.approx(whole.facts["cost_usd"] / 2)
+    assert half.calls()["batch_id"].notna().all()
+    with pytest.raises(UsageError, match="--detach goes with --batch"):
+        await study.arun(detach=True)
+
+
 async def test_trials_that_failed_are_in_the_outcome(folder):
     outcome = await Study("study.toml", cache="none").areplay()
     assert (outcome.ok, outcome.exit_code) == (False, 4)

@@ -67,6 +67,7 @@ NOT_DERIVED = (
     "calls.started_at",
     "calls.latency_s",
     "calls.cost_usd",
+    "calls.batch_id",
     "sweeps.ended_at",
     "sweeps.exit_code",
     "sweeps.git_commit",

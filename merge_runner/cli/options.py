@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -81,6 +81,34 @@ MaxCostOption = Annotated[
 ]
 
 
+BatchOption = Annotated[
+    bool,
+    typer.Option(
+        "--batch",
+        help="Ask in the provider's batches, one decision of all trials a round, at a lower price.",
+    ),
+]
+
+
+RoundDeadlineOption = Annotated[
+    str | None,
+    typer.Option(
+        "--round-deadline",
+        metavar="TIME",
+        help="Cancel a batch after this time and ask singly what it has not answered: 2h, unless "
+        "told; 0: at once.",
+    ),
+]
+
+
+DetachOption = Annotated[
+    bool,
+    typer.Option(
+        "--detach", help="With --batch: end when all waits for batches; the next run goes on."
+    ),
+]
+
+
 StrictModelOption = Annotated[
     bool, typer.Option("--strict-model", help="Stop when another model answers.")
 ]
@@ -138,6 +166,16 @@ RecordingOption = Annotated[
         "--recording", help="Also replay from this file, without importing it; may be repeated."
     ),
 ]
+
+
+def batch_options(*, batch: bool, round_deadline: str | None, detach: bool) -> dict[str, Any]:
+    """What of ``plan.Options`` is about batches; raises UsageError."""
+    if round_deadline is None:
+        return {"batch": batch, "detach": detach}
+    from merge_runner.run.until import duration_s
+
+    deadline_s = duration_s(round_deadline, "--round-deadline")
+    return {"batch": batch, "detach": detach, "round_deadline_s": deadline_s}
 
 
 def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:

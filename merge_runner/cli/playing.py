@@ -96,9 +96,13 @@ def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
         return None
     expected = asyncio.run(prepared.estimate())
     cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
+    takes = f"{cost}, {expected.minutes} minutes or more"
+    if (batch := expected.batch) is not None:
+        halved = "" if batch.cost_usd is None else f"about {batch.cost_usd} USD in batches, "
+        takes = f"{halved}{cost} singly, at most {batch.most_rounds} rounds of batches"
     say(
         f"{expected.driver}: {expected.trials} trials, about {expected.calls} calls that are not "
-        f"recorded yet, {cost}, {expected.minutes} minutes or more"
+        f"recorded yet, {takes}"
     )
     if yes:
         return expected
@@ -121,6 +125,7 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         print_out(json.dumps(asdict(expected)))
         return
     cost = "unknown" if expected.cost_usd is None else f"{expected.cost_usd:.2f} USD"
+    singly = ", asked singly" if expected.batch is not None else ""
     for name, text in (
         ("driver", expected.driver),
         ("trials", f"{expected.trials} that have not ended yet"),
@@ -130,14 +135,21 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
             f"about {expected.input_tokens} in, {expected.output_tokens} out"
             + (", as measured before" if expected.measured else ""),
         ),
-        ("cost", f"about {cost}"),
-        ("time", f"about {expected.minutes} minutes"),
+        ("cost", f"about {cost}{singly}"),
+        ("time", f"about {expected.minutes} minutes{singly}"),
     ):
         print_out(f"{name:<8}{text}")
+    if (batch := expected.batch) is not None:
+        usd = "unknown" if batch.cost_usd is None else f"{batch.cost_usd:.2f} USD"
+        print_out(
+            f"batch   about {usd} in about {batch.rounds} rounds, at most {batch.most_rounds}; a "
+            "round takes as long as its slowest batch: minutes, an hour, at most a day"
+        )
     if expected.trials_within_cap is not None:
         print_out(f"cap     buys about {expected.trials_within_cap} trials")
     if len(expected.cells) > 1:
-        headings = ["cell", "trials", "calls", "tokens in", "tokens out", "USD", "minutes"]
+        headings = ["cell", "trials", "calls", "tokens in", "tokens out"]
+        headings += [f"{what}{singly}" for what in ("USD", "minutes")]
         write_table(
             [*headings, "trials within the cap"],
             [tuple("" if v is None else v for v in astuple(c)) for c in expected.cells],

@@ -7,9 +7,11 @@ from typing import Annotated
 import typer
 
 from merge_runner.cli.options import (
+    BatchOption,
     CacheOption,
     ConditionsOption,
     DbOption,
+    DetachOption,
     DryRunOption,
     InFlightOption,
     JsonOption,
@@ -19,12 +21,14 @@ from merge_runner.cli.options import (
     OnlyOption,
     RecordingOption,
     ReplayOption,
+    RoundDeadlineOption,
     RpmOption,
     SampleSetOption,
     StrictModelOption,
     TpmOption,
     VariantsOption,
     YesOption,
+    batch_options,
     levels,
     listed,
 )
@@ -76,6 +80,9 @@ def first(
     rpm: RpmOption = None,
     tpm: TpmOption = None,
     max_cost: MaxCostOption = None,
+    batch: BatchOption = False,
+    round_deadline: RoundDeadlineOption = None,
+    detach: DetachOption = False,
     strict_model: StrictModelOption = False,
     dry_run: DryRunOption = False,
     yes: YesOption = False,
@@ -100,6 +107,7 @@ def first(
         replay=replay,
         recordings=recording or (),
         strict_model=strict_model,
+        **batch_options(batch=batch, round_deadline=round_deadline, detach=detach),
     )
     plan = make_plan(
         name,

@@ -19,6 +19,9 @@ def emulate(
     fault_rate: Annotated[float, typer.Option(help="Share of attempts with a fault.")] = 0.0,
     faults: Annotated[Path | None, typer.Option(help="A TOML file of faults.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the faults.")] = 0,
+    batch_delay: Annotated[
+        float | None, typer.Option(help="Seconds until a batch has its results.", min=0)
+    ] = None,
     until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Run the local stand-in for a language model on 127.0.0.1; prints its base URL."""
@@ -26,10 +29,14 @@ def emulate(
 
     from merge_runner.emulator.server import run
 
+    plan = faults_of(fault_rate, faults, seed)
+    if batch_delay is not None:
+        batch = plan.batch.model_copy(update={"delay_s": batch_delay})
+        plan = plan.model_copy(update={"batch": batch})
     asyncio.run(
         run(
             port,
-            faults_of(fault_rate, faults, seed),
+            plan,
             announce=print_out,
             until_stdin_closes=until_stdin_closes,
         )

@@ -10,9 +10,11 @@ from typing import Annotated
 import typer
 
 from merge_runner.cli.options import (
+    BatchOption,
     CacheOption,
     ConditionsOption,
     DbOption,
+    DetachOption,
     DryRunOption,
     InFlightOption,
     JsonOption,
@@ -24,12 +26,14 @@ from merge_runner.cli.options import (
     RecordingOption,
     ReplayOption,
     RepsOption,
+    RoundDeadlineOption,
     RpmOption,
     SampleSetOption,
     StrictModelOption,
     TpmOption,
     VariantsOption,
     YesOption,
+    batch_options,
     levels,
     listed,
 )
@@ -84,6 +88,9 @@ def sweep(
             help="Play on a Dask cluster: local:N, a scheduler's address, or its file.",
         ),
     ] = None,
+    batch: BatchOption = False,
+    round_deadline: RoundDeadlineOption = None,
+    detach: DetachOption = False,
     strict_model: StrictModelOption = False,
     dry_run: DryRunOption = False,
     yes: YesOption = False,
@@ -117,6 +124,7 @@ def sweep(
         strict_model=strict_model,
         dask=dask,
         until=None if until is None else deadline(until, datetime.now(UTC)),
+        **batch_options(batch=batch, round_deadline=round_deadline, detach=detach),
     )
     plan = make_plan(
         name,

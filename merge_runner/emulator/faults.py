@@ -36,26 +36,65 @@ FAULTS: tuple[Fault, ...] = get_args(Fault)
 # These change what a trial records. All others are transient: a sweep with them, which asks again,
 # ends like one without.
 OUTCOMES: frozenset[Fault] = frozenset({"empty", "refused", "malformed"})
+# The faults that are replies.
+STATUS_FAULTS = {
+    "request_timeout": 408,
+    "conflict": 409,
+    "server_error": 500,
+    "overloaded": 503,
+}
 TRANSIENT: tuple[Fault, ...] = tuple(fault for fault in FAULTS if fault not in OUTCOMES)
 
 
 Rate = Annotated[float, Field(ge=0, le=1)]
 
 
+Seconds = Annotated[float, Field(ge=0)]
+
+
+class BatchPlan(BaseModel):
+    """What becomes of batches; rates are probabilities per line, ``lost`` per creation.
+
+    A line has its result within ``delay_s``, and a share ``slow`` of them ``slow_factor`` times as
+    late; a batch ends with its last line, but not before its state was asked for ``polls`` times.
+    A share ``failed`` of the lines ends with a 429, 500 or 503 and ``expired`` without being asked.
+    Of a share ``lost`` of the creations the answer is lost. While more than ``enqueued_tokens``
+    would wait, a batch is refused. Whoever asks for a file of results is told ``late_results``
+    times that there is none, and then gets half of it ``short_results`` times. Lists have the
+    newest batch first, or with ``oldest_first`` the oldest.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    delay_s: Seconds = 0.0
+    polls: Annotated[int, Field(ge=0)] = 0
+    slow: Rate = 0.0
+    slow_factor: Annotated[float, Field(ge=1)] = 10.0
+    failed: Rate = 0.0
+    expired: Rate = 0.0
+    lost: Rate = 0.0
+    enqueued_tokens: Annotated[int, Field(gt=0)] | None = None
+    late_results: Annotated[int, Field(ge=0)] = 0
+    short_results: Annotated[int, Field(ge=0)] = 0
+    oldest_first: bool = False
+
+
 class FaultPlan(BaseModel):
     """How often each fault occurs; ``rates`` are probabilities per attempt.
 
     ``latency_s`` delays every answer. ``delay_s`` is how long a rate limit asks to wait. A hang is
-    silent for ``hang_s``, longer than a client's patience, and then closes.
+    silent for ``hang_s``, longer than a client's patience, and then closes. ``batch`` says what
+    becomes of batches.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     seed: int = 0
     rates: dict[Fault, Rate] = {}
-    latency_s: Annotated[float, Field(ge=0)] = 0.0
-    delay_s: Annotated[float, Field(ge=0)] = 0.05
-    hang_s: Annotated[float, Field(ge=0)] = 30.0
+    latency_s: Seconds = 0.0
+    delay_s: Seconds = 0.05
+    hang_s: Seconds = 30.0
+    batch: BatchPlan = BatchPlan()
 
     @model_validator(mode="after")
     def _at_most_one_fault(self) -> FaultPlan:
@@ -98,7 +137,8 @@ def load_faults(path: Path) -> FaultPlan:
         first = exc.errors()[0]
         place = [str(part) for part in first["loc"] if part != "[key]"]
         wrong = first["msg"].removeprefix("Value error, ")
-        valid = FAULTS if place[:1] == ["rates"] else FaultPlan.model_fields
+        tables = {"rates": FAULTS, "batch": tuple(BatchPlan.model_fields)}
+        valid = tables.get(place[0] if place else "", tuple(FaultPlan.model_fields))
         raise UsageError(
             f"{path}: {'.'.join(place) or 'rates'}: {wrong}; valid: {', '.join(valid)}"
         ) from exc

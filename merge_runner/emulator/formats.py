@@ -87,6 +87,7 @@ class _OpenAI(ServedFormat):
 
     error_names: ClassVar = {
         400: "invalid_request_error",
+        404: "not_found",
         408: "timeout",
         409: "conflict",
         429: "rate_limit_exceeded",
@@ -193,6 +194,7 @@ class _Gemini(ServedFormat):
     path = r"/{version:v1\w*}/models/{model}:generateContent"
     error_names: ClassVar = {
         400: "INVALID_ARGUMENT",
+        404: "NOT_FOUND",
         408: "DEADLINE_EXCEEDED",
         409: "ABORTED",
         429: "RESOURCE_EXHAUSTED",
@@ -249,6 +251,7 @@ class _Anthropic(ServedFormat):
     path = "/v1/messages"
     error_names: ClassVar = {
         400: "invalid_request_error",
+        404: "not_found_error",
         408: "timeout_error",
         409: "conflict_error",
         429: "rate_limit_error",
@@ -287,4 +290,5 @@ class _Anthropic(ServedFormat):
         return body, {"retry-after": str(delay_s)} if delay_s else {}
 
 
-SERVED = (_Chat(), _Responses(), _Gemini(), _Anthropic())
+CHAT, RESPONSES, GEMINI, MESSAGES = _Chat(), _Responses(), _Gemini(), _Anthropic()
+SERVED = (CHAT, RESPONSES, GEMINI, MESSAGES)

@@ -3,52 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
-import json
-import re
 import socket
 import struct
 import sys
-from collections import Counter
 from collections.abc import Awaitable, Callable
 from functools import partial
-from typing import Any
 
 from aiohttp import web
 
-from merge_runner.config import validated
-from merge_runner.emulator.driver import answer
-from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.formats import SERVED, Said, ServedFormat
+from merge_runner.emulator.batch_routes import BatchRoutes
+from merge_runner.emulator.batches import Batches
+from merge_runner.emulator.faults import STATUS_FAULTS, FaultPlan
+from merge_runner.emulator.formats import SERVED, ServedFormat
+from merge_runner.emulator.replies import MODELS, Asked, Replies, dumps, marked
 from merge_runner.errors import UsageError
-from merge_runner.planted_effect import PlantedEffect, planted_fields
-from merge_runner.records import (
-    ANSWERED_FIELD,
-    ATTEMPT_HEADER,
-    SCRIPTED_FIELD,
-    SCRIPTED_HEADER,
-    SIDES,
-    SLOT_HEADER,
-    Slot,
-)
+from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_HEADER, SLOT_HEADER
 
 HOST = "127.0.0.1"
 # The names under which a browser or a client may reach it.
 OWN_NAMES = ("127.0.0.1", "localhost", "[::1]")
-MODELS = ("scripted-driver",)
-STATUS_FAULTS = {
-    "request_timeout": 408,
-    "conflict": 409,
-    "server_error": 500,
-    "overloaded": 503,
-}
-# What anything but a chat request can raise: refused with 400.
-UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
-# What the model says in place of the driver's answer.
-TEXTS = {
-    "malformed": "M\n\nI would rather describe my plan in words than write a list of numbers.",
-    "empty": "",
-}
 ID_HEADER = "x-request-id"
 # A linger time of zero sends a reset instead of an orderly close.
 RESET_AT_CLOSE = struct.pack("ii", 1, 0)
@@ -60,13 +33,16 @@ class Emulator:
 
     def __init__(self, faults: FaultPlan | None = None) -> None:
         self._faults = faults or FaultPlan()
-        self._asked: Counter[str] = Counter()
+        self._replies = Replies(self._faults)
+        self._batches = Batches(self._replies)
         self.app = web.Application(client_max_size=2**22, middlewares=[_only_by_own_name])
         self.app.on_response_prepare.append(_say_scripted)
         self.app.add_routes(
             [
                 *(web.post(each.path, partial(self._serve, each)) for each in SERVED),
                 web.get("/v1/models", self._models),
+                *BatchRoutes(self._batches).routes(),
+                web.get("/emulator/answered", self._answered),
             ]
         )
 
@@ -74,50 +50,40 @@ class Emulator:
         listed = [{"id": model, "object": "model", "owned_by": "emulator"} for model in MODELS]
         return web.json_response({"object": "list", "data": listed})
 
+    async def _answered(self, request: web.Request) -> web.StreamResponse:
+        """How often each request was answered, also in batches that nobody has fetched yet."""
+        self._batches.settle()
+        return web.json_response(self._replies.count())
+
     async def _serve(self, wire: ServedFormat, request: web.Request) -> web.StreamResponse:
         raw = await request.read()
+        asked = Asked(
+            wire=wire,
+            path=request.path,
+            raw=raw,
+            model=request.match_info.get("model"),
+            slot=request.headers.get(SLOT_HEADER),
+            attempt=request.headers.get(ATTEMPT_HEADER, ""),
+        )
         try:
-            body = json.loads(raw)
-            slot = _slot(request.headers.get(SLOT_HEADER))
-            prompt = wire.prompt(body)
-            model = request.match_info.get("model") or str(body.get("model", MODELS[0]))
-            (prompt + model).encode()
-            planted = planted_fields(wire.parameters(body))
-        except UNREADABLE:
-            return _error(wire, 400, "The body is not valid.")
-        try:
-            effect = validated(PlantedEffect, planted, "the emulator") if planted else None
+            question = self._replies.question(asked)
         except UsageError as exc:
             return _error(wire, 400, str(exc))
-        where = request.headers.get(SLOT_HEADER) or hashlib.sha256(raw).hexdigest()
-        attempt = self._attempt(request, where)
-        fault = self._faults.fault(where, attempt)
+        attempt = self._replies.attempt(asked)
+        fault = self._faults.fault(asked.where, attempt)
         await asyncio.sleep(self._faults.latency_s)
         if fault in ("hang", "reset", "truncated_body"):
             return await self._break_off(request, fault)
         if fault == "bad_gateway":
             return web.Response(status=502, text="<html>502 Bad Gateway</html>")
         if fault == "rate_limit":
-            return _error(wire, 429, "Rate limit reached.", self._faults.wait_s(where, attempt))
+            delay_s = self._faults.wait_s(asked.where, attempt)
+            return _error(wire, 429, "Rate limit reached.", delay_s)
         if fault in STATUS_FAULTS:
             return _error(wire, STATUS_FAULTS[fault], "An emulated fault.")
-        text = TEXTS[fault] if fault in TEXTS else answer(prompt, slot, effect)
-        # Only the same attempt at the same request gets the same id: the audit takes one that
-        # comes back for an answer that was given twice.
-        reply_id = hashlib.sha256(raw + f"{request.path} {where} {attempt}".encode()).hexdigest()
-        reply = wire.answer(Said(reply_id[:24], model, prompt, text, fault == "refused"))
-        reply[ANSWERED_FIELD] = {
-            "body_sha256": hashlib.sha256(raw).hexdigest(),
-            "slot": slot and slot.as_dict(),
-        }
-        sent = _dumps(reply)[: -20 if fault == "truncated_json" else None]
+        reply = self._replies.answer(question, attempt, fault)
+        sent = dumps(reply)[: -20 if fault == "truncated_json" else None]
         return web.Response(body=sent, content_type="application/json")
-
-    def _attempt(self, request: web.Request, where: str) -> int:
-        """The attempt's number: the client's own count, or else how often this was asked."""
-        told = request.headers.get(ATTEMPT_HEADER, "")
-        self._asked[where] += 1
-        return int(told) if re.fullmatch("[0-9]{1,6}", told) else self._asked[where]
 
     async def _break_off(self, request: web.Request, fault: str) -> web.StreamResponse:
         """Say nothing for long, or cut the connection before or within the reply."""
@@ -161,28 +127,11 @@ async def _only_by_own_name(request: web.Request, handler: Handler) -> web.Strea
     return await handler(request)
 
 
-def _slot(header: str | None) -> Slot | None:
-    """The slot that a client sent; raises ValueError or TypeError for an impossible one."""
-    if header is None:
-        return None
-    slot = Slot(**json.loads(header))
-    numbers = (slot.repetition, slot.decision, slot.sample_set)
-    known = isinstance(slot.condition, str) and slot.side in SIDES
-    if not known or not all(type(number) is int for number in numbers):
-        raise ValueError("no such slot")
-    return slot
-
-
 def _error(wire: ServedFormat, status: int, message: str, delay_s: float = 0.0) -> web.Response:
     body, headers = wire.error(status, message, delay_s)
     return web.Response(
-        body=_dumps(body), status=status, headers=headers, content_type="application/json"
+        body=dumps(marked(body)), status=status, headers=headers, content_type="application/json"
     )
-
-
-def _dumps(body: dict[str, Any]) -> bytes:
-    """A body as it is sent, with the field that says that no model made it."""
-    return json.dumps({**body, SCRIPTED_FIELD: True}, ensure_ascii=False).encode()
 
 
 async def serve(port: int, faults: FaultPlan | None = None) -> tuple[web.AppRunner, str]:

@@ -56,6 +56,7 @@ class PaidAttempt:
     """
 
     budget: Budget
+    ledger: Ledger
     trial: int
     key: str
     asked: Asked
@@ -76,14 +77,24 @@ class PaidAttempt:
         """The attempt is sent now, after these: what is set aside for it becomes durable."""
         await self.budget.make_durable(self, attempts)
 
+    def set_aside(self, attempts: Sequence[Attempt]) -> bool:
+        """An operation on the cache: the durable part of ``begin``; False if a cap is used up."""
+        return self.ledger.set_aside(
+            self.key, attempts, self.aside_usd, self.budget.caps, self.asked
+        )
+
+    def begun(self) -> None:
+        """What ``set_aside`` wrote is durable."""
+        self.budget.unqueue(self)
+
     async def settle(self, attempts: Sequence[Attempt]) -> None:
         """The attempt, the last of these, brought no answer; its cost may be unknown."""
-        await self.budget.ledger.settle(self.key, attempts, self.aside_usd)
+        await self.ledger.settle(self.key, attempts, self.aside_usd, self.asked)
         self._cost_usd = attempts[-1].cost_usd
 
     async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer that the attempt brought, and what it cost, in one transaction."""
-        kept = await self.budget.ledger.keep(entry, self.aside_usd)
+        kept = await self.ledger.keep(entry, self.aside_usd, self.asked)
         self._cost_usd = entry.attempts[-1].cost_usd
         if self._cost_usd is not None:
             self.budget.costs.learn(self.trial, self.asked.model, self._cost_usd)
@@ -167,6 +178,11 @@ class Budget:
         line = self._door[frozenset(self.costs.of(trial))]
         await self._in_line(line, trial, lambda first, _: self._begins(trial, first))
 
+    def begin_anew(self, trial: int) -> None:
+        """The trial goes on where an earlier run has asked for it, so that it waits for nothing."""
+        if self._pots and trial not in self._left:
+            self._begun.setdefault(trial, defaultdict(float))
+
     def leave(self, trial: int) -> None:
         """The trial has ended or is suspended, and needs no more money."""
         self._left.add(trial)
@@ -195,7 +211,7 @@ class Budget:
         Waits while other attempts or older trials may free money, then raises TrialSuspended. The
         caller closes what is returned; ``attempt`` does so by itself.
         """
-        paid = PaidAttempt(self, trial, key, asked)
+        paid = PaidAttempt(self, self.ledger, trial, key, asked)
         if not self._pots:
             paid.aside_usd = self._expected_usd(asked)
         else:
@@ -205,11 +221,27 @@ class Budget:
             )
         return paid
 
+    @asynccontextmanager
+    async def going_on(
+        self, trial: int, key: str, asked: Asked, scope: str
+    ) -> AsyncIterator[PaidAttempt]:
+        """The money of an attempt that an earlier run has begun, under the ledger of this name."""
+        ledger = self.ledger.other(scope)
+        paid = PaidAttempt(self, ledger, trial, key, asked, ledger.aside_usd(key), queued=False)
+        for pot in self._pots_of(asked):
+            pot.in_flight += 1
+        paid.account = self._begun.get(trial, paid.account)
+        paid.account[asked.model] += paid.aside_usd
+        try:
+            yield paid
+        finally:
+            paid.close()
+
     async def make_durable(self, paid: PaidAttempt, attempts: Sequence[Attempt]) -> None:
         """Move what is set aside for an attempt to the ledger; raises TrialSuspended."""
         if not await self.ledger.reserve(paid.key, attempts, paid.aside_usd, self.caps, paid.asked):
             raise TrialSuspended("another run spends from the same cap, and has used it up")
-        self._unqueue(paid)
+        self.unqueue(paid)
 
     def end(self, paid: PaidAttempt) -> None:
         """An attempt has ended."""
@@ -217,10 +249,11 @@ class Budget:
             pot.in_flight -= 1
         paid.account[paid.asked.model] += paid.charged_usd - paid.aside_usd
         if paid.queued:
-            self._unqueue(paid)
+            self.unqueue(paid)
         self._tell()
 
-    def _unqueue(self, paid: PaidAttempt) -> None:
+    def unqueue(self, paid: PaidAttempt) -> None:
+        """What is set aside for an attempt lies in the ledger now, or is given back."""
         paid.queued = False
         for pot in self._pots_of(paid.asked):
             pot.queued_usd -= paid.aside_usd
@@ -361,12 +394,22 @@ class Unpaid:
     async def admit(self, trial: int) -> None:
         """Every trial may begin."""
 
+    def begin_anew(self, trial: int) -> None:
+        """Every trial may begin."""
+
     def leave(self, trial: int) -> None:
         """No money is kept for the trial."""
 
     @asynccontextmanager
     async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[UnpaidAttempt]:
         """Nothing is set aside."""
+        yield UnpaidAttempt(self.cache, key)
+
+    @asynccontextmanager
+    async def going_on(
+        self, trial: int, key: str, asked: Asked, scope: str
+    ) -> AsyncIterator[UnpaidAttempt]:
+        """Nothing was set aside."""
         yield UnpaidAttempt(self.cache, key)
 
 
@@ -380,6 +423,13 @@ class UnpaidAttempt:
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
         """Nothing is noted: what a process that dies has in flight costs nothing."""
+
+    def set_aside(self, attempts: Sequence[Attempt]) -> bool:
+        """There is nothing to set aside."""
+        return True
+
+    def begun(self) -> None:
+        """See ``set_aside``."""
 
     async def settle(self, attempts: Sequence[Attempt]) -> None:
         """Keep the attempts for a later run."""

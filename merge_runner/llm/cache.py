@@ -90,7 +90,7 @@ class CallTotals:
     """Sums over entries of one model, at one endpoint, asked in one manner (see content_hashes.py).
 
     ``measured`` counts the answers that state their tokens and are the model's own, no stand-in's:
-    tokens and latencies are theirs.
+    tokens and latencies are theirs. So many of them are ``untimed``: a batch tells no latency.
     """
 
     cost_usd: float = 0.0
@@ -98,6 +98,13 @@ class CallTotals:
     input_tokens: int = 0
     output_tokens: int = 0
     latency_s: float = 0.0
+    untimed: int = 0
+
+    @property
+    def mean_latency_s(self) -> float | None:
+        """The mean over the answers that have one; None: none has."""
+        timed = self.measured - self.untimed
+        return self.latency_s / timed if timed else None
 
     def add(self, entry: CachedCall) -> None:
         """Count an entry."""
@@ -107,6 +114,7 @@ class CallTotals:
             return
         if last.usage.input_tokens is not None and last.usage.output_tokens is not None:
             self.measured += 1
+            self.untimed += last.latency_s is None
             self.input_tokens += last.usage.input_tokens
             self.output_tokens += last.usage.output_tokens
             self.latency_s += last.latency_s or 0.0
@@ -334,6 +342,11 @@ class ResponseCache:
         """An operation: keep a text in two rows, so that one damaged row does not lose it."""
         for each in (name, _AGAIN + name):
             self._disk.set(each, _behind_checksum(text))
+
+    def remove_twice(self, name: str) -> None:
+        """An operation: forget a text that is kept twice."""
+        for each in (name, _AGAIN + name):
+            self._disk.delete(each)
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
         """All entries, of the folder and of the overlay, each verified.

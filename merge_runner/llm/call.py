@@ -9,17 +9,23 @@ from dataclasses import dataclass, field
 from datetime import datetime
 
 from merge_runner.errors import CallFailed
+from merge_runner.llm.batch.journal import OpenLine
 from merge_runner.llm.ledger import Asked
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
 
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Who waits for what, and until when (UTC); None: until it happens."""
+    """Who waits for what, and until when (UTC); None: until it happens.
+
+    It is ``idle`` where what it waits for does not happen by itself: an answer that makes room, or
+    that is somebody else's.
+    """
 
     who: str
     what: str
     until: datetime | None = None
+    idle: bool = False
 
 
 @dataclass(slots=True, eq=False)
@@ -30,7 +36,8 @@ class Call:
     ``attempts`` are all that were made, the first ``earlier`` of them by earlier runs. ``began_s``
     is when the first attempt was due, on the event loop's clock. While the call waits, ``wait``
     says for what; otherwise it is in flight, or being saved. A call that is ``stopping`` waits for
-    nothing any more. ``task`` makes it.
+    nothing any more. ``task`` makes it. ``asking`` counts those who wait for its answer. It goes
+    ``singly`` where a batch brought no answer, and ``open`` says in which batch it waits already.
     """
 
     request: ChatRequest
@@ -42,6 +49,9 @@ class Call:
     earlier: int = 0
     began_s: float = 0.0
     wait: Wait | None = None
+    asking: int = 0
+    singly: bool = False
+    open: OpenLine | None = None
     task: asyncio.Task[ChatReply] = field(init=False)
 
     @property
@@ -56,11 +66,22 @@ class Call:
         return last.error or last.outcome
 
     @contextmanager
-    def waiting(self, what: str, until: datetime | None = None) -> Iterator[Wait]:
+    def asked_by_one(self) -> Iterator[None]:
+        """While this lasts, one more waits for the answer."""
+        self.asking += 1
+        try:
+            yield
+        finally:
+            self.asking -= 1
+
+    @contextmanager
+    def waiting(
+        self, what: str, until: datetime | None = None, *, idle: bool = False
+    ) -> Iterator[Wait]:
         """While this lasts, nothing of the call is in flight, so that it can be given up."""
         if self.stopping:
             raise CallFailed("the sweep was stopped", self.request)
-        self.wait = wait = Wait(f"{self.asked.driver}: {self.asked.slot}", what, until)
+        self.wait = wait = Wait(f"{self.asked.driver}: {self.asked.slot}", what, until, idle)
         try:
             yield wait
         finally:

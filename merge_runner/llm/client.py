@@ -21,6 +21,8 @@ from merge_runner.errors import (
     RecordingError,
     SweepStopped,
 )
+from merge_runner.llm.batch.batches import Batches
+from merge_runner.llm.batch.lines import LineEnd
 from merge_runner.llm.budget import Unpaid
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.call import Call, Wait, slot_text
@@ -62,6 +64,8 @@ from merge_runner.served_model import is_other_model
 
 # Kernel locks cannot be awaited; beside a call that takes seconds this delay is nothing.
 CLAIM_POLL_S = 0.1
+# A call whose lines failed so often is asked singly.
+MOST_LINES = 3
 # A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
 
@@ -75,7 +79,8 @@ class LlmClient:
     kept; ``drain`` waits for it. ``budget`` is None for a model that costs nothing. ``first`` is
     the run's first call to the endpoint, which goes alone. ``sealed`` says that nothing may be
     asked anew; ``strict`` that an answer of another model stops the sweep. ``model`` is its name in
-    the registry where ``name`` also tells its parameters.
+    the registry where ``name`` also tells its parameters. ``batches`` are those in which it may be
+    asked, or where its calls may wait already.
     """
 
     name: str
@@ -89,6 +94,7 @@ class LlmClient:
     strict: bool = False
     model: str = ""
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
+    batches: Batches | None = None
     meter: Meter = field(default_factory=Meter)
     _calls: dict[str, Call] = field(default_factory=dict)
     _stopping: bool = False
@@ -102,12 +108,15 @@ class LlmClient:
         if recorded := self._recorded(request):
             reply = self._read(recorded)
         elif call := self._calls.get(request.key):
-            reply = await asyncio.shield(call.task)
+            with call.asked_by_one():
+                reply = await asyncio.shield(call.task)
             # The attempts are counted once, for whoever asked first.
             reply = replace(reply, earlier=len(reply.attempts))
         else:
             # Shielded: the call may be paid for already when its trial is cancelled.
-            reply = await asyncio.shield(self._start(request, order).task)
+            call = self._start(request, order)
+            with call.asked_by_one():
+                reply = await asyncio.shield(call.task)
         other_model = self._other_model(reply)
         self.meter.count_reply(reply, other_model)
         if self.strict and other_model is not None:
@@ -140,6 +149,12 @@ class LlmClient:
     def waits(self) -> list[Wait]:
         """What the other calls wait for."""
         return [call.wait for call in self._calls.values() if call.wait is not None]
+
+    @property
+    def idle_askers(self) -> int:
+        """How many wait for calls that wait, themselves, for another's answer."""
+        calls = self._calls.values()
+        return sum(call.asking for call in calls if call.wait is not None and call.wait.idle)
 
     @property
     def _format(self) -> WireFormat:
@@ -195,11 +210,13 @@ class LlmClient:
     async def _in_turn(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
         # Both before the claim: else another process would wait for a call that waits here.
-        with call.waiting("for trials before it to end, under --max-cost"):
+        opened = self.batches is not None and self.batches.takes_up(call)
+        with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
         if self.sealed:
             return await self._make(call)
-        alone, stopped = await self._goes_alone(call), False
+        # Nobody waits for an answer that may take hours.
+        alone, stopped = not opened and await self._goes_alone(call), False
         try:
             return await self._claimed(call)
         except SweepStopped:
@@ -220,7 +237,7 @@ class LlmClient:
         """Claim a call, and make it unless it is recorded by now."""
         key = call.request.key
         while (known := await self.cache.claim(key)) is None:
-            with call.waiting("for the same call, which is being made already"):
+            with call.waiting("for the same call, which is being made already", idle=True):
                 await asyncio.sleep(CLAIM_POLL_S)
         try:
             for name in known.damaged:
@@ -229,7 +246,12 @@ class LlmClient:
                     f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set "
                     f"aside in the cache as 'damaged {name}', and asked again"
                 )
-            call.attempts, call.earlier = list(known.attempts), len(known.attempts)
+            call.attempts = list(known.attempts)
+            if self.batches is not None:
+                call.open = self.batches.rounds.open_line(key, known.attempts)
+            if call.open is not None:  # the attempt that has begun there is the one that goes on
+                call.attempts = [each for each in call.attempts if each.number < call.open.attempt]
+            call.earlier = len(call.attempts)
             # Whoever held the claim before may have made the call.
             return self._read(known.entry) if known.entry else await self._make(call)
         finally:
@@ -241,6 +263,8 @@ class LlmClient:
         deadline = Deadline(self.entry.deadline_s)
 
         async def sleep(seconds: float) -> None:
+            if self._goes_in_batch(call):
+                return  # the next round begins late enough
             until = datetime.now(UTC) + timedelta(seconds=seconds)
             with call.waiting(f"after {call.last_failure}", until) as wait:
                 if seconds >= LONG_WAIT_S:
@@ -265,25 +289,77 @@ class LlmClient:
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; returns its answer, which is kept, or raises what follows from it."""
+        if self.batches is not None and (call.open or self._goes_in_batch(call)):
+            return await self._attempt_in_batch(call, self.batches)
         async with self._permitted(call) as (paid, settle):
             await paid.begin(call.attempts)
             with deadline.attempt() as seconds_left:
                 outcome, raw = await self._send(call, settle, seconds_left)
-            self._tell_overrun(call, paid.aside_usd)
-            error = self._consequences.error(call, outcome, raw)
-            if error is None:
-                kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
-                return self._answer(call, kept, outcome)
-            self._pause(call, outcome)
-            await paid.settle(call.attempts)  # before the error, which may end the whole run
-            raise error
+            return await self._concluded(call, paid, outcome, raw)
+
+    async def _concluded(
+        self, call: Call, paid: AttemptPort, outcome: AttemptOutcome, raw: RawReply | None
+    ) -> ChatReply:
+        """Keep what an attempt brought: its answer, or why there is none, which is raised."""
+        self._tell_overrun(call, paid.aside_usd)
+        error = self._consequences.error(call, outcome, raw)
+        if error is None:
+            kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
+            return self._answer(call, kept, outcome)
+        self._pause(call, outcome)
+        await paid.settle(call.attempts)  # before the error, which may end the whole run
+        raise error
+
+    def _goes_in_batch(self, call: Call) -> bool:
+        """Whether the next attempt at a call goes with the next round."""
+        if self.batches is None or not self.batches.rounds.ways.submits or call.singly:
+            return False
+        return sum(attempt.batch_id is not None for attempt in call.own_attempts) < MOST_LINES
+
+    async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
+        """Make one attempt as a line of a batch; see ``_attempt``."""
+        opened, call.open = call.open, None
+        async with batches.attempt(call, opened) as (paid, line):
+            with call.waiting(f"for batches of {batches.model}", idle=True):
+                end = await batches.rounds.ask(line)
+            record, outcome = self._line_record(call, end, batches.price_factor)
+            record = replace(record, started_at=batches.rounds.submitted_at(line))
+            call.attempts.append(record)
+            call.singly |= end.singly
+            self.meter.count_attempt(record)
+            try:
+                if end.error is None:
+                    return await self._concluded(call, paid, outcome, end.raw)
+                await paid.settle(call.attempts)
+                raise end.error
+            finally:
+                batches.rounds.ended(line)
+
+    def _line_record(
+        self, call: Call, end: LineEnd, price_factor: float
+    ) -> tuple[Attempt, AttemptOutcome]:
+        """What came of a line: the attempt as it is recorded, and what it means."""
+        number = len(call.attempts) + 1
+        if end.raw is None:
+            free = self.entry.price == "free" or not end.unclear
+            outcome = AttemptOutcome("retry", end.outcome, end.message)
+            record = Attempt(number, end.outcome, error=end.message, cost_usd=0.0 if free else None)
+        else:
+            # No limit of single calls is meant, and no call waits for one.
+            outcome = replace(judge(end.raw, self._format), pause=False, delay_s=None)
+            record = self._record(number, end.raw, outcome, call.worst)
+            usd = record.cost_usd
+            if end.raw.status != 200 and record.usage == Usage():
+                usd = 0.0  # no line that failed is charged
+            record = replace(record, cost_usd=None if usd is None else usd * price_factor)
+        return replace(record, batch_id=end.batch_id), outcome
 
     @asynccontextmanager
     async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, Settle]]:
         """What an attempt needs before it is sent: its money, then its turn."""
         # A turn must be used as soon as it is given, or the limits do not hold.
         async with AsyncExitStack() as stack:
-            with call.waiting("for calls in flight to be paid, under --max-cost"):
+            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
                 paid = await stack.enter_async_context(
                     self._money.attempt(call.order, call.request.key, call.asked)
                 )
@@ -330,7 +406,8 @@ class LlmClient:
 
     def _tell_overrun(self, call: Call, aside_usd: float) -> None:
         spent_usd = call.attempts[-1].cost_usd or 0.0
-        if spent_usd <= aside_usd + TOLERANCE_USD:
+        released = aside_usd == 0  # by a user, while a batch was waited for
+        if released or spent_usd <= aside_usd + TOLERANCE_USD:
             return
         self.meter.notes.append(
             f"{self.driver}: {call.asked.slot}: the reply cost {spent_usd:.4f} USD, and "

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import ssl
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import AsyncIterator, Awaitable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, TypeVar
 from uuid import uuid4
 
 import aiohttp
@@ -15,12 +16,12 @@ from httpx_aiohttp import AiohttpTransport, HttpxAiohttpClient
 
 from merge_runner.config import LOOPBACK, Endpoint
 from merge_runner.errors import UsageError
-from merge_runner.llm.bodies import ENCODING, read_body
+from merge_runner.llm.bodies import ENCODING, read_body, read_lines
 from merge_runner.llm.connections import Connections, Trust
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.http_outcome import RawReply
 from merge_runner.llm.masking import Mask
-from merge_runner.llm.transport import TransportFailure
+from merge_runner.llm.transport import ErrorReply, TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
 # A shorter one is a dummy, and may occur in any text.
@@ -29,6 +30,7 @@ NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
+T = TypeVar("T")
 
 
 class NoCookies(httpx.Cookies):
@@ -108,20 +110,62 @@ class HttpTransport:
             slot = canonical_json(request.slot.as_dict())
             headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
         body = request.body.encode()
-        return await self._reply("POST", request.path, headers, body, timeout_s)
+        return await self.ask("POST", request.path, headers, body, timeout_s=timeout_s)
 
     async def get(self, path: str, *, timeout_s: float) -> RawReply:
         """Ask for what the server tells of itself; raises TransportFailure."""
-        return await self._reply("GET", path, {}, b"", timeout_s)
+        return await self.ask("GET", path, {}, timeout_s=timeout_s)
 
-    async def _reply(
-        self, method: str, path: str, headers: Mapping[str, str], body: bytes, timeout_s: float
+    async def ask(
+        self,
+        method: str,
+        path: str,
+        headers: Mapping[str, str],
+        body: bytes = b"",
+        *,
+        timeout_s: float,
+        most_bytes: int | None = None,
     ) -> RawReply:
+        """Ask for anything; raises TransportFailure."""
         own_id = self._own + next(self._ids)
         request = self._http_request(method, path, headers, body, own_id)
-        try:
+        with self._failures(timeout_s):
             async with asyncio.timeout(timeout_s):
-                return await self._exchange(request, own_id)
+                reply = await self._client.send(request, stream=True)
+                try:
+                    self._check_id(reply, own_id)
+                    return await self._read(reply, most_bytes or self._most_bytes)
+                finally:
+                    await reply.aclose()
+
+    async def lines(
+        self, path: str, headers: Mapping[str, str], *, timeout_s: float
+    ) -> AsyncIterator[str | TransportFailure]:
+        """Get a body of lines, each up to ``most_bytes`` long, or why it is refused.
+
+        Nothing may be late by more than ``timeout_s``. Raises ErrorReply where the status is not
+        200, and TransportFailure.
+        """
+        own_id = self._own + next(self._ids)
+        request = self._http_request("GET", path, headers, b"", own_id)
+        with self._failures(timeout_s):
+            reply = await _within(timeout_s, self._client.send(request, stream=True))
+            try:
+                self._check_id(reply, own_id)
+                if reply.status_code != 200:
+                    raise ErrorReply(await _within(timeout_s, self._read(reply, self._most_bytes)))
+                encoding = reply.headers.get("content-encoding", "")
+                chunks = _in_time(reply.aiter_raw(), timeout_s)
+                async for line in read_lines(chunks, encoding, self._most_bytes):
+                    yield self._mask(line) if isinstance(line, str) else line
+            finally:
+                await reply.aclose()
+
+    @contextmanager
+    def _failures(self, timeout_s: float) -> Iterator[None]:
+        """Turn every error of the libraries into a TransportFailure."""
+        try:
+            yield
         except TransportFailure:
             self._trust.doubted = True
             raise
@@ -131,14 +175,9 @@ class HttpTransport:
         except (httpx.RequestError, aiohttp.ClientError) as exc:
             raise self._failure(exc) from exc
 
-    async def _exchange(self, request: httpx.Request, own_id: str) -> RawReply:
-        reply = await self._client.send(request, stream=True)
-        try:
-            self._check_id(reply, own_id)
-            encoding = reply.headers.get("content-encoding", "")
-            body = await read_body(reply.aiter_raw(), encoding, self._most_bytes)
-        finally:
-            await reply.aclose()
+    async def _read(self, reply: httpx.Response, most_bytes: int) -> RawReply:
+        encoding = reply.headers.get("content-encoding", "")
+        body = await read_body(reply.aiter_raw(), encoding, most_bytes)
         # A provider may echo the key in an error; it must not get into a log or a database.
         headers = {name.lower(): value for name, value in reply.headers.items()}
         return RawReply(reply.status_code, headers, self._mask(body))
@@ -182,18 +221,35 @@ class HttpTransport:
         return f"{self._endpoint.base_url} cannot be reached ({reason})"
 
     def _url(self, path: str) -> httpx.URL:
+        """The URL of a path, which is never at another host: the key goes to the configured one."""
         if path not in self._urls:
             try:
-                self._urls[path] = httpx.URL(self._endpoint.base_url + path)
+                url = httpx.URL(self._endpoint.base_url + path)
             except httpx.InvalidURL as exc:
-                raise UsageError(
-                    f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml"
-                ) from exc
+                raise _no_path(path) from exc
+            if url.netloc != httpx.URL(self._endpoint.base_url).netloc:
+                raise _no_path(path)
+            self._urls[path] = url
         return self._urls[path]
 
     async def close(self) -> None:
         """Close all connections."""
         await self._client.aclose()
+
+
+def _no_path(path: str) -> UsageError:
+    return UsageError(f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml")
+
+
+async def _within(seconds: float, awaited: Awaitable[T]) -> T:
+    async with asyncio.timeout(seconds):
+        return await awaited
+
+
+async def _in_time(chunks: AsyncIterator[bytes], timeout_s: float) -> AsyncIterator[bytes]:
+    """The chunks; raises TimeoutError where one is late."""
+    while (chunk := await _within(timeout_s, anext(chunks, None))) is not None:
+        yield chunk
 
 
 def _client(base_url: str, connections: int, trust: Trust) -> StrictClient:

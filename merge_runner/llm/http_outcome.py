@@ -130,7 +130,7 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     """What a reply means, by the rules of docs/reference/providers.md."""
     if raw.status == 200:
         return _judge_success(raw, wire)
-    outcome = _judge_error(raw.error, wire)
+    outcome = judge_error(raw.error, wire)
     # The usage that an error states is billed.
     usage = wire.read(as_dict(raw.first)).usage
     return replace(outcome, reading=replace(outcome.reading, usage=usage))
@@ -145,7 +145,7 @@ def _judge_success(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if reading.outcome != "error":
         return AttemptOutcome("accept", reading.outcome, reading=reading)
     error = replace(raw.error, status=_status_within(raw.error, wire))
-    return replace(_judge_error(error, wire), reading=reading)
+    return replace(judge_error(error, wire), reading=reading)
 
 
 def _status_within(error: ServerError, wire: WireFormat) -> int:
@@ -162,7 +162,8 @@ def _told(wire: WireFormat, ask: Callable[[WireFormat], T | None]) -> T | None:
     return next((answer for answer in answers if answer is not None), None)
 
 
-def _judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
+def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
+    """What an error means, whatever was asked for."""
     meaning = _told(wire, lambda each: each.meaning(error)) or MEANINGS.get(error.status)
     delay = server_delay_s(error, (wire, *PASSED_ON))
     should_retry = error.headers.get("x-should-retry")

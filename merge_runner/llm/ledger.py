@@ -208,6 +208,7 @@ class Ledger:
 
     def __init__(self, cache: ResponseCache, scope: str) -> None:
         self.spending = Spending()
+        self.scope = scope
         self._cache = cache
         self._name = _SPENT + scope
         self._open = f"{_OPEN}{scope} "
@@ -224,35 +225,57 @@ class Ledger:
         asked: Asked,
     ) -> bool:
         """Set the worst case of a call's next attempt aside; False if that exceeds a cap."""
+        return await self._cache.write(
+            lambda: self.set_aside(key, attempts, worst_usd, caps, asked)
+        )
 
-        def operation() -> bool:
-            # Read within the transaction: another process may have spent since.
-            spending = self.read()
-            if not caps.pays(worst_usd, asked.model, spending):
-                return False
-            spending.reserved_usd += worst_usd
-            spending.part(asked.model).reserved_usd += worst_usd
-            spending.open_attempts += 1
-            self._write(spending)
-            self._write_open(key, [*self._opened(key), SetAside(worst_usd, asked, _now())])
-            self._cache.keep_unanswered(key, (*attempts, _begun(len(attempts) + 1)))
-            return True
+    def set_aside(
+        self,
+        key: str,
+        attempts: Sequence[Attempt],
+        worst_usd: float,
+        caps: Caps,
+        asked: Asked,
+    ) -> bool:
+        """An operation on the cache: what ``reserve`` does."""
+        # Read within the transaction: another process may have spent since.
+        spending = self.read()
+        if not caps.pays(worst_usd, asked.model, spending):
+            return False
+        spending.reserved_usd += worst_usd
+        spending.part(asked.model).reserved_usd += worst_usd
+        spending.open_attempts += 1
+        self._write(spending)
+        self._write_open(key, [*self._opened(key), SetAside(worst_usd, asked, _now())])
+        self._cache.keep_unanswered(key, (*attempts, _begun(len(attempts) + 1)))
+        return True
 
-        return await self._cache.write(operation)
+    def aside_usd(self, key: str) -> float:
+        """What is set aside for the last attempt at a call; 0 where nothing is."""
+        opened = self._opened(key)
+        return opened[-1].usd if opened else 0.0
 
-    async def settle(self, key: str, attempts: Sequence[Attempt], worst_usd: float) -> None:
+    def other(self, scope: str) -> Ledger:
+        """The ledger of this name in the same cache, which may be this one."""
+        return self if scope == self.scope else Ledger(self._cache, scope)
+
+    async def settle(
+        self, key: str, attempts: Sequence[Attempt], worst_usd: float, asked: Asked
+    ) -> None:
         """The last of a call's attempts brought no answer; its cost may be unknown."""
 
         def operation() -> None:
-            self._settle(key, attempts, worst_usd)
+            self._settle(key, attempts, worst_usd, asked)
             self._cache.keep_unanswered(key, tuple(attempts))
 
         await self._cache.write(operation)
 
-    async def keep(self, entry: CachedCall, worst_usd: float) -> CachedCall:
+    async def keep(self, entry: CachedCall, worst_usd: float, asked: Asked) -> CachedCall:
         """Keep an answered call, and settle its last attempt in the same transaction."""
         key = entry.request.key
-        return await self._cache.put(entry, lambda: self._settle(key, entry.attempts, worst_usd))
+        return await self._cache.put(
+            entry, lambda: self._settle(key, entry.attempts, worst_usd, asked)
+        )
 
     def reasons(self) -> list[Reason]:
         """Why something is set aside, the largest sum first."""
@@ -286,10 +309,15 @@ class Ledger:
         released: Release = self._cache.run_now([operation])[0]
         return released
 
-    def _settle(self, key: str, attempts: Sequence[Attempt], worst_usd: float) -> None:
+    def _settle(
+        self, key: str, attempts: Sequence[Attempt], worst_usd: float, asked: Asked
+    ) -> None:
         actual_usd = attempts[-1].cost_usd
+        opened = self._opened(key)
+        # A batch may end after its money was released.
+        released = not opened and worst_usd == 0
         # The row of reasons may be damaged; the sums, which the cap needs, lie elsewhere.
-        *earlier, one = self._opened(key) or [SetAside(worst_usd, Asked(), _now())]
+        *earlier, one = opened or [SetAside(worst_usd, asked, _now())]
         if actual_usd is None:
             self._write_open(key, [*earlier, replace(one, outcome=attempts[-1].outcome)])
             return  # it stays set aside: it may have been charged
@@ -298,10 +326,11 @@ class Ledger:
         for sums in (spending, spending.part(one.asked.model)):
             sums.spent_usd += actual_usd
             sums.reserved_usd = max(0.0, sums.reserved_usd - worst_usd)
-        spending.open_attempts -= 1
+        if not released:
+            spending.open_attempts -= 1
         if not spending.open_attempts:
             _nothing_aside(spending)  # what is left is rounding
-        if actual_usd > worst_usd + TOLERANCE_USD:
+        if not released and actual_usd > worst_usd + TOLERANCE_USD:
             spending.overrun_usd += actual_usd - worst_usd
             driver, honest_usd = one.asked.driver, one.asked.honest_usd or worst_usd
             ratio = actual_usd / max(honest_usd, TOLERANCE_USD)

@@ -172,6 +172,7 @@ def call_row(
         _as_json(attempt),
         attempt.error,
         is_scripted(request, attempt),
+        attempt.batch_id,
     )
 
 

@@ -124,7 +124,8 @@ CREATE TABLE IF NOT EXISTS calls (
     request JSON,                     -- the body that was sent
     reply JSON,                       -- the body that came
     error VARCHAR,
-    scripted BOOLEAN NOT NULL DEFAULT false -- a scripted stand-in answered, whoever was asked
+    scripted BOOLEAN NOT NULL DEFAULT false, -- a scripted stand-in answered, whoever was asked
+    batch_id VARCHAR                  -- the provider's batch that it was a line of; NULL: of none
 );
 
 -- A human's first action, decoded from the published page by its user; the pair is not known.

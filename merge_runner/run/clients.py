@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 
@@ -17,18 +17,23 @@ from merge_runner.config import (
 )
 from merge_runner.emulator.process import emulator_process
 from merge_runner.errors import UsageError
-from merge_runner.llm.budget import Budget
+from merge_runner.llm.batch.batches import Batches
+from merge_runner.llm.batch.journal import Journal
+from merge_runner.llm.batch.modes import batch_service, batch_terms, require_batch
+from merge_runner.llm.batch.rounds import BatchWays, Rounds
+from merge_runner.llm.budget import Budget, Unpaid
 from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.ledger import NO_CAPS, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
+from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import is_known
 from merge_runner.llm.shared_limits import SharedLimits, limits_file
 from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.run.estimate import trial_costs
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.plan import Options, Plan, most_prompts
 
 # For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
@@ -110,7 +115,8 @@ def open_services(
                 rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]], shared=shared
             )
         limiters[name] = by_model[model]
-    budget = Budget(ledger, options.caps, trial_costs(plan, measured))
+    costs = trial_costs(plan, measured, batch=options.batch)
+    budget = Budget(ledger, options.caps, costs)
     return LocalServices(limiters=limiters, budget=budget)
 
 
@@ -152,8 +158,12 @@ def live_clients(
     *,
     connections: int,
     stack: AsyncExitStack,
+    rounds: Rounds | None = None,
 ) -> dict[str, LlmClient]:
-    """Clients with connections, closed with ``stack``. Raises UsageError where a key is missing."""
+    """Clients with connections, closed with ``stack``. Raises UsageError where a key is missing.
+
+    ``rounds`` are those of this run, which get the batch modes of its models.
+    """
     from merge_runner.llm.http import HttpTransport
 
     _allow_open_files(connections + SPARE_FILES)
@@ -168,6 +178,8 @@ def live_clients(
                 endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 1e6)
             )
             stack.push_async_callback(transports[model].close)
+            if rounds is not None and batch_terms(entry) is not None:
+                rounds.services[model] = batch_service(entry, endpoint, transports[model])
         clients[name] = LlmClient(
             name=name,
             entry=entry,
@@ -178,9 +190,76 @@ def live_clients(
             budget=None if entry.price == "free" else budget,
             strict=endpoint_plan.strict,
             model=model,
-            first=FirstCall(passed=name in endpoint_plan.passed, known=name in endpoint_plan.known),
+            first=FirstCall(
+                # A round is asked at once: no call of it waits for another one's answer.
+                passed=name in endpoint_plan.passed or (rounds is not None and rounds.ways.submits),
+                known=name in endpoint_plan.known,
+            ),
+            batches=_batches(model, entry, cache, budget, rounds),
         )
     return clients
+
+
+def _batches(
+    model: str, entry: ModelEntry, cache: CachePort, budget: BudgetPort, rounds: Rounds | None
+) -> Batches | None:
+    """The batches in which a model is asked; None where it has none, and on a cluster."""
+    terms = batch_terms(entry)
+    if rounds is None or terms is None or not isinstance(budget, Budget):
+        return None
+    money = Unpaid(cache) if entry.price == "free" else budget
+    return Batches(rounds, model, budget.ledger.scope, money, terms.price_factor)
+
+
+def open_rounds(
+    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
+) -> Rounds | None:
+    """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
+    journal = Journal(cache)
+    models = set(plan.registered.values())
+    left = [each for each in journal.batches() if each.model in models and journal.waiting(each)]
+    own = [each for each in left if each.ledger == plan.ledger]
+    if options.dask is not None:
+        if own:
+            raise UsageError(
+                "calls wait in batches of an earlier run: run the same command without --dask "
+                "until they have ended"
+            )
+        return None
+    if own and not options.batch:
+        say("calls that wait in batches of an earlier run are not asked again")
+    if others := sorted({each.ledger for each in left} - {plan.ledger}):
+        say(f"calls that wait in batches of {', '.join(others)} are not asked again")
+    if not options.batch and not left:
+        return None
+    most = max((most_prompts(arm) for arm in plan.arms), default=1)
+    ways = BatchWays(options.batch, options.round_deadline_s, options.detach, most)
+    free = {plan.registered[n] for n, entry in plan.entries.items() if entry.price == "free"}
+    return Rounds(journal, {}, ways, free=free, say=say)
+
+
+def check_batches(plan: Plan, options: Options) -> None:
+    """Raise UsageError where a run cannot use batches as it is told to."""
+    if options.detach and not options.batch:
+        raise UsageError("--detach goes with --batch")
+    if not options.batch:
+        return
+    if options.replay:
+        raise UsageError("a replay asks nothing: leave --batch out")
+    if options.round_deadline_s == 0:
+        raise UsageError("--round-deadline 0 ends batches: leave --batch out, or give it longer")
+    if options.dask is not None:
+        raise UsageError("--batch plays in this process: leave --dask out")
+    if not plan.entries:
+        raise UsageError("no language model is asked: leave --batch out")
+    registry = load_models(plan.study.path.parent)
+    for name, entry in plan.entries.items():
+        require_batch(plan.registered[name], entry, registry)
+        if options.detach and entry.provider == "emulator" and running_emulator_url() is None:
+            raise UsageError(
+                "an emulator that a sweep starts ends with it: for --detach start `merge-runner "
+                "emulate` and name it in EMULATOR_BASE_URL"
+            )
 
 
 def _allow_open_files(wanted: int) -> None:

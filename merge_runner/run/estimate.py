@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
+from merge_runner.llm.batch.modes import batch_terms
 from merge_runner.llm.cache import CallTotals
 from merge_runner.llm.ledger import NO_CAPS, Caps, Spending
 from merge_runner.llm.prices import cost_usd
@@ -52,11 +53,24 @@ class CellEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class BatchEstimate:
+    """What a run costs in batches in USD (None: unknown), in how many rounds, usually and at most.
+
+    A round takes as long as its slowest batch.
+    """
+
+    cost_usd: float | None
+    rounds: int
+    most_rounds: int
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
 
     ``measured`` lists the drivers whose tokens and latency are taken from their earlier answers.
-    ``trials_within_cap`` is None without a cap, or where a price is unknown.
+    ``trials_within_cap`` is None without a cap, or where a price is unknown. ``batch`` is what the
+    same takes in batches, where the run is to use them.
     """
 
     driver: str
@@ -70,16 +84,21 @@ class Estimate:
     measured: tuple[str, ...]
     trials_within_cap: int | None
     cells: tuple[CellEstimate, ...]
+    batch: BatchEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Calls:
-    """How many calls a model of the registry has yet to answer in one cell, and what one takes."""
+    """How many calls a model of the registry has yet to answer in one cell, and what one takes.
+
+    A run pays a ``part`` of their price: less than all of it in batches.
+    """
 
     model: str
     entry: ModelEntry
     number: int
     each: _PerCall
+    part: float
 
     @property
     def usage(self) -> Usage:
@@ -91,9 +110,14 @@ class _Calls:
 
     @property
     def cost_usd(self) -> float | None:
-        """What they cost together."""
+        """What they cost together, asked singly."""
         price = cost_usd(self.entry, self.usage)
         return None if price is None else self.number * price
+
+    @property
+    def paid_usd(self) -> float | None:
+        """What the run pays for them."""
+        return None if self.cost_usd is None else self.cost_usd * self.part
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +142,10 @@ def estimate(
     endpoint, ``spending`` what counts against the caps already.
     """
     arms = plan.by_label()
-    calls = {label: _calls(plan, arms[label], cell.calls, facts) for label, cell in todo.items()}
+    calls = {
+        label: _calls(plan, arms[label], cell.calls, facts, batch=options.batch)
+        for label, cell in todo.items()
+    }
     whole = [made for cell in calls.values() for made in cell]
     shares = {
         label: _share_within(options.caps, spending, cell, whole) for label, cell in calls.items()
@@ -145,11 +172,33 @@ def estimate(
         ),
         trials_within_cap=_within(shares, todo),
         cells=cells,
+        batch=_in_batches(plan, whole) if options.batch else None,
+    )
+
+
+def price_factor(entry: ModelEntry) -> float:
+    """What part of its price a model costs in batches."""
+    terms = batch_terms(entry)
+    return 1.0 if terms is None else terms.price_factor
+
+
+def _in_batches(plan: Plan, calls: Sequence[_Calls]) -> BatchEstimate:
+    costs = [each.paid_usd for each in calls]
+    known = [cost for cost in costs if cost is not None]
+    return BatchEstimate(
+        cost_usd=round(sum(known), 2) if len(known) == len(costs) else None,
+        rounds=max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0),
+        most_rounds=max(map(most_prompts, plan.arms), default=0),
     )
 
 
 def _calls(
-    plan: Plan, arm: Arm, calls: Mapping[str, float], facts: Mapping[str, CallTotals]
+    plan: Plan,
+    arm: Arm,
+    calls: Mapping[str, float],
+    facts: Mapping[str, CallTotals],
+    *,
+    batch: bool,
 ) -> list[_Calls]:
     return [
         _Calls(
@@ -157,6 +206,7 @@ def _calls(
             entry,
             round(calls[name]),
             _per_call(plan, arm, entry, facts[name]),
+            price_factor(entry) if batch else 1.0,
         )
         for name, entry in arm.entries.items()
     ]
@@ -193,7 +243,7 @@ def _share_within(
 
 def _usd(calls: Sequence[_Calls], model: str | None) -> float:
     """What calls cost a cap: that of one model, or None, that of all."""
-    return sum(each.cost_usd or 0.0 for each in calls if model in (None, each.model))
+    return sum(each.paid_usd or 0.0 for each in calls if model in (None, each.model))
 
 
 def _within(shares: Mapping[str, float | None], todo: Mapping[str, Todo]) -> int | None:
@@ -213,25 +263,28 @@ def _minutes(options: Options, trials: int, calls: Sequence[_Calls]) -> float:
     return round(slowest_s / 60, 1)
 
 
-def trial_costs(plan: Plan, facts: Mapping[str, CallTotals]) -> TrialCosts:
-    """What the trials of a plan are expected to cost; a cell is an arm.
+def trial_costs(plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = False) -> TrialCosts:
+    """What the trials of a plan are expected to cost, in a ``batch`` run or not; a cell is an arm.
 
     ``facts`` is as for ``estimate``.
     """
     labels = {spec.order: spec.arm for spec in plan.trial_specs()}
-    calls = {arm.label: _trial_calls(plan, arm) for arm in plan.arms}
+    parts = {name: price_factor(e) if batch else 1.0 for name, e in plan.entries.items()}
+    calls = {arm.label: _trial_calls(plan, arm, parts) for arm in plan.arms}
     earlier: defaultdict[str, Answers] = defaultdict(Answers)
     for name, totals in facts.items():
         if totals.measured:
             one_usd = cost_usd(plan.entries[name], _measured_usage(totals)) or 0.0
-            earlier[plan.registered[name]].add(totals.measured * one_usd, totals.measured)
+            usd = totals.measured * one_usd * parts[name]
+            earlier[plan.registered[name]].add(usd, totals.measured)
     return TrialCosts(labels.__getitem__, calls, earlier)
 
 
-def _trial_calls(plan: Plan, arm: Arm) -> dict[str, TrialCalls]:
+def _trial_calls(plan: Plan, arm: Arm, parts: Mapping[str, float]) -> dict[str, TrialCalls]:
     """The calls of each model in a trial: at most up to the timeout, every answer at its cap.
 
-    A model that drives on both sides with different parameters counts with the dearer ones.
+    A model that drives on both sides with different parameters counts with the dearer ones. Each
+    costs so many ``parts`` of its price.
     """
     sides = Counter(name for name in arm.asked.values() if name in arm.entries)
     usual, most = usual_prompts(arm), most_prompts(arm)
@@ -241,7 +294,8 @@ def _trial_calls(plan: Plan, arm: Arm) -> dict[str, TrialCalls]:
     for name, number in sides.items():
         entry = arm.entries[name]
         worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
-        made = TrialCalls(number * usual, number * most, cost_usd(entry, worst) or 0.0)
+        worst_usd = (cost_usd(entry, worst) or 0.0) * parts[name]
+        made = TrialCalls(number * usual, number * most, worst_usd)
         other = calls.get(model := plan.registered[name])
         calls[model] = made if other is None else made.and_(other)
     return calls
@@ -257,7 +311,8 @@ def _measured_usage(totals: CallTotals) -> Usage:
 
 def _per_call(plan: Plan, arm: Arm, entry: ModelEntry, facts: CallTotals) -> _PerCall:
     if facts.measured:
-        return _PerCall(_measured_usage(facts), facts.latency_s / facts.measured)
+        latency_s = facts.mean_latency_s or entry.typical_latency_s
+        return _PerCall(_measured_usage(facts), latency_s)
     # English has about 4 bytes a token.
     prompt_tokens = len(typical_prompt(plan, arm).encode()) // 4
     usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)

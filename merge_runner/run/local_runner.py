@@ -85,13 +85,14 @@ class TrialRunner(Protocol):
 
 @dataclass
 class LocalRunner:
-    """Plays at most ``in_flight`` trials at once."""
+    """Plays at most ``in_flight`` trials at once; ``asking`` counts the open questions of each."""
 
     plan: Plan
     clients: Mapping[str, LlmClient]
     in_flight: int
     gate: Gate = field(default_factory=Gate)
     playing: Counter[Cell] = field(default_factory=Counter)
+    asking: Counter[int] = field(default_factory=Counter)
     workers: None = None
     closed: bool = False
 
@@ -130,6 +131,12 @@ class LocalRunner:
     def waits(self) -> Sequence[Wait]:
         """What the other calls wait for."""
         return [wait for client in self.clients.values() for wait in client.waits]
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no trial goes on by itself: all ask, and wait for the answers to others."""
+        idle = sum(client.idle_askers for client in self.clients.values())
+        return self.running == len(self.asking) and self.asking.total() == idle
 
     def answers(self, name: str) -> int:
         """How many live replies a model's trials have used."""
@@ -174,5 +181,11 @@ class LocalRunner:
                 client.leave(spec.order)
 
     async def _ask(self, model: str, prompt: str, slot: Slot, spec: TrialSpec) -> ChatReply:
-        await self.gate.enter()  # thousands of recorded replies would all be ready at once
-        return await self.clients[model].ask(prompt, slot, order=spec.order)
+        self.asking[spec.order] += 1
+        try:
+            await self.gate.enter()  # thousands of recorded replies would all be ready at once
+            return await self.clients[model].ask(prompt, slot, order=spec.order)
+        finally:
+            self.asking[spec.order] -= 1
+            if not self.asking[spec.order]:
+                del self.asking[spec.order]

@@ -22,6 +22,7 @@ from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials, require
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
 from merge_runner.errors import UsageError
+from merge_runner.llm.batch.rounds import USUAL_DEADLINE_S
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Caps
@@ -63,7 +64,9 @@ class Options:
     ``rpm`` and ``tpm`` override the registry's. ``split_usd`` caps what single models cost.
     ``dask`` names the cluster that plays the trials; if None, this process plays them.
     ``faults_identity`` keeps the answers of an emulator that was told to misbehave apart from those
-    of the usual one. A ``dry_run`` sends nothing. From ``until`` on no trial begins.
+    of the usual one. A ``dry_run`` sends nothing. From ``until`` on no trial begins. In a ``batch``
+    run all trials ask together, at a lower price; a batch is cancelled after ``round_deadline_s``,
+    and a run that is to ``detach`` waits for none.
     """
 
     db: Path
@@ -81,6 +84,9 @@ class Options:
     dask: str | None = None
     dry_run: bool = False
     until: datetime | None = None
+    batch: bool = False
+    round_deadline_s: float = USUAL_DEADLINE_S
+    detach: bool = False
 
     @property
     def caps(self) -> Caps:

@@ -40,6 +40,7 @@ CELL_EVERY_S = 0.5
 PULSE_S = 0.05
 NOTES_SHOWN = 10
 REASONS_SHOWN = 3
+CLOSE_IT = "you may close this: the same command goes on"
 
 
 @dataclass(slots=True)
@@ -65,6 +66,7 @@ class Progress:
     worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
     unstored: Callable[[], str] = str  # says why trials are not stored; empty: nothing is wrong
+    batches: Callable[[], list[str]] = list  # says which batches are waited for
 
     @property
     def title(self) -> str:
@@ -105,7 +107,8 @@ class Progress:
             ("failed", str(self.ways["failed"])),
             ("calls", f"{self._calls_live} live, {self._calls_cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
-            ("cost", f"{self._cost_usd:.2f} USD{self._spent()}"),
+            ("cost", f"{self._cost_usd:.2f} USD{self._in_the_end()}{self._spent()}"),
+            *(("batches", text) for text in self._batches()),
             *(("calls waiting", "; ".join(texts)) for texts in [self._waiting()] if texts),
             ("time", f"{elapsed:.0f} s{left}{self._until()}"),
         ]
@@ -133,7 +136,7 @@ class Progress:
             committed_usd=self.ledger.spending.committed_usd,
             left_s=self._left_s(),
             worst_stall_s=self.worst_stall_s,
-            waiting=tuple(map(printable, self._waiting())),
+            waiting=tuple(map(printable, [*self.batches(), *self._waiting()])),
             warnings=tuple(map(printable, self._warnings())),
         )
 
@@ -158,11 +161,25 @@ class Progress:
         workers = self.runner.workers
         return "" if workers is None else f" on {workers or 'no'} worker{'s' * (workers != 1)}"
 
+    def _in_the_end(self) -> str:
+        """What a run in batches will cost, by the calls that are answered."""
+        part = self._part()
+        if not part or not self._cost_usd or not self.batches():
+            return ""
+        return f", about {self._cost_usd / part:.2f} in the end"
+
     def _spent(self) -> str:
         """What counts against the cap: spending of all runs of the sweep, and money set aside."""
         if self.cap_usd is None:
             return ""
         return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+
+    def _batches(self) -> list[str]:
+        """What is pending where, and what to do about it: nothing."""
+        texts = self.batches()
+        more = [f"{len(texts) - REASONS_SHOWN} others"] * (len(texts) > REASONS_SHOWN)
+        shown = texts[:REASONS_SHOWN] + more
+        return [*shown, CLOSE_IT] if shown else []
 
     def _until(self) -> str:
         return "" if self.until is None else f", until {self.until:%a %H:%M}"
@@ -194,17 +211,24 @@ class Progress:
     def _left_s(self) -> float | None:
         """The estimated time left in s; None while there is nothing to estimate it from.
 
+        How long a batch takes nobody knows.
         Trials that run in step all end late, so early in a run the calls are a better basis.
         """
+        if self.batches():
+            return None
+        part = self._part()
+        elapsed = time.monotonic() - self.started
+        return elapsed / part - elapsed if part else None
+
+    def _part(self) -> float | None:
+        """What part of this run is done, by its trials or its calls; None: none of it, or all."""
         ended, total = self.ended, self.total
         if ended == total:
             return None
         calls = self._calls_live + self._calls_cached
         expected_calls = total * self.plan.calls_of_a_trial
         by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
-        part = max(ended / total, by_calls)
-        elapsed = time.monotonic() - self.started
-        return elapsed / part - elapsed if part else None
+        return max(ended / total, by_calls) or None
 
     def _waiting(self) -> list[str]:
         """How many calls wait, for what, and the latest time until when, if known."""

@@ -59,6 +59,7 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
         "overrun_usd": round(spending.overrun_usd, 6),
         "cache_cost_usd": round(outcome.cache_cost_usd, 6),
         "damaged_entries": meter.damaged,
+        "open_batches": outcome.batches,
         "playing_s": round(outcome.playing_s, 3),
         "worst_stall_s": round(outcome.worst_stall_s, 3),
         "decisions": facts.decisions if facts else None,
@@ -91,6 +92,7 @@ def as_lines(outcome: Outcome, options: Options, expected: Estimate | None) -> I
         yield ""
         yield from _failures(facts)
     yield from _costs(outcome, options, expected)
+    yield from (f"open batch: {text}" for text in outcome.batches)
     for key in outcome.meter.damaged:
         yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
     for pair, answers in _mismatches(facts).items():
@@ -135,7 +137,7 @@ def _costs(outcome: Outcome, options: Options, expected: Estimate | None) -> Ite
         + (f" and {unknown} calls of unknown cost" if unknown else "")
     )
     if expected is not None:
-        cost = expected.cost_usd
+        cost = (expected.batch or expected).cost_usd
         yield (
             f"estimated before: {expected.calls} calls, "
             + ("an unknown price" if cost is None else f"{cost:.2f} USD")

@@ -22,6 +22,7 @@ from merge_runner.errors import (
     TrialSuspended,
     UsageError,
 )
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.content_hashes import canonical_json, manner
 from merge_runner.llm.formats import FORMATS
@@ -37,7 +38,9 @@ from merge_runner.results.rows import factor_rows
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     EndpointPlan,
+    check_batches,
     live_clients,
+    open_rounds,
     open_services,
     sealed_clients,
     start_endpoints,
@@ -70,8 +73,9 @@ class Outcome:
     ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` what all replies in
     the cache cost when they were made. ``facts`` summarises what the database holds of the sweep,
     and ``audit`` the checks made there; both are None where nothing is stored, or its user
-    ``gave_up`` waiting for the database. ``playing_s`` is how
-    long the trials took, ``worst_stall_s`` the longest delay of the event loop.
+    ``gave_up`` waiting for the database. ``batches`` are those that go on without this run.
+    ``playing_s`` is how long the trials took, ``worst_stall_s`` the longest delay of the event
+    loop.
     """
 
     plan: Plan
@@ -86,6 +90,7 @@ class Outcome:
     facts: SweepFacts | None = None
     audit: Audit | None = None
     gave_up: bool = False
+    batches: list[str] = field(default_factory=list)
     playing_s: float = 0.0
     worst_stall_s: float = 0.0
 
@@ -104,6 +109,7 @@ class Sweep:
 
     def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
         """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
+        check_batches(plan, options)
         self._options = options
         self._say = say
         recorded = partial(Spilled, options.recordings) if options.recordings else None
@@ -128,6 +134,7 @@ class Sweep:
         self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
         self._suspended: TrialSuspended | None = None
         self._out_of_time = False
+        self._rounds: Rounds | None = None
         self._progress = Progress(
             plan=plan,
             planned=Counter(spec.cell for spec in specs.values()),
@@ -350,6 +357,7 @@ class Sweep:
             if plan.endpoints[name] in self._cache.stats(entry.id).totals
         )
         endpoint_plan = EndpointPlan(urls, options.strict_model, known)
+        self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
         if options.dask is None:
             clients = live_clients(
                 plan,
@@ -359,8 +367,14 @@ class Sweep:
                 services.budget,
                 connections=options.connections,
                 stack=stack,
+                rounds=rounds,
             )
-            return LocalRunner(plan, clients, options.in_flight)
+            if rounds is not None:
+                stack.push_async_callback(rounds.close)
+                self._progress.batches = rounds.standing
+            # A trial that waits for a round takes up nobody's time.
+            in_flight = len(self._todo) if options.batch else options.in_flight
+            return LocalRunner(plan, clients, in_flight)
         from merge_runner.run.cluster.connect import connected
 
         client = await stack.enter_async_context(connected(options.dask))
@@ -394,11 +408,21 @@ class Sweep:
             )
             work.cancel()
 
-        clock = asyncio.create_task(self._stop_in_time(runner, interrupted))
+        beside = [asyncio.create_task(self._stop_in_time(runner, interrupted))]
+        if self._rounds is not None and isinstance(runner, LocalRunner):
+            watching = asyncio.create_task(self._rounds.watch(lambda: runner.is_idle))
+            watching.add_done_callback(lambda _: work.cancel())  # nobody would close a round
+            beside.append(watching)
         with on_interrupt(interrupted, drain.cancel):
             await asyncio.wait([drain])
             await asyncio.wait([work])
-        clock.cancel()
+        for task in beside:
+            task.cancel()
+        for error in await asyncio.gather(*beside, return_exceptions=True):
+            if isinstance(error, Exception):
+                raise error
+        if self._rounds is not None:
+            outcome.batches = self._rounds.standing()
         self._note_end(work, outcome)
 
     def _note_end(self, work: asyncio.Task[None], outcome: Outcome) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime, time, timedelta
 
 from merge_runner.errors import UsageError
@@ -33,6 +34,14 @@ def deadline(text: str, now: datetime) -> datetime:
     if found <= now:
         raise UsageError(f"--until {text} is over: name a time to come, such as 07:00")
     return found
+
+
+def duration_s(text: str, option: str) -> float:
+    """The seconds that a text such as 2h, 90m or 0 names; raises UsageError."""
+    found = re.fullmatch(r"([0-9]{1,6}(?:\.[0-9]{1,3})?)\s*(h|m|min|s|)", text.strip())
+    if found is None or (found[2] == "" and float(found[1])):
+        raise UsageError(f"{option} {text!r} is no duration: write 2h, 90m, 30s or 0")
+    return float(found[1]) * {"h": 3600, "m": 60, "min": 60}.get(found[2], 1)
 
 
 def _date_time(text: str) -> datetime:

@@ -6,7 +6,14 @@ from collections import Counter
 
 import pytest
 
-from merge_runner.emulator.faults import FAULTS, TRANSIENT, FaultPlan, load_faults, transient_faults
+from merge_runner.emulator.faults import (
+    FAULTS,
+    TRANSIENT,
+    BatchPlan,
+    FaultPlan,
+    load_faults,
+    transient_faults,
+)
 from merge_runner.errors import UsageError
 from tests.harness import PROJECT
 
@@ -106,10 +113,11 @@ def test_a_file_sets_every_part_of_a_plan(tmp_path):
     )
 
 
-def test_the_file_of_the_docs_is_one_and_has_every_fault(tmp_path):
+def test_the_files_of_the_docs_are_such_and_have_every_fault(tmp_path):
     page = (PROJECT / "docs/reference/emulator.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    example, batches = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert set(load(tmp_path, example).rates) == set(FAULTS)
+    assert load(tmp_path, batches).batch.model_fields_set == set(BatchPlan.model_fields)
 
 
 def test_an_unknown_fault_is_refused_with_the_valid_ones(tmp_path):
@@ -171,3 +179,12 @@ def test_rates_that_add_up_to_more_than_one_are_refused(tmp_path):
 def test_a_missing_file_is_refused_by_name(tmp_path):
     with pytest.raises(UsageError, match=r"nowhere\.toml"):
         load_faults(tmp_path / "nowhere.toml")
+
+
+def test_the_file_also_says_what_becomes_of_batches(tmp_path):
+    loaded = load(tmp_path, "[batch]\nfailed = 0.1\nenqueued_tokens = 9000\n")
+    assert loaded == FaultPlan(batch=BatchPlan(failed=0.1, enqueued_tokens=9000))
+    # The replies are those of an emulator without faults.
+    assert loaded.identity == ""
+    with pytest.raises(UsageError, match=r"batch\.fails: .*valid: delay_s, polls, slow, .*lost"):
+        load(tmp_path, "[batch]\nfails = 0.1\n")

@@ -378,10 +378,10 @@ O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
 async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
     for key, outcome in (("a", "timeout"), ("b", "timeout"), ("c", "server_error")):
         await ledger.reserve(key, [], 0.25, NO_CAPS, O3)
-        await ledger.settle(key, tried(None, outcome), 0.25)
+        await ledger.settle(key, tried(None, outcome), 0.25, Asked())
     await ledger.reserve("d", [], 0.125, NO_CAPS, O3)
     await ledger.reserve("paid", [], 0.25, NO_CAPS, O3)
-    await ledger.settle("paid", tried(0.1), 0.25)
+    await ledger.settle("paid", tried(0.1), 0.25, Asked())
     reasons = ledger.reasons()
     assert [(r.outcome, r.attempts, r.usd) for r in reasons] == [
         ("timeout", 2, 0.5),
@@ -399,7 +399,7 @@ async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
         await ledger.reserve("key", attempts, 0.25, NO_CAPS, O3)
         actual = 0.0 if outcome == "connection_lost" else None
         last = Attempt(number, outcome, cost_usd=actual)
-        await ledger.settle("key", [*attempts, last], 0.25)
+        await ledger.settle("key", [*attempts, last], 0.25, Asked())
     assert {r.outcome: r.attempts for r in ledger.reasons()} == {"timeout": 1, "bad_body": 1}
 
 

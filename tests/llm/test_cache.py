@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import CachedCall, CallTotals, ResponseCache
 from merge_runner.llm.content_hashes import make_request, manner
 from merge_runner.llm.ledger import NO_CAPS, Asked, Ledger
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage
@@ -384,6 +384,13 @@ def told(number, *, model="m", endpoint="openai", effort="low", **attempt):
     )
     usage = Usage(input_tokens=100, output_tokens=10)
     return CachedCall(request, (Attempt(1, "ok", 200, usage=usage, reply="{}", **attempt),))
+
+
+def test_a_line_of_a_batch_tells_its_tokens_and_no_latency():
+    totals = CallTotals()
+    for number, latency_s in enumerate((None, 20.0, None)):
+        totals.add(told(number, latency_s=latency_s))
+    assert (totals.measured, totals.mean_latency_s) == (3, 20.0)
 
 
 def test_what_is_measured_is_of_one_endpoint_and_one_way_to_ask(cache):

@@ -185,3 +185,7 @@ def test_the_estimate_tells_each_variant_and_what_the_cap_buys():
         plan, replace(options, max_cost_usd=None), todo=todo, facts={"o3": facts}, spending=spent
     )
     assert free.trials_within_cap is None
+    batch = replace(options, batch=True)
+    halved = estimate(plan, batch, todo=todo, facts={"o3": facts}, spending=spent)
+    assert halved.batch.cost_usd == 5.46
+    assert halved.trials_within_cap == 40

@@ -34,3 +34,19 @@ def test_the_calls_tell_the_time_left_while_no_trial_has_ended():
     assert dict(shown.fields())["time"] == "10 s, about 20 s left"
     shown.runner = runner(Meter())
     assert dict(shown.fields())["time"] == "10 s"
+
+
+def test_batches_are_shown_with_their_cost_in_the_end_and_that_nobody_need_wait():
+    texts = [f"round 4 of at most 30: 220 calls of o3 in batch {number}" for number in range(5)]
+    meter = Meter(calls_live=70)
+    meter.count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
+    shown = progress(runner(meter), cap_usd=20, batches=lambda: texts)
+    assert [text for name, text in shown.fields() if name == "batches"] == [
+        *texts[:3],
+        "2 others",
+        "you may close this: the same command goes on",
+    ]
+    assert (
+        dict(shown.fields())["cost"] == "1.50 USD, about 4.50 in the end, 4.25 of 20 over all runs"
+    )
+    assert "left" not in dict(shown.fields())["time"]  # nobody knows how long a batch takes

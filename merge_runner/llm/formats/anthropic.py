@@ -41,6 +41,7 @@ class AnthropicMessages(WireFormat):
         "reasoning_effort": ("output_config", "effort"),
     }
     members = frozenset({"content", "stop_reason"})
+    headers = {"anthropic-version": VERSION}  # noqa: RUF012 # never changed
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
         """One user message; ``max_tokens`` is required."""
@@ -52,7 +53,7 @@ class AnthropicMessages(WireFormat):
                 "messages": [{"role": "user", "content": prompt}],
                 **entry.parameters,
             },
-            headers={"anthropic-version": VERSION},
+            headers=dict(self.headers),
         )
 
     def read(self, payload: dict[str, Any]) -> Reading:

@@ -83,6 +83,9 @@ class WireFormat(ABC):
     members: ClassVar[frozenset[str]]
     """Members of a body: an answer has at least one of them, whatever it says."""
 
+    headers: ClassVar[Mapping[str, str]] = {}
+    """Headers that every request to a batch mode has, since they change its meaning."""
+
     retries_empty: ClassVar[bool] = False
     """Whether an empty answer is a known fault of the service that asking again may mend."""
 

@@ -1,0 +1,150 @@
+"""What becomes of batches at the emulator, on a clock of the test's own."""
+
+from __future__ import annotations
+
+import json
+
+import aiohttp
+import pytest
+
+from merge_runner.emulator.batches import Batches
+from merge_runner.emulator.faults import BatchPlan, FaultPlan
+from merge_runner.emulator.formats import CHAT
+from merge_runner.emulator.process import emulator_process
+from merge_runner.emulator.replies import Asked, Replies
+from merge_runner.errors import UsageError
+from merge_runner.records import SLOT_HEADER
+
+
+class Clock:
+    def __init__(self):
+        self.now_s = 1000.0
+
+    def __call__(self):
+        return self.now_s
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+def batches_of(clock, seed=0, **plan):
+    return Batches(Replies(FaultPlan(seed=seed, batch=BatchPlan(**plan))), clock)
+
+
+def chat(prompt, number=0):
+    body = {"model": "m", "messages": [{"role": "user", "content": prompt}], "seed": number}
+    return Asked(CHAT, CHAT.path, json.dumps(body).encode(), custom_id=f"line-{number}")
+
+
+def some(prompt, count=20):
+    return [chat(prompt, number) for number in range(count)]
+
+
+def test_a_batch_ends_on_the_clock_with_its_last_line(clock, driving_prompt):
+    batches = batches_of(clock, delay_s=100.0)
+    batch = batches.create("b", "", some(driving_prompt), {})
+    counts = []
+    while not batches.poll(batch.id).ended:
+        counts.append(batch.finished(clock.now_s))
+        clock.now_s += 10
+    assert counts == sorted(counts)
+    assert counts[0] == 0 < counts[5] < 20
+    assert 1020 < batch.due_s <= clock.now_s <= 1110
+    assert [each.custom_id for each in batch.results] != [each.custom_id for each in batch.lines]
+
+
+def test_a_slow_line_keeps_its_batch_waiting(clock, driving_prompt):
+    usual = batches_of(clock, delay_s=100.0).create("b", "", some(driving_prompt), {})
+    tailed = batches_of(clock, delay_s=100.0, slow=0.1, slow_factor=50.0)
+    slow = tailed.create("b", "", some(driving_prompt), {})
+    late = [fate.after_s for fate in slow.fates if fate.after_s > 100]
+    assert 0 < len(late) < 10
+    assert slow.due_s > usual.due_s
+
+
+def test_the_fate_of_a_line_is_a_function_of_the_seed_and_of_how_often_it_was_submitted(
+    clock, driving_prompt
+):
+    def fates(seed, times):
+        batches = batches_of(clock, seed, failed=0.3, expired=0.3)
+        created = [batches.create("b", "", some(driving_prompt), {}) for _ in range(times)]
+        return [fate.kind for fate in created[-1].fates]
+
+    assert fates(0, 1) == fates(0, 1)
+    assert len({tuple(each) for each in (fates(0, 1), fates(1, 1), fates(0, 2))}) == 3
+
+
+def test_each_kind_of_line_occurs_at_its_rate(clock, driving_prompt):
+    batches = batches_of(clock, failed=0.1, expired=0.05)
+    kinds = [fate.kind for fate in batches.create("b", "", some("x", 4000), {}).fates]
+    assert kinds.count("failed") == pytest.approx(400, abs=80)
+    assert kinds.count("expired") == pytest.approx(200, abs=60)
+
+
+def test_tokens_wait_until_their_batch_has_ended(clock, driving_prompt):
+    lines = some(driving_prompt)
+    tokens = sum(len(line.raw) for line in lines) // 4
+    batches = batches_of(clock, delay_s=10.0, enqueued_tokens=tokens)
+    assert batches.create("b", "", lines, {}).refused is None
+    assert "Limit" in batches.create("b", "", lines[:1], {}).refused
+    clock.now_s += 20
+    assert batches.create("b", "", lines[:1], {}).refused is None
+
+
+def test_a_line_that_cannot_be_read_fails_alone(clock, driving_prompt):
+    batches = batches_of(clock)
+    odd = Asked(CHAT, CHAT.path, b'{"messages": 7}', custom_id="odd")
+    batch = batches.create("b", "", [chat(driving_prompt), odd], {})
+    batches.settle()
+    assert {each.custom_id: each.status for each in batch.results} == {"line-0": 200, "odd": 400}
+
+
+def test_a_batch_has_a_line(clock):
+    with pytest.raises(UsageError, match="at least one"):
+        batches_of(clock).create("b", "", [], {})
+
+
+async def test_the_emulator_counts_its_answers_singly_and_in_batches(emulator, driving_prompt):
+    body = {"model": "m", "messages": [{"role": "user", "content": driving_prompt}]}
+    slot = json.dumps(
+        {"condition": "N_0_0", "repetition": 1, "side": "left", "decision": 0, "sample_set": 0}
+    )
+    line = {"custom_id": "k", "params": {**body, "max_tokens": 9}}
+    async with aiohttp.ClientSession(await emulator()) as session:
+        for _ in range(2):
+            await session.post("/v1/chat/completions", json=body, headers={SLOT_HEADER: slot})
+        await session.post("/v1/messages/batches", json={"requests": [line]})
+        async with session.get("/emulator/answered") as reply:
+            counted = await reply.json()
+    assert [(each["custom_id"], each["slot"], each["answered"]) for each in counted] == [
+        (None, slot, 2),
+        ("k", None, 1),
+    ]
+
+
+async def test_a_file_has_an_id_that_no_other_has_had(emulator):
+    async def upload():
+        form = aiohttp.FormData({"purpose": "batch"})
+        form.add_field("file", b"{}", filename="in.jsonl")
+        async with session.post("/v1/files", data=form) as reply:
+            return (await reply.json())["id"]
+
+    async with aiohttp.ClientSession(await emulator()) as session:
+        first, second = await upload(), await upload()
+        await session.delete(f"/v1/files/{first}")
+        assert await upload() not in (first, second)
+
+
+async def test_the_command_says_how_long_batches_take(driving_prompt):
+    body = {"model": "m", "messages": [{"role": "user", "content": driving_prompt}]}
+    requests = {"requests": [{"custom_id": "k", "params": body}]}
+    async with (
+        emulator_process(["--batch-delay", "3600"]) as url,
+        aiohttp.ClientSession(url) as session,
+    ):
+        async with session.post("/v1/messages/batches", json=requests) as reply:
+            created = await reply.json()
+        async with session.get(f"/v1/messages/batches/{created['id']}") as reply:
+            assert (await reply.json())["processing_status"] == "in_progress"

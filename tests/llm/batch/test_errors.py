@@ -1,0 +1,602 @@
+"""What services make of servers that refuse, break off or say what they should not."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import json
+import socket
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from aiohttp import web
+
+from merge_runner.errors import UsageError
+from merge_runner.llm.batch.service import BatchFailed, BatchLimits
+from tests.llm.batch.conftest import KEY, endpoint_at
+from tests.llm.batch.lines import lines
+
+CREATE = {
+    "openai-chat": "POST /v1/files",
+    "openai-responses": "POST /v1/files",
+    "anthropic": "POST /v1/messages/batches",
+    "gemini": "POST /upload/v1beta/files",
+}
+BATCH = {
+    "openai-chat": "GET /v1/batches/b1",
+    "anthropic": "GET /v1/messages/batches/b1",
+    "gemini": "GET /v1beta/batches/b1",
+}
+LISTS = {
+    "openai-chat": "GET /v1/batches",
+    "anthropic": "GET /v1/messages/batches",
+    "gemini": "GET /v1beta/batches",
+}
+CANCEL = {
+    "openai-chat": "POST /v1/batches/b1/cancel",
+    "anthropic": "POST /v1/messages/batches/b1/cancel",
+    "gemini": "POST /v1beta/batches/b1:cancel",
+}
+RESULTS = "GET /v1/messages/batches/b1/results"
+OUTPUT, ERRORS = "GET /v1/files/f1/content", "GET /v1/files/f2/content"
+
+
+async def failure(service, form, count=2):
+    with pytest.raises(BatchFailed) as failed:
+        await service.submit(lines(form, count), "mark")
+    return failed.value
+
+
+def results_at(server, reply, **counts):
+    """Let a batch of Anthropic have these results."""
+    ended = {"processing_status": "ended", "request_counts": counts}
+    server.replies[BATCH["anthropic"]] = (200, ended)
+    server.replies[RESULTS] = reply
+
+
+def error(message="no", **members):
+    return {"error": {"message": message, "type": "error", "code": "none", **members}}
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "kind"),
+    [
+        (401, error(), "refused"),
+        (403, error(), "refused"),
+        (404, error(), "single"),
+        (405, error(), "single"),
+        (400, error(), "single"),
+        (413, error(), "smaller"),
+        (429, error(), "again"),
+        (429, error(code="token_limit_exceeded"), "smaller"),
+        (429, error("You have reached the limit of enqueued tokens."), "smaller"),
+        (429, error(type="insufficient_quota", code="insufficient_quota"), "quota"),
+        (402, error(), "quota"),
+        (500, error(), "again"),
+        (503, error(), "again"),
+        (302, {}, "single"),
+    ],
+)
+async def test_each_refusal_of_a_creation_says_what_to_do(
+    server, service_at, form, status, body, kind
+):
+    server.replies[CREATE[form]] = (status, body, {"retry-after": "7"})
+    failed = await failure(service_at(server.url, form), form)
+    assert failed.kind == kind
+    assert f"HTTP {status}" in str(failed)
+    # A gateway may say that it waited for too long; a file is no batch yet.
+    assert failed.sent == (status >= 500 and form == "anthropic")
+    assert kind != "again" or failed.delay_s == 7
+
+
+async def test_a_single_line_that_is_too_large_is_asked_singly(server, service_at, form):
+    server.replies[CREATE[form]] = (413, error())
+    service = service_at(server.url, form)
+    assert (await failure(service, form, 1)).kind == "single"
+    assert len(server.asked) == 1
+    service.limits = BatchLimits(1, 100)
+    failed = await failure(service, form, 1)
+    assert (failed.kind, failed.sent, len(server.asked)) == ("single", False, 1)
+
+
+@pytest.mark.parametrize(
+    "url", ["", "x", "@127.0.0.1:1/x", "http://[::1", "http://h/\u00e9", "/" + "x" * 8050]
+)
+async def test_an_upload_goes_to_no_other_host_and_to_no_odd_place(server, service_at, url):
+    begun = (200, {}, {"x-goog-upload-url": url})
+    server.replies[CREATE["gemini"]] = begun
+    failed = await failure(service_at(server.url, "gemini"), "gemini")
+    assert (failed.kind, failed.sent) == ("again", False)
+    assert "names no URL" in str(failed)
+
+
+async def test_no_path_leads_to_another_host(server, transport_to):
+    transport = transport_to(endpoint_at(server.url, "anthropic"))
+    with pytest.raises(UsageError, match="can be no path"):
+        await transport.get("@localhost:1/x", timeout_s=5)
+    with pytest.raises(UsageError, match="can be no path"):
+        await transport.get("0/x", timeout_s=5)
+    assert not server.asked
+
+
+@pytest.mark.parametrize("told", [{}, {"id": "../../etc", "name": "batches/../x"}])
+async def test_a_creation_without_an_id_may_have_created_a_batch(server, service_at, form, told):
+    server.replies["POST /up"] = (200, {"file": {"name": "files/f1"}})
+    server.replies["POST /v1beta/models/some-model:batchGenerateContent"] = (200, told)
+    if form == "gemini":
+        server.replies[CREATE[form]] = (200, {}, {"x-goog-upload-url": f"{server.url}/up"})
+    else:
+        server.replies[CREATE[form]] = (200, told)
+    failed = await failure(service_at(server.url, form), form)
+    assert failed.kind == "again"
+    assert "of a known form" in str(failed)
+    # A file is no batch yet.
+    assert failed.sent == (not form.startswith("openai"))
+
+
+async def test_a_creation_that_nobody_takes_was_not_sent(service_at, form):
+    with socket.socket() as reserved:
+        reserved.bind(("127.0.0.1", 0))
+        service = service_at(f"http://127.0.0.1:{reserved.getsockname()[1]}", form)
+        failed = await failure(service, form)
+    assert (failed.kind, failed.sent) == ("again", False)
+    assert "nothing listens" in str(failed)
+
+
+async def test_no_error_shows_the_key(server, service_at, form):
+    server.replies[CREATE[form]] = (401, error(f"Incorrect key: {KEY}"))
+    assert KEY not in str(await failure(service_at(server.url, form), form))
+
+
+def succeeded(key, text="an answer"):
+    message = {"content": [{"type": "text", "text": text}], "stop_reason": "end_turn"}
+    return {"custom_id": key, "result": {"type": "succeeded", "message": message}}
+
+
+def jsonl(*parts):
+    return b"\n".join(
+        part if isinstance(part, bytes) else json.dumps(part).encode() for part in parts
+    )
+
+
+async def read(service):
+    """The keys of the results that can be used, and what is said of the others."""
+    results = []
+    try:
+        async for result in service.results("b1"):
+            results.append(result)  # noqa: PERF401 # those before the error are kept
+    except BatchFailed as exc:
+        return [each.key for each in results], exc
+    return [each.key for each in results], None
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        (b'{"custom_id": "b", "res', "line 2 is no JSON"),
+        (b"[1, 2]", "line 2 is no JSON object"),
+        (b'"text"', "line 2 is no JSON object"),
+        (b'{"result": {"type": "succeeded"}}', "it has no custom_id"),
+        (b'{"custom_id": 7, "result": {}}', "it has no custom_id"),
+        (b'{"custom_id": "b", "result": {"type": "strange"}}', "of b is of no known type"),
+        (jsonl(succeeded("a", "another")), "there is another result of a"),
+        (b"[" * 200 + b"]" * 200, "line 2: the reply is refused: it nests deeper"),
+        (
+            jsonl(succeeded("b", "x" * 5000)),
+            "line 2: the reply is refused: it is longer than 0.004",
+        ),
+    ],
+)
+async def test_a_result_that_cannot_be_used_costs_no_other_one(server, service_at, broken, said):
+    results_at(server, (200, jsonl(succeeded("a"), broken, succeeded("c"), b"")))
+    keys, failed = await read(service_at(server.url, "anthropic", most_bytes=4000))
+    assert keys == ["a", "c"]
+    assert failed.kind == "single"
+    assert said in str(failed)
+
+
+async def test_one_error_speaks_for_all_results_that_cannot_be_used(server, service_at):
+    results_at(server, (200, jsonl(b"?", succeeded("a"), b"?", succeeded("a"))))
+    keys, failed = await read(service_at(server.url, "anthropic"))
+    assert keys == ["a"]
+    assert str(failed) == "3 results of the batch cannot be used: line 1 is no JSON"
+
+
+async def test_a_lone_surrogate_in_a_result_can_be_kept(server, service_at):
+    line = rb'{"custom_id": "a", "result": {"type": "succeeded", "message": {"x": "\ud83d"}}}'
+    results_at(server, (200, line))
+    (result,) = [each async for each in service_at(server.url, "anthropic").results("b1")]
+    assert result.raw.body.encode() == rb'{"x": "\ud83d"}'
+
+
+async def test_results_that_break_off_can_be_read_again(server, service_at):
+    async def cut(request):
+        whole = jsonl(succeeded("a"), succeeded("b"), b"")
+        response = web.StreamResponse()
+        response.content_length = len(whole)
+        await response.prepare(request)
+        await response.write(whole[: len(whole) // 2 + 10])
+        await asyncio.sleep(0.05)
+        request.transport.abort()
+        return response
+
+    results_at(server, cut)
+    service = service_at(server.url, "anthropic")
+    keys, failed = await read(service)
+    assert (keys, failed.kind) == (["a"], "again")
+    results_at(server, (200, jsonl(succeeded("a"), succeeded("b"))))
+    assert await read(service) == (["a", "b"], None)
+
+
+async def test_packed_results_are_read(server, service_at):
+    async def packed(request):
+        body = gzip.compress(jsonl(succeeded("a"), succeeded("b")))
+        return web.Response(body=body, headers={"content-encoding": "gzip"})
+
+    results_at(server, packed)
+    assert await read(service_at(server.url, "anthropic")) == (["a", "b"], None)
+
+
+async def test_results_that_are_refused_say_what_to_do(server, service_at):
+    results_at(server, (503, error("busy")))
+    _, failed = await read(service_at(server.url, "anthropic"))
+    assert (failed.kind, str(failed)) == ("again", "HTTP 503: busy")
+
+
+async def test_a_key_goes_to_no_other_host_than_the_configured_one(server, service_at):
+    batch = {"processing_status": "ended", "results_url": "http://127.0.0.1:1/elsewhere"}
+    server.replies["GET /v1/messages/batches/b1"] = (200, batch)
+    server.replies[RESULTS] = (200, jsonl(succeeded("a")))
+    service = service_at(server.url, "anthropic")
+    assert (await service.status("b1")).state == "ended"
+    assert await read(service) == (["a"], None)
+
+
+async def test_a_reply_echoes_no_key(server, service_at):
+    results_at(server, (200, jsonl(succeeded("a", f"your key is {KEY}"))))
+    (result,) = [each async for each in service_at(server.url, "anthropic").results("b1")]
+    assert KEY not in result.raw.body
+    assert "[key]" in result.raw.body
+
+
+@pytest.mark.parametrize(
+    ("line", "status"),
+    [
+        ({"response": {"status_code": 200, "body": {"x": 1}}, "error": None}, 200),
+        ({"response": {"status_code": 400, "body": {"error": {}}}, "error": None}, 400),
+        ({"response": None, "error": {"code": "server_error", "message": "m"}}, 500),
+        ({"response": None, "error": {"code": "batch_expired", "message": "m"}}, None),
+        ({"response": None, "error": {"code": "batch_cancelled", "message": "m"}}, None),
+    ],
+)
+async def test_a_line_of_openai_is_a_reply_or_was_not_asked(server, service_at, line, status):
+    server.replies[BATCH["openai-chat"]] = (200, {"status": "completed", "error_file_id": "f1"})
+    server.replies[OUTPUT] = (200, jsonl({"custom_id": "a", **line}))
+    (result,) = [each async for each in service_at(server.url, "openai-chat").results("b1")]
+    assert (result.raw and result.raw.status) == status
+
+
+@pytest.mark.parametrize(
+    ("code", "status"), [(3, 400), (8, 429), (13, 500), (14, 503), (99, 500), (429, 429), (1, None)]
+)
+async def test_an_error_of_gemini_has_the_status_of_its_code(server, service_at, code, status):
+    responses = [{"metadata": {"key": "a"}, "error": {"code": code, "message": "m"}}]
+    output = {"inlinedResponses": {"inlinedResponses": responses}}
+    server.replies[BATCH["gemini"]] = (200, {"done": True, "response": output})
+    (result,) = [each async for each in service_at(server.url, "gemini").results("b1")]
+    assert (result.raw and result.raw.status) == status
+
+
+@pytest.mark.parametrize(
+    ("kind", "status"),
+    [
+        ("invalid_request_error", 400),
+        ("rate_limit_error", 429),
+        ("overloaded_error", 529),
+        ("new", 500),
+    ],
+)
+async def test_an_error_of_anthropic_has_the_status_of_its_type(server, service_at, kind, status):
+    told = {"type": "error", "error": {"type": kind, "message": "m"}}
+    line = {"custom_id": "a", "result": {"type": "errored", "error": told}}
+    results_at(server, (200, jsonl(line)))
+    (result,) = [each async for each in service_at(server.url, "anthropic").results("b1")]
+    assert (result.raw.status, result.raw.payload) == (status, told)
+
+
+@pytest.mark.parametrize(
+    ("form", "path", "batch", "state"),
+    [
+        ("openai-chat", "/v1/batches/b1", {"status": "validating"}, "waiting"),
+        ("openai-chat", "/v1/batches/b1", {"status": "finalizing"}, "waiting"),
+        ("openai-chat", "/v1/batches/b1", {"status": "some new one"}, "waiting"),
+        ("openai-chat", "/v1/batches/b1", {"status": "failed"}, "failed"),
+        ("openai-chat", "/v1/batches/b1", {"status": "expired"}, "ended"),
+        ("anthropic", "/v1/messages/batches/b1", {"processing_status": "canceling"}, "waiting"),
+        ("anthropic", "/v1/messages/batches/b1", {"processing_status": "ended"}, "ended"),
+        ("gemini", "/v1beta/batches/b1", {"metadata": {"state": "BATCH_STATE_RUNNING"}}, "waiting"),
+        ("gemini", "/v1beta/batches/b1", {"metadata": {"state": "JOB_STATE_PAUSED"}}, "waiting"),
+        ("gemini", "/v1beta/batches/b1", {"metadata": {"state": "JOB_STATE_EXPIRED"}}, "ended"),
+        ("gemini", "/v1beta/batches/b1", {"metadata": {"state": "BATCH_STATE_FAILED"}}, "failed"),
+        ("gemini", "/v1beta/batches/b1", {"metadata": {"state": "batch_state_failed"}}, "failed"),
+        ("gemini", "/v1beta/batches/b1", {"done": True, "response": {}}, "ended"),
+        ("gemini", "/v1beta/batches/b1", {"done": True, "error": {"code": 13}}, "failed"),
+        ("gemini", "/v1beta/batches/b1", {"done": "no"}, "waiting"),
+        ("openai-chat", "/v1/batches/b1", {"status": "Completed"}, "ended"),
+        ("anthropic", "/v1/messages/batches/b1", {"processing_status": "ENDED"}, "ended"),
+    ],
+)
+async def test_each_word_of_a_provider_is_one_of_three_states(
+    server, service_at, form, path, batch, state
+):
+    server.replies[f"GET {path}"] = (200, batch)
+    assert (await service_at(server.url, form).status("b1")).state == state
+
+
+async def test_results_that_a_provider_has_and_does_not_show_yet_are_waited_for(server, service_at):
+    done = {"status": "completed", "request_counts": {"total": 2, "completed": 2, "failed": 0}}
+    server.replies[BATCH["openai-chat"]] = (200, done)
+    assert (await read(service_at(server.url, "openai-chat")))[1].kind == "again"
+    server.replies[BATCH["gemini"]] = (
+        200,
+        {"done": True, "metadata": {"state": "BATCH_STATE_SUCCEEDED"}},
+    )
+    assert (await read(service_at(server.url, "gemini")))[1].kind == "again"
+
+
+async def test_a_list_that_turns_in_a_circle_ends(server, service_at):
+    page = {"data": [{"id": "b1"}], "has_more": True}
+    server.replies[LISTS["openai-chat"]] = (200, page)
+    service = service_at(server.url, "openai-chat")
+    assert await service.find("mark", [], since=datetime.now(UTC)) is None
+    assert len(server.asked) == 2
+
+
+async def test_a_failed_batch_says_why_and_what_to_do(server, service_at):
+    errors = {"data": [{"code": "model_not_found", "message": "no such model", "line": 1}]}
+    server.replies[BATCH["openai-chat"]] = (200, {"status": "failed", "errors": errors})
+    status = await service_at(server.url, "openai-chat").status("b1")
+    assert (status.failure, status.message) == ("refused", "no such model")
+    server.replies[BATCH["gemini"]] = (
+        200,
+        {"metadata": {"state": "BATCH_STATE_FAILED"}, "error": {"code": 3, "message": "odd"}},
+    )
+    status = await service_at(server.url, "gemini").status("b1")
+    assert (status.failure, status.message) == ("single", "odd")
+
+
+async def used(service, what):
+    """What an operation on a batch that exists raises."""
+    asked = {
+        "status": lambda: service.status("b1"),
+        "find": lambda: service.find("mark", ["a"], since=datetime.now(UTC)),
+        "cancel": lambda: service.cancel("b1"),
+    }
+    with pytest.raises(BatchFailed) as failed:
+        await asked[what]()
+    return failed.value
+
+
+@pytest.mark.parametrize("form", BATCH)
+@pytest.mark.parametrize("what", ["status", "find", "cancel"])
+@pytest.mark.parametrize(
+    ("status", "kind"),
+    [
+        (404, "lost"),
+        (410, "lost"),
+        (302, "lost"),
+        (405, "again"),
+        (413, "again"),
+        (429, "again"),
+        (500, "again"),
+        (401, "refused"),
+    ],
+)
+async def test_a_batch_that_may_exist_is_never_asked_singly(
+    server, service_at, form, what, status, kind
+):
+    where = {"status": BATCH, "find": LISTS, "cancel": CANCEL}[what][form]
+    server.replies[where] = (status, error())
+    assert (await used(service_at(server.url, form), what)).kind == kind
+
+
+@pytest.mark.parametrize("form", BATCH)
+@pytest.mark.parametrize("status", [400, 409])
+async def test_to_cancel_a_batch_that_has_ended_is_no_error(server, service_at, form, status):
+    server.replies[CANCEL[form]] = (status, error())
+    await service_at(server.url, form).cancel("b1")
+
+
+@pytest.mark.parametrize("form", BATCH)
+async def test_a_status_that_is_refused_for_its_form_is_not_asked_for_for_ever(
+    server, service_at, form
+):
+    server.replies[BATCH[form]] = (200, b'{"a":' * 200 + b"1" + b"}" * 200)
+    assert (await used(service_at(server.url, form), "status")).kind == "lost"
+
+
+async def test_a_body_that_may_be_long_may_hold_many_values(server, service_at):
+    large = {"processing_status": "ended", "x": [0] * 1_100_000}
+    server.replies[BATCH["anthropic"]] = (200, large)
+    assert (await service_at(server.url, "anthropic").status("b1")).state == "ended"
+
+
+@pytest.mark.parametrize(("status", "kind"), [(404, "again"), (410, "lost"), (500, "again")])
+async def test_a_file_of_answers_that_is_not_there_hides_no_file_of_errors(
+    server, service_at, status, kind
+):
+    ended = {"status": "completed", "output_file_id": "f1", "error_file_id": "f2"}
+    server.replies[BATCH["openai-chat"]] = (200, ended)
+    server.replies[OUTPUT] = (status, error())
+    line = {"custom_id": "b", "response": {"status_code": 429, "body": error()}}
+    server.replies[ERRORS] = (200, jsonl(line))
+    keys, failed = await read(service_at(server.url, "openai-chat"))
+    assert (keys, failed.kind) == (["b"], kind)
+
+
+async def test_broken_results_are_read_once_more(server, service_at):
+    bodies = [jsonl(succeeded("a"), b"?"), jsonl(succeeded("a"), succeeded("b"))]
+
+    async def reply(request):
+        return web.Response(body=bodies.pop(0))
+
+    results_at(server, reply)
+    assert await read(service_at(server.url, "anthropic")) == (["a", "b"], None)
+    assert not bodies
+
+
+async def test_fewer_results_than_the_provider_counts_are_read_again(server, service_at):
+    results_at(server, (200, jsonl(succeeded("a"))), succeeded=2, errored=1)
+    keys, failed = await read(service_at(server.url, "anthropic"))
+    assert (keys, failed.kind, str(failed)) == (["a"], "again", "1 of the 3 results are there")
+
+
+async def test_more_results_than_requests_are_not_read(server, service_at):
+    told = [succeeded(key) for key in "abcd"]
+    results_at(server, (200, jsonl(*told)), succeeded=2)
+    keys, failed = await read(service_at(server.url, "anthropic"))
+    assert (keys, failed.kind) == (["a", "b"], "single")
+    assert "more results" in str(failed)
+
+
+async def test_results_that_are_no_longer_kept_are_lost(server, service_at):
+    results_at(server, (200, b""))
+    server.replies[BATCH["anthropic"]] = (200, {"archived_at": "2026-11-20T00:00:00Z"})
+    assert (await read(service_at(server.url, "anthropic")))[1].kind == "lost"
+
+
+async def test_blank_lines_and_those_of_windows_are_results_of_nothing(server, service_at):
+    body = b"\r\n".join([b"", *jsonl(succeeded("a"), b"", succeeded("b")).split(b"\n"), b"", b""])
+    results_at(server, (200, body), succeeded=2)
+    assert await read(service_at(server.url, "anthropic")) == (["a", "b"], None)
+
+
+async def test_a_message_shows_no_more_of_a_key_than_a_reader_takes(server, service_at):
+    long = "k" * 10_000
+    results_at(server, (200, jsonl({"custom_id": long, "result": {}}, succeeded("a"))))
+    assert len(str((await read(service_at(server.url, "anthropic")))[1])) < 200
+    results_at(server, (200, jsonl(succeeded(long), succeeded(long))))
+    assert len(str((await read(service_at(server.url, "anthropic")))[1])) < 200
+    server.replies[BATCH["anthropic"]] = (500, error("m" * 10_000))
+    assert len(str(await used(service_at(server.url, "anthropic"), "status"))) < 600
+
+
+@pytest.mark.parametrize("form", BATCH)
+async def test_an_id_may_have_a_thousand_characters(server, service_at, form):
+    long = "b" * 1000
+    batch = {**listed(form, "mark", datetime.now(UTC)), "id": long, "name": f"batches/{long[8:]}"}
+    server.replies[LISTS[form]] = (200, {LIST_MEMBERS[form]: [batch]})
+    service = service_at(server.url, form)
+    found = await service.find("mark", ["a"], since=datetime.now(UTC))
+    assert len(found.batch_id) == (992 if form == "gemini" else 1000)
+
+
+LIST_MEMBERS = {"openai-chat": "data", "anthropic": "data", "gemini": "operations"}
+
+
+def listed(form, mark, created, batch_id="b1"):
+    """A batch of one request as a list shows it."""
+    told = created.isoformat()
+    match form:
+        case "openai-chat":
+            metadata = {"merge_runner_mark": mark}
+            return {"id": batch_id, "created_at": created.timestamp(), "metadata": metadata}
+        case "anthropic":
+            return {"id": batch_id, "created_at": told, "request_counts": {"processing": 1}}
+    metadata = {"displayName": mark, "createTime": told}
+    return {"name": f"batches/{batch_id}", "metadata": metadata}
+
+
+def paged(form, *pages):
+    """A list in pages, the last of which alone has none after it."""
+
+    async def reply(request):
+        number = int(next((v for k, v in request.query.items() if "after" in k or "Token" in k), 0))
+        page = {LIST_MEMBERS[form]: pages[number]}
+        if number + 1 < len(pages):
+            following = str(number + 1)
+            page |= {"has_more": True, "last_id": following, "nextPageToken": following}
+        return web.json_response(page)
+
+    return reply
+
+
+NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
+
+
+@pytest.mark.parametrize("form", BATCH)
+async def test_a_batch_is_found_in_a_list_that_begins_with_the_oldest(server, service_at, form):
+    old = [listed(form, "mark", NOW - timedelta(days=n), f"old{n}") for n in (9, 8, 7)]
+    new = [listed(form, "mark", NOW, name) for name in ("known", "mine")]
+    server.replies[LISTS[form]] = paged(form, old[:2], [], [old[2]], new)
+    service = service_at(server.url, form)
+    found = await service.find("mark", ["a"], since=NOW, known=["known"])
+    assert found.batch_id == "mine"
+    assert await service.find("mark", ["a"], since=NOW, known=["known", "mine"]) is None
+
+
+@pytest.mark.parametrize("form", BATCH)
+async def test_nobody_looks_behind_a_page_from_which_a_list_goes_back_in_time(
+    server, service_at, form
+):
+    old = [listed(form, "mark", NOW - timedelta(days=n), f"old{n}") for n in (7, 8, 9)]
+    server.replies[LISTS[form]] = paged(form, old[:2], [old[2]])
+    assert await service_at(server.url, form).find("mark", ["a"], since=NOW) is None
+    assert len(server.asked) == 1
+
+
+@pytest.mark.parametrize("form", BATCH)
+async def test_a_batch_is_found_behind_a_page_of_later_ones(server, service_at, form):
+    told = [listed(form, "other", NOW + timedelta(days=n), f"b{n}") for n in (3, 2, 1, 0)]
+    mine = listed(form, "mark", NOW, "mine")
+    server.replies[LISTS[form]] = paged(form, told[:2], told[2:], [mine])
+    service = service_at(server.url, form)
+    known = [f"b{n}" for n in range(4)]
+    assert (await service.find("mark", ["a"], since=NOW, known=known)).batch_id == "mine"
+
+
+@pytest.mark.parametrize("form", BATCH)
+async def test_a_list_without_end_leaves_open_whether_there_is_a_batch(server, service_at, form):
+    server.replies[LISTS[form]] = paged(form, *[[]] * 200)
+    failed = await used(service_at(server.url, form), "find")
+    assert (failed.kind, len(server.asked)) == ("lost", 100)
+
+
+@pytest.mark.parametrize("form", BATCH)
+async def test_every_request_has_the_headers_of_its_format(server, service_at, form):
+    service = service_at(server.url, form)
+    await failure(service, form)
+    for what in ("status", "find", "cancel"):
+        await used(service, what)
+    await read(service)
+    expected = "2023-06-01" if form == "anthropic" else None
+    assert {headers.get("anthropic-version") for _, headers in server.asked} == {expected}
+
+
+@pytest.mark.parametrize(
+    ("form", "batch", "kind"),
+    [
+        ("openai-chat", {"code": "server_error"}, "again"),
+        ("openai-chat", {"code": "rate_limit_exceeded"}, "again"),
+        ("openai-chat", {"code": "token_limit_exceeded"}, "smaller"),
+        ("openai-chat", {"code": "invalid_json_line"}, "single"),
+        ("gemini", {"code": 8}, "again"),
+        ("gemini", {"code": 8, "message": "Enqueued token limit reached"}, "smaller"),
+        ("gemini", {"code": 13}, "again"),
+        ("gemini", {"code": 14}, "again"),
+        ("gemini", {"code": 503}, "again"),
+        ("gemini", {"code": 3}, "single"),
+        ("gemini", {"code": 12}, "single"),
+        ("gemini", {"code": 7}, "refused"),
+    ],
+)
+async def test_a_batch_that_failed_for_a_while_is_submitted_again(
+    server, service_at, form, batch, kind
+):
+    told = {
+        "openai-chat": {"status": "failed", "errors": {"data": [batch]}},
+        "gemini": {"metadata": {"state": "BATCH_STATE_FAILED"}, "error": batch},
+    }
+    server.replies[BATCH[form]] = (200, told[form])
+    status = await service_at(server.url, form).status("b1")
+    assert (status.state, status.failure) == ("failed", kind)

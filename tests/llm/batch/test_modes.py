@@ -1,0 +1,90 @@
+"""Which models have a batch mode, and how lines are parted."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from merge_runner.config import PROVIDERS, BatchTerms
+from merge_runner.errors import UsageError
+from merge_runner.llm.batch.modes import BATCH_MODES, batch_terms, require_batch
+from merge_runner.llm.batch.service import BatchLimits, in_batches
+from merge_runner.llm.bodies import read_lines
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.models import load_models
+from tests.llm.batch.conftest import entry_of
+from tests.llm.batch.lines import lines
+
+OWN = BatchTerms(price_factor=0.6, source="contract, 2026-11")
+
+
+def test_the_shipped_models_of_four_providers_have_a_batch_mode_at_half_price():
+    terms = {name: batch_terms(entry) for name, entry in load_models().items()}
+    without = {name for name, each in terms.items() if each is None}
+    assert without == {"local", "smollm2", "smollm2-free"}
+    assert {each.price_factor for each in terms.values() if each} == {0.5}
+    assert BATCH_MODES.keys() == FORMATS.keys()
+
+
+def test_an_entry_may_have_terms_of_its_own_or_no_batch_mode():
+    assert batch_terms(entry_of("openai-chat", "openrouter")) is None
+    assert batch_terms(entry_of("openai-chat", "openrouter", batch=OWN)) == OWN
+    assert batch_terms(entry_of("openai-chat", batch="none")) is None
+    # One deployment's path, which no batch can name.
+    assert batch_terms(entry_of("openai-chat", path="/deployments/x/chat/completions")) is None
+
+
+def test_the_price_of_a_provider_holds_at_its_own_address(form, monkeypatch):
+    elsewhere = {"base_url": "http://127.0.0.1:8000"}
+    entry = entry_of(form, **elsewhere)
+    assert batch_terms(entry) is None
+    assert batch_terms(entry_of(form, **elsewhere, batch=OWN)) == OWN
+    with pytest.raises(UsageError, match=r"known at http://127\.0\.0\.1:8000; valid.*batch = \{"):
+        require_batch("mine", entry, {"mine": entry})
+    variable = PROVIDERS[entry.provider].base_url_env
+    monkeypatch.setenv(variable, "http://127.0.0.1:8000")
+    assert batch_terms(entry_of(form)) is None
+    monkeypatch.delenv(variable)
+    assert batch_terms(entry_of(form)).price_factor == 0.5
+    assert batch_terms(entry_of(form, "emulator")).price_factor == 0.5
+
+
+def test_a_model_without_a_batch_mode_is_refused_with_the_valid_ones():
+    entries = load_models()
+    assert require_batch("o3", entries["o3"], entries).price_factor == 0.5
+    with pytest.raises(UsageError, match=r"local has no batch mode.*valid with --batch: emul.*o3"):
+        require_batch("local", entries["local"], entries)
+
+
+def test_a_key_is_an_id_that_every_provider_takes(form):
+    for line in lines(form, 3):
+        assert re.fullmatch("[a-zA-Z0-9_-]{1,64}", line.key)
+
+
+@given(st.lists(st.integers(1, 60)), st.integers(1, 7), st.integers(60, 200))
+def test_lines_are_parted_in_order_into_as_few_batches_as_fit(sizes, most_lines, most_size):
+    numbered = list(enumerate(sizes))
+    parts = list(in_batches(numbered, BatchLimits(most_lines, most_size), lambda line: line[1]))
+    assert [line for part in parts for line in part] == numbered
+    totals = [sum(size for _, size in part) for part in parts]
+    assert all(len(part) <= most_lines for part in parts)
+    assert all(total <= most_size for total in totals)
+    for part, total, following in zip(parts, totals, parts[1:], strict=False):
+        assert len(part) == most_lines or total + following[0][1] > most_size
+
+
+@given(st.lists(st.text(alphabet="ab\u2028\u00e9", max_size=9)), st.data())
+async def test_lines_are_the_same_however_a_body_is_cut(texts, data):
+    body = "\n".join(texts).encode()
+    cuts = data.draw(st.lists(st.integers(0, len(body)), max_size=5).map(sorted))
+
+    async def chunks():
+        for start, end in zip([0, *cuts], [*cuts, len(body)], strict=True):
+            yield body[start:end]
+
+    assert [line async for line in read_lines(chunks(), "", 100)] == [
+        each for each in texts if each
+    ]

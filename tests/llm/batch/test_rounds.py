@@ -1,0 +1,811 @@
+"""Rounds through the client, over a batch mode in memory that misbehaves as told."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import random
+import re
+import tempfile
+from collections import Counter
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.config import ModelEntry, Price
+from merge_runner.errors import (
+    CacheFailed,
+    CallFailed,
+    EndpointRefused,
+    ProviderDown,
+    QuotaExhausted,
+    WaitingForBatches,
+)
+from merge_runner.llm.batch.batches import Batches
+from merge_runner.llm.batch.journal import Journal
+from merge_runner.llm.batch.rounds import BatchWays, Rounds
+from merge_runner.llm.batch.service import (
+    BatchFailed,
+    BatchLimits,
+    BatchStatus,
+    Found,
+    LineResult,
+)
+from merge_runner.llm.budget import Budget
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.client import LlmClient
+from merge_runner.llm.http_outcome import RawReply
+from merge_runner.llm.ledger import Caps, Ledger
+from merge_runner.llm.limiter import Limiter
+from merge_runner.records import Slot
+from tests.virtual_time import in_virtual_time, now_s
+
+PRICE = Price(input=1.0, output=100.0, source="made up")
+USAGE = {"prompt_tokens": 10, "completion_tokens": 5}
+# Of the tokens above, in USD.
+ONE_USD = (10 * 1.0 + 5 * 100.0) / 1e6
+
+
+def answer(text):
+    choice = {"message": {"content": text}, "finish_reason": "stop"}
+    return RawReply(200, {}, json.dumps({"model": "m-1", "choices": [choice], "usage": USAGE}))
+
+
+def error(status, kind="server_error"):
+    told = {"error": {"message": "no", "type": kind, "code": None}}
+    return RawReply(status, {}, json.dumps(told))
+
+
+class Memory:
+    """A provider's batch mode, of which each batch ends at the first look.
+
+    ``fates`` are replies to lines by repetition, one after the other: None is an expiry, and what
+    is "missing" has no result. ``creations`` and ``states`` are raised or returned in their order
+    before the usual.
+    """
+
+    limits = BatchLimits(lines=1000, size=10**6)
+
+    def __init__(self):
+        self.batches = {}
+        self.marks = {}
+        self.fates = {}
+        self.creations = []
+        self.states = []
+        self.cancelled = []
+        self.answered = Counter()
+        self.hidden = set()
+        self.unsure = []
+
+    def size(self, line):
+        return 1
+
+    async def submit(self, lines, mark):
+        step = self.creations.pop(0) if self.creations else None
+        if isinstance(step, BatchFailed) and not step.sent:
+            raise step
+        batch_id = f"batch-{len(self.batches)}"
+        self.batches[batch_id] = list(lines)
+        self.marks[batch_id] = mark
+        if step is not None:
+            raise step
+        return batch_id
+
+    async def find(self, mark, keys, *, since, known=()):
+        for batch_id in self.unsure:
+            if batch_id not in known:
+                return Found(batch_id, sure=False)
+        for batch_id, its in self.marks.items():
+            if its == mark and batch_id not in known:
+                return Found(batch_id)
+        return None
+
+    async def status(self, batch_id):
+        if batch_id not in self.batches:
+            raise BatchFailed("single", "HTTP 404: no such batch", sent=False)
+        step = self.states.pop(0) if self.states else BatchStatus("ended", "completed")
+        if isinstance(step, BatchFailed):
+            raise step
+        return step
+
+    async def results(self, batch_id):
+        for line in reversed(self.batches[batch_id]):
+            repetition = line.request.slot.repetition
+            fates = self.fates.get(repetition, [])
+            fate = fates.pop(0) if fates else answer(f"batched {repetition}")
+            if fate == "missing":
+                continue
+            if fate is not None and fate.status == 200:
+                self.answered[line.key] += 1
+            yield LineResult(line.key, fate, "" if fate else "it has expired")
+
+    async def cancel(self, batch_id):
+        self.cancelled.append(batch_id)
+
+    @property
+    def sizes(self):
+        return [len(lines) for lines in self.batches.values()]
+
+
+class Alone:
+    """The plain endpoint."""
+
+    def __init__(self):
+        self.asked = []
+
+    async def send(self, request, *, attempt, timeout_s):
+        self.asked.append(request.slot.repetition)
+        return answer(f"alone {request.slot.repetition}")
+
+
+@pytest.fixture
+def cache(tmp_path):
+    cache = ResponseCache(tmp_path / "responses")
+    yield cache
+    cache.close()
+
+
+class Run:
+    """A run's client, and the rounds that it asks in."""
+
+    def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", **ways):
+        self.said = []
+        self.alone = Alone()
+        usual = {"submits": True, "deadline_s": 7200.0, "detach": False, "most_rounds": 30}
+        free = {"m"} if price == "free" else set()
+        self.rounds = Rounds(
+            Journal(cache),
+            {"m": service},
+            BatchWays(**{**usual, **ways}),
+            free=free,
+            say=self.said.append,
+        )
+        self.ledger = Ledger(cache, scope)
+        budget = Budget(self.ledger, Caps(cap))
+        entry = ModelEntry(
+            provider="openai", format="openai-chat", id="m-1", max_output_tokens=100, price=price
+        )
+        self.client = LlmClient(
+            name="m",
+            entry=entry,
+            endpoint="openai",
+            cache=cache,
+            transport=self.alone,
+            limiter=Limiter(),
+            budget=budget,
+            batches=Batches(self.rounds, "m", scope, budget, 0.5),
+        )
+
+    async def ask(self, repetitions=1, decision=0):
+        """The replies to several at once, or what each of them raised."""
+        async with contextlib.AsyncExitStack() as stack:
+            asks = [
+                asyncio.create_task(
+                    self.client.ask("prompt", Slot("A1", each, "left", decision, 0), order=each)
+                )
+                for each in range(1, repetitions + 1)
+            ]
+
+            def is_idle():
+                waiting = sum(not each.done() for each in asks)
+                return bool(waiting) and waiting == self.client.idle_askers
+
+            watching = asyncio.create_task(self.rounds.watch(is_idle))
+            stack.callback(watching.cancel)
+            return await asyncio.gather(*asks, return_exceptions=True)
+
+    async def end(self):
+        await self.client.drain()
+        await self.rounds.close()
+
+
+def texts(replies):
+    return [each.text for each in replies]
+
+
+def outcomes(reply):
+    return [(attempt.outcome, attempt.batch_id) for attempt in reply.attempts]
+
+
+@in_virtual_time
+async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
+    service = Memory()
+    run = Run(cache, service)
+    replies = await run.ask(20)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 21)]
+    assert service.sizes == [20]
+    assert {attempt.batch_id for reply in replies for attempt in reply.attempts} == {"batch-0"}
+    (attempt,) = replies[0].attempts
+    assert attempt.cost_usd == pytest.approx(ONE_USD / 2)
+    assert datetime.now(UTC) - datetime.fromisoformat(attempt.started_at) < timedelta(minutes=5)
+    assert attempt.latency_s is None
+    assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
+    assert (run.ledger.read().reserved_usd, run.alone.asked) == (0.0, [])
+    await run.end()
+    assert Journal(cache).batches() == []
+
+
+@in_virtual_time
+async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
+    class Watching(Memory):
+        async def submit(self, lines, mark):
+            aside.append(run.ledger.read().reserved_usd)
+            self.size = len(lines[0].request.body.encode())
+            return await super().submit(lines, mark)
+
+    aside = []
+    service = Watching()
+    run = Run(cache, service)
+    await run.ask(3)
+    bytes_of_one = len(service.batches["batch-0"][0].request.body.encode())
+    assert aside == [pytest.approx(3 * (bytes_of_one + 100 * 100.0) / 1e6 / 2)]
+
+
+@in_virtual_time
+async def test_a_line_that_failed_goes_with_the_next_round_and_the_third_time_alone(cache):
+    service = Memory()
+    service.fates = {2: [error(500)], 3: [error(429), error(500), error(503)]}
+    run = Run(cache, service)
+    replies = await run.ask(3)
+    assert texts(replies) == ["batched 1", "batched 2", "alone 3"]
+    assert service.sizes == [3, 2, 1]
+    assert outcomes(replies[1]) == [("server_error", "batch-0"), ("ok", "batch-1")]
+    assert [attempt.cost_usd for attempt in replies[2].attempts[:3]] == [0.0] * 3
+    assert run.alone.asked == [3]
+    assert run.ledger.read().spent_usd == pytest.approx((0.5 + 0.5 + 1) * ONE_USD)
+    assert run.ledger.read().reserved_usd == 0.0
+
+
+@in_virtual_time
+async def test_a_line_that_expired_is_asked_alone_at_the_full_price(cache):
+    service = Memory()
+    service.fates = {1: [None]}
+    run = Run(cache, service)
+    (reply,) = await run.ask()
+    assert reply.text == "alone 1"
+    assert outcomes(reply) == [("expired", "batch-0"), ("ok", None)]
+    assert [attempt.cost_usd for attempt in reply.attempts] == [0.0, pytest.approx(ONE_USD)]
+
+
+@in_virtual_time
+async def test_a_request_that_is_refused_fails_its_call_alone(cache):
+    service = Memory()
+    service.fates = {1: [error(400, "invalid_request_error")]}
+    refused, other = await Run(cache, service).ask(2)
+    assert isinstance(refused, CallFailed)
+    assert other.text == "batched 2"
+
+
+@in_virtual_time
+async def test_a_line_without_a_result_may_have_been_charged_and_is_asked_alone(cache):
+    service = Memory()
+    service.fates = {1: ["missing"]}
+    run = Run(cache, service)
+    (reply,) = await run.ask()
+    assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
+    assert reply.attempts[0].cost_usd is None
+    assert run.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cache):
+    service = Memory()
+    service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 2
+    run = Run(cache, service)
+    assert texts(await run.ask(8)) == [f"batched {number}" for number in range(1, 9)]
+    assert sorted(service.sizes) == [2, 2, 4]
+    assert len(run.said) == 1
+    await run.ask(8, decision=1)
+    assert service.sizes[3:] == [8]  # there is room again
+    assert not run.ledger.read().reserved_usd
+    await run.end()
+    assert Journal(cache).batches() == []
+
+
+@in_virtual_time
+async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
+    service = Memory()
+    service.states = [BatchStatus("failed", "failed", message="enqueued", failure="smaller")]
+    run = Run(cache, service)
+    replies = await run.ask(4)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
+    assert service.sizes == [4, 2, 2]
+    assert [len(reply.attempts) for reply in replies] == [1] * 4
+
+
+@in_virtual_time
+async def test_where_no_batch_mode_is_at_the_first_creation_the_run_ends(cache):
+    service = Memory()
+    service.creations = [BatchFailed("single", "HTTP 404", sent=False)]
+    run = Run(cache, service)
+    (first, *_) = await run.ask(3)
+    assert (type(first), first.exit_code) == (EndpointRefused, 2)
+    assert "leave --batch out" in str(first)
+    assert (run.alone.asked, run.ledger.read().committed_usd) == ([], 0.0)
+
+
+@in_virtual_time
+async def test_where_the_batch_mode_is_gone_later_everything_is_asked_alone(cache):
+    service = Memory()
+    service.creations = [None, BatchFailed("single", "HTTP 404", sent=False)]
+    run = Run(cache, service)
+    await run.ask(3)
+    replies = await run.ask(3, decision=1)
+    assert texts(replies) == ["alone 1", "alone 2", "alone 3"]
+    assert replies[0].attempts[0].cost_usd == 0.0
+
+
+@in_virtual_time
+async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache, monkeypatch):
+    async def is_full(*_):
+        raise CacheFailed("the disk is full")
+
+    service = Memory()
+    run = Run(cache, service)
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "put", is_full)
+        assert {type(each) for each in await run.ask(2)} == {CacheFailed}
+        await run.end()
+    later = Run(cache, service)
+    assert texts(await later.ask(2)) == ["batched 1", "batched 2"]
+    assert (service.sizes, later.alone.asked) == ([2], [])
+    await later.end()
+    assert Journal(cache).batches() == []
+
+
+async def left_with(cache, service, repetitions=1, **ways):
+    """What a --detach run ends with that leaves a batch behind."""
+    service.states = [BatchStatus("waiting", "in_progress")] * 1000
+    run = Run(cache, service, detach=True, **ways)
+    (left, *_) = await run.ask(repetitions)
+    await run.end()
+    service.states = []
+    return left
+
+
+@pytest.mark.parametrize("deadline_s", [0.0, 7200.0])
+@in_virtual_time
+async def test_a_batch_that_may_be_a_strangers_is_no_ones_own_in_the_next_run_either(
+    cache, deadline_s
+):
+    class Dying(Memory):
+        async def submit(self, lines, mark):
+            await super().submit(lines, mark)
+            created.set()
+            await asyncio.Event().wait()
+
+    created = asyncio.Event()
+    dying = Dying()
+    await killed(Run(cache, dying), 1, created)
+    service = Memory()
+    service.batches = {"stranger": [], **dying.batches}
+    service.unsure = ["stranger", "batch-0"]
+    assert isinstance(await left_with(cache, service), WaitingForBatches)
+    service.states = [BatchStatus("waiting", "in_progress")] * 2
+    run = Run(cache, service, deadline_s=deadline_s)
+    (reply,) = await run.ask()
+    assert outcomes(reply) == [("ok", "batch-0")]
+    assert (service.cancelled, run.alone.asked, len(service.batches)) == ([], [], 2)
+
+
+@in_virtual_time
+async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
+    class Slow(Memory):
+        async def status(self, batch_id):
+            ended = batch_id in self.cancelled
+            return BatchStatus("ended" if ended else "waiting", "its word")
+
+    service = Slow()
+    service.creations = [None, BatchFailed("again", "HTTP 504")]
+    with contextlib.closing(ResponseCache(tmp_path / "other")) as other:
+        one, two = Run(cache, service), Run(other, service, deadline_s=0.0)
+        asking = asyncio.create_task(one.ask())
+        await asyncio.sleep(10)
+        (reply,) = await two.ask()
+        assert outcomes(reply) == [("ok", "batch-1")]
+        assert service.cancelled == ["batch-1"]
+        asking.cancel()
+        await one.end()
+        await two.end()
+
+
+@in_virtual_time
+async def test_a_creation_that_comes_into_effect_late_is_not_repeated(cache):
+    class Late(Memory):
+        async def submit(self, lines, mark):
+            service.tasks.append(asyncio.create_task(self.arrive(lines, mark)))
+            raise BatchFailed("again", "HTTP 504")
+
+        async def arrive(self, lines, mark):
+            await asyncio.sleep(20)
+            await super().submit(lines, mark)
+
+    service = Late()
+    service.tasks = []
+    assert texts(await Run(cache, service).ask(2)) == ["batched 1", "batched 2"]
+    assert service.sizes == [2]
+
+
+@in_virtual_time
+async def test_a_single_line_that_finds_no_room_is_asked_alone_after_a_few_tries(cache):
+    service = Memory()
+    service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 1000
+    run = Run(cache, service)
+    (reply,) = await asyncio.wait_for(run.ask(), 120)
+    assert reply.text == "alone 1"
+    assert len(service.creations) > 990
+    assert len(run.said) == 2
+
+
+@in_virtual_time
+async def test_what_a_cancelled_batch_answered_unreadably_stays_set_aside(cache):
+    class Unreadable(Memory):
+        async def results(self, batch_id):
+            raise BatchFailed("single", "a result of the batch cannot be used")
+            yield
+
+    service = Unreadable()
+    service.states = [BatchStatus("waiting", "in_progress")]
+    run = Run(cache, service, deadline_s=0.0)
+    (reply,) = await run.ask()
+    assert service.cancelled == ["batch-0"]
+    assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
+    assert run.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
+    class Down(Memory):
+        async def submit(self, lines, mark):
+            self.creations.append(mark)
+            await asyncio.sleep(30)
+            raise BatchFailed("again", "HTTP 502")
+
+    service = Down()
+    run = Run(cache, service)
+    asking = asyncio.create_task(run.ask())
+    await asyncio.sleep(5)
+    asking.cancel()
+    began_s = now_s()
+    await run.end()
+    assert now_s() - began_s < 31
+    assert len(service.creations) == 1
+
+
+class WithoutResults(Memory):
+    async def results(self, batch_id):
+        raise BatchFailed("again", "HTTP 503")
+        yield
+
+
+@in_virtual_time
+async def test_a_detached_run_ends_while_the_results_cannot_be_fetched(cache):
+    service = WithoutResults()
+    await left_with(cache, service)
+    run = Run(cache, service, detach=True)
+    (left,) = await asyncio.wait_for(run.ask(), 60)
+    assert isinstance(left, WaitingForBatches)
+    assert run.said == ["m: HTTP 503; it is asked again until it answers"]
+    await run.end()
+
+
+@in_virtual_time
+async def test_an_answer_whose_money_was_released_is_spent_on_its_model_and_is_no_overrun(cache):
+    service = Memory()
+    left = Run(cache, service, cap=10)
+    service.states = [BatchStatus("waiting", "in_progress")] * 1000
+    asking = asyncio.create_task(left.ask())
+    await asyncio.sleep(1)
+    asking.cancel()
+    await left.end()
+    left.ledger.release()
+    service.states = []
+    run = Run(cache, service, cap=10)
+    await run.ask()
+    spending = run.ledger.read()
+    assert spending.by_model["m"].spent_usd == spending.spent_usd == pytest.approx(ONE_USD / 2)
+    assert (spending.overruns, spending.overrun_usd, spending.open_attempts) == ({}, 0.0, 0)
+    assert not run.client.meter.notes
+
+
+async def note(cache, **known):
+    """Change what the journal knows of its only batch."""
+    journal = Journal(cache)
+    (batch,) = journal.batches()
+    await journal.note(replace(batch, **known))
+
+
+HOURS_AGO = (datetime.now(UTC) - timedelta(hours=5)).isoformat()
+
+
+class Endless(Memory):
+    looks = 0
+
+    async def status(self, batch_id):
+        self.looks += 1
+        return BatchStatus("waiting", "in_progress")
+
+
+@in_virtual_time
+async def test_results_that_never_come_are_waited_for_in_bounds_and_may_have_been_charged(cache):
+    run = Run(cache, WithoutResults())
+    (reply,) = await run.ask()
+    assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
+    assert run.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_a_cancelled_batch_that_does_not_end_is_waited_for_in_bounds(cache):
+    service = Endless()
+    await left_with(cache, service)
+    await note(cache, cancelled_at=HOURS_AGO)
+    run = Run(cache, service)
+    (reply,) = await run.ask()
+    assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
+    assert run.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_a_batch_that_may_be_a_strangers_is_looked_at_as_any_other_after_its_deadline(cache):
+    service = Endless()
+    await left_with(cache, service)
+    await note(cache, submitted_at=HOURS_AGO, sure=False)
+    run = Run(cache, service, deadline_s=3600.0)
+    asking = asyncio.create_task(run.ask())
+    service.looks = 0
+    await asyncio.sleep(3600)
+    assert 50 < service.looks < 70  # once a minute
+    assert service.cancelled == []
+    asking.cancel()
+    await run.end()
+
+
+@pytest.mark.parametrize(
+    ("kind", "raised"),
+    [("quota", QuotaExhausted), ("refused", EndpointRefused)],
+)
+@in_virtual_time
+async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothing(
+    cache, kind, raised
+):
+    service = Memory()
+    service.creations = [BatchFailed(kind, "no", sent=False)] * 1000
+    run = Run(cache, service)
+    assert {type(each) for each in await run.ask(3)} == {raised}
+    spending = run.ledger.read()
+    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.0, 0.0, 0)
+    await run.end()
+    assert Journal(cache).batches() == []
+
+
+@pytest.mark.parametrize("sent", [True, False])
+@in_virtual_time
+async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cache, sent):
+    service = Memory()
+    service.creations = [BatchFailed("again", "no", sent=False)] * 99
+    if sent:
+        service.creations = [BatchFailed("again", "lost", sent=True)]
+
+        async def down(*_, **__):
+            raise BatchFailed("again", "down", sent=True)
+
+        service.find = down
+    run = Run(cache, service)
+    assert {type(each) for each in await run.ask(3)} == {ProviderDown}
+    await run.end()
+    assert run.ledger.read().open_attempts == 3  # whether it was created is not known yet
+    service.creations = []
+    vars(service).pop("find", None)
+    assert texts(await Run(cache, service).ask(3)) == ["batched 1", "batched 2", "batched 3"]
+    assert service.sizes == [3]
+    assert Ledger(cache, "test").read().open_attempts == 0
+
+
+@in_virtual_time
+async def test_a_batch_whose_creation_got_no_answer_is_found_and_not_created_again(cache):
+    service = Memory()
+    service.creations = [BatchFailed("again", "connection lost", sent=True)]
+    assert texts(await Run(cache, service).ask(3)) == ["batched 1", "batched 2", "batched 3"]
+    assert service.sizes == [3]
+
+
+@in_virtual_time
+async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
+    service = Memory()
+    service.states = [BatchFailed("again", "HTTP 503")] * 40
+    run = Run(cache, service)
+    assert texts(await run.ask()) == ["batched 1"]
+    assert run.said == ["m: HTTP 503; it is asked again until it answers"]
+
+
+@in_virtual_time
+async def test_a_batch_is_cancelled_at_the_deadline_and_what_it_has_is_taken(cache):
+    service = Memory()
+    service.states = [BatchStatus("waiting", "in_progress")] * 3
+    service.fates = {2: [None]}
+    run = Run(cache, service, deadline_s=0.0)
+    assert texts(await run.ask(2)) == ["batched 1", "alone 2"]
+    assert service.cancelled == ["batch-0"]
+
+
+async def killed(run, repetitions, when):
+    """Ask, and end the run as a kill does when ``when`` is set: nothing more is written."""
+    asking = asyncio.create_task(run.ask(repetitions))
+    await when.wait()
+    asking.cancel()
+    for task in run.rounds._background._tasks:
+        task.cancel()
+    await run.client.drain()
+
+
+@pytest.mark.parametrize("step", ["before the creation", "after it", "while it waits"])
+@in_virtual_time
+async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice(cache, step):
+    class Dying(Memory):
+        async def submit(self, lines, mark):
+            if step == "before the creation":
+                died.set()
+                await asyncio.Event().wait()
+            batch_id = await super().submit(lines, mark)
+            if step == "after it":
+                died.set()
+                await asyncio.Event().wait()
+            return batch_id
+
+        async def status(self, batch_id):
+            if not died.is_set():
+                died.set()
+                return BatchStatus("waiting", "in_progress")
+            return await super().status(batch_id)
+
+    died = asyncio.Event()
+    service = Dying()
+    first = Run(cache, service)
+    await killed(first, 5, died)
+    before = first.ledger.read()
+    assert before.open_attempts == 5
+    step = "over"
+    second = Run(cache, service)
+    replies = await second.ask(5)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 6)]
+    assert [outcomes(reply) for reply in replies] == [[("ok", "batch-0")]] * 5
+    assert service.sizes == [5]
+    assert set(service.answered.values()) == {1}
+    spending = second.ledger.read()
+    assert spending.spent_usd == pytest.approx(5 * ONE_USD / 2)
+    assert (spending.reserved_usd, spending.open_attempts) == (0.0, 0)
+    await second.end()
+    assert Journal(cache).batches() == []
+
+
+@in_virtual_time
+async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache):
+    service = Memory()
+    first = Run(cache, service, detach=True)
+    service.states = [BatchStatus("waiting", "in_progress")] * 2
+    (left, *_) = await asyncio.gather(first.ask(2), return_exceptions=True)
+    assert isinstance(left[0], WaitingForBatches)
+    await first.end()
+    later = Run(cache, service, submits=False)
+    assert texts(await later.ask(3)) == ["batched 1", "batched 2", "alone 3"]
+    assert later.alone.asked == [3]
+
+
+@in_virtual_time
+async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache):
+    service = Memory()
+    first = Run(cache, service, detach=True, scope="first")
+    service.states = [BatchStatus("waiting", "in_progress")]
+    await asyncio.wait([asyncio.create_task(first.ask(2))], timeout=5)
+    await first.end()
+    second = Run(cache, service, scope="second")
+    assert texts(await second.ask(2)) == ["batched 1", "batched 2"]
+    assert first.ledger.read().spent_usd == pytest.approx(ONE_USD)
+    assert first.ledger.read().open_attempts == second.ledger.read().open_attempts == 0
+    assert second.ledger.read().spent_usd == 0.0
+
+
+@in_virtual_time
+async def test_a_batch_that_is_gone_stops_the_run_unless_its_deadline_is_over(cache):
+    service = Memory()
+    service.states = [BatchStatus("waiting", "in_progress")]
+    first = Run(cache, service, detach=True)
+    await first.ask()
+    await first.end()
+    service.batches.clear()
+    (stopped,) = await Run(cache, service).ask()
+    assert isinstance(stopped, EndpointRefused)
+    assert "--round-deadline 0" in str(stopped)
+    anew = Run(cache, service, deadline_s=0.0)
+    (reply,) = await anew.ask()
+    assert [attempt.outcome for attempt in reply.attempts] == ["batch_lost", "ok"]
+    assert anew.ledger.read().open_attempts == 1  # nobody knows what it cost
+
+
+@in_virtual_time
+async def test_somebody_elses_batch_is_not_taken_for_ones_own(cache):
+    service = Memory()
+    other = Run(cache, service, scope="other")
+    await other.ask(3, decision=7)
+    await other.end()
+    service.unsure = ["batch-0"]
+    service.creations = [BatchFailed("again", "lost", sent=True)]
+    Journal(cache)._cache.run_now([lambda: cache.remove("ended batches")])
+    run = Run(cache, service)
+    replies = await run.ask(3)
+    assert {attempt.batch_id for reply in replies for attempt in reply.attempts} == {"batch-1"}
+    assert service.cancelled == []
+
+
+@in_virtual_time
+async def test_under_a_cap_a_round_takes_what_fits_and_the_next_ones_the_rest(cache):
+    service = Memory()
+    run = Run(cache, service, cap=0.06)
+    replies = await run.ask(20)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 21)]
+    assert len(service.sizes) > 1
+    assert max(service.sizes) * 0.005 <= 0.06
+    assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
+
+
+class Dear(Memory):
+    """Bills up to the worst case of each line, or what it did not cost, as the seed says."""
+
+    def __init__(self, seed):
+        super().__init__()
+        self.chance = random.Random(seed)
+        self.bill_usd = 0.0
+
+    async def results(self, batch_id):
+        async for result in super().results(batch_id):
+            read = 10
+            written = self.chance.randint(0, 100)
+            kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])
+            if kind != "ok":
+                yield LineResult(result.key, error(500) if kind == "failed" else None)
+                continue
+            body = json.loads(result.raw.body)
+            body["usage"] = {"prompt_tokens": read, "completion_tokens": written}
+            self.bill_usd += (read + 100 * written) / 1e6 / 2
+            yield LineResult(result.key, RawReply(200, {}, json.dumps(body)))
+
+
+@given(seed=st.integers(0, 1000), cents=st.integers(1, 12), runs=st.integers(1, 3))
+@settings(max_examples=25)
+def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
+    @in_virtual_time
+    async def sweep():
+        with tempfile.TemporaryDirectory() as folder:
+            cache = ResponseCache(Path(folder))
+            service, alone_usd = Dear(seed), 0.0
+            for number in range(runs):
+                run = Run(cache, service, cap=cents / 100)
+                await run.ask(12, decision=number)
+                await run.end()
+                alone_usd += len(run.alone.asked) * ONE_USD
+            assert service.bill_usd + alone_usd <= cents / 100 + 1e-9
+            assert run.ledger.read().spent_usd == pytest.approx(service.bill_usd + alone_usd)
+            cache.close()
+
+    sweep()
+
+
+@in_virtual_time
+async def test_what_is_pending_is_told_by_round_model_and_batch(cache):
+    service = Memory()
+    service.states = [BatchStatus("waiting", "in_progress", done=1, total=3)] * 10**4
+    run = Run(cache, service)
+    asking = asyncio.create_task(run.ask(3, decision=6))
+    while not (told := run.rounds.standing()) or "done" not in told[0]:
+        await asyncio.sleep(0.1)
+    (line,) = told
+    since = "[0-9]{2}:[0-9]{2}:[0-9]{2} UTC"
+    told = f"round 7 of at most 30: 3 calls of m in batch batch-0 since {since} .0 s., 1 of 3 done"
+    assert re.fullmatch(told, line)
+    asking.cancel()
+    await run.end()
