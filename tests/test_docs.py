@@ -211,9 +211,8 @@ def test_commands_that_run_in_the_tests_own_process_are_ours_and_start_no_event_
     ],
 )
 def test_make_test_runs_the_quick_tests_or_those_that_are_named_and_make_check_all(words, ending):
-    run = subprocess.run(
-        ["make", "--dry-run", *words], cwd=PROJECT, capture_output=True, text=True, check=True
-    )
+    command = ["make", "--no-print-directory", "--dry-run", *words]
+    run = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True)
     assert run.stdout.endswith(ending)
 
 

@@ -19,7 +19,7 @@ BATCH = 64
 """Trials in one transaction: few enough that a reader gets its turn soon."""
 BATCH_OF_REPLAY = 4 * BATCH
 """Of trials that take no time: a transaction costs as much as storing dozens of them."""
-MOST_PENDING = 4 * BATCH
+MOST_PENDING = 8 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
 # While storing fails, as when another program holds the file: how many bytes may wait in memory
 # before they are spilled, and before trials wait because spilling fails, too.
@@ -143,19 +143,15 @@ class Flusher:
         sizes = accumulate(map(size_of, self._pending[: self._batch]))
         # At least one: a single trial may be larger than a batch should be.
         number = max(1, sum(size <= BATCH_BYTES for size in sizes))
-        batch, self._pending = self._pending[:number], self._pending[number:]
+        # It stays in front until it is stored: others are added behind it meanwhile.
+        batch = self._pending[:number]
         # In a thread, since DuckDB waits for the file's lock and for the disk; the trials go on.
         try:
             self.differing |= await asyncio.to_thread(
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
             )
-        except asyncio.CancelledError:
-            self._pending = batch + self._pending
-            raise
         except StoreError as exc:
             self._problem = exc
-            # Back in front, so that trials are stored in the order in which they ended.
-            self._pending = batch + self._pending
             if self.left and str(exc) != self._said:  # it is tried again every second
                 self._said = str(exc)
                 self._say(f"the sweep goes on; {self.problem}")
@@ -164,6 +160,7 @@ class Flusher:
             return False
         else:
             self._problem = None
+            del self._pending[: len(batch)]
             self._bytes -= sum(map(size_of, batch))
             return True
         finally:
