@@ -6,7 +6,6 @@ import logging
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
@@ -23,6 +22,7 @@ from starlette.responses import (
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from analysis.explorer.assets import STATIC
 from analysis.explorer.guard import Guard, from_elsewhere
 from analysis.explorer.pages import ablations, humans, sql, sweep, tables, trial, trials
 from analysis.explorer.site import NothingNew, NotThere, Site
@@ -35,7 +35,6 @@ FIRST_TIME = (
     "The trials are read for the first time; ten thousand take about ten seconds. This page comes "
     "back by itself."
 )
-STATIC = Path(__file__).with_name("static")
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 # Nothing in a reply runs, whatever a browser takes it for.
 SEALED = {"content-security-policy": "default-src 'none'; sandbox"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import os
 import re
@@ -12,13 +11,11 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-
+from analysis.explorer.assets import inlined
 from analysis.explorer.catalogue import FACETS, FACTOR, SEVERAL, Filter
 from analysis.explorer.details import read_decisions, read_trial
 from analysis.explorer.pages.ablations import ablations_page
@@ -36,8 +33,6 @@ from analysis.tables import TABLES
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
 
-STATIC = Path(__file__).with_name("static")
-STYLES = ("vendor/uplot-1.6.32.min.css", "explorer.css")
 PLAIN = ("keys.js",)
 LISTING = ("keys.js", "unpacked.js", "listing.js")
 BUNDLE = ("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
@@ -59,15 +54,6 @@ _OURS = re.compile(rf"(?:index|{'|'.join(EXPORTED)}|(?:sweep|table|trials)-.*)\.
 _PACKED = re.compile(
     r'<script type="application/json" id="(?:bundle|cells)">.*?</script>', re.DOTALL
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Inlined:
-    """Styles and scripts within a page, and their hashes for its policy."""
-
-    styles: list[Markup]
-    scripts: list[Markup]
-    hashes: str
 
 
 Watch = Callable[[Sequence[Any], str], Iterable[Any]]
@@ -213,20 +199,6 @@ def _listing(site: Site, rows: list[Row], behind: Mapping[str, Any]) -> str:
         cells=embedded(_packed(behind)),
         inlined=inlined(LISTING),
     )
-
-
-def inlined(scripts: Sequence[str]) -> Inlined:
-    """Our styles and these scripts, to stand within a page."""
-
-    def texts(names: Sequence[str]) -> list[str]:
-        return [(STATIC / name).read_text(encoding="utf-8") for name in names]
-
-    styles, code = texts(STYLES), texts(scripts)
-    hashes = " ".join(
-        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-        for text in (*styles, *code)
-    )
-    return Inlined([Markup(text) for text in styles], [Markup(text) for text in code], hashes)  # noqa: S704 # files of ours
 
 
 @contextmanager

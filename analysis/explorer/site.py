@@ -11,6 +11,7 @@ from pathlib import Path
 import jinja2
 
 from analysis.explorer.analysis_process import Computing
+from analysis.explorer.assets import STYLES
 from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.display_text import visible
 from analysis.explorer.query_process import Sandbox
@@ -71,6 +72,7 @@ class Site:
             program=self.program,
             shell="static.html" if self.static else "base.html",
             static=self.static,
+            styles=STYLES,
             study=self.db.name if self.static else str(self.db),
             visible=visible,
             clock=clock,

@@ -31,6 +31,8 @@ PATIENCE_S = 60.0
 LOGS = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
 """How the names of a database's own files go on."""
 ROWS_AT_ONCE, COPIED_AT_ONCE = 100, 2_048
+ROWS_OF_A_GROUP = 8_192
+"""Of what is written: a group is rewritten, in memory, with each transaction until it is full."""
 # How many bytes of the file a call takes where replies are short, compressed and with its share of
 # the states. By how much the file may exceed that for its row groups still to be merged, and for
 # its texts to be read without more memory.
@@ -189,7 +191,7 @@ def _attached(
 ) -> tuple[duckdb.DuckDBPyConnection, str]:
     connection = instance.confined(path) if read_only else instance.cursor()
     name = instance.name()
-    mode = "READ_ONLY" if read_only else "READ_WRITE"
+    mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
     began = time.monotonic()
     told = False
     while True:
@@ -225,7 +227,7 @@ def _holder(exc: duckdb.Error) -> str:
 def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
     """Let the next write merge small row groups, unless the rows hold long texts.
 
-    Merging takes as much memory as the texts of 122,880 rows, and rewrites these each time.
+    Merging takes as much memory as the texts of a full group, and rewrites these each time.
     """
     tasks = 100 if _bytes_of_texts(connection) <= MERGED_BYTES else 0
     connection.execute(f"SET max_vacuum_tasks = {tasks}")

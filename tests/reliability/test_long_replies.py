@@ -18,11 +18,15 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.database import (
     BYTES_OF_A_CALL,
     MERGED_BYTES,
+    ROWS_OF_A_GROUP,
     SETTINGS,
     SHORT_BYTES,
+    append,
     in_memory,
     merge_small_groups,
+    open_database,
     room_for_texts,
+    schema_sql,
 )
 from merge_runner.results.recording import export_recording, read_recording
 from tests.harness import RECORDING
@@ -115,6 +119,24 @@ def test_a_recording_of_any_size_is_exported_in_the_same_order_and_with_the_same
         export_recording(file, cache, [e.request.key for e in entries[::-1]], {})
         contents.append(list(read_recording(file)))
     assert contents[0] == contents[1] == entries
+
+
+def test_small_groups_are_merged_to_ones_that_fit_into_memory(tmp_path):
+    def opened(*, read_only):
+        return open_database(tmp_path / "study.duckdb", read_only=read_only, patience_s=1)
+
+    with opened(read_only=False) as connection:
+        connection.execute(schema_sql())
+    for _ in range(30):
+        with opened(read_only=False) as connection:
+            merge_small_groups(connection)
+            append(connection, "sweep_trials", [("sweep", "trial", "spec")] * 1_000)
+    with opened(read_only=True) as connection:
+        groups = connection.execute(
+            "SELECT max(count) FROM pragma_storage_info('sweep_trials') GROUP BY row_group_id"
+        ).fetchall()
+    assert len(groups) < 10
+    assert max(groups) <= (ROWS_OF_A_GROUP,)
 
 
 def test_small_groups_of_rows_are_merged_and_texts_read_as_short_unless_they_are_long(tmp_path):

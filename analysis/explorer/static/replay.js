@@ -17,8 +17,8 @@ window.startReplay = () => {
   if (!holder) return;
   const at = (id) => document.getElementById(id);
   const trial = JSON.parse(holder.textContent);
-  const style = getComputedStyle(document.documentElement);
-  const COLOURS = { left: style.getPropertyValue("--left"), right: style.getPropertyValue("--right") };
+  // Read anew at each drawing: the system may turn from light to dark, and paper is light.
+  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
   const HEIGHT = 130, PAPER = 660; // of a chart, and the width of one in print, in pixels
   const SPEEDS = [0.25, 0.5, 1, 2, 4];
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -145,11 +145,12 @@ window.startReplay = () => {
     value: (_, v) => (v === null || v === undefined ? "–" : v.toFixed(2)), ...extra,
   });
   const chart = (id, heading, unit, own, others, { scales, ...extra } = {}) => {
+    const axis = { stroke: colour("ink"), grid: { stroke: colour("line") }, ticks: { stroke: colour("line") } };
     const plot = new uPlot({
       title: heading, width: at("charts").clientWidth, height: HEIGHT, legend: { live: true },
       cursor: { sync: { key: "replay" }, drag: { x: false, y: false } },
       scales: { x: { time: false }, ...scales },
-      axes: [{ size: 24, gap: 2, values: (_, ticks) => ticks.map((t) => `${t} s`) }, { size: 54, label: unit, labelSize: 18, labelGap: 0 }],
+      axes: [{ ...axis, size: 24, gap: 2, values: (_, ticks) => ticks.map((t) => `${t} s`) }, { ...axis, size: 54, label: unit, labelSize: 18, labelGap: 0 }],
       series: [{ label: "t", value: (_, v) => (v === null || v === undefined ? "–" : `${v.toFixed(1)} s`) }, ...own.map(([s]) => s), ...others.map(([s]) => s)],
       hooks: { ready: [clickable, () => { placeRibbons(); show(); }] }, ...extra,
     }, [times, ...own.map(([, values]) => values), ...others.map(([, values]) => values)], at(id));
@@ -164,7 +165,7 @@ window.startReplay = () => {
     at("scrub").max = end();
     const dashed = { dash: [4, 4], width: 1.2 };
     const lines = (run, what, note, extra) => ["left", "right"].map((side) =>
-      [series(`${side}${note}`, COLOURS[side], extra), resampled(run, side, what)]);
+      [series(`${side}${note}`, colour(side), extra), resampled(run, side, what)]);
     const both = (id, heading, unit, what, extra, options) => chart(id, heading, unit,
       lines(trial, what, "", extra), ghost ? lines(ghost, what, ", other", { ...dashed, ...extra }) : [], options);
     both("chart-v", "Velocity", "m/s", "v", {});
@@ -176,10 +177,10 @@ window.startReplay = () => {
     const bound = times.map((t, i) => (inside(trial, t) && trial.bounds.length ? trial.bounds[i] ?? 0 : null));
     const lower = bound.map((b) => (b === null ? null : -b));
     chart("chart-h", "Headway: how far the left vehicle is ahead; shaded: collision", "m",
-      [[series("headway", "#000"), headways(trial)],
-        [series("collision below", "#999", banded), bound], [series("and above", "#999", banded), lower]],
-      ghost ? [[series("headway, other", "#000", dashed), headways(ghost)]] : [],
-      { bands: [{ series: [2, 3], fill: "rgba(204, 121, 167, .35)" }] });
+      [[series("headway", colour("ink")), headways(trial)],
+        [series("collision below", colour("edge"), banded), bound], [series("and above", colour("edge"), banded), lower]],
+      ghost ? [[series("headway, other", colour("ink"), dashed), headways(ghost)]] : [],
+      { bands: [{ series: [2, 3], fill: colour("collision") }] });
   };
 
   // ---- ribbons of decisions, on the same axis
@@ -373,8 +374,14 @@ window.startReplay = () => {
     show();
   };
   new ResizeObserver(() => fit(at("charts").clientWidth)).observe(at("charts"));
-  addEventListener("beforeprint", () => fit(PAPER));
-  addEventListener("afterprint", () => fit(at("charts").clientWidth));
+  const paper = (on) => {
+    document.documentElement.classList.toggle("paper", on);
+    drawCharts();
+    fit(on ? PAPER : at("charts").clientWidth);
+  };
+  addEventListener("beforeprint", () => paper(true));
+  addEventListener("afterprint", () => paper(false));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawCharts);
 
   document.addEventListener("keydown", (event) => {
     if (isCommand(event) || document.querySelector("dialog[open]")) return;
