@@ -18,7 +18,7 @@ from analysis.accounts.classes import (
     ONE_TOO_LITTLE,
     Decided,
     driven_at,
-    point_of_no_return,
+    judged_at,
 )
 from analysis.accounts.course import BRAKING, SPEEDING_UP, TICK_S, Course, first_arrival_s
 from merge_runner.records import SIDES, Side
@@ -119,12 +119,16 @@ def changes_of_mind(decisions: Decided, side: Side) -> list[tuple[float, str]]:
 
 
 def _collision(course: Course, name: str) -> str:
-    at = point_of_no_return(course)
+    at = judged_at(course)
     left, right = (_change(course.change_mps(side, at)) for side in SIDES)
+    when = (
+        "the end; nobody alone could have avoided it"
+        if at == course.last
+        else f"{_clock(course, at)}, when one driver alone could last have avoided it"
+    )
     return (
-        f"{MEANINGS[name]}. At {_clock(course, at)}, the last moment at which one driver alone "
-        f"could have avoided it, the left vehicle was {left} and the right one {right} than at "
-        f"the start; {ACTED_MPS:g} m/s or more count as acting."
+        f"{MEANINGS[name]}. At {when}, the left vehicle was {left} and the right one {right} "
+        f"than at the start; {ACTED_MPS:g} m/s or more count as acting."
     )
 
 
@@ -142,9 +146,7 @@ def _near_miss(trial: Mapping[str, Any]) -> str:
 
 def _long_wait(course: Course, trial: Mapping[str, Any]) -> str:
     alone, took = first_arrival_s(course), trial["time_to_merge_s"]
-    slowest = " and ".join(
-        f"the {side} one to {min(course.speeds_mps[side]):.1f} m/s" for side in SIDES
-    )
+    left, right = (min(course.speeds_mps[side]) for side in SIDES)
     reached = (
         "Nobody had reached the merge point at the end"
         if took is None
@@ -152,7 +154,7 @@ def _long_wait(course: Course, trial: Mapping[str, Any]) -> str:
     )
     return (
         f"{reached}; at the initial speeds it would have been there after {alone:.1f} s. "
-        f"The vehicles slowed down: {slowest}."
+        f"The left vehicle's lowest speed was {left:.1f} m/s, the right one's {right:.1f} m/s."
     )
 
 

@@ -45,7 +45,7 @@ Decided = Sequence[Mapping[str, Any]]
 def collision_class(course: Course, decisions: Decided) -> str:
     """How a collision came about.
 
-    It is judged at the last sample at which one driver alone could still have avoided it, by
+    It is judged at the last sample from which one driver alone could still have avoided it, by
     braking or speeding up as hard as the vehicle can. ``invalid plan``: a driver drove on an older
     plan, or none, when its own braking could last have helped. Else by what the drivers had done
     with their speeds until that sample, from ACTED_MPS on: both gained (``both insisted``), both
@@ -53,21 +53,27 @@ def collision_class(course: Course, decisions: Decided) -> str:
     """
     if any(_drove_no_plan_of_its_own(course, decisions, side) for side in SIDES):
         return INVALID_PLAN
-    until = point_of_no_return(course)
+    until = judged_at(course)
     left, right = (_way(course.change_mps(side, until)) for side in SIDES)
     if left != right:
         return ONE_TOO_LITTLE
     return {BRAKING: BOTH_GAVE_WAY, 0.0: NO_ACTION, SPEEDING_UP: BOTH_INSISTED}[left]
 
 
-def point_of_no_return(course: Course) -> int:
-    """The last sample at which one driver alone can avoid the collision; the first where none."""
-    until: int | None = None
+def judged_at(course: Course) -> int:
+    """The sample at which a collision is judged: the last chance of anybody, the end where none."""
+    chance = last_chance_of_all(course)
+    return course.last if chance is None else chance
+
+
+def last_chance_of_all(course: Course) -> int | None:
+    """The last sample from which one driver alone avoids the collision; None: there is none."""
+    found: int | None = None
     for side in SIDES:
         for action in (BRAKING, SPEEDING_UP):
-            later = course.last_chance(side, action, -1 if until is None else until)
-            until = until if later is None else later
-    return until or 0
+            later = course.last_chance(side, action, -1 if found is None else found)
+            found = found if later is None else later
+    return found
 
 
 def driven_at(decisions: Decided, side: Side, time_s: float) -> Mapping[str, Any] | None:

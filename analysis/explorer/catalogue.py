@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
+from pydantic import ValidationError
 
 from analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
 from analysis.accounts.course import Course
@@ -190,7 +191,7 @@ SELECT number, listed.source, spec::VARCHAR AS spec, made,
     list(velocity_mps ORDER BY step) FILTER (side = 'right') AS right_mps
 FROM trials JOIN listed USING (trial_id, spec_hash) JOIN states USING (trial_id, spec_hash)
 LEFT JOIN specs USING (spec_hash) LEFT JOIN driven USING (trial_id, spec_hash)
-WHERE trials.status = 'collided' AND time_s >= 0 GROUP BY ALL
+WHERE trials.status = 'collided' AND time_s >= 0 GROUP BY ALL HAVING len(left_m) = len(right_m)
 """
 TAKEN = """
 TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states; TRUNCATE decided; TRUNCATE driven;
@@ -545,10 +546,15 @@ class Catalogue:
         return self._connection
 
 
-def _how(crash: Row) -> str:
-    """The class of a collision."""
+def _how(crash: Row) -> str | None:
+    """The class of a collision; None where its spec cannot be read, which the audit tells."""
+    try:
+        scenario, track = _task(crash["source"], crash["spec"] or "{}")
+    except (ValidationError, UsageError):
+        return None
     course = Course(
-        *_task(crash["source"], crash["spec"] or "{}"),
+        scenario,
+        track,
         crash["times_s"],
         {side: crash[f"{side}_m"] for side in SIDES},
         {side: crash[f"{side}_mps"] for side in SIDES},

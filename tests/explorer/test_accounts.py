@@ -94,6 +94,25 @@ def test_what_is_stored_later_has_its_account_too(db, tmp_path):
     ]
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "DELETE FROM states WHERE side = 'left'",
+        "DELETE FROM states WHERE side = 'right' AND step = 3",
+        'UPDATE specs SET spec = \'{"scenario": {"step_s": -1}}\'',
+        "UPDATE specs SET spec = '{\"track\": 7}'",
+    ],
+)
+def test_a_collision_that_cannot_be_judged_is_listed_without_an_account(tmp_path, damage):
+    path = write_study(tmp_path / "t.duckdb", [drive("no action")])
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(damage)
+    catalogue = Site(path).catalogue
+    catalogue.refresh()
+    (row,) = catalogue.every(Filter())
+    assert (row["outcome"], row["account"]) == ("collided", None)
+
+
 def test_the_list_is_filtered_by_account_and_downloaded_with_it(client):
     text = client.get("/trials?account=near+miss&model=o3").text
     assert len(re.findall(r'<th scope="row">', text)) == 1
@@ -113,7 +132,7 @@ def test_the_list_is_filtered_by_account_and_downloaded_with_it(client):
 def test_the_page_of_a_trial_says_why_it_went_so(client, account, heading):
     text = client.get(address(account)).text
     assert f"<summary>{heading}</summary>" in text
-    assert "Who would have been first at the merge point" in text
+    assert "When each would have reached the merge point" in text
 
 
 def test_where_there_is_nothing_to_explain_nothing_is_explained(client):

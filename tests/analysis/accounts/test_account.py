@@ -12,8 +12,8 @@ from tests.analysis.accounts.crashes import EXAMPLES, NO_PLAN, course_of, crash,
 from tests.analysis.studies import played
 
 WORDS = {
-    "both insisted": "Both insisted: both had sped up. At 2.0 s, the last moment at which one "
-    "driver alone could have avoided it, the left vehicle was 2.5 m/s faster and the right one 2.0 "
+    "both insisted": "Both insisted: both had sped up. At 2.0 s, when one driver alone could "
+    "last have avoided it, the left vehicle was 2.5 m/s faster and the right one 2.0 "
     "m/s faster than at the start; 0.5 m/s or more count as acting.",
     "no action": "Neither acted.",
     "near miss": "It came close: the gap was 0.4 m when the first vehicle reached the merge point, "

@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from analysis.accounts.classes import COLLISIONS, collision_class, point_of_no_return
+from analysis.accounts.classes import COLLISIONS, collision_class, judged_at
 from analysis.accounts.course import BRAKING, SPEEDING_UP
 from analysis.data.reference_data import human_outcomes, published
 from merge_runner.config import ScenarioConfig
@@ -60,7 +60,7 @@ def test_an_invalid_plan_counts_only_where_it_was_driven_at_the_last_chance(at, 
 def test_what_is_done_after_the_last_chance_changes_no_class():
     before, after = ((0.0,) * seconds + (1.0,) * 3 for seconds in (2, 3))
     course, decisions = crash("N_0_0", after, after)
-    assert course.times_s[point_of_no_return(course)] == pytest.approx(2.2)
+    assert course.times_s[judged_at(course)] == pytest.approx(2.2)
     assert course.change_mps("left", course.last) == 0.5
     assert collision_class(course, decisions) == "no action"
     assert collision_class(*crash("N_0_0", before, before)) == "both insisted"
@@ -85,7 +85,7 @@ def test_who_braked_as_hard_as_it_could_can_only_have_sped_up():
     weak = ScenarioConfig(max_acceleration_mps2=0.8)
     course, decisions = crash("N_0_0", (-1.0,) * 8, (-1.0,) * 8, scenario=weak)
     assert course.last_chance("left", BRAKING) is None
-    assert course.last_chance("left", SPEEDING_UP) == point_of_no_return(course)
+    assert course.last_chance("left", SPEEDING_UP) == judged_at(course)
     assert collision_class(course, decisions) == "both gave way"
 
 
