@@ -146,7 +146,7 @@ def _near_miss(trial: Mapping[str, Any]) -> str:
 
 def _long_wait(course: Course, trial: Mapping[str, Any]) -> str:
     alone, took = first_arrival_s(course), trial["time_to_merge_s"]
-    left, right = (min(course.speeds_mps[side]) for side in SIDES)
+    left, right = (_slowest(course, side) for side in SIDES)
     reached = (
         "Nobody had reached the merge point at the end"
         if took is None
@@ -154,8 +154,13 @@ def _long_wait(course: Course, trial: Mapping[str, Any]) -> str:
     )
     return (
         f"{reached}; at the initial speeds it would have been there after {alone:.1f} s. "
-        f"The left vehicle's lowest speed was {left:.1f} m/s, the right one's {right:.1f} m/s."
+        f"The left vehicle was slowest {left}, the right one {right}."
     )
+
+
+def _slowest(course: Course, side: Side) -> str:
+    speeds = course.speeds_mps[side]
+    return f"at {_clock(course, speeds.index(min(speeds)))}, with {min(speeds):.1f} m/s"
 
 
 def _choices(decisions: Decided) -> Iterator[str]:

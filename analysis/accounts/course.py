@@ -52,10 +52,15 @@ class Course:
         return self.speeds_mps[side][sample] - self.speeds_mps[side][0]
 
     def arrival_s(self, side: Side, sample: int) -> float:
-        """When a vehicle would be at the merge point if it kept its speed; inf: never."""
+        """When a vehicle would be at the merge point if it kept its speed.
+
+        inf: not before a trial is timed out.
+        """
+        now_s, speed_mps = self.times_s[sample], self.speeds_mps[side][sample]
         distance_m = self.track.merge_point_m - self.positions_m[side][sample]
-        speed_mps = self.speeds_mps[side][sample]
-        return self.times_s[sample] + (distance_m / speed_mps if speed_mps > 0 else inf)
+        if distance_m >= speed_mps * (self.scenario.timeout_s - now_s):
+            return inf
+        return now_s + distance_m / speed_mps
 
     def avoided(self, side: Side, action: float, since: int) -> bool:
         """Whether there is no collision if a side drives one action from a sample on."""

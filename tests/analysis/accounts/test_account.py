@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import pytest
 
 from analysis.accounts.account import Mark, Prediction, account, changes_of_mind
@@ -9,7 +11,7 @@ from analysis.accounts.classes import collision_class
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from tests.analysis.accounts.crashes import EXAMPLES, NO_PLAN, course_of, crash, decided, drive
-from tests.analysis.studies import played
+from tests.analysis.studies import Drive, played
 
 WORDS = {
     "both insisted": "Both insisted: both had sped up. At 2.0 s, when one driver alone could "
@@ -19,7 +21,8 @@ WORDS = {
     "near miss": "It came close: the gap was 0.4 m when the first vehicle reached the merge point, "
     "and afterwards the time to collision fell to 0.9 s.",
     "long wait": "The first vehicle reached the merge point after 12.5 s; at the initial speeds it "
-    "would have been there after 4.6 s.",
+    "would have been there after 4.6 s. The left vehicle was slowest at 3.0 s, with 3.3 m/s, the "
+    "right one at 3.0 s, with 2.5 m/s.",
 }
 FACTS = {"gap_m": 0.42, "min_ttc_s": 0.9, "time_to_merge_s": 12.5}
 
@@ -80,7 +83,15 @@ def test_predictions_are_those_of_constant_speeds_at_each_decision():
     assert last.left_s == pytest.approx(start_s)
     assert last.right_s < start_s
     assert Prediction(0.0, 5.0, 4.8).first == "right, by 0.2 s"
-    assert Prediction(0.0, 5.0, float("inf")).arrivals == ["5.0", "never"]
+    assert Prediction(0.0, 5.0, inf).arrivals == ["5.0", "never"]
+
+
+def test_a_vehicle_that_stands_or_creeps_would_never_arrive():
+    record = played(Drive("o3", "baseline", "N_0_0", 1, (-1.0,) * 4 + (0.002,) * 2, ()))
+    course = course_of(record)
+    assert course.arrival_s("left", course.at(4.0)) == inf
+    assert 0 < course.speeds_mps["left"][course.at(5.0)] < 0.01
+    assert course.arrival_s("left", course.at(5.0)) == inf
 
 
 def test_a_change_of_mind_is_told_and_marked_once():
