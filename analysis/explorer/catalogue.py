@@ -6,19 +6,26 @@ import json
 import tempfile
 import threading
 from dataclasses import dataclass, field, fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import duckdb
+from pydantic import ValidationError
 
+from analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
+from analysis.accounts.course import Course
+from analysis.explorer.details import scenario_of
 from analysis.explorer.query_worker import csv_cell
 from analysis.explorer.reading import PATIENCE_S, Row, reading, records
+from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.human_replay import HUMAN_REPLAY, unresponsive
 from merge_runner.drivers.registry import language_models, stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, schema_sql, spill_folder
 from merge_runner.results.levels import LEVELS
+from merge_runner.scenarios.merge.geometry import Track, track_of
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer, quoted
 
@@ -49,8 +56,9 @@ CREATE TABLE listed (
     status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
     error VARCHAR, scripted BOOLEAN, stand_in VARCHAR, caution VARCHAR,
     time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
-    joint BOOLEAN, decisions BIGINT, invalid BIGINT, fallbacks BIGINT, attempts BIGINT,
-    cost_usd DOUBLE, left_mps FLOAT[], right_mps FLOAT[], left_range_mps FLOAT[],
+    joint BOOLEAN, min_ttc_s DOUBLE, account VARCHAR, decisions BIGINT, invalid BIGINT,
+    fallbacks BIGINT, attempts BIGINT, cost_usd DOUBLE,
+    left_mps FLOAT[], right_mps FLOAT[], left_range_mps FLOAT[],
     right_range_mps FLOAT[], flaws VARCHAR[], posed VARCHAR[],
     tried STRUCT(requested VARCHAR, served VARCHAR, answered BOOLEAN, outcome VARCHAR,
         unpriced BIGINT, times BIGINT)[],
@@ -63,6 +71,8 @@ CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
 CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
     fallbacks BIGINT, flaws VARCHAR[]);
+CREATE TABLE driven (trial_id VARCHAR, spec_hash VARCHAR, made STRUCT(side VARCHAR,
+    time_s DOUBLE, fallback BOOLEAN)[]);
 CREATE TABLE called AS SELECT trial_id, spec_hash, attempts, cost_usd, posed, tried FROM listed;
 """  # noqa: S608 # constants
 # The trials of each sweep, and how often what went wrong in a trial. Equal failures are counted
@@ -108,6 +118,12 @@ INSERT INTO memory.decided
     SELECT trial_id, spec_hash, count(*), count(*) FILTER (NOT valid), count(*) FILTER (fallback),
         list(failure) FILTER (failure IS NOT NULL)
     FROM decisions SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
+INSERT INTO memory.driven
+    SELECT trial_id, spec_hash, list({side: side, time_s: time_s, fallback: fallback}
+        ORDER BY decision)
+    FROM decisions SEMI JOIN (FROM memory.decided WHERE fallbacks > 0) USING (trial_id, spec_hash)
+        SEMI JOIN (FROM memory.trials WHERE status = 'collided') USING (trial_id, spec_hash)
+    GROUP BY ALL;
 INSERT INTO memory.called BY NAME
     SELECT trial_id, spec_hash, sum(times) AS attempts, sum(cost_usd) AS cost_usd,
         list(DISTINCT side ORDER BY side) FILTER (scripted) AS posed,
@@ -123,7 +139,7 @@ INSERT INTO memory.called BY NAME
 """
 # A fallback follows every invalid reply, and nothing else; the audit checks that.
 # A sparkline has about 24 points; its words give the slowest and the fastest of all samples.
-LIST = """
+LIST = f"""
 INSERT INTO listed BY NAME
 SELECT trials.trial_id, trials.spec_hash, source, model_left, model_right,
     if(source = 'human', 'human', driver) AS model,
@@ -133,7 +149,8 @@ SELECT trials.trial_id, trials.spec_hash, source, model_left, model_right,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'
         ELSE 'all valid' END AS validity,
-    time_to_merge_s, gap_m, rmse_mps, joint, coalesce(decisions, 0) AS decisions,
+    time_to_merge_s, gap_m, rmse_mps, joint, min_ttc_s, {OTHER_ACCOUNTS} AS account,
+    coalesce(decisions, 0) AS decisions,
     coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
     coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps, left_range_mps,
     right_range_mps, flaws, posed, tried, levels
@@ -142,6 +159,7 @@ JOIN trial_metrics USING (trial_id, spec_hash)
 JOIN trial_drivers USING (trial_id, spec_hash)
 LEFT JOIN decided USING (trial_id, spec_hash)
 LEFT JOIN called USING (trial_id, spec_hash)
+LEFT JOIN ({ALONE}) USING (trial_id, spec_hash)
 LEFT JOIN (
     SELECT trial_id, spec_hash, list(factor || '=' || value ORDER BY factor) AS levels
     FROM trial_factors WHERE factor <> 'prompt' GROUP BY ALL
@@ -162,7 +180,22 @@ LEFT JOIN (
 ) USING (trial_id, spec_hash);
 INSERT INTO levels SELECT number, factor, value FROM new_levels
     JOIN listed USING (trial_id, spec_hash) WHERE factor <> 'prompt';
-TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states; TRUNCATE decided; TRUNCATE called;
+"""  # noqa: S608 # constants
+# Of the trials that were listed last, the collisions; those without a fallback need no decisions.
+CRASHES = """
+SELECT number, listed.source, spec::VARCHAR AS spec, made,
+    list(time_s ORDER BY step) FILTER (side = 'left') AS times_s,
+    list(position_m ORDER BY step) FILTER (side = 'left') AS left_m,
+    list(position_m ORDER BY step) FILTER (side = 'right') AS right_m,
+    list(velocity_mps ORDER BY step) FILTER (side = 'left') AS left_mps,
+    list(velocity_mps ORDER BY step) FILTER (side = 'right') AS right_mps
+FROM trials JOIN listed USING (trial_id, spec_hash) JOIN states USING (trial_id, spec_hash)
+LEFT JOIN specs USING (spec_hash) LEFT JOIN driven USING (trial_id, spec_hash)
+WHERE trials.status = 'collided' AND time_s >= 0 GROUP BY ALL HAVING len(left_m) = len(right_m)
+"""
+TAKEN = """
+TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states; TRUNCATE decided; TRUNCATE driven;
+TRUNCATE called;
 """
 # Trials that a stand-in drove, without a note on it yet: by their drivers and spec, and its sides.
 UNNAMED = """
@@ -206,6 +239,7 @@ class Filter:
     variant: str = ""
     condition: str = ""
     outcome: str = ""
+    account: str = ""
     validity: str = ""
     cause: str = ""
     q: str = ""
@@ -282,6 +316,8 @@ class Catalogue:
                 while waiting:
                     # With the file closed: measuring takes longer than copying.
                     self._memory.execute(LIST)
+                    self._account_for_collisions()
+                    self._memory.execute(TAKEN)
                     waiting = self._reading(TAKE)
             except StoreLocked:
                 if self._stamp is None:
@@ -391,6 +427,15 @@ class Catalogue:
             *(row["condition"], row["trial_id"], row["spec_hash"], row["rep"], limit),
         )
 
+    def account_counts(self, wanted: Filter) -> list[Row]:
+        """How many trials of a filter have which account: model, variant, account, trials."""
+        where, values = wanted.where()
+        return self.ask(
+            "SELECT model, variant, account, count(*) AS trials FROM listed "  # noqa: S608 # constants
+            f"WHERE {where} AND account IS NOT NULL GROUP BY ALL ORDER BY ALL",
+            *values,
+        )
+
     def pairs(self, model: str, variant: str, fate: str) -> list[Row]:
         """Trials of a variant beside those of the baseline; ``fate``: outcome or joint."""
         return self.ask(PAIRS.format(fate=fate), model, variant)
@@ -459,6 +504,16 @@ class Catalogue:
         count: int = waiting[0]
         return count
 
+    def _account_for_collisions(self) -> None:
+        """Note how each collision among the trials that were listed last came about."""
+        crashes = records(self._memory, CRASHES, ())
+        self._memory.execute(
+            "UPDATE listed SET account = found.account "
+            "FROM (SELECT unnest(?::INTEGER[]) AS number, unnest(?::VARCHAR[]) AS account) "
+            "AS found WHERE listed.number = found.number",
+            [[crash["number"] for crash in crashes], [_how(crash) for crash in crashes]],
+        )
+
     def _name_stand_ins(self) -> None:
         """Note for each trial that a stand-in drove which model it stood in for."""
         unnamed = self._memory.execute(UNNAMED).fetchall()
@@ -489,6 +544,29 @@ class Catalogue:
     def _memory(self) -> duckdb.DuckDBPyConnection:
         assert self._connection is not None, "it was never refreshed"
         return self._connection
+
+
+def _how(crash: Row) -> str | None:
+    """The class of a collision; None where its spec cannot be read, which the audit tells."""
+    try:
+        scenario, track = _task(crash["source"], crash["spec"] or "{}")
+    except (ValidationError, UsageError):
+        return None
+    course = Course(
+        scenario,
+        track,
+        crash["times_s"],
+        {side: crash[f"{side}_m"] for side in SIDES},
+        {side: crash[f"{side}_mps"] for side in SIDES},
+    )
+    return collision_class(course, crash["made"] or [])
+
+
+@lru_cache
+def _task(source: str, spec: str) -> tuple[ScenarioConfig, Track]:
+    """What the trials of a spec were driven by: there are few specs, and many trials."""
+    told = json.loads(spec)
+    return scenario_of(source, told.get("scenario")), track_of(told)
 
 
 def order_by(sort: str) -> str:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from analysis.accounts.account import Account, account
+from analysis.accounts.course import Course
 from analysis.explorer.details import Decision, Trial
 from analysis.explorer.display_text import visible
 from analysis.explorer.reading import Row
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
-from merge_runner.records import SIDES
+from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import Track
 
@@ -170,6 +172,28 @@ def _hardest(samples: Row) -> str:
     return f"; its hardest acceleration was {max(controlled, key=abs):+.1f} m/s²"
 
 
+def account_of(row: Row, trial: Trial) -> Account | None:
+    """Why a trial went as it did; None where there is nothing to explain."""
+    if row["account"] is None:
+        return None
+    samples = {
+        side: [i for i, t in enumerate(found["time_s"]) if t >= 0]
+        for side, found in trial.states.items()
+    }
+
+    def under_control(name: str) -> dict[Side, list[float]]:
+        return {side: [trial.states[side][name][i] for i in kept] for side, kept in samples.items()}
+
+    course = Course(
+        trial.scenario,
+        trial.track,
+        under_control("time_s")["left"],
+        under_control("position_m"),
+        under_control("velocity_mps"),
+    )
+    return account(course, trial.decisions, row)
+
+
 def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
     """What the replay draws: samples, decisions, the track, the bounds of a collision."""
     return {
@@ -190,6 +214,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
             for side, samples in trial.states.items()
         },
         "bounds": collision_bounds(trial),
+        "marks": marks(row, trial),
         "decisions": [
             {
                 "n": d["decision"],
@@ -272,6 +297,15 @@ def _bound(scenario: ScenarioConfig, track: Track, left_m: float, right_m: float
         else:
             high = middle
     return round(high, 3)
+
+
+def marks(row: Row, trial: Trial) -> list[dict[str, Any]]:
+    """What the charts of a trial mark."""
+    found = account_of(row, trial)
+    return [
+        {"t": round(mark.time_s, 3), "side": mark.side, "kind": mark.kind, "text": mark.text}
+        for mark in (found.marks if found else [])
+    ]
 
 
 def _rounded(values: Sequence[float], digits: int) -> list[float]:

@@ -54,6 +54,7 @@ def shown(row: Row, trial: Trial) -> dict[str, Any]:
         "judged": views.judged_text(trial.scenario),
         "view_box": views.view_box(trial.track),
         "data": embedded(views.replay_data(row, trial)) if trial.states else None,
+        "account": views.account_of(row, trial),
         "lines": views.summary(row, trial),
         "samples": views.sample_table(trial),
         "trial_decisions": decided,
