@@ -1,4 +1,4 @@
-"""How the human trials ended in each condition, as published; read without pandas, at once."""
+"""Published counts of trials and collisions, read without pandas, at once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-OUTCOMES = Path(__file__).with_name("human_outcomes.csv")
+DATA = Path(__file__).parent
 
 
 class HumanCounts(NamedTuple):
@@ -26,8 +26,21 @@ class HumanCounts(NamedTuple):
 @cache
 def human_counts() -> dict[str, HumanCounts]:
     """The published outcomes by condition."""
-    with OUTCOMES.open(encoding="utf-8", newline="") as file:
-        return {
-            row["condition"]: HumanCounts(*(int(row[name]) for name in HumanCounts._fields))
-            for row in csv.DictReader(file)
-        }
+    return {
+        row["condition"]: HumanCounts(*(int(row[name]) for name in HumanCounts._fields))
+        for row in _rows("human_outcomes")
+    }
+
+
+@cache
+def published_accounts() -> dict[str, dict[str, int]]:
+    """Collisions of the humans and of the published model by class."""
+    found: dict[str, dict[str, int]] = {}
+    for row in _rows("collision_accounts"):
+        found.setdefault(row["drivers"], {})[row["account"]] = int(row["collisions"])
+    return found
+
+
+def _rows(name: str) -> list[dict[str, str]]:
+    with (DATA / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))

@@ -19,7 +19,7 @@ from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.app import explorer
 from analysis.explorer.child import NoAnswer
-from analysis.explorer.pages.home import home_page, task_picture
+from analysis.explorer.pages.home import account_rows, home_page, task_picture
 from analysis.explorer.pages.tables import FIGURES
 from analysis.explorer.site import NothingNew, Site
 from analysis.explorer.urls import StaticLinks
@@ -201,6 +201,22 @@ def test_an_exported_study_begins_with_it_and_says_nothing_of_runs(db):
     assert 'id="strip"' not in text
     assert "trials.html?condition=" in text
     site.computing.close()
+
+
+def test_classes_of_collisions_stand_beside_the_published_ones():
+    published = {"humans": {"same action": 14, "no action": 5, "other": 4}}
+    found = [
+        {"model": "o3", "variant": "baseline", "account": "both gave way", "trials": 3},
+        {"model": "o3", "variant": None, "account": "invalid plan", "trials": 1},
+    ]
+    rows = account_rows(found, published)
+    assert list(rows["classes"]) == [
+        *("both insisted", "both gave way", "no action", "other", "invalid plan")
+    ]
+    assert rows["classes"]["both gave way"] == {("o3", "baseline"): 3}
+    assert rows["classes"]["invalid plan"] == {("o3", ""): 1}
+    assert (rows["same"], rows["groups"]) == ({"humans": 14}, [("o3", "baseline"), ("o3", "")])
+    assert account_rows([], published) is None
 
 
 def test_the_picture_of_the_task_shows_a_moment_before_the_merge():

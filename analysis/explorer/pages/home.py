@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from analysis.data.human_counts import human_counts
+from analysis.data.human_counts import human_counts, published_accounts
 from analysis.explorer import views
 from analysis.explorer.analysis_worker import HUMAN
 from analysis.explorer.catalogue import FACETS, FACTOR
@@ -45,6 +45,8 @@ ACCOUNTS = """
 SELECT model, variant, account, count(*) AS trials FROM listed
 WHERE status = 'collided' AND account IS NOT NULL GROUP BY ALL ORDER BY ALL
 """
+# What is published as one class of collisions, and the two that it holds.
+SAME, SAME_ACTION = "same action", ("both insisted", "both gave way")
 UNPRICED = "SELECT coalesce(sum(unpriced), 0)::BIGINT AS attempts FROM tried"
 
 
@@ -97,7 +99,9 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         humans=human_cells(humans),
         rows=(rows := worst_first(groups)),
         condition_texts=condition_texts(site, [row["name"] for row in rows]),
-        accounts=account_rows(site.catalogue.ask(ACCOUNTS) if "account" in FACETS else []),
+        accounts=account_rows(site.catalogue.ask(ACCOUNTS), published_accounts())
+        if "account" in FACETS
+        else None,
         unpriced=unpriced["attempts"],
         panels=panels,
         charts=_charts(site, panels),
@@ -226,15 +230,27 @@ def verdicts_of(site: Site, table: Table) -> dict[str, Any]:
     return {"names": list(names), "drivers": drivers}
 
 
-def account_rows(found: Sequence[Row]) -> dict[str, Any]:
-    """Collisions by their class, of each driver and prompt: ``cells`` by group, as links."""
-    groups = dict.fromkeys((row["model"], row["variant"] or "") for row in found)
-    classes: dict[str, dict[tuple[str, str], int]] = {}
+def account_rows(
+    found: Sequence[Row], published: Mapping[str, Mapping[str, int]]
+) -> dict[str, Any] | None:
+    """Collisions by class, of each driver and prompt and as published; None without a collision.
+
+    ``classes`` have the counts by group. What is published does not tell the first two apart: they
+    are ``same``.
+    """
+    if not found:
+        return None
+    classes: dict[str, dict[tuple[str, str], int]] = {name: {} for name in SAME_ACTION}
+    for name in (name for of in published.values() for name in of if name != SAME):
+        classes.setdefault(name, {})
     for row in found:
-        cells = classes.setdefault(row["account"], {})
-        cells[row["model"], row["variant"] or ""] = row["trials"]
-    ordered = sorted(classes.items(), key=lambda item: (-sum(item[1].values()), item[0]))
-    return {"groups": list(groups), "classes": ordered}
+        classes.setdefault(row["account"], {})[row["model"], row["variant"] or ""] = row["trials"]
+    return {
+        "groups": list(dict.fromkeys((row["model"], row["variant"] or "") for row in found)),
+        "classes": classes,
+        "published": published,
+        "same": {who: of[SAME] for who, of in published.items()},
+    }
 
 
 def task_picture() -> dict[str, Any]:
