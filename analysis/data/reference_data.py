@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from analysis.data.human_counts import human_counts
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 DATA = Path(__file__).parent
@@ -42,8 +43,8 @@ def human_outcomes() -> pd.DataFrame:
     merged_first. ``collided_boxes``: the experiment's collisions are boxes that overlap.
     """
     rows = []
-    for counts in published("human_outcomes").itertuples():
-        condition = HUMAN_CONDITIONS[counts.condition]
+    for name, counts in human_counts().items():
+        condition = HUMAN_CONDITIONS[name]
         outcomes = (
             [("finished", "left")] * counts.left_first
             + [("finished", "right")] * counts.right_first
@@ -51,7 +52,7 @@ def human_outcomes() -> pd.DataFrame:
         )
         rows += [
             (
-                counts.condition,
+                name,
                 condition.projected_headway_m,
                 condition.relative_velocity_mps,
                 *outcome,

@@ -6,7 +6,7 @@ pandas and the fits hold a Python process for seconds, and no page may wait for 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.data.derived_cache import finished, keep_finished, present_state
 from analysis.explorer.child import serve
-from analysis.metrics import GAP, Metric, shown_in
+from analysis.metrics import GAP, LEFT_FIRST, Metric, shown_in
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Table, from_text, options_text, to_text
@@ -25,6 +25,10 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 if TYPE_CHECKING:
     from analysis.data.study import Group, Study
     from analysis.explain import Source
+
+HUMAN = "human"
+# The tables that have the rows of groups: of each driver and prompt, or each level of a factor.
+VARIANTS, FACTORS = "ablation-quantitative", "factors"
 
 
 class Numbers:
@@ -38,8 +42,9 @@ class Numbers:
 
         Where no table has the cell, the answer says so as ``absent``.
 
-        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, or ``humans``, and what
-        follows that is ignored. Raises MergeRunnerError.
+        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, ``figure NAME``,
+        ``humans``, or ``home FACTOR`` with an empty factor for drivers and prompts; what follows
+        the last two is ignored. Raises MergeRunnerError.
         """
         match list(request):
             case ["tables", *names]:
@@ -50,6 +55,10 @@ class Numbers:
                 return self._counted() | self._cells(names)
             case ["humans", *_]:
                 return self._counted() | human_panels(self.study) | self._tables(["contrasts"])
+            case ["home", factor, *_]:
+                return self._counted() | home_panels(self.study, factor)
+            case ["figure", name]:
+                return self._counted() | {"svg": self._figure(name)}
         raise UsageError(f"nothing answers {request!r}")
 
     @cached_property
@@ -138,6 +147,11 @@ class Numbers:
                         cells[f"{name}/{row.id}:{column.name}"] = sets.setdefault(behind, len(sets))
         return {"cells": cells, "sets": list(sets)}
 
+    def _figure(self, name: str) -> str:
+        from analysis.figures.gallery import rendered
+
+        return rendered(self.study, name, "svg").decode()
+
     def _keys(self, source: Source) -> list[tuple[str, str]]:
         """The (trial, spec) of a source's trials."""
         return [(name, self._specs[source.group][name]) for name in source.trials]
@@ -153,48 +167,98 @@ class Numbers:
 
 
 def human_panels(study: Study) -> dict[str, Any]:
-    """The humans and the baseline of every driver, measured in each condition.
+    """The humans and the baseline of every driver, measured in each condition, with notes."""
+    from analysis.tables.notes import sample_notes
+
+    shown = [_group_facts(study, group) for group in study.baselines]
+    found = beside_humans(study, study.baselines, shown, shown_in("humans"))
+    return found | {"notes": sample_notes(study, study.baselines)}
+
+
+def home_panels(study: Study, factor: str) -> dict[str, Any]:
+    """Who goes first and the gap: of the humans, and every driver and prompt, or every level."""
+    from analysis.stats.factors import levels_by_factor
+
+    groups = [group for group in study.groups if group.id == HUMAN]
+    shown = [_group_facts(study, group) for group in groups]
+    if factor:
+        found = [level for levels in levels_by_factor(study) for level in levels]
+        levels = [level for level in found if level.factor == factor]
+        groups += [level.pooled for level in levels]
+        facts = [
+            {"id": level.id, "label": f"{level.name}{level.mark}", "table": FACTORS}
+            for level in levels
+        ]
+        shown += [
+            _group_facts(study, level.pooled) | own
+            for level, own in zip(levels, facts, strict=True)
+        ]
+    else:
+        groups += study.models
+        prompts = len({group.setting for group in study.models}) > 1
+        shown += [
+            _group_facts(study, group)
+            | ({"label": f"{group.label}, {group.setting}"} if prompts else {})
+            for group in study.models
+        ]
+    return beside_humans(study, groups, shown, [LEFT_FIRST, GAP])
+
+
+def _group_facts(study: Study, group: Group) -> dict[str, Any]:
+    """What a page has to know of a group but its numbers; ``table`` holds its rows."""
+    return {
+        "id": group.id,
+        "label": group.label,
+        "table": VARIANTS,
+        "measured": group.measured,
+        "mirrored": bool(group.seats[1]),
+        "scenario": study.specs.get(group.spec_hash or "", {}).get("scenario"),
+    }
+
+
+def beside_humans(
+    study: Study,
+    groups: Sequence[Group],
+    facts: Sequence[Mapping[str, Any]],
+    metrics: Sequence[Metric],
+) -> dict[str, Any]:
+    """Groups, measured in each condition by these metrics, with facts of each.
 
     Values are in the units of the metrics. Before an import the humans have outcomes alone;
     ``published`` holds what is published of the rest, by the metric's name: ``values`` by
     condition, as far as there are such, and a ``text`` that says what they are.
     """
-    from analysis.data.load import load_specs
     from analysis.data.reference_data import HUMAN_TRIALS, citation
     from analysis.stats.measures import known, outcomes_note
-    from analysis.tables.notes import sample_notes
 
-    specs = load_specs(study.db)
     there = study.human in study.groups
-    unknown = [metric for metric in shown_in("humans") if not known(study.human, metric)]
+    unknown = [metric for metric in metrics if not known(study.human, metric)]
     return {
         "measured": study.human.measured,
         "outcomes_from": citation("human_outcomes"),
         "published_trials": HUMAN_TRIALS,
         "published": {metric.name: _published(metric) for metric in unknown} if there else {},
         "conditions": study.conditions,
-        "notes": sample_notes(study, study.baselines),
         "caveat": outcomes_note(study.human) if there else "",
         "groups": [
             {
-                "id": group.id,
-                "driver": group.label,
-                "mirrored": bool(group.seats[1]),
-                "scenario": specs.get(group.spec_hash or "", {}).get("scenario"),
-                "conditions": {name: _in_condition(group, name) for name in study.conditions},
+                **of,
+                "conditions": {
+                    name: _in_condition(group, name, metrics) for name in study.conditions
+                },
             }
-            for group in study.baselines
+            for group, of in zip(groups, facts, strict=True)
         ],
     }
 
 
-def _in_condition(group: Group, condition: str) -> dict[str, Any]:
-    """The metrics of a group in one condition: estimates with 95 % intervals, and counts."""
+def _in_condition(group: Group, condition: str, metrics: Sequence[Metric]) -> dict[str, Any]:
+    """Metrics of a group in one condition: estimates with 95 % intervals, and counts."""
     from analysis.stats.measures import counts, estimate, known, trials_of
 
     part = group.part(lambda trials: trials["condition"] == condition)
     found: dict[str, Any] = {}
-    for metric in shown_in("humans"):
+    for metric in metrics:
         if known(group, metric):
             found[metric.name] = asdict(estimate(part, metric))
             found[metric.name]["all"] = len(trials_of(part, metric))

@@ -24,7 +24,7 @@ from starlette.staticfiles import StaticFiles
 
 from analysis.explorer.assets import STATIC
 from analysis.explorer.guard import Guard, from_elsewhere
-from analysis.explorer.pages import ablations, humans, sql, sweep, tables, trial, trials
+from analysis.explorer.pages import ablations, home, humans, sql, sweep, tables, trial, trials
 from analysis.explorer.site import NothingNew, NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
@@ -69,7 +69,7 @@ def _sweep_routes(site: Site) -> list[Route]:
     page = partial(_page, site)
     one = page(lambda r: sweep.sweep_page(site, r.path_params["sweep"], _seen(r)))
     return [
-        Route("/", page(lambda _: RedirectResponse(sweep.home(site)))),
+        Route("/", page(lambda r: home.home_page(site, r.query_params))),
         Route("/sweeps", page(lambda r: sweep.sweeps_page(site, _seen(r)))),
         Route("/sweeps/{sweep:path}", one),
     ]
@@ -117,9 +117,21 @@ def _computed_routes(site: Site) -> list[Route]:
     def table(request: Request) -> str:
         return tables.table_page(site, request.path_params["name"], request.query_params)
 
+    def file(request: Request) -> Response:
+        named = request.path_params["name"], request.path_params["suffix"]
+        text, kind = tables.table_file(site, *named)
+        name = {"content-disposition": f'attachment; filename="{".".join(named)}"'}
+        return Response(text, media_type=kind, headers=name)
+
+    def figure(request: Request) -> Response:
+        svg = tables.figure_svg(site, request.path_params["name"])
+        return Response(svg, media_type="image/svg+xml", headers=SEALED)
+
     page = partial(_page, site)
     return [
         Route("/tables", page(lambda _: tables.tables_page(site))),
+        Route("/tables/{name}.{suffix}", page(file)),
+        Route("/figures/{name}.svg", page(figure)),
         Route("/tables/{name}", page(table)),
         Route("/ablations", page(lambda r: ablations.ablations_page(site, r.query_params))),
         Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),

@@ -50,9 +50,9 @@ LISTED = f"""
 CREATE SEQUENCE numbers;
 CREATE TABLE listed (
     number INTEGER DEFAULT nextval('numbers'), trial_id VARCHAR, spec_hash VARCHAR,
-    source VARCHAR, model_left VARCHAR, model_right VARCHAR, model VARCHAR, variant VARCHAR,
-    condition VARCHAR, projected_headway_m DOUBLE, relative_velocity_mps DOUBLE, rep INTEGER,
-    pair VARCHAR,
+    source VARCHAR, who VARCHAR, model_left VARCHAR, model_right VARCHAR, model VARCHAR,
+    variant VARCHAR, condition VARCHAR, projected_headway_m DOUBLE, relative_velocity_mps DOUBLE,
+    rep INTEGER, pair VARCHAR,
     status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
     error VARCHAR, scripted BOOLEAN, stand_in VARCHAR, caution VARCHAR,
     time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
@@ -141,7 +141,10 @@ INSERT INTO memory.called BY NAME
 # A sparkline has about 24 points; its words give the slowest and the fastest of all samples.
 LIST = f"""
 INSERT INTO listed BY NAME
-SELECT trials.trial_id, trials.spec_hash, source, model_left, model_right,
+SELECT trials.trial_id, trials.spec_hash, source,
+    CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' ELSE 'drivers' END
+        AS who,
+    model_left, model_right,
     if(source = 'human', 'human', driver) AS model,
     variant, condition, projected_headway_m, relative_velocity_mps, rep, pair, status,
     merged_first, end_time_s, error, scripted,
@@ -223,18 +226,21 @@ SORTS = {
 SHOWN = "* EXCLUDE (flaws, posed, tried)"
 SPEEDS = "left_mps, right_mps, left_range_mps, right_range_mps"
 WITHOUT_SPEEDS = f"* EXCLUDE (flaws, posed, tried, {SPEEDS})"
-EXPORTED = f"* EXCLUDE (flaws, posed, tried, levels, number, model_left, model_right, {SPEEDS})"
+EXPORTED = (
+    f"* EXCLUDE (who, flaws, posed, tried, levels, number, model_left, model_right, {SPEEDS})"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
     """Which trials are wanted; an empty text wants all. ``q`` is part of a name.
 
-    ``levels`` are (factor, level). ``trials`` are (trial, spec), where those behind a cell of a
-    table are wanted.
+    ``who`` is ``drivers``, ``humans`` or ``stand-ins``. ``levels`` are (factor, level). ``trials``
+    are (trial, spec), where those behind a cell of a table are wanted.
     """
 
     sweep: str = ""
+    who: str = ""
     model: str = ""
     variant: str = ""
     condition: str = ""
@@ -371,9 +377,7 @@ class Catalogue:
         """
         where, values = wanted.where()
         rows = self.ask(
-            "SELECT CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' "  # noqa: S608 # constants
-            "ELSE 'drivers' END AS who, "
-            "count(*) AS trials, count(*) FILTER (status = 'collided') AS collided, "
+            "SELECT who, count(*) AS trials, count(*) FILTER (status = 'collided') AS collided, "  # noqa: S608 # constants
             "count(*) FILTER (status = 'failed') AS failed, "
             "count(*) FILTER (status <> 'failed') AS ended, "
             "coalesce(sum(decisions), 0) AS decisions, coalesce(sum(invalid), 0) AS invalid, "

@@ -20,20 +20,21 @@ from analysis.explorer.catalogue import FACETS, FACTOR, SEVERAL, Filter
 from analysis.explorer.details import read_decisions, read_trial
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.computed import computed
+from analysis.explorer.pages.home import home_page
 from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
-from analysis.explorer.pages.tables import table_page, tables_page
+from analysis.explorer.pages.tables import FILES, table_files, table_page, tables_page
 from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
 from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import list_sweeps
-from analysis.explorer.urls import EXPORTED, StaticLinks, bundle_name
+from analysis.explorer.urls import EXPORTED, HOME, StaticLinks, bundle_name
 from analysis.tables import TABLES
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
 
-PLAIN = ("keys.js",)
+PLAIN = ("keys.js", "sorting.js")
 LISTING = ("keys.js", "unpacked.js", "listing.js")
 BUNDLE = ("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
 # A link that only a server can follow.
@@ -49,7 +50,9 @@ _SECRET_NAMES = ("_KEY", "_TOKEN", "_SECRET", "_PASSWORD")
 _HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\]")
 SHORTEST_SECRET = 8
 # The names of an export's pages: those of an earlier one are deleted, and nothing else.
-_OURS = re.compile(rf"(?:index|{'|'.join(EXPORTED)}|(?:sweep|table|trials)-.*)\.html")
+_OURS = re.compile(
+    rf"(?:{'|'.join(EXPORTED)}|(?:sweep|table|trials)-.*)\.html|table-.*\.(?:{'|'.join(FILES)})"
+)
 # Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
     r'<script type="application/json" id="(?:bundle|cells)">.*?</script>', re.DOTALL
@@ -85,7 +88,7 @@ def export_folder(
             pages[bundle_name(condition)] = bundle_page(site, mine, title, watch)
         if not wanted:
             pages |= {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site, watch)}
-        pages["index.html"] = _index(pages)
+        pages.setdefault("index.html", next(iter(pages.values())))  # of some trials: their list
         _refuse_secrets_of(site, pages)
     yield from _written(folder, pages, _OURS)
 
@@ -101,23 +104,18 @@ def export_page(
 
 
 def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
-    """The pages of the whole study: its sweeps, the newest first, and what is computed of it."""
+    """The pages of the whole study: at a glance, its sweeps, and what is computed of it."""
     at = site.at
+    yield at.to(HOME), home_page(site, {})
     for entry in list_sweeps(site.catalogue):
         yield at.sweep(entry.sweep_id), sweep_page(site, entry.sweep_id)
     yield at.to("sweeps"), sweeps_page(site)
     yield at.to("tables"), tables_page(site)
     for name in watch(list(TABLES), "Tables"):
         yield at.table(name), table_page(site, name, {})
+        yield from table_files(site, name)
     yield at.to("ablations"), ablations_page(site, {})
     yield at.to("humans"), humans_page(site, {})
-
-
-def _index(pages: Mapping[str, str]) -> str:
-    """The page to begin at: the newest sweep, or the trials."""
-    return next((text for name, text in pages.items() if name.startswith("sweep-")), "") or next(
-        iter(pages.values())
-    )
 
 
 def bundle_page(site: Site, rows: Sequence[Row], name: str, watch: Watch) -> str:

@@ -15,7 +15,7 @@ from analysis.explorer.assets import STYLES
 from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.display_text import visible
 from analysis.explorer.query_process import Sandbox
-from analysis.explorer.urls import Links, StaticLinks
+from analysis.explorer.urls import HOME, Links, StaticLinks
 from analysis.explorer.views import clock
 from analysis.metrics import METRICS
 from merge_runner.errors import MergeRunnerError
@@ -23,7 +23,8 @@ from merge_runner.paths import DEFAULT_DB
 
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {
-    "Sweeps": "sweeps",
+    "Study": HOME,
+    "Runs": "sweeps",
     "Trials": "trials",
     "Tables": "tables",
     "Ablations": "ablations",

@@ -295,6 +295,23 @@ def _entries(catalogue: Catalogue) -> list[ListedSweep]:
     ]
 
 
+def standing_of(catalogue: Catalogue) -> list[tuple[ListedSweep, Assessment]]:
+    """The runs that go on, or ended early and nobody went on with them; else the newest one.
+
+    The newest come first. Raises what ``Catalogue.refresh`` does.
+    """
+    entries = list_sweeps(catalogue)
+    found = []
+    for place, entry in enumerate(entries):
+        later = _later(entry, entries[:place])
+        if entry.state != "finished" and not later:
+            found.append((entry, assessment_of(entry, later, 0)))
+    if found or not entries:
+        return found
+    mismatches = mismatches_of(catalogue.ask(TRIED, entries[0].sweep_id))
+    return [(entries[0], assessment_of(entries[0], "", sum(mismatches.values())))]
+
+
 def find_sweep(catalogue: Catalogue, sweep_id: str) -> Sweep | None:
     """One sweep; None where there is none. Raises what ``Catalogue.refresh`` does."""
     entries = list_sweeps(catalogue)

@@ -13,12 +13,16 @@ _ODD = re.compile(r"[^A-Za-z0-9_.-]")
 _SECONDS = re.compile(r"[0-9]{1,12}(\.[0-9]{1,6})?")
 
 
+# The page to begin at.
+HOME = "index"
+
+
 class Links:
     """Addresses of the pages as a server gives them."""
 
     def to(self, name: str, /, **state: object) -> str:
         """A page of its own: ``trials``, ``sql``."""
-        return f"/{name}" + query_of(state)
+        return f"/{'' if name == HOME else name}" + query_of(state)
 
     def trial(self, row: Mapping[str, Any], **state: object) -> str:
         """A trial's page; ``row`` has its name and its spec."""
@@ -42,6 +46,14 @@ class Links:
         """A table of the analysis."""
         return f"/tables/{quote(name)}" + query_of(state)
 
+    def table_file(self, name: str, suffix: str) -> str:
+        """A table as a file to download."""
+        return f"/tables/{quote(name)}.{suffix}"
+
+    def figure(self, name: str) -> str:
+        """A figure of the report as SVG."""
+        return f"/figures/{quote(name)}.svg"
+
     def cell(self, table: str, row: str, column: str) -> str:
         """The trials behind a cell.
 
@@ -59,7 +71,7 @@ class Links:
 
 
 # The pages that the export of a whole study has beside the trials, each as a file of this name.
-EXPORTED = ("sweeps", "trials", "tables", "ablations", "humans")
+EXPORTED = (HOME, "sweeps", "trials", "tables", "ablations", "humans")
 
 
 class StaticLinks(Links):
@@ -98,6 +110,14 @@ class StaticLinks(Links):
     def table(self, name: str, **state: object) -> str:
         """A table of the analysis."""
         return f"table-{name}.html"
+
+    def table_file(self, name: str, suffix: str) -> str:
+        """A table as a file beside the pages."""
+        return f"table-{name}.{suffix}"
+
+    def figure(self, name: str) -> str:
+        """Nothing: a server draws it."""
+        return ""
 
     def cell(self, table: str, row: str, column: str) -> str:
         """The trials behind a cell, where there are any."""

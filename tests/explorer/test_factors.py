@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -43,7 +44,8 @@ def test_a_trials_page_names_its_levels(client):
 
 @pytest.mark.slow
 def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, tmp_path):
-    page = client.get("/").text
+    (sweep,) = set(re.findall(r'href="(/sweeps/[^"]+)"', client.get("/sweeps").text))
+    page = client.get(sweep).text
     assert "mine: cheap, dear drives" in page
     assert page.count('class="ended"') >= 18
     assert "dear temperature=0.2" in page
@@ -58,7 +60,7 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
     with duckdb.connect(str(copy)) as connection:
         connection.execute("UPDATE sweeps SET exit_code = 3")
         connection.execute("DELETE FROM trials WHERE trial_id LIKE '%rep02%'")
-    stopped = TestClient(explorer(Site(copy), {HOST}), base_url=f"http://{HOST}").get("/").text
+    stopped = TestClient(explorer(Site(copy), {HOST}), base_url=f"http://{HOST}").get(sweep).text
     assert "18 of 36 trials have an outcome" in stopped
     assert "<code>merge-runner sweep mine.toml --model cheap --model dear</code>" in stopped
 

@@ -46,7 +46,11 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_se
         listing.goto(f"{address}/sweeps")
         expect(listing.locator(".state")).to_have_text("running")
         trials.goto(f"{address}/trials?condition=N_0_0")
+        study = page.context.new_page()
+        study.goto(address)
+        expect(study.locator("#strip")).to_contain_text("Running")
         page.goto(address)
+        page.locator("#strip a").click()
         verdict = page.locator(".sweep-verdict")
         expect(verdict).to_contain_text("Running")
         assert serious(page) == []
@@ -58,10 +62,13 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_se
         # The list and the trials have noticed its end too.
         expect(listing.locator(".state")).to_have_text("finished")
         expect(listing.locator("tbody tr")).to_contain_text("2 of 2")
+        # So has the study, in its strip and in its counts.
+        expect(study.locator("#strip")).to_contain_text("Finished: all 2 trials ended")
+        expect(study.locator("#costs tbody td").first).to_have_text("2")
         trials.get_by_role("link", name="Show them").click()
         expect(trials.locator("tbody tr")).to_have_count(1)
         assert "condition=N_0_0" in trials.url
-        for other in (listing, trials):
+        for other in (listing, trials, study):
             other.close()
         page.get_by_role("link", name="Trials").first.click()
         expect(page.locator("tbody tr")).to_have_count(2)

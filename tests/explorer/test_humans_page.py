@@ -10,9 +10,10 @@ from starlette.testclient import TestClient
 
 from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
-from analysis.explorer.analysis_worker import Numbers
+from analysis.explorer.analysis_worker import HUMAN, Numbers
 from analysis.explorer.app import explorer
-from analysis.explorer.pages.humans import HUMAN, chart, kinds, marks
+from analysis.explorer.charts import chart, marks
+from analysis.explorer.pages.humans import kinds
 from analysis.explorer.pictures import marker
 from analysis.explorer.site import Site
 from analysis.figures.styles import HUMAN_STYLE, MARKERS, driver_style
@@ -100,8 +101,8 @@ def test_the_page_says_what_counts_as_a_collision_for_whom(ask):
 
 
 def test_a_driver_looks_as_in_the_figures_and_no_other_driver_does():
-    groups = [{"id": HUMAN, "driver": HUMAN}]
-    groups += [{"id": f"{i}/baseline", "driver": str(i)} for i in range(12)]
+    groups = [{"id": HUMAN, "label": HUMAN}]
+    groups += [{"id": f"{i}/baseline", "label": str(i)} for i in range(12)]
     human, *drivers = marks(groups).values()
     assert human.style == HUMAN_STYLE
     assert [mark.style for mark in drivers] == [driver_style(i) for i in range(12)]
@@ -134,7 +135,7 @@ def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
     )
     assert [shape for shape, _ in point["arrows"]] == ["down", "triangle"]
     assert drawn["top"] <= point["ends"][1] <= point["y"] <= point["ends"][0] <= drawn["bottom"]
-    assert chart(rmse, content["groups"], [], content["published"])["ticks"][0][1] == "0"
+    assert chart(rmse, content["groups"], [], {})["ticks"][0][1] == "0"
     text = ask()
     assert len(re.findall(r'class="cut"', text)) >= 2
     assert "An arrow at the edge: an interval goes on beyond the axis. killed in" in text

@@ -12,7 +12,7 @@ from typing import Any
 from analysis.explorer import views
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.computed import computed
-from analysis.explorer.pictures import Scale
+from analysis.explorer.pictures import Scale, marker
 from analysis.explorer.site import NotThere, Site
 from analysis.metrics import COLLISIONS
 from analysis.metrics import JOINT as JOINT_RATE
@@ -110,6 +110,7 @@ def ablations_page(site: Site, asked: Mapping[str, str]) -> str:
         left_out=partial(left_out, site),
         fates=FATES,
         bar=bar,
+        path=marker,
         width=WIDTH,
         **values,
     )

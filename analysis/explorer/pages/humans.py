@@ -3,61 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from analysis.explorer import views
+from analysis.explorer.analysis_worker import HUMAN
+from analysis.explorer.charts import Kind, drawn
 from analysis.explorer.details import scenario_of
 from analysis.explorer.pages.computed import computed
-from analysis.explorer.pictures import Axis, Scale, ends_and_ticks, marker, reach
+from analysis.explorer.pictures import marker
 from analysis.explorer.site import Site
-from analysis.figures.styles import HUMAN_STYLE, Style, driver_style
-from analysis.metrics import Metric, intervals_of, shown_in
+from analysis.metrics import BOXES, shown_in
 from analysis.tables.formats import notes_of, shown_value
 from analysis.tables.model import Table, from_text
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-
-HUMAN = "human"
-SHAPE_WORDS = {"down": "triangle that points down"}
-# Sizes in a picture, in its units.
-LEFT, TOP, HEIGHT, FOOT, STEP, LEAST, ARROW = 46.0, 8.0, 120.0, 40.0, 13.0, 112.0, 3.0
-
-
-# Shares of the few trials of a condition are not known to more digits.
-PERCENT_DIGITS = 1
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A row of panels: a metric as this page shows it."""
-
-    metric: Metric
-
-    @property
-    def name(self) -> str:
-        """The metric's."""
-        return self.metric.name
-
-    @property
-    def heading(self) -> str:
-        """``The gap``."""
-        return self.metric.in_sentences[0].upper() + self.metric.in_sentences[1:]
-
-    @property
-    def meaning(self) -> str:
-        """What is drawn."""
-        return f"{self.metric.meaning}; intervals: {intervals_of([self.metric])}"
-
-    @property
-    def digits(self) -> int:
-        """How many decimals a value has."""
-        digits = self.metric.decimals
-        return min(digits, PERCENT_DIGITS) if self.metric.rate else digits
-
-    @property
-    def denominators(self) -> bool:
-        """Whether its table tells those who ended from all, of whom some may be undecided."""
-        return self.metric.rate and self.metric.trials == "ended"
 
 
 def kinds() -> list[Kind]:
@@ -65,19 +24,6 @@ def kinds() -> list[Kind]:
     metrics = shown_in("humans")
     metrics.sort(key=lambda one: (one.trials == "ended", one.humans_from != "outcomes"))
     return [Kind(metric) for metric in metrics]
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """How a group is drawn."""
-
-    style: Style
-    label: str
-
-    @property
-    def word(self) -> str:
-        """The shape in words."""
-        return SHAPE_WORDS.get(self.style.shape, self.style.shape)
 
 
 def humans_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -90,28 +36,14 @@ def humans_page(site: Site, asked: Mapping[str, str]) -> str:
         content = found.result.content
         groups = content["groups"]
         contrasts = against_humans(from_text(content["tables"][0]))
-        values = {
-            "human": next((group for group in groups if group["id"] == HUMAN), None),
-            "measured": content["measured"],
+        values = drawn(site.at, content, kinds()) | {
             "outcomes_from": content["outcomes_from"],
             "published_trials": content["published_trials"],
-            "conditions": {
-                name: views.condition_text(*of) for name, of in content["conditions"].items()
-            },
-            "own": [name for name in content["conditions"] if name not in HUMAN_CONDITIONS],
-            "published": [one["text"] for one in content["published"].values()],
-            "groups": groups,
-            # Their trials are listed as they were driven, and not by the condition that is shown.
-            "mirrored": {group["id"] for group in groups if group["mirrored"]},
             "rules": {group["id"]: rule_text(group) for group in groups},
-            "marks": marks(groups),
-            "charts": [
-                chart(kind, groups, list(content["conditions"]), content["published"])
-                for kind in kinds()
-            ],
             "collisions": {
                 kind.name: collisions(groups, kind.name) for kind in kinds() if kind.denominators
             },
+            "human_collisions": human_collisions(groups),
             "caveat": content["caveat"],
             "notes": content["notes"],
             "differences": differences(contrasts),
@@ -123,10 +55,8 @@ def humans_page(site: Site, asked: Mapping[str, str]) -> str:
         "humans.html",
         here="humans",
         computed=found,
-        in_table={metric.name for metric in shown_in("tables")},
         human_conditions=len(HUMAN_CONDITIONS),
         path=marker,
-        value=value_text,
         **values,
     )
 
@@ -136,19 +66,6 @@ def rule_text(group: Mapping[str, Any]) -> str:
     source = HUMAN if group["id"] == HUMAN else ""
     scenario = scenario_of(source, group["scenario"])
     return f"{views.collision_text(scenario)}, looked for {1 / scenario.step_s:g} times a second"
-
-
-def marks(groups: Sequence[Mapping[str, Any]]) -> dict[str, Mark]:
-    """A colour and a shape for each group; humans are black."""
-    found: dict[str, Mark] = {}
-    models = 0
-    for group in groups:
-        style = HUMAN_STYLE
-        if group["id"] != HUMAN:
-            style = driver_style(models)
-            models += 1
-        found[group["id"]] = Mark(style, group["driver"])
-    return found
 
 
 def collisions(groups: Sequence[Mapping[str, Any]], rule: str) -> list[dict[str, Any]]:
@@ -170,6 +87,17 @@ def collisions(groups: Sequence[Mapping[str, Any]], rule: str) -> list[dict[str,
     return rows
 
 
+def human_collisions(groups: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """The human collisions in each condition of the experiment, in words."""
+    rows = [row for row in collisions(groups, BOXES.name) if row["group"] == HUMAN]
+    return {
+        name: f"human {k} of {ended}"
+        for row in rows
+        for name, (k, ended, _) in row["cells"].items()
+        if name in HUMAN_CONDITIONS
+    }
+
+
 def against_humans(contrasts: Table) -> Table:
     """The rows in which humans are the reference."""
     return replace(
@@ -188,68 +116,3 @@ def differences(contrasts: Table) -> list[dict[str, Any]]:
         }
         for row in contrasts.rows
     ]
-
-
-def chart(
-    kind: Kind,
-    groups: Sequence[Mapping[str, Any]],
-    conditions: Sequence[str],
-    published: Mapping[str, Any],
-) -> dict[str, Any]:
-    """One row of panels: where everything is drawn, in the units of the picture.
-
-    ``cut`` names the intervals that go on beyond the axis.
-    """
-    printed: dict[str, float] = published.get(kind.name, {}).get("values", {})
-    labels = {group["id"]: group["driver"] for group in groups}
-    known = [
-        found
-        for group in groups
-        for of_condition in group["conditions"].values()
-        if (found := of_condition.get(kind.name)) is not None and found["value"] is not None
-    ]
-    metric = kind.metric
-    low, high, ticks = ends_and_ticks(
-        *reach(known, list(printed.values())), metric.lowest, metric.highest
-    )
-    axis = Axis(Scale(low, high, TOP + HEIGHT, TOP), ticks)
-    panel = max(LEAST, STEP * (len(groups) + 1))
-    panels: list[dict[str, Any]] = []
-    for i, name in enumerate(conditions):
-        x0 = LEFT + i * panel
-        points = []
-        for j, group in enumerate(groups):
-            found = group["conditions"][name].get(kind.name)
-            if found is None or found["value"] is None:
-                continue
-            x = round(x0 + panel / 2 + STEP * (j - (len(groups) - 1) / 2), 1)
-            points.append({"group": group["id"], "x": x, "of": found, **axis.placed(found, ARROW)})
-        line = axis.y(printed[name]) if name in printed else None
-        panels.append({"name": name, "x": round(x0, 1), "points": points, "line": line})
-    return {
-        "kind": kind,
-        "width": round(LEFT + panel * len(conditions) + 4),
-        "height": TOP + HEIGHT + FOOT,
-        "top": TOP,
-        "bottom": TOP + HEIGHT,
-        "panel": panel,
-        "ticks": [(axis.y(tick), f"{tick:g}") for tick in axis.ticks],
-        "panels": panels,
-        "printed": printed,
-        "cut": [
-            f"{labels[point['group']]} in {panel['name']}: {value_text(point['of'], kind.digits)}"
-            for panel in panels
-            for point in panel["points"]
-            if point["arrows"]
-        ],
-    }
-
-
-def value_text(found: Mapping[str, Any] | None, digits: int) -> str:
-    """An estimate with its interval and n, for the table behind a chart."""
-    if found is None or found["value"] is None:
-        return "–"
-    interval = ""
-    if found["low"] is not None:
-        interval = f" [{found['low']:.{digits}f}, {found['high']:.{digits}f}]"
-    return f"{found['value']:.{digits}f}{interval}, n {found['n']}"

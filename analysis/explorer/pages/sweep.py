@@ -19,17 +19,11 @@ KINDS = {
 }
 
 
-def home(site: Site) -> str:
-    """The address to begin at: the newest sweep."""
-    sweeps = list_sweeps(site.catalogue)
-    return site.at.sweep(sweeps[0].sweep_id) if sweeps else site.at.to("trials")
-
-
 def sweeps_page(site: Site, seen: str = "") -> str:
     """All sweeps; raises NothingNew where they are as they were ``seen``."""
     sweeps = list_sweeps(site.catalogue)
     return site.render(
-        "sweeps.html", here="sweeps", sweeps=sweeps, lasted=_lasted, seen=_news(sweeps, seen)
+        "sweeps.html", here="sweeps", sweeps=sweeps, lasted=_lasted, seen=news_of(sweeps, seen)
     )
 
 
@@ -47,7 +41,7 @@ def sweep_page(site: Site, sweep_id: str, seen: str = "") -> str:
         "sweep.html",
         here="sweeps",
         newer=newer,
-        seen=_news(shown, seen, state),
+        seen=news_of(shown, seen, state),
         # A screen reader says the sentence once a state, and not every time that a number changes.
         quiet=seen.startswith(f"{state}-"),
         heard=bool(seen),
@@ -55,7 +49,7 @@ def sweep_page(site: Site, sweep_id: str, seen: str = "") -> str:
     )
 
 
-def _news(shown: object, seen: str, state: str = "all") -> str:
+def news_of(shown: object, seen: str, state: str = "all") -> str:
     """What is shown, as a short text that differs where it does; raises NothingNew."""
     now = f"{state}-{hashlib.sha256(repr(shown).encode()).hexdigest()[:16]}"
     if now == seen:
@@ -86,14 +80,14 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
             for kind, text in KINDS.items()
         },
         "bar": bar,
-        "condition_texts": _condition_texts(site, conditions),
+        "condition_texts": condition_texts(site, conditions),
         "prompt_text": prompt_text,
         "duration": duration,
         "lasted": _lasted(sweep.entry.row["started_at"], sweep.entry.last_word),
     }  # fmt: skip
 
 
-def _condition_texts(site: Site, names: list[str]) -> dict[str, str]:
+def condition_texts(site: Site, names: list[str]) -> dict[str, str]:
     """Conditions in words; empty for one that no human drove and that has no trial yet."""
     known = {
         name: (one.projected_headway_m, one.relative_velocity_mps)

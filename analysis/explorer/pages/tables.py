@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
 
+from analysis.explorer.analysis_process import Request
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import NotThere, Site
+from analysis.table_format import TableFormat
 from analysis.tables import TABLES
-from analysis.tables.formats import table_view
-from analysis.tables.model import from_text
+from analysis.tables.formats import render, table_view
+from analysis.tables.model import Row, Table, from_text
+from merge_runner.errors import StoreError
 
 # What each shows, for the list: their own titles are known only when they are made.
 ABOUT = {
@@ -35,22 +39,83 @@ ABOUT = {
     "words": "what follows a tactical word, and what the first word follows",
     "first-look-surface": "first situations that were only asked, and what headway is worth",
 }
+# The figures of the report, which are drawn when they are asked for.
+FIGURES = {
+    "figure2": "Figure 2: speeds, who merges first, the gap and the RMSE, with the baseline",
+    "figure2-variants": "the same for every driver and prompt variant",
+    "ablation-matrix": "which indicators hold for which driver and variant",
+    "distributions": "every metric that is no share: median, quartiles and every trial",
+    "factors": "each level of a study's factors, by every metric",
+    "first-look-surface": "first situations that were only asked",
+    "first-action": "the first action, by own relative velocity",
+}
+# How a table can be downloaded, by the suffix of the file: its format, and the file's type.
+FILES = {
+    TableFormat.CSV.suffix: (TableFormat.CSV, "text/csv; charset=utf-8"),
+    TableFormat.LATEX.suffix: (TableFormat.LATEX, "application/x-tex; charset=utf-8"),
+}
+FILE_WAIT_S = 300.0
 
 
 def tables_page(site: Site) -> str:
-    """The list of all tables."""
-    return site.render("tables.html", here="tables", about=ABOUT)
+    """The list of all tables and figures."""
+    figures = FIGURES if site.at.figure("") else {}
+    return site.render("tables.html", here="tables", about=ABOUT, figures=figures)
+
+
+def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
+    """A table as a file's text with the type of the file; raises NotThere and StoreError."""
+    if suffix not in FILES:
+        raise NotThere(f"a table comes as {' or '.join(FILES)}")
+    form, kind = FILES[suffix]
+    (text,) = awaited(site, ("tables", _named(name, TABLES, "table")))["tables"]
+    return render([from_text(text)], form) + "\n", kind
+
+
+def table_files(site: Site, name: str) -> Iterator[tuple[str, str]]:
+    """A table's files by their names, for an export; nothing where its page says why not."""
+    found = computed(site, ("tables", name), {})
+    if found.result is None:
+        return
+    (text,) = found.result.content["tables"]
+    for suffix, (form, _) in FILES.items():
+        yield site.at.table_file(name, suffix), render([from_text(text)], form) + "\n"
+
+
+def figure_svg(site: Site, name: str) -> str:
+    """A figure; raises NotThere and StoreError."""
+    svg: str = awaited(site, ("figure", _named(name, FIGURES, "figure")))["svg"]
+    return svg
+
+
+def awaited(site: Site, request: Request) -> dict[str, Any]:
+    """What a computation answers, however long that takes; raises StoreError."""
+    found = computed(site, request, {}, wait_s=FILE_WAIT_S)
+    if found.result is None:
+        raise StoreError(found.failure or "it is still being computed: ask again in a minute")
+    return found.result.content
+
+
+def is_alike(table: Table, row: Row) -> bool:
+    """Whether a row of ``fallbacks`` compares the same trials with themselves."""
+    return table.name == "fallbacks" and row.values.get("n") == row.values.get("n_without")
+
+
+def _named(name: str, known: Collection[str], what: str) -> str:
+    if name not in known:
+        raise NotThere(f"there is no {what} {name}; there are {', '.join(known)}")
+    return name
 
 
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """One table; raises NotThere."""
-    if name not in TABLES:
-        raise NotThere(f"there is no table {name}; there are {', '.join(TABLES)}")
-    found = computed(site, ("tables", name), asked)
-    shown = None
+    found = computed(site, ("tables", _named(name, TABLES, "table")), asked)
+    shown, alike = None, set[str]()
     if found.result is not None:
+        table = from_text(found.result.content["tables"][0])
+        alike = {row.id for row in table.rows if is_alike(table, row)}
         shown = table_view(
-            from_text(found.result.content["tables"][0]),
+            table,
             lambda table, row, column: site.at.cell(table.name, row.id, column.name),
         )
     names = list(TABLES)
@@ -60,8 +125,10 @@ def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         here="tables",
         name=name,
         about=ABOUT[name],
+        files=[(suffix, site.at.table_file(name, suffix)) for suffix in FILES],
         computed=found,
         table=shown,
+        alike=alike,
         before=names[at - 1] if at else None,
         after=names[at + 1] if at + 1 < len(names) else None,
     )

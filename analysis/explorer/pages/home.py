@@ -1,0 +1,292 @@
+"""The study at a glance: the question, how its runs stand, and what its trials answer so far."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from analysis.data.human_counts import human_counts, published_accounts
+from analysis.explorer import views
+from analysis.explorer.analysis_worker import HUMAN
+from analysis.explorer.catalogue import FACETS, FACTOR
+from analysis.explorer.charts import Kind, drawn
+from analysis.explorer.pages.computed import Computed, computed
+from analysis.explorer.pages.sweep import condition_texts, news_of
+from analysis.explorer.pictures import marker
+from analysis.explorer.reading import Row
+from analysis.explorer.site import NotThere, Site
+from analysis.explorer.sweeps import standing_of
+from analysis.metrics import GAP, LEFT_FIRST
+from analysis.tables.formats import notes_of, shown_value
+from analysis.tables.model import Table, from_text
+from merge_runner.config import ScenarioConfig
+from merge_runner.records import SIDES, Side
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.study.crossing import PROMPT
+
+# More groups than these cannot be told apart in a picture.
+DRAWN = 12
+# The condition and the moment that the picture of the task shows, in s from the start of the run.
+PICTURED, PICTURED_S = "L_4_0", 6.5
+# Trials of drivers by group and condition; ``who`` tells those of stand-ins apart.
+PLAYED = """
+SELECT {key} AS key, who, condition, string_agg(DISTINCT stand_in, '; ') AS stand_in,
+    count(*) AS trials, count(*) FILTER (status <> 'failed') AS ended,
+    count(*) FILTER (status = 'failed') AS failed,
+    count(*) FILTER (status = 'collided') AS collided,
+    coalesce(sum(decisions), 0)::BIGINT AS decisions,
+    coalesce(sum(invalid), 0)::BIGINT AS invalid, coalesce(sum(cost_usd), 0) AS cost_usd
+FROM {trials} WHERE {where} GROUP BY ALL ORDER BY ALL
+"""
+COUNTS = ("trials", "ended", "failed", "collided", "decisions", "invalid", "cost_usd")
+ACCOUNTS = """
+SELECT model, variant, account, count(*) AS trials FROM listed
+WHERE status = 'collided' AND account IS NOT NULL GROUP BY ALL ORDER BY ALL
+"""
+# What is published as one class of collisions, and the two that it holds.
+SAME, SAME_ACTION = "same action", ("both insisted", "both gave way")
+UNPRICED = "SELECT coalesce(sum(unpriced), 0)::BIGINT AS attempts FROM tried"
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What the trials of a group come to by condition; ``state`` is their filter."""
+
+    label: str
+    who: str
+    state: dict[str, str]
+    stand_in: str = ""
+    cells: dict[str, Row] = field(default_factory=dict)
+
+    @property
+    def total(self) -> dict[str, Any]:
+        """The counts over all conditions."""
+        return {name: sum(cell[name] for cell in self.cells.values()) for name in COUNTS}
+
+    def share(self, condition: str) -> float:
+        """How many of the trials that ended collided; -1 where none ended."""
+        cell = self.cells.get(condition)
+        return cell["collided"] / cell["ended"] if cell and cell["ended"] else -1.0
+
+
+def home_page(site: Site, asked: Mapping[str, str]) -> str:
+    """The study; raises NotThere, and NothingNew where nothing is new since it was ``seen``."""
+    given = {name: value for name, value in asked.items() if name != "seen"}
+    factors = [PROMPT, *site.catalogue.factors()]
+    by = asked.get("by", "")
+    if by not in {"", *factors}:
+        raise NotThere(f"trials are grouped by {', '.join(factors)}, or by driver and prompt")
+    standing = standing_of(site.catalogue)
+    groups = groups_of(site, by)
+    humans = site.catalogue.ask(PLAYED.format(key="who", trials="listed", where="who = 'humans'"))
+    seen = news_of((standing, site.catalogue.state(), site.catalogue.held), asked.get("seen", ""))
+    imported = sum(row["trials"] for row in humans)
+    panels = computed(site, ("home", by, str(imported)), given, wait_s=0.0)
+    verdicts = computed(site, ("tables", "indicators"), given, wait_s=0.0)
+    (unpriced,) = site.catalogue.ask(UNPRICED)
+    return site.render(
+        "home.html",
+        here="index",
+        standing=standing,
+        seen=seen,
+        by=by,
+        factors=factors,
+        task=task_picture(),
+        groups=groups,
+        first=ranking(groups),
+        humans=human_cells(humans),
+        rows=(rows := worst_first(groups)),
+        condition_texts=condition_texts(site, [row["name"] for row in rows]),
+        accounts=account_rows(site.catalogue.ask(ACCOUNTS), published_accounts())
+        if "account" in FACETS
+        else None,
+        unpriced=unpriced["attempts"],
+        panels=panels,
+        charts=_charts(site, panels),
+        verdicts=verdicts,
+        indicators=_indicators(site, verdicts),
+        path=marker,
+    )
+
+
+def groups_of(site: Site, by: str) -> list[Played]:
+    """Drivers and prompts, or the levels of a factor; before several their sum."""
+    drivers = "who <> 'humans'"
+    if not by:
+        key, trials = "{'model': model, 'variant': variant}", "listed"
+    elif by == PROMPT:
+        key, trials = "{'variant': variant}", "listed"
+    else:
+        key, trials = "{'level': level}", "listed JOIN levels USING (number)"
+        drivers += " AND factor = ?"
+    rows = site.catalogue.ask(
+        PLAYED.format(key=key, trials=trials, where=drivers),
+        *([by] if "factor" in drivers else []),
+    )
+    found: dict[tuple[str, ...], Played] = {}
+    for row in rows:
+        levels = {name: value or "" for name, value in row["key"].items()}
+        state = {f"{FACTOR}{by}" if name == "level" else name: v for name, v in levels.items()}
+        label = ", ".join(filter(None, levels.values()))
+        new = Played(label, row["who"], {"who": row["who"], **state}, row["stand_in"] or "")
+        found.setdefault((row["who"], *levels.values()), new).cells[row["condition"]] = row
+    return [*_sums(site, list(found.values())), *found.values()]
+
+
+def _sums(site: Site, groups: Sequence[Played]) -> list[Played]:
+    """All trials of drivers, and all of stand-ins, where they are several groups."""
+    sums = []
+    for who in ("drivers", "stand-ins"):
+        if sum(group.who == who for group in groups) > 1:
+            rows = site.catalogue.ask(
+                PLAYED.format(key="who", trials="listed", where="who = ?"), who
+            )
+            whole = Played(f"all {who}", who, {"who": who})
+            whole.cells.update({row["condition"]: row for row in rows})
+            sums.append(whole)
+    return sums
+
+
+def human_cells(imported: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """The published human collisions by condition; ``there``: all of its trials are imported."""
+    listed = {row["condition"]: row for row in imported}
+    return {
+        name: {
+            "collided": of.collided,
+            "ended": of.trials,
+            "there": name in listed
+            and (listed[name]["collided"], listed[name]["ended"]) == (of.collided, of.trials),
+        }
+        for name, of in human_counts().items()
+    }
+
+
+def ranking(groups: Sequence[Played]) -> Played | None:
+    """The group by which conditions are ordered: the first that collided, if any did."""
+    return next((group for group in groups if group.total["collided"]), next(iter(groups), None))
+
+
+def worst_first(groups: Sequence[Played]) -> list[dict[str, Any]]:
+    """The conditions by the share of collisions of the ranking group."""
+    first = ranking(groups)
+    if first is None:
+        return []
+    played = {name for group in groups for name in group.cells}
+    usual = {name: place for place, name in enumerate(HUMAN_CONDITIONS)}
+    names = sorted(played, key=lambda name: (-first.share(name), usual.get(name, len(usual)), name))
+    most = max((first.share(name) for name in names), default=0.0)
+    return [
+        {
+            "name": name,
+            "share": first.share(name),
+            "width": round(100 * first.share(name) / most, 1) if most > 0 else 0.0,
+        }
+        for name in names
+    ]
+
+
+def _charts(site: Site, found: Computed) -> dict[str, Any] | None:
+    """Who goes first and the gap, beside the humans."""
+    if found.result is None:
+        return None
+    content = found.result.content
+    rest = {name: content[name] for name in ("caveat", "outcomes_from", "published_trials")}
+    return rest | drawn(site.at, content, [Kind(LEFT_FIRST), Kind(GAP)], DRAWN)
+
+
+def _indicators(site: Site, found: Computed) -> dict[str, Any] | None:
+    """Table V by driver: each verdict with the share of human data sets that pass."""
+    if found.result is None:
+        return None
+    table = from_text(found.result.content["tables"][0])
+    return {**verdicts_of(site, table), "notes": notes_of(table)}
+
+
+def verdicts_of(site: Site, table: Table) -> dict[str, Any]:
+    """What Table V judges: its indicators, and by driver each verdict as printed.
+
+    ``ceiling`` is the share of human data sets that pass, ``link`` leads to the trials.
+    """
+    columns = {column.name: column for column in table.columns}
+    drivers: dict[str, dict[str, Any]] = {}
+    for row in table.rows:
+        if row.values.get("paper") is None and row.values.get("robust") is None:
+            continue
+        said = {
+            name: shown_value(columns[name], row.values.get(name))
+            for name in ("paper", "robust", "ceiling_paper")
+        }
+        known = row.values.get("ceiling_paper") is not None
+        drivers.setdefault(str(row.values["driver"]), {})[str(row.values["indicator"])] = {
+            "paper": said["paper"],
+            "robust": said["robust"] if row.values.get("differ") else "",
+            "ceiling": said["ceiling_paper"] if known else "",
+            "link": site.at.cell(table.name, row.id, "n") if row.groups != (HUMAN,) else "",
+            "note": row.note,
+        }
+    names = dict.fromkeys(name for cells in drivers.values() for name in cells)
+    return {"names": list(names), "drivers": drivers}
+
+
+def account_rows(
+    found: Sequence[Row], published: Mapping[str, Mapping[str, int]]
+) -> dict[str, Any] | None:
+    """Collisions by class, of each driver and prompt and as published; None without a collision.
+
+    ``classes`` have the counts by group. What is published does not tell the first two apart: they
+    are ``same``.
+    """
+    if not found:
+        return None
+    classes: dict[str, dict[tuple[str, str], int]] = {name: {} for name in SAME_ACTION}
+    for name in (name for of in published.values() for name in of if name != SAME):
+        classes.setdefault(name, {})
+    for row in found:
+        classes.setdefault(row["account"], {})[row["model"], row["variant"] or ""] = row["trials"]
+    return {
+        "groups": list(dict.fromkeys((row["model"], row["variant"] or "") for row in found)),
+        "classes": classes,
+        "published": published,
+        "same": {who: of[SAME] for who, of in published.items()},
+    }
+
+
+def task_picture() -> dict[str, Any]:
+    """The track from above with both vehicles, in m; as in a replay all drive to the right."""
+    scenario = ScenarioConfig()
+    places = CONDITIONS[PICTURED].positions_m(PICTURED_S, TRACK)
+    vehicles = []
+    for side, position_m in zip(SIDES, places, strict=True):
+        across, along = TRACK.place(side, position_m)
+        sine, cosine = TRACK.heading(side, position_m)
+        vehicles.append(
+            {"side": side, "x": round(along, 2), "y": round(across, 2),
+             "matrix": f"{cosine:.4f} {sine:.4f} {-sine:.4f} {cosine:.4f}"}
+        )  # fmt: skip
+    return {
+        "view_box": views.view_box(TRACK),
+        "branches": {side: _path(side) for side in SIDES},
+        "tunnels": {side: [_point(side, 0.0), _point(side, TRACK.tunnel_exit_m)] for side in SIDES},
+        "merge_m": round(TRACK.merge_y_m, 2),
+        "end_m": round(TRACK.end_y_m, 2),
+        "vehicles": vehicles,
+        "length_m": scenario.vehicle_length_m,
+        "width_m": scenario.vehicle_width_m,
+        "alone_m": TRACK.merge_point_m - TRACK.tunnel_exit_m,
+        "condition": PICTURED,
+        "words": views.condition_text(
+            CONDITIONS[PICTURED].projected_headway_m, CONDITIONS[PICTURED].relative_velocity_mps
+        ),
+    }
+
+
+def _path(side: Side) -> str:
+    points = [_point(side, at) for at in (0.0, TRACK.merge_point_m, TRACK.end_m)]
+    return " ".join(f"{x},{y}" for x, y in points)
+
+
+def _point(side: Side, position_m: float) -> tuple[float, float]:
+    across, along = TRACK.place(side, position_m)
+    return round(along, 2), round(across, 2)

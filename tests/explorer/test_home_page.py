@@ -1,0 +1,298 @@
+"""The study at a glance: what is there at once, what arrives, and where its numbers lead."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import replace
+from html import unescape
+from urllib.parse import parse_qs, urlsplit
+
+import duckdb
+import pytest
+from playwright.sync_api import expect
+from starlette.testclient import TestClient
+
+from analysis.data.human_counts import human_counts
+from analysis.data.reference_data import published
+from analysis.data.study import Study
+from analysis.explorer.analysis_process import Computing
+from analysis.explorer.app import explorer
+from analysis.explorer.child import NoAnswer
+from analysis.explorer.pages.home import account_rows, home_page, task_picture
+from analysis.explorer.pages.tables import FIGURES
+from analysis.explorer.site import NothingNew, Site
+from analysis.explorer.urls import StaticLinks
+from analysis.figures.gallery import FIGURES as DRAWN
+from analysis.table_format import TableFormat
+from analysis.tables import make_tables
+from analysis.tables.formats import render
+from merge_runner.config import ScenarioConfig
+from merge_runner.scenarios.merge.collision import collided
+from merge_runner.scenarios.merge.geometry import TRACK
+from tests.analysis.studies import Said, write_study, yielding
+from tests.explorer.test_humans_page import import_some
+from tests.explorer.test_tables_pages import Addresses, InProcess, listed
+
+HOST = "127.0.0.1:8700"
+WORST = "L_0_-8"
+
+
+class Never(InProcess):
+    """A computation that never comes to anything."""
+
+    def ask(self, request, **limits):
+        raise NoAnswer("not now")
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    """o3 and a variant of it, which collide in two conditions; one trial is lost."""
+    drives = []
+    for drive in [*yielding("o3"), *yielding("o3", "A1", reps=1)]:
+        crash = drive.condition == WORST or (drive.condition == "N_0_0" and drive.rep == 1)
+        said = {1: Said(("timeout",), lost=True)} if drive.condition == "R_0_8" else {}
+        straight = {"left": (0.0,), "right": (0.0,)} if crash else {}
+        drives.append(replace(drive, said=said if drive.rep == 2 else {}, **straight))
+    return write_study(tmp_path_factory.mktemp("home") / "study.duckdb", drives)
+
+
+@pytest.fixture(scope="module")
+def own(db):
+    site = Site(db)
+    site.computing = Computing(db, InProcess)
+    site.catalogue.refresh()
+    yield site
+    site.computing.close()
+
+
+def client_of(site):
+    return TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
+
+
+@pytest.fixture(scope="module")
+def client(own):
+    return client_of(own)
+
+
+def whole(client, address="/"):
+    """The page once all has arrived."""
+    while 'class="computing"' in (text := client.get(address).text):
+        pass
+    return text
+
+
+def test_counts_are_there_before_anything_is_computed_and_lead_to_their_trials(db):
+    site = Site(db)
+    site.computing = Computing(db, Never)
+    client = client_of(site)
+    text = unescape(client.get("/").text)
+    with duckdb.connect(str(db), read_only=True) as connection:
+        counts = dict(
+            connection.execute(
+                "SELECT condition, count(*) FROM trials WHERE status = 'collided' GROUP BY ALL"
+            ).fetchall()
+        )
+    assert counts == {WORST: 4, "N_0_0": 2}
+    assert f"<strong>{WORST}</strong>: 4 of 4 trials (100.0 %) of all drivers" in text
+    table = text.split('id="collisions"')[1].split("</table>")[0]
+    rows = re.findall(r'<th scope="row"[^>]*>(?:<a[^>]*>)?([^<]+)', table)
+    assert rows[:2] == [WORST, "N_0_0"]
+    links = re.findall(r'<a href="(/trials\?[^"]*)">(\d+)</a>', table + text.split('id="costs"')[1])
+    assert len(links) > 40
+    for link, count in links:
+        assert listed(client.get(link).text) == int(count), link
+    site.computing.close()
+
+
+@pytest.mark.slow
+def test_points_verdicts_and_values_lead_to_their_trials(client):
+    text = unescape(whole(client))
+    point = re.search(r'<a href="([^"]+)"[^>]*aria-label="o3, baseline, L_4_0: 100[^"]*n 3"', text)
+    assert point, text
+    assert listed(whole(client, point[1])) == 3
+    verdict = re.search(r'<a href="([^"]+)" aria-label="I1 of o3: (.)"', text)
+    assert verdict[2] in "✓✗–"
+    assert parse_qs(urlsplit(verdict[1]).query)["cell"] == ["indicators/o3/baseline/I1:n"]
+    assert re.search(r"humans pass: \d+ %", text)
+    assert "What to keep in mind" in text
+    assert Addresses(text).inline == []
+
+
+def test_a_study_is_grouped_by_any_of_its_factors(client, own):
+    text = client.get("/?by=prompt").text
+    assert '<strong aria-current="true">prompt</strong>' in text
+    heads = text.split('id="collisions"')[1].split("</thead>")[0]
+    assert [name.strip() for name in re.findall(r'<th scope="col">([^<]+)', heads)][2:] == [
+        "all drivers",
+        "A1",
+        "baseline",
+        "humans",
+    ]
+    assert "grouped by prompt" in client.get("/?by=mood").text
+    groups = [g["id"] for g in own.computing.ask(("home", "prompt", "0"), (0, 0), wait_s=60)
+              .content["groups"]]  # fmt: skip
+    assert groups == ["human", "prompt=baseline", "prompt=A1"]
+    point = re.search(r'<a href="([^"]+)"[^>]*aria-label="A1, L_4_0:', whole(client, "/?by=prompt"))
+    assert listed(whole(client, unescape(point[1]))) == 1
+
+
+def test_levels_of_a_factor_are_groups_with_their_trials(played):
+    site = Site(played.db)
+    site.computing = Computing(played.db, Never)
+    client = client_of(site)
+    costs = unescape(client.get("/?by=temperature").text).split('id="costs"')[1]
+    links = re.findall(r'<a href="(/trials\?[^"]*factor.temperature=[^"]*)">(\d+)</a>', costs)
+    assert len(links) >= 2
+    for link, count in links:
+        assert listed(client.get(link).text) == int(count)
+    site.computing.close()
+
+
+def test_human_counts_are_the_published_ones_and_lead_on_only_when_all_are_imported(
+    db, tmp_path, client
+):
+    assert sum(of.collided for of in human_counts().values()) == 28
+    outcomes = published("human_outcomes").set_index("condition")
+    for name, of in human_counts().items():
+        assert tuple(outcomes.loc[name, list(of._fields)]) == of
+    assert "who=humans" not in client.get("/").text
+    part = shutil.copy(db, tmp_path / "part.duckdb")
+    import_some(part, tmp_path / "recordings")
+    site = Site(part)
+    site.computing = Computing(part, Never)
+    text = client_of(site).get("/").text
+    assert "who=humans" not in text
+    # Nor do they join the drivers' counts.
+    assert "4 of 4 trials (100.0 %) of all drivers" in text
+    site.computing.close()
+
+
+def test_the_strip_says_what_to_type_and_nothing_twice(db, tmp_path):
+    copy = shutil.copy(db, tmp_path / "study.duckdb")
+    with duckdb.connect(copy) as connection:
+        connection.execute("UPDATE sweeps SET ended_at = started_at, exit_code = 3")
+    site = Site(tmp_path / "study.duckdb", program="/opt/bin/merge-runner")
+    site.computing = Computing(copy, Never)
+    client = client_of(site)
+    text = client.get("/").text
+    assert "Stopped: the account" in text
+    assert "<code>/opt/bin/merge-runner sweep test --model" in text
+    (again,) = re.findall(r'hx-get="(/\?seen=[^"]+)"', text)
+    assert client.get(again).status_code == 204
+    with pytest.raises(NothingNew):
+        home_page(site, {"seen": again.partition("=")[2]})
+    with duckdb.connect(copy) as connection:
+        connection.execute("UPDATE sweeps SET exit_code = 0")
+    assert (
+        "the database holds only" in client.get(again).text or "Finished" in client.get(again).text
+    )
+    site.computing.close()
+
+
+def test_an_exported_study_begins_with_it_and_says_nothing_of_runs(db):
+    site = Site(db, StaticLinks(), shared={"inlined": None})
+    site.catalogue.refresh()
+    assert site.at.to("index") == "index.html"
+    site.computing = Computing(db, Never)
+    site._environment.globals["shell"] = "base.html"
+    text = home_page(site, {})
+    assert "Do they drive like humans?" in text
+    assert 'id="strip"' not in text
+    assert "trials.html?condition=" in text
+    site.computing.close()
+
+
+def test_classes_of_collisions_stand_beside_the_published_ones():
+    published = {"humans": {"same action": 14, "no action": 5, "other": 4}}
+    found = [
+        {"model": "o3", "variant": "baseline", "account": "both gave way", "trials": 3},
+        {"model": "o3", "variant": None, "account": "invalid plan", "trials": 1},
+    ]
+    rows = account_rows(found, published)
+    assert list(rows["classes"]) == [
+        *("both insisted", "both gave way", "no action", "other", "invalid plan")
+    ]
+    assert rows["classes"]["both gave way"] == {("o3", "baseline"): 3}
+    assert rows["classes"]["invalid plan"] == {("o3", ""): 1}
+    assert (rows["same"], rows["groups"]) == ({"humans": 14}, [("o3", "baseline"), ("o3", "")])
+    assert account_rows([], published) is None
+
+
+def test_the_picture_of_the_task_shows_a_moment_before_the_merge():
+    task = task_picture()
+    left, right = task["vehicles"]
+    assert left["x"] > right["x"]
+    assert left["y"] < 0 < right["y"]
+    for one in (left, right):
+        assert TRACK.tunnel_exit_m * TRACK.branch_cosine < one["x"] < task["merge_m"]
+    assert not collided(ScenarioConfig(), TRACK, left["x"], right["x"])
+
+
+@pytest.mark.parametrize(("suffix", "form"), [("csv", TableFormat.CSV), ("tex", TableFormat.LATEX)])
+def test_a_table_comes_as_a_file(client, db, suffix, form):
+    reply = client.get(f"/tables/attempts.{suffix}")
+    assert reply.text == render(make_tables(Study(db), ["attempts"]), form) + "\n"
+    assert f'filename="attempts.{suffix}"' in reply.headers["content-disposition"]
+    assert f'href="/tables/attempts.{suffix}" download' in whole(client, "/tables/attempts")
+    assert client.get("/tables/attempts.exe").status_code == 404
+    assert client.get(f"/tables/nothing.{suffix}").status_code == 404
+
+
+@pytest.mark.slow
+def test_every_figure_is_offered_and_comes_as_svg(client):
+    assert list(FIGURES) == list(DRAWN)
+    assert set(re.findall(r'href="/figures/([^"]+)\.svg"', client.get("/tables").text)) == set(
+        DRAWN
+    )
+    reply = client.get("/figures/ablation-matrix.svg")
+    assert reply.headers["content-type"].startswith("image/svg+xml")
+    assert "</svg>" in reply.text
+    assert "sandbox" in reply.headers["content-security-policy"]
+    assert client.get("/figures/nothing.svg").status_code == 404
+
+
+def test_rows_of_fallbacks_in_which_nothing_differs_are_folded(client):
+    text = whole(client, "/tables/fallbacks")
+    (rows,) = re.findall(r"<summary>(\d+) rows in which nothing differs", text)
+    assert text.count("<tr id=") == int(rows)
+    assert 'id="table"' not in text
+
+
+def test_no_head_of_a_table_is_empty(client):
+    heads = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", whole(client, "/tables/indicators"))
+    assert heads
+    assert all(re.sub("<[^>]*>", "", head).strip() for head in heads)
+
+
+def test_heads_sort_and_the_address_keeps_it(page):
+    page.goto("/tables")
+    page.goto("/")
+    column = page.locator("#costs tbody td:nth-child(2)")
+    page.locator("#costs thead").get_by_role("button", name="trials").click()
+    down = [int(text) for text in column.all_inner_texts()]
+    assert down == sorted(down, reverse=True)
+    assert len(set(down)) > 1
+    expect(page.locator("#costs th[aria-sort=descending]")).to_have_text("trials")
+    page.reload()
+    assert [int(text) for text in column.all_inner_texts()] == down
+    page.locator("#costs thead").get_by_role("button", name="trials").click()
+    assert [int(text) for text in column.all_inner_texts()] == sorted(down)
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    page.locator("#copy-link").click()
+    expect(page.locator("#copy-link")).to_have_text("copied")
+    assert page.evaluate("navigator.clipboard.readText()") == page.url
+    assert "sorted=costs.1" in page.url
+
+
+@pytest.mark.parametrize("address", ["/", "/humans"])
+def test_nothing_is_cut_off_at_1024_pixels(page, address):
+    page.set_viewport_size({"width": 1024, "height": 800})
+    page.goto(address)
+    expect(page.locator(".multiples").first).to_be_visible()
+    cut = page.eval_on_selector_all(
+        ".multiples, .multiples svg, main",
+        "all => all.filter(e => e.getBoundingClientRect().right > innerWidth).length",
+    )
+    assert cut == 0
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
