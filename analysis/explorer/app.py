@@ -24,7 +24,7 @@ from starlette.staticfiles import StaticFiles
 
 from analysis.explorer.assets import STATIC
 from analysis.explorer.guard import Guard, from_elsewhere
-from analysis.explorer.pages import ablations, humans, sql, sweep, tables, trial, trials
+from analysis.explorer.pages import ablations, conditions, humans, sql, sweep, tables, trial, trials
 from analysis.explorer.site import NothingNew, NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
@@ -117,8 +117,14 @@ def _computed_routes(site: Site) -> list[Route]:
     def table(request: Request) -> str:
         return tables.table_page(site, request.path_params["name"], request.query_params)
 
+    def condition(request: Request) -> str:
+        return conditions.condition_page(site, request.path_params["name"], request.query_params)
+
     page = partial(_page, site)
     return [
+        Route("/conditions", page(lambda r: conditions.conditions_page(site, r.query_params))),
+        Route("/conditions/{name:path}", page(condition)),
+        Route("/glossary", page(lambda _: site.render("glossary.html", here="glossary"))),
         Route("/tables", page(lambda _: tables.tables_page(site))),
         Route("/tables/{name}", page(table)),
         Route("/ablations", page(lambda r: ablations.ablations_page(site, r.query_params))),
