@@ -15,7 +15,7 @@ from analysis.explorer.traces import MEASURES, read_band, read_traces
 
 HUMAN = "human"
 # So many trials are drawn: a browser can still show them, and more would be one dark spot.
-MOST = 1_000
+MOST = 500
 # Sizes in the picture, in its units.
 WIDTH, LEFT, RIGHT, PANEL, BETWEEN, TOP, FOOT = 1000, 42, 8, 170, 34, 24, 42
 PANELS = dict(
@@ -170,12 +170,14 @@ def _path(row: Row, trace: Row, time: Scale, axes: Mapping[str, Axis]) -> str:
     In whole units, each point by its distance from the one before: that is a third of the text.
     """
     end = CROSS if row["outcome"] == "collided" else ""
-    across = [round(time(second)) for second in trace["time_s"]]
+    across = time.whole(trace["time_s"])
+    steps = [x - before for before, x in pairwise(across)] or [0]
     parts = []
     for name, axis in axes.items():
-        points = list(zip(across, (round(axis.scale(y)) for y in trace[name]), strict=True))
-        steps = " ".join(f"{x - x0} {y - y0}" for (x0, y0), (x, y) in pairwise(points))
-        parts.append(f"M{points[0][0]} {points[0][1]}l{steps or '0 0'}{end}")
+        up = axis.scale.whole(trace[name])
+        rises = [y - before for before, y in pairwise(up)] or [0]
+        line = " ".join([f"{x} {y}" for x, y in zip(steps, rises, strict=True)])
+        parts.append(f"M{across[0]} {up[0]}l{line}{end}")
     return "".join(parts).replace(" -", "-")
 
 
