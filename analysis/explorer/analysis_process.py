@@ -16,8 +16,6 @@ from merge_runner.study.parts import adopted
 
 Request = tuple[str, ...]
 REMEMBERED = 100
-# What the fits of these tables take on their own, in s on a slow machine.
-LONG_S = {"who-first": 8, "gap": 13, "indicators": 15, "ablation-qualitative": 15}
 # Nobody has to wait for more: an export waits so long, and the process is killed then.
 LONGEST_S = 3600.0
 MOST_BYTES = 2**30
@@ -132,8 +130,3 @@ class Computing:
         if self._child is not None:
             self._child.close()
         self._child = self._state = None
-
-
-def about_s(request: Request, trials: int) -> int:
-    """About how long a first answer takes, in s: to load pandas, to read the trials, to fit."""
-    return round(12 + trials / 500 + sum(LONG_S.get(name, 1) for name in request[1:]))

@@ -24,7 +24,17 @@ from starlette.staticfiles import StaticFiles
 
 from analysis.explorer.assets import STATIC
 from analysis.explorer.guard import Guard, from_elsewhere
-from analysis.explorer.pages import ablations, home, humans, sql, sweep, tables, trial, trials
+from analysis.explorer.pages import (
+    ablations,
+    conditions,
+    home,
+    humans,
+    sql,
+    sweep,
+    tables,
+    trial,
+    trials,
+)
 from analysis.explorer.site import NothingNew, NotThere, Site
 from merge_runner.errors import MergeRunnerError
 
@@ -127,8 +137,14 @@ def _computed_routes(site: Site) -> list[Route]:
         svg = tables.figure_svg(site, request.path_params["name"])
         return Response(svg, media_type="image/svg+xml", headers=SEALED)
 
+    def condition(request: Request) -> str:
+        return conditions.condition_page(site, request.path_params["name"], request.query_params)
+
     page = partial(_page, site)
     return [
+        Route("/conditions", page(lambda r: conditions.conditions_page(site, r.query_params))),
+        Route("/conditions/{name:path}", page(condition)),
+        Route("/glossary", page(lambda _: site.render("glossary.html", here="glossary"))),
         Route("/tables", page(lambda _: tables.tables_page(site))),
         Route("/tables/{name}.{suffix}", page(file)),
         Route("/figures/{name}.svg", page(figure)),

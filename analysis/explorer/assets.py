@@ -15,7 +15,7 @@ STYLES = (
     "vendor/uplot-1.6.32.min.css",
     *(
         f"styles/{name}.css"
-        for name in ("colours", "base", "trial", "sql", "tables", "sweeps", "home")
+        for name in ("colours", "base", "trial", "sql", "tables", "sweeps", "home", "conditions")
     ),
 )
 

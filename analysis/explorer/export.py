@@ -20,6 +20,7 @@ from analysis.explorer.catalogue import FACETS, FACTOR, SEVERAL, Filter
 from analysis.explorer.details import read_decisions, read_trial
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.computed import computed
+from analysis.explorer.pages.conditions import condition_page, conditions_page
 from analysis.explorer.pages.home import home_page
 from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
@@ -34,7 +35,7 @@ from analysis.tables import TABLES
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
 
-PLAIN = ("keys.js", "sorting.js")
+PLAIN = ("keys.js", "sorting.js", "traces.js")
 LISTING = ("keys.js", "unpacked.js", "listing.js")
 BUNDLE = ("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
 # A link that only a server can follow.
@@ -51,7 +52,7 @@ _HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\
 SHORTEST_SECRET = 8
 # The names of an export's pages: those of an earlier one are deleted, and nothing else.
 _OURS = re.compile(
-    rf"(?:{'|'.join(EXPORTED)}|(?:sweep|table|trials)-.*)\.html|table-.*\.(?:{'|'.join(FILES)})"
+    rf"(?:{'|'.join(EXPORTED)}|(?:condition|sweep|table|trials)-.*)\.html|table-.*\.(?:{'|'.join(FILES)})"
 )
 # Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
@@ -110,6 +111,10 @@ def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
     for entry in list_sweeps(site.catalogue):
         yield at.sweep(entry.sweep_id), sweep_page(site, entry.sweep_id)
     yield at.to("sweeps"), sweeps_page(site)
+    yield at.to("conditions"), conditions_page(site, {})
+    for row in site.catalogue.ask("SELECT DISTINCT condition FROM listed ORDER BY ALL"):
+        yield at.condition(row["condition"]), condition_page(site, row["condition"], {})
+    yield at.to("glossary"), site.render("glossary.html", here="glossary")
     yield at.to("tables"), tables_page(site)
     for name in watch(list(TABLES), "Tables"):
         yield at.table(name), table_page(site, name, {})

@@ -34,6 +34,11 @@ class Scale:
         inside = min(max(value, self.low), self.high)
         return self.from_ + (self.to - self.from_) * (inside - self.low) / (self.high - self.low)
 
+    def whole(self, values: Sequence[float]) -> list[int]:
+        """The places of values that all lie between the ends, in whole units."""
+        unit = (self.to - self.from_) / (self.high - self.low)
+        return [round(self.from_ + unit * (value - self.low)) for value in values]
+
 
 def speed_range(rows: Sequence[Row]) -> tuple[int, int]:
     """The whole m/s at the bottom and the top of all sparklines of these trials."""

@@ -14,9 +14,10 @@ from analysis.explorer.analysis_process import Computing
 from analysis.explorer.assets import STYLES
 from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.display_text import visible
+from analysis.explorer.glossary import sections
 from analysis.explorer.query_process import Sandbox
 from analysis.explorer.urls import HOME, Links, StaticLinks
-from analysis.explorer.views import clock
+from analysis.explorer.views import clock, condition_text
 from analysis.metrics import METRICS
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
@@ -26,6 +27,7 @@ PAGES = {
     "Study": HOME,
     "Runs": "sweeps",
     "Trials": "trials",
+    "Conditions": "conditions",
     "Tables": "tables",
     "Ablations": "ablations",
     "Humans": "humans",
@@ -77,6 +79,8 @@ class Site:
             study=self.db.name if self.static else str(self.db),
             visible=visible,
             clock=clock,
+            condition_text=condition_text,
+            glossary=sections(),
             **self.shared,
         )
 

@@ -65,13 +65,17 @@ class Links:
         """A sweep's page."""
         return f"/sweeps/{quote(sweep_id)}"
 
+    def condition(self, name: str, **state: object) -> str:
+        """All trials of a condition in one picture."""
+        return f"/conditions/{quote(name)}" + query_of(state)
+
     def static(self, name: str) -> str:
         """A script or a style."""
         return f"/static/{name}"
 
 
 # The pages that the export of a whole study has beside the trials, each as a file of this name.
-EXPORTED = (HOME, "sweeps", "trials", "tables", "ablations", "humans")
+EXPORTED = (HOME, "sweeps", "trials", "conditions", "tables", "ablations", "humans", "glossary")
 
 
 class StaticLinks(Links):
@@ -127,6 +131,11 @@ class StaticLinks(Links):
     def sweep(self, sweep_id: str) -> str:
         """A sweep's page: a file, whose name means the same in an address."""
         return f"sweep-{_ODD.sub('_', sweep_id)}.html"
+
+    def condition(self, name: str, **state: object) -> str:
+        """All trials of a condition in one picture, or nothing where only trials are exported."""
+        there = "conditions" in self._pages
+        return f"condition-{_ODD.sub('_', name)}.html" + query_of(state) if there else ""
 
 
 def bundle_name(condition: str) -> str:

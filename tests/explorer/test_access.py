@@ -1,29 +1,76 @@
-"""Nothing on the pages keeps anybody out who reads with other eyes."""
+"""Nothing on the pages keeps anybody out who reads with other eyes, at night or on a phone."""
 
 from __future__ import annotations
 
 import pytest
+from playwright.sync_api import expect
 
 from tests.explorer.axe import serious
+from tests.explorer.test_exported import exported
+
+__all__ = ["exported"]
 
 PAGES = (
     "/sweeps",
     "/",
+    "/conditions",
+    "/conditions/N_0_0",
+    "/glossary",
     "/tables",
     "/tables/attempts",
+    "/tables/indicators",
     "/ablations",
     "/discordant?model=emulator&variant=A1",
     "/trials/o4/baseline/L_4_0/rep01?side=left&decision=2",
     "/humans",
     "/sql?q=select+1",
     "/trials",
+    "/trials?cell=attempts/emulator%2Fbaseline:calls",
     "/trials/emulator/baseline/N_0_0/rep01?side=left&decision=2"
     "&compare=emulator/baseline/N_0_0/rep02",
 )
+# The scheme of the colours and the width of the window, in pixels.
+LOOKS = (("light", 1024), ("dark", 420))
+DRAWN_ANEW = "new Promise(then => requestAnimationFrame(() => requestAnimationFrame(then)))"
+OVER = "document.documentElement.scrollWidth - innerWidth"
+
+
+def findings(page):
+    """What is wrong with a page in each look; where it is too wide, by how many pixels."""
+    found = []
+    for scheme, width in LOOKS:
+        page.emulate_media(color_scheme=scheme)
+        page.set_viewport_size({"width": width, "height": 900})
+        page.evaluate(DRAWN_ANEW)
+        found += [(scheme, width, over) for over in [page.evaluate(OVER)] if over > 0]
+        found += [(scheme, width, *finding) for finding in serious(page)]
+    return found
 
 
 @pytest.mark.parametrize("address", PAGES)
-def test_axe_finds_nothing_serious(page, address):
+def test_a_page_fits_its_window_and_axe_finds_nothing_serious(page, address):
     page.goto(address)
     page.wait_for_load_state("networkidle")
-    assert serious(page) == []
+    expect(page.locator(".computing")).to_have_count(0)
+    assert findings(page) == []
+
+
+def test_exported_pages_fit_and_axe_finds_nothing_serious(page, exported):
+    for path in sorted(exported.glob("*.html")):
+        page.goto(f"file://{path}")
+        if path.name.startswith("trials-"):
+            expect(page.locator("#charts .uplot")).to_have_count(3)
+        assert (path.name, findings(page)) == (path.name, [])
+
+
+def test_the_dialog_of_a_page_has_its_words_and_leads_to_all(page):
+    page.goto("/trials")
+    page.locator("#help-button").click()
+    words = page.locator("#words dt:visible")
+    expect(words.get_by_text("gap", exact=True)).to_be_visible()
+    assert "tunnel" not in words.all_inner_texts()
+    for scheme, _ in LOOKS:
+        page.emulate_media(color_scheme=scheme)
+        assert serious(page) == []
+    page.get_by_role("link", name="All words").click()
+    expect(page.locator("#main dt", has_text="tunnel")).to_be_visible()

@@ -214,7 +214,9 @@ def test_while_it_runs_the_cells_are_those_of_its_progress_file(study):
     text = text_of(client)
     assert "Running: 1 of 33 trials ended, 1 failed, about 20 s left." in text
     assert "1.50 USD in this run; 2.50 of at most 9.00 USD over all runs" in text
-    assert "N_0_0 1 of 3 1 failed" in text
+    assert (
+        "N_0_0 both would reach the merge point together, at equal speeds 1 of 3 1 failed" in text
+    )
     assert "all 1 of 33 1 failed" in text
 
 

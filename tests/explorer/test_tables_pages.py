@@ -143,6 +143,13 @@ def test_facets_sorting_and_exports_keep_the_cell(ask):
     assert len(ask(f"/trials.csv?cell={cell}").splitlines()) == 2
 
 
+@pytest.mark.slow
+def test_the_query_of_a_cell_leads_to_the_page_of_queries_and_finds_its_trials(ask):
+    page = ask("/trials?cell=ablation-quantitative/o3/A1:gap_m")
+    (link,) = (address for address in Addresses(page).to if address.startswith("/sql?q="))
+    assert f"<strong>{listed(page)}</strong> rows" in ask(link)
+
+
 def test_a_cell_that_is_none_says_so(ask):
     for address in ("/trials", "/trials.csv"):
         row = unescape(ask(f"{address}?cell=attempts/nobody:n", 404))

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
-from analysis.explorer.analysis_process import LONGEST_S, Request, Result, Waiting, about_s
+from analysis.explorer.analysis_process import LONGEST_S, Request, Result, Waiting
 from analysis.explorer.child import NoAnswer
 from analysis.explorer.site import NotThere, Site
 from analysis.explorer.urls import query_of, seconds
@@ -26,7 +26,6 @@ class Computed:
     result: Result | None
     failure: str
     elapsed_s: float
-    about_s: int
     listed: int
     older: bool
     again: str
@@ -65,7 +64,6 @@ def computed(
         result=result,
         failure=failure,
         elapsed_s=found.elapsed_s if isinstance(found, Waiting) else 0.0,
-        about_s=about_s(request, state[0]),
         listed=state[0],
         older=result is not None and result.state != state,
         again=query_of({**asked, **later}),

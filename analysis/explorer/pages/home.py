@@ -11,8 +11,9 @@ from analysis.explorer import views
 from analysis.explorer.analysis_worker import HUMAN
 from analysis.explorer.catalogue import FACETS, FACTOR
 from analysis.explorer.charts import Kind, drawn
+from analysis.explorer.conditions import condition_texts
 from analysis.explorer.pages.computed import Computed, computed
-from analysis.explorer.pages.sweep import condition_texts, news_of
+from analysis.explorer.pages.sweep import news_of
 from analysis.explorer.pictures import marker
 from analysis.explorer.reading import Row
 from analysis.explorer.site import NotThere, Site
@@ -98,7 +99,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         first=ranking(groups),
         humans=human_cells(humans),
         rows=(rows := worst_first(groups)),
-        condition_texts=condition_texts(site, [row["name"] for row in rows]),
+        condition_texts=condition_texts(site.catalogue, [row["name"] for row in rows]),
         accounts=account_rows(site.catalogue.ask(ACCOUNTS), published_accounts())
         if "account" in FACETS
         else None,

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
 from datetime import UTC, datetime
 
+from analysis.explorer.conditions import condition_texts, ordered
 from analysis.explorer.site import NothingNew, NotThere, Site
 from analysis.explorer.sweeps import Sweep, VariantCondition, duration, find_sweep, list_sweeps
-from analysis.explorer.views import condition_text, prompt_text
+from analysis.explorer.views import prompt_text
 from merge_runner.prompts.blocks import VARIANTS
-from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 KINDS = {
     "trial": "Trials that failed",
@@ -60,8 +59,8 @@ def news_of(shown: object, seen: str, state: str = "all") -> str:
 def _values(site: Site, sweep: Sweep) -> dict[str, object]:
     """What the templates of a sweep show."""
     usual = sweep.entry.config.planned if sweep.entry.config.arms else VARIANTS
-    variants = _ordered({variant for variant, _ in sweep.cells}, usual)
-    conditions = _ordered({condition for _, condition in sweep.cells}, HUMAN_CONDITIONS)
+    variants = ordered({variant for variant, _ in sweep.cells}, usual)
+    conditions = ordered({condition for _, condition in sweep.cells})
     rows = [
         (condition, [sweep.cells.get((variant, condition)) for variant in variants])
         for condition in conditions
@@ -80,31 +79,11 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
             for kind, text in KINDS.items()
         },
         "bar": bar,
-        "condition_texts": condition_texts(site, conditions),
+        "condition_texts": condition_texts(site.catalogue, conditions),
         "prompt_text": prompt_text,
         "duration": duration,
         "lasted": _lasted(sweep.entry.row["started_at"], sweep.entry.last_word),
     }  # fmt: skip
-
-
-def condition_texts(site: Site, names: list[str]) -> dict[str, str]:
-    """Conditions in words; empty for one that no human drove and that has no trial yet."""
-    known = {
-        name: (one.projected_headway_m, one.relative_velocity_mps)
-        for name, one in HUMAN_CONDITIONS.items()
-    } | {
-        row["condition"]: (row["projected_headway_m"], row["relative_velocity_mps"])
-        for row in site.catalogue.ask(
-            "SELECT DISTINCT condition, projected_headway_m, relative_velocity_mps FROM listed"
-        )
-    }
-    return {name: condition_text(*known[name]) if name in known else "" for name in names}
-
-
-def _ordered(names: Iterable[str], usual: Iterable[str]) -> list[str]:
-    """Names in their usual order, those that are unknown last."""
-    places = {name: place for place, name in enumerate(usual)}
-    return sorted(names, key=lambda name: (places.get(name, len(places)), name))
 
 
 def bar(cell: VariantCondition) -> list[tuple[str, float, float]]:

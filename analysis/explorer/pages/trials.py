@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
+from analysis.explorer.conditions import condition_texts
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.site import NothingNew, NotThere, Site
@@ -34,10 +35,12 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     last = max(1, -(-trials // PAGE))
     number = min(page_of(asked), last)
     rows = site.catalogue.page(wanted, sort, number)
+    facets = site.catalogue.facets(wanted)
     return site.render(
         "trials.html",
         here="trials",
-        facets=site.catalogue.facets(wanted),
+        facets=facets,
+        condition_texts=condition_texts(site.catalogue, (name for name, _ in facets["condition"])),
         chosen=wanted.chosen,
         kept={**wanted.chosen, "cell": cell},
         cell=cell,

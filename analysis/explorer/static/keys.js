@@ -5,7 +5,16 @@
   window.isCommand = (event) => (event.ctrlKey || event.metaKey || event.altKey) && !event.getModifierState("AltGraph");
   const typing = (target) => target.matches("input:not([type=range]), select, textarea, [contenteditable]");
   const help = document.getElementById("help");
-  document.getElementById("help-button").addEventListener("click", () => help.showModal());
+  const words = [...document.querySelectorAll("#words > div")].map((entry) => {
+    const names = entry.querySelector("dt").textContent.split(", ").map((name) => name.replace(/[^\w ]/g, "\\$&"));
+    return [entry, new RegExp(`(?<![\\w-])(${names.join("|")})(s|es)?(?![\\w-])`, "i")];
+  });
+  const explain = () => {
+    const said = document.getElementById("main").innerText;
+    for (const [entry, name] of words) entry.hidden = !name.test(said);
+    help.showModal();
+  };
+  document.getElementById("help-button").addEventListener("click", explain);
 
   let chosen = -1, address = null;
   const leads = (row) => row.querySelector("a")?.getAttribute("href");
@@ -33,7 +42,7 @@
     }
     if (help.open) return;
     const search = document.getElementById("search");
-    if (event.key === "?") help.showModal();
+    if (event.key === "?") explain();
     else if (event.key === "/" && search) search.focus();
     else if (event.key === "j") choose(1);
     else if (event.key === "k") choose(-1);

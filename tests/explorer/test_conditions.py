@@ -1,0 +1,199 @@
+"""All trials of a condition in one picture: what is drawn of whom, and where it leads."""
+
+from __future__ import annotations
+
+import html
+import re
+
+import duckdb
+import pytest
+from playwright.sync_api import expect
+from starlette.testclient import TestClient
+
+from analysis.explorer.app import explorer
+from analysis.explorer.export import export_folder
+from analysis.explorer.pages import conditions
+from analysis.explorer.site import Site
+from analysis.explorer.traces import POINTS, read_band, read_traces
+from tests.analysis.studies import Drive, write_study, yielding
+from tests.explorer.serving import served
+
+HOST = "127.0.0.1:8700"
+# Where the cross of a collision is on the screen: 2 units before the end of its line.
+ON_THE_CROSS = """path => {
+    const at = path.getPointAtLength(path.getTotalLength() - 2);
+    const { x, y } = at.matrixTransform(path.getScreenCTM());
+    return [x, y];
+}"""
+CRASH = Drive("o3", "baseline", "N_0_0", 9, (0.0,) * 9, (0.0,) * 9)
+# The median of these three is the second one.
+HUMANS = [Drive("human", "baseline", "N_0_0", i, (i / 10,) * 9, (-0.5,) * 9) for i in (1, 2, 3)]
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    """Two drivers, one with two prompts, a collision, and three humans in one condition."""
+    path = tmp_path_factory.mktemp("conditions") / "t.duckdb"
+    others = [*yielding("o3", "A1", reps=2), *yielding("o4", reps=2)]
+    write_study(path, [*yielding("o3", reps=2), CRASH, *others, *HUMANS])
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(
+            "UPDATE trials SET source = 'human', pair = 'P1', variant = NULL "
+            "WHERE trial_id LIKE 'human/%'"
+        )
+    return path
+
+
+@pytest.fixture
+def ask(db):
+    site = Site(db)
+    client = TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
+    yield client.get
+    site.close()
+
+
+def traces(text):
+    """The trials of the picture by name, with the class of each line."""
+    found = re.findall(
+        r'<a href="/trials/([^"?]*)[^>]*><title>[^<]*</title><path class="([^"]*)"', text
+    )
+    return dict(found)
+
+
+def test_the_picture_has_a_line_for_each_trial_that_leads_to_it(ask, db):
+    text = ask("/conditions/N_0_0").text
+    with duckdb.connect(str(db), read_only=True) as connection:
+        there = connection.execute(
+            "SELECT trial_id, coalesce(merged_first || '-first', status) FROM trials "
+            "WHERE condition = 'N_0_0' AND source <> 'human'"
+        ).fetchall()
+    assert traces(text) == dict(there)
+    assert traces(text)["o3/baseline/N_0_0/rep09"] == "collided"
+    assert text.count(conditions.CROSS) == len(conditions.PANELS)
+
+
+@pytest.mark.parametrize(
+    ("asked", "names"),
+    [
+        ("model=o4", {"o4/baseline"}),
+        ("model=o3&variant=A1", {"o3/A1"}),
+        ("variant=A1", {"o3/A1"}),
+        ("model=human", {"human/baseline"}),
+    ],
+)
+def test_the_address_chooses_the_driver_and_the_prompt(ask, asked, names):
+    found = traces(ask(f"/conditions/N_0_0?{asked}").text)
+    assert {name.rpartition("/N_0_0")[0] for name in found} == names
+
+
+def test_the_humans_are_a_median_and_a_band(ask, db):
+    text = ask("/conditions/N_0_0").text
+    assert text.count('class="median"') == text.count('class="band"') == len(conditions.PANELS)
+    assert "median of 3 human trials" in text
+    keys = [(f"human/baseline/N_0_0/rep0{i}", "human-baseline") for i in (1, 2, 3)]
+    band, own = read_band(db, keys), read_traces(db, keys)
+    middle = own[keys[1]]
+    at = {round(t, 3): v for t, v in zip(middle["time_s"], middle["left_mps"], strict=True)}
+    assert len(at) > 10
+    for row in band[:20]:  # while all of them go on
+        low, median, high = row["left_mps"]
+        assert median == pytest.approx(at.get(round(row["time_s"], 3), median))
+        assert low <= median <= high
+    assert band[-1]["time_s"] > 5
+    # The 10th percentile of three is a fifth of the way from the first to the second.
+    low, median, high = band[20]["left_mps"]
+    first, last = (own[key]["left_mps"][own[key]["time_s"].index(4.0)] for key in keys[::2])
+    assert low == pytest.approx(first + (median - first) / 5)
+    assert high == pytest.approx(last - (last - median) / 5)
+
+
+def test_without_humans_the_page_says_what_reads_them(ask):
+    text = ask("/conditions/L_4_0").text
+    assert "merge-runner human import PATH" in text
+    assert 'class="median"' not in text
+
+
+def test_a_trace_begins_and_ends_with_its_trial(db):
+    key = ("o3/baseline/N_0_0/rep09", "o3-baseline")
+    trace = read_traces(db, [key])[key]
+    with duckdb.connect(str(db), read_only=True) as connection:
+        (last,) = connection.execute(
+            "SELECT [max(time_s), arg_max(position_m, time_s) FILTER (side = 'left') - "
+            "arg_max(position_m, time_s) FILTER (side = 'right')] FROM states "
+            "WHERE (trial_id, spec_hash) = ($1, $2)",
+            key,
+        ).fetchone()
+    assert trace["time_s"][0] == 0
+    assert [trace["time_s"][-1], trace["headway_m"][-1]] == last
+    assert len(trace["time_s"]) <= POINTS + 2
+
+
+def test_of_too_many_trials_a_part_is_drawn_and_the_page_says_so(ask, monkeypatch):
+    monkeypatch.setattr(conditions, "MOST", 3)
+    text = ask("/conditions/N_0_0").text
+    assert len(traces(text)) == 3
+    assert '<strong id="drawn">3</strong> trials are drawn, taken evenly from the list of 7' in text
+
+
+def test_the_list_leads_to_every_condition_and_counts_by_driver(ask, db):
+    text = ask("/conditions").text
+    with duckdb.connect(str(db), read_only=True) as connection:
+        names = connection.execute("SELECT DISTINCT condition FROM trials").fetchall()
+    for (name,) in names:
+        assert f'href="/conditions/{name}"' in text
+    assert "both would reach the merge point together, at equal speeds" in text
+    link = re.search(r'href="([^"]*outcome=collided)"[^>]*>1<', text)[1]
+    assert "condition=N_0_0&amp;model=o3" in link
+    assert "<strong>1</strong> trials" in ask(html.unescape(link)).text
+
+
+def test_a_condition_that_nobody_drove_is_not_there(ask):
+    reply = ask("/conditions/nothing")
+    assert reply.status_code == 404
+    assert "no trial of the condition nothing is here" in reply.text
+
+
+def test_a_page_that_looks_for_news_gets_none_where_there_are_none(ask):
+    for page in ("/conditions", "/conditions/N_0_0"):
+        news = html.unescape(re.search(r'hx-get="([^"]*seen=[^"]*)"', ask(page).text)[1])
+        assert ask(news).status_code == 204
+        assert ask(news.replace("seen=", "seen=0")).status_code == 200
+
+
+def test_a_click_on_a_trace_opens_its_trial_and_a_choice_changes_the_picture(browser, db):
+    context = browser.new_context(viewport={"width": 1440, "height": 1000})
+    page = context.new_page()
+    with served(db) as address:
+        page.goto(f"{address}/conditions/N_0_0")
+        page.locator("#choice-model").select_option("o4")
+        expect(page.locator(".overlay path")).to_have_count(2)
+        assert page.url.endswith("model=o4")
+        page.locator("#choice-model").select_option("o3")
+        page.locator("#choice-variant").select_option("baseline")
+        crash = page.locator("path.collided")
+        expect(crash).to_have_count(1)
+        crash.scroll_into_view_if_needed()
+        x, y = crash.evaluate(ON_THE_CROSS)
+        page.mouse.click(x, y)
+        expect(page.locator("h1")).to_have_text("o3/baseline/N_0_0/rep09")
+        page.get_by_role("link", name="the traces of N_0_0").click()
+        expect(page.locator("h1")).to_contain_text("N_0_0")
+    context.close()
+
+
+def test_an_export_has_the_same_picture_and_chooses_without_a_server(page, db, tmp_path):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("analysis.explorer.export.TABLES", ["attempts"])
+        list(export_folder(db, tmp_path / "pages", []))
+    page.context.set_offline(True)
+    page.goto(f"file://{tmp_path}/pages/conditions.html")
+    page.get_by_role("link", name="N_0_0", exact=True).click()
+    expect(page.locator(".overlay path:visible")).to_have_count(7)
+    expect(page.locator("#drawn")).to_have_text("7")
+    expect(page.locator(".overlay .median")).to_have_count(3)
+    page.locator("#choice-model").select_option("human")
+    expect(page.locator(".overlay path:visible")).to_have_count(3)
+    page.get_by_role("link", name="o4", exact=True).click()
+    expect(page.locator(".overlay path:visible")).to_have_count(2)
+    page.locator("tbody tr", has_text="o4").locator("td a").first.click()
+    expect(page.locator("tbody tr:visible")).to_have_count(2)
