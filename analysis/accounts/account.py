@@ -20,7 +20,7 @@ from analysis.accounts.classes import (
     driven_at,
     judged_at,
 )
-from analysis.accounts.course import BRAKING, SPEEDING_UP, TICK_S, Course, first_arrival_s
+from analysis.accounts.course import BRAKING, SPEEDING_UP, TICK_S, Course
 from merge_runner.records import SIDES, Side
 
 SAYS = {"M": "merge", "Y": "yield"}
@@ -34,7 +34,7 @@ HEADINGS = {NEAR_MISS: "Why it came close", LONG_WAIT: "Why it took so long"}
 MEANINGS = {
     BOTH_INSISTED: "Both insisted: both had sped up",
     BOTH_GAVE_WAY: "Both gave way: both had slowed down",
-    ONE_TOO_LITTLE: "One did too little: the two did not do the same, but it was not enough",
+    ONE_TOO_LITTLE: "One did too little: the two did different things, which was not enough",
     NO_ACTION: "Neither acted",
     INVALID_PLAN: "A driver drove without a valid plan when its braking could last have helped",
 }
@@ -52,7 +52,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """When each vehicle would be at the merge point if it kept its speed of a time; inf: never."""
+    """When each vehicle would be at the merge point at the speed that it had then; inf: never."""
 
     time_s: float
     left_s: float
@@ -86,7 +86,7 @@ class Account:
 
 
 def account(course: Course, decisions: Decided, trial: Mapping[str, Any]) -> Account:
-    """The account of a trial of any class: ``trial`` has its account, gap_m and min_ttc_s."""
+    """The account of a trial of any class: ``trial`` has it and its measures."""
     name = trial["account"]
     chances: dict[Side, int | None] = {}
     if name == NEAR_MISS:
@@ -145,7 +145,7 @@ def _near_miss(trial: Mapping[str, Any]) -> str:
 
 
 def _long_wait(course: Course, trial: Mapping[str, Any]) -> str:
-    alone, took = first_arrival_s(course), trial["time_to_merge_s"]
+    alone, took = min(course.arrival_s(side, 0) for side in SIDES), trial["time_to_merge_s"]
     left, right = (_slowest(course, side) for side in SIDES)
     reached = (
         "Nobody had reached the merge point at the end"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from math import inf
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.records import SIDES, Side, other_side
+from merge_runner.records import Side, other_side
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration
@@ -121,8 +121,3 @@ def _least(enough: Callable[[float], bool]) -> float:
         middle = (low + high) / 2
         low, high = (low, middle) if enough(middle) else (middle, high)
     return high
-
-
-def first_arrival_s(course: Course) -> float:
-    """When the first vehicle would be at the merge point if both kept their initial speeds."""
-    return min(course.arrival_s(side, 0) for side in SIDES)
