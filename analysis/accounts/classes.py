@@ -16,8 +16,8 @@ NEAR_MISS, LONG_WAIT = "near miss", "long wait"
 ACTED_MPS = 0.5
 """From this change of speed on a driver has acted: what makes a contribution in ``joint``, too."""
 NEAR_TTC_S = 1.5
-"""A time to collision that is critical: van der Horst and Hogema (1993), at the 6th workshop of
-the International Cooperation on Theories and Concepts in Traffic Safety."""
+"""Below this time to collision an encounter is commonly called critical: A. R. A. van der Horst, A
+time-based analysis of road user behaviour in normal and critical encounters (TU Delft, 1990)."""
 NEAR_GAP_M = 1.0
 """A gap that is as good as none: ours. The humans' mean is 3.85 m."""
 LONG_WAIT_TIMES = 2.0

@@ -9,7 +9,7 @@ from typing import Any
 from analysis.data.human_counts import human_counts, published_accounts
 from analysis.explorer import views
 from analysis.explorer.analysis_worker import HUMAN
-from analysis.explorer.catalogue import FACETS, FACTOR
+from analysis.explorer.catalogue import FACTOR, Filter
 from analysis.explorer.charts import Kind, drawn
 from analysis.explorer.conditions import condition_texts
 from analysis.explorer.pages.computed import Computed, computed
@@ -42,10 +42,6 @@ SELECT {key} AS key, who, condition, string_agg(DISTINCT stand_in, '; ') AS stan
 FROM {trials} WHERE {where} GROUP BY ALL ORDER BY ALL
 """
 COUNTS = ("trials", "ended", "failed", "collided", "decisions", "invalid", "cost_usd")
-ACCOUNTS = """
-SELECT model, variant, account, count(*) AS trials FROM listed
-WHERE status = 'collided' AND account IS NOT NULL GROUP BY ALL ORDER BY ALL
-"""
 # What is published as one class of collisions, and the two that it holds.
 SAME, SAME_ACTION = "same action", ("both insisted", "both gave way")
 UNPRICED = "SELECT coalesce(sum(unpriced), 0)::BIGINT AS attempts FROM tried"
@@ -100,9 +96,9 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         humans=human_cells(humans),
         rows=(rows := worst_first(groups)),
         condition_texts=condition_texts(site.catalogue, [row["name"] for row in rows]),
-        accounts=account_rows(site.catalogue.ask(ACCOUNTS), published_accounts())
-        if "account" in FACETS
-        else None,
+        accounts=account_rows(
+            site.catalogue.account_counts(Filter(outcome="collided")), published_accounts()
+        ),
         unpriced=unpriced["attempts"],
         panels=panels,
         charts=_charts(site, panels),
