@@ -32,8 +32,9 @@ from merge_runner.errors import UsageError
 
 PLAIN = ("keys.js",)
 BUNDLE = (
-    "keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js", "replay.js", "samples.js", "bundle.js",
-)  # fmt: skip
+    *("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js"),
+    *("replay.js", "value_tables.js", "bundle.js"),
+)
 # A link that only a server can follow.
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 # The names of an export's pages: those of an earlier one are deleted, and nothing else.
@@ -110,7 +111,7 @@ def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
         yield at.sweep(entry.sweep_id), sweep_page(site, entry.sweep_id)
     yield at.to("sweeps"), sweeps_page(site)
     yield at.to("tables"), tables_page(site)
-    for name in watch(list(TABLES), "Tables"):
+    for name in watch(list(TABLES), "tables"):
         yield at.table(name), table_page(site, name, {})
     yield at.to("ablations"), ablations_page(site, {})
     yield at.to("humans"), humans_page(site, {})
@@ -130,7 +131,7 @@ def _bundles(site: Site, parts: Mapping[str, Sequence[Row]], watch: Watch) -> It
     ]
     packing = packed_blocks(site, [rows for _, rows in blocks])
     # Each step is a block that has been packed.
-    done = ((name, next(packing)) for name, _ in watch(blocks, "Trials"))
+    done = ((name, next(packing)) for name, _ in watch(blocks, "packing trials"))
     for name, found in groupby(done, lambda one: one[0]):
         yield _bundle_page(site, name, parts[name], [block for _, block in found])
 
