@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["app", "main"]
 
 HTML = b"<!doctype html"
+TOLD_EVERY_S = 10.0
 
 app.add_typer(human_app, name="human")
 app.command()(power)
@@ -239,9 +241,19 @@ def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[s
 
 
 def _watched(things: Sequence[Any], name: str) -> Iterable[Any]:
-    """Show on a terminal how far a loop is."""
+    """Show how far a loop is: on a terminal as a bar, else in a line now and then."""
     from rich.console import Console
     from rich.progress import track
 
-    console = Console(stderr=True)
-    return track(things, name, console=console, transient=True, disable=not sys.stderr.isatty())
+    if sys.stderr.isatty():
+        return track(things, name, console=Console(stderr=True), transient=True)
+    return _told(things, name)
+
+
+def _told(things: Sequence[Any], name: str) -> Iterator[Any]:
+    told = time.monotonic()
+    for done, thing in enumerate(things):
+        if time.monotonic() - told >= TOLD_EVERY_S:
+            say(f"{name}: {100 * done // len(things)} %")
+            told = time.monotonic()
+        yield thing

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,35 +16,44 @@ from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.geometry import Track, track_of
 
-OF_TRIAL = "trial_id = $trial AND spec_hash = $spec"
-STATES = f"""
-SELECT side, list(time_s ORDER BY step) AS time_s, list(position_m ORDER BY step) AS position_m,
-    list(velocity_mps ORDER BY step) AS velocity_mps,
+# One trial, or all of some lists, of a table.
+ONE = "WHERE trial_id = $trial AND spec_hash = $spec"
+MANY = """SEMI JOIN (
+    SELECT unnest($trials::VARCHAR[]) AS trial_id, unnest($specs::VARCHAR[]) AS spec_hash
+) USING (trial_id, spec_hash)"""
+STATES = """
+SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
+    list(position_m ORDER BY step) AS position_m, list(velocity_mps ORDER BY step) AS velocity_mps,
     list(acceleration_mps2 ORDER BY step) AS acceleration_mps2
-FROM states WHERE {OF_TRIAL} GROUP BY ALL
-"""  # noqa: S608 # constants
+FROM states {which} GROUP BY ALL
+"""
 # Where a call got no answer the trial ended, and what the other driver decided is never driven.
 DECISIONS = f"""
 SELECT decision, time_s, side, valid, failure, tactical, plan, applied, fallback, rationale,
     false AS lost
-FROM decisions WHERE {OF_TRIAL}
+FROM decisions {ONE}
 UNION ALL BY NAME
 SELECT DISTINCT decision, side, false AS valid, false AS fallback, true AS lost
-FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) WHERE {OF_TRIAL}
+FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) {ONE}
 ORDER BY decision, side
 """  # noqa: S608 # constants
-TASK = f"SELECT source, spec FROM trials LEFT JOIN specs USING (spec_hash) WHERE {OF_TRIAL}"  # noqa: S608 # constants
+TASKS = """
+SELECT trial_id, spec_hash, source, spec
+FROM (FROM trials {which}) LEFT JOIN specs USING (spec_hash)
+"""
+# What is known of a decision that was never made.
+UNDECIDED = dict.fromkeys(
+    ("time_s", "failure", "tactical", "plan", "applied", "rationale"), None
+) | {"valid": False, "fallback": False}
 # Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz.
 HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
-# Of one decision with the one before it, or of all.
-DECIDED = f"""
-SELECT * FROM decisions WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
-    AND ($number IS NULL OR decision IN ($number, $number - 1)) ORDER BY side, decision
-"""  # noqa: S608 # constants
-ATTEMPTS = f"""
-SELECT * FROM calls WHERE {OF_TRIAL} AND ($side IS NULL OR side = $side)
-    AND ($number IS NULL OR decision = $number) ORDER BY side, decision, attempt
-"""  # noqa: S608 # constants
+DECIDED = "SELECT * FROM decisions {which} ORDER BY decision, side"
+ATTEMPTS = "SELECT * FROM calls {which} ORDER BY decision, side, attempt"
+# One decision, of those with the one before it.
+NUMBERED = f"{ONE} AND side = $side AND decision IN ($number, $number - $before)"
+
+
+Key = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,15 +99,52 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     """Read a trial that is known to be there."""
     key = {"trial": trial_id, "spec": spec_hash}
     with reading(db) as connection:
-        states = {row.pop("side"): row for row in records(connection, STATES, key)}
+        states = records(connection, STATES.format(which=ONE), key)
         decisions = records(connection, DECISIONS, key)
-        (task,) = records(connection, TASK, key)
+        (task,) = records(connection, TASKS.format(which=ONE), key)
+    return _trial(task, states, decisions)
+
+
+def read_whole(
+    db: Path, keys: Sequence[Key]
+) -> Iterator[tuple[Trial, dict[tuple[str, int], Decision]]]:
+    """Read trials that are known to be there, each with its decisions by side and number.
+
+    In as many queries as for one: what these have found is in memory at once.
+    """
+    wanted = {"trials": [trial for trial, _ in keys], "specs": [spec for _, spec in keys]}
+    with reading(db) as connection:
+        tasks, states, decided, attempts = (
+            _by_trial(records(connection, sql.format(which=MANY), wanted))
+            for sql in (TASKS, STATES, DECIDED, ATTEMPTS)
+        )
+    for key in keys:
+        decisions = _decisions(decided.get(key, []), attempts.get(key, []))
+        listed = [{**UNDECIDED, **one.row} for one in decisions.values()]
+        yield _trial(tasks[key][0], states.get(key, []), listed), decisions
+
+
+def _by_trial(rows: list[Row]) -> dict[Key, list[Row]]:
+    found: dict[Key, list[Row]] = {}
+    for row in rows:
+        found.setdefault((row["trial_id"], row["spec_hash"]), []).append(row)
+    return found
+
+
+def _trial(task: Row, states: list[Row], decisions: list[Row]) -> Trial:
     told = json.loads(task["spec"] or "{}")
     scenario = scenario_of(task["source"], told.get("scenario"))
-    ordered = {side: states[side] for side in SIDES if side in states}
-    paces = {side: pace_of(scenario, told.get(side, {})) for side in SIDES}
-    track, caution = track_of(told), unresponsive(told)
-    trial = Trial(trial_id, spec_hash, scenario, track, paces, ordered, decisions, caution)
+    samples = {row["side"]: row for row in states}
+    trial = Trial(
+        task["trial_id"],
+        task["spec_hash"],
+        scenario,
+        track_of(told),
+        {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
+        {side: samples[side] for side in SIDES if side in samples},
+        decisions,
+        unresponsive(told),
+    )
     for row in decisions:
         if row["lost"]:
             row["time_s"] = trial.end_s
@@ -112,26 +158,28 @@ def scenario_of(source: str, told: Mapping[str, Any] | None) -> ScenarioConfig:
     return ScenarioConfig.model_validate(usual if told is None else told)
 
 
-def read_decisions(
-    db: Path, trial_id: str, spec_hash: str, side: str | None = None, number: int | None = None
-) -> dict[tuple[str, int], Decision]:
-    """Read the decisions of a trial, or one of a side, by side and number.
+def read_decision(
+    db: Path, trial_id: str, spec_hash: str, side: str, number: int
+) -> Decision | None:
+    """Read a decision of a trial, or None where there is none.
 
     A call without an answer ends its trial before there is a decision: what was asked is there.
     """
     key = {"trial": trial_id, "spec": spec_hash, "side": side, "number": number}
     with reading(db) as connection:
-        rows = records(connection, DECIDED, key)
-        calls = records(connection, ATTEMPTS, key)
+        rows = records(connection, DECIDED.format(which=NUMBERED), {**key, "before": 1})
+        attempts = records(connection, ATTEMPTS.format(which=NUMBERED), {**key, "before": 0})
+    return _decisions(rows, attempts).get((side, number))
+
+
+def _decisions(rows: list[Row], calls: list[Row]) -> dict[tuple[str, int], Decision]:
+    """Decisions in their order by side and number, with those that got no answer."""
     decided = {(row["side"], row["decision"]): row for row in rows}
     attempts: dict[tuple[str, int], list[Row]] = {}
     for call in calls:
         attempts.setdefault((call["side"], call["decision"]), []).append(call)
-    return {
-        at: _decision(at, decided, attempts.get(at, []))
-        for at in dict.fromkeys((*decided, *attempts))
-        if number in {None, at[1]}
-    }
+    order = sorted({*decided, *attempts}, key=lambda at: (at[1], at[0]))
+    return {at: _decision(at, decided, attempts.get(at, [])) for at in order}
 
 
 def _decision(

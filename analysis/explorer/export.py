@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import base64
-import json
-import os
 import re
+import shutil
 import tempfile
-import zlib
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from analysis.explorer.assets import inlined
-from analysis.explorer.catalogue import FACETS, FACTOR, SEVERAL, Filter
-from analysis.explorer.details import read_decisions, read_trial
+from analysis.explorer.catalogue import Filter
+from analysis.explorer.exported_list import listing_page
+from analysis.explorer.leaks import Leaks
+from analysis.explorer.packing_processes import AT_ONCE, Block, packed_blocks
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.conditions import condition_page, conditions_page
@@ -25,39 +24,31 @@ from analysis.explorer.pages.home import home_page
 from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
 from analysis.explorer.pages.tables import FILES, table_files, table_page, tables_page
-from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
-from analysis.explorer.pictures import sparkline, speed_range
+from analysis.explorer.pages.trial import embedded
 from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import list_sweeps
 from analysis.explorer.urls import EXPORTED, HOME, StaticLinks, bundle_name
 from analysis.tables import TABLES
 from merge_runner.errors import UsageError
-from merge_runner.paths import PROJECT
 
 PLAIN = ("keys.js", "sorting.js", "traces.js")
-LISTING = ("keys.js", "unpacked.js", "listing.js")
-BUNDLE = ("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
+BUNDLE = (
+    *("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js"),
+    *("replay.js", "value_tables.js", "bundle.js"),
+)
 # A link that only a server can follow.
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
-# What looks like a key, wherever it is from; the values of this machine's keys are looked for too.
-_KEYS = re.compile(
-    r"\b(?:sk-[A-Za-z0-9_-]{16,}|AIza[A-Za-z0-9_-]{30,}|Bearer [A-Za-z0-9._-]{16,}"
-    r"|gh[opsu]_[A-Za-z0-9]{30,}|github_pat_[A-Za-z0-9_]{30,}|hf_[A-Za-z0-9]{30,}"
-    r"|xox[abp]-[A-Za-z0-9-]{16,}|A[KS]IA[A-Z0-9]{16})"
-)
-_SECRET_NAMES = ("_KEY", "_TOKEN", "_SECRET", "_PASSWORD")
-# A folder in anybody's home.
-_HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\]")
-SHORTEST_SECRET = 8
 # The names of an export's pages: those of an earlier one are deleted, and nothing else.
 _OURS = re.compile(
     rf"(?:{'|'.join(EXPORTED)}|(?:condition|sweep|table|trials)-.*)\.html|table-.*\.(?:{'|'.join(FILES)})"
 )
 # Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
-    r'<script type="application/json" id="(?:bundle|cells)">.*?</script>', re.DOTALL
+    r'<script type="application/json" id="(?:bundle|packed-list)">.*?</script>', re.DOTALL
 )
+# What the numbers of all tables are made of: it takes longest, and goes on while trials are packed.
+CELLS = ("cells", *TABLES)
 
 
 Watch = Callable[[Sequence[Any], str], Iterable[Any]]
@@ -79,29 +70,42 @@ def export_folder(
     key or a path of this machine. Raises UsageError.
     """
     links = StaticLinks(["trials"]) if wanted else StaticLinks()
-    with _opened(db, wanted, links) as (site, rows):
+    with _opened(db, wanted, links) as (site, rows), _Staged(folder, Leaks(db), _OURS) as staged:
+        if not wanted:
+            site.computing.ask(CELLS, site.catalogue.state())
+        by_condition = sorted(rows, key=lambda row: row["condition"])  # stable: by name within it
+        parts = {name: list(own) for name, own in groupby(by_condition, _condition)}
+        for condition, text in zip(parts, _bundles(site, parts, watch), strict=True):
+            staged.write(bundle_name(condition), text)
         behind = {"cells": {}, "sets": []} if wanted else _behind(site, rows)
         links.behind = behind["cells"]
-        pages = {site.at.to("trials"): _listing(site, rows, behind)}
-        for condition in sorted({row["condition"] for row in rows}):
-            mine = [row for row in rows if row["condition"] == condition]
-            title = f"Trials of {condition}"
-            pages[bundle_name(condition)] = bundle_page(site, mine, title, watch)
+        listing = listing_page(site, rows, behind)
+        pages = {}
         if not wanted:
-            pages |= {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site, watch)}
-        pages.setdefault("index.html", next(iter(pages.values())))  # of some trials: their list
-        _refuse_secrets_of(site, pages)
-    yield from _written(folder, pages, _OURS)
+            pages = {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site, watch)}
+        pages[site.at.to("trials")] = listing
+        pages.setdefault("index.html", listing)  # of some trials
+        for name, text in pages.items():
+            staged.write(name, text)
+        staged.finish()
+    yield from staged.paths
 
 
 def export_page(
     db: Path, file: Path, wanted: Sequence[str], watch: Watch = unwatched
 ) -> Iterator[Path]:
     """Write one page with the wanted trials; yields its path. Raises UsageError."""
-    with _opened(db, wanted, StaticLinks(alone=file.name)) as (site, rows):
-        pages = {file.name: bundle_page(site, rows, "Trials", watch)}
-        _refuse_secrets_of(site, pages)
-    yield from _written(file.parent, pages)
+    links = StaticLinks(alone=file.name)
+    with _opened(db, wanted, links) as (site, rows), _Staged(file.parent, Leaks(db)) as staged:
+        for text in _bundles(site, {"": rows}, watch):
+            staged.write(file.name, text)
+        staged.finish()
+    yield from staged.paths
+
+
+def _condition(row: Row) -> str:
+    condition: str = row["condition"]
+    return condition
 
 
 def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
@@ -116,49 +120,53 @@ def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
         yield at.condition(row["condition"]), condition_page(site, row["condition"], {})
     yield at.to("glossary"), site.render("glossary.html", here="glossary")
     yield at.to("tables"), tables_page(site)
-    for name in watch(list(TABLES), "Tables"):
+    for name in watch(list(TABLES), "tables"):
         yield at.table(name), table_page(site, name, {})
         yield from table_files(site, name)
     yield at.to("ablations"), ablations_page(site, {})
     yield at.to("humans"), humans_page(site, {})
 
 
-def bundle_page(site: Site, rows: Sequence[Row], name: str, watch: Watch) -> str:
-    """A page with several trials, of which it shows one."""
-    trials = {site.at.data(row): _packed(_trial(site, row, rows)) for row in watch(rows, name)}
+def _bundles(site: Site, parts: Mapping[str, Sequence[Row]], watch: Watch) -> Iterator[str]:
+    """Of each condition a page with all its trials, of which it shows one."""
+    blocks = [
+        (name, rows[first : first + AT_ONCE])
+        for name, rows in parts.items()
+        for first in range(0, len(rows), AT_ONCE)
+    ]
+    packing = packed_blocks(site, [rows for _, rows in blocks])
+    # Each step is a block that has been packed.
+    done = ((name, next(packing)) for name, _ in watch(blocks, "packing trials"))
+    for name, found in groupby(done, lambda one: one[0]):
+        yield _bundle_page(site, name, parts[name], [block for _, block in found])
+
+
+def _bundle_page(site: Site, condition: str, rows: Sequence[Row], blocks: Sequence[Block]) -> str:
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        driver = "humans" if row["source"] == "human" else f"{row['model']}, {row['variant']}"
+        groups.setdefault(driver, []).append(row)
+    bundle = {
+        "blocks": [block["shared"] for block in blocks],
+        "trials": {
+            key: [number, text]
+            for number, block in enumerate(blocks)
+            for key, text in block["trials"].items()
+        },
+    }
     return site.render(
         "bundle.html",
         here="trials",
-        name=name,
-        rows=rows,
-        bundle=embedded(trials),
+        name=f"Trials of {condition}" if condition else "Trials",
+        groups=groups,
+        bundle=embedded(bundle),
         inlined=inlined(BUNDLE),
     )
 
 
-def _trial(site: Site, row: Row, beside: Sequence[Row]) -> dict[str, object]:
-    """What the page needs of one trial."""
-    trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
-    found = read_decisions(site.db, row["trial_id"], row["spec_hash"])
-    values = shown(row, trial)
-    there = {(other["trial_id"], other["spec_hash"]) for other in beside}
-    others = {
-        kind: [other for other in kin if (other["trial_id"], other["spec_hash"]) in there]
-        for kind, kin in alternatives(site, row).items()
-    }
-    html = site.render("_trial.html", here="trials", **values, alternatives=others, panel="")
-    panels = {
-        f"{side}/{number}": rendered(site, row, trial, decision)
-        for (side, number), decision in found.items()
-    }
-    _refuse_secrets(site, row["trial_id"], [html, *panels.values(), values["data"] or ""])
-    data = json.loads(values["data"]) if values["data"] else None
-    return {"html": _LINK_TO_NOWHERE.sub(r"\1", html), "panels": panels, "data": data}
-
-
 def _behind(site: Site, rows: list[Row]) -> dict[str, Any]:
     """The trials behind the numbers of all tables: each number's set, and places in the list."""
-    found = computed(site, ("cells", *TABLES), {})
+    found = computed(site, CELLS, {})
     if found.result is None:
         return {"cells": {}, "sets": []}  # the pages of the tables say why there are none
     places = {(row["trial_id"], row["spec_hash"]): i for i, row in enumerate(rows)}
@@ -168,40 +176,6 @@ def _behind(site: Site, rows: list[Row]) -> dict[str, Any]:
         for one in found.result.content["sets"]
     ]
     return {"cells": found.result.content["cells"], "sets": sets}
-
-
-def _listing(site: Site, rows: list[Row], behind: Mapping[str, Any]) -> str:
-    """The list of trials, whose script filters them by what stands beside each."""
-    of_row = [{name: [row[name]] for name in FACETS if name in row} for row in rows]
-    for name, table in SEVERAL.items():
-        pairs = site.catalogue.ask(f"SELECT number, {name} AS value FROM {table} ORDER BY ALL")  # noqa: S608 # constants
-        values: dict[int, list[str]] = {}
-        for pair in pairs:
-            values.setdefault(pair["number"], []).append(pair["value"])
-        for row, of in zip(rows, of_row, strict=True):
-            of[name] = values.get(row["number"], [])
-    facets = {
-        name: sorted(Counter(v for of in of_row for v in of[name] if v is not None).items())
-        for name in FACETS
-    }
-    for row, of in zip(rows, of_row, strict=True):
-        of["levels"] = row["levels"] or []
-    counts = Counter(level for of in of_row for level in of["levels"])
-    for (factor, level), count in sorted((tuple(n.split("=", 1)), k) for n, k in counts.items()):
-        facets.setdefault(f"{FACTOR}{factor}", []).append((level, count))
-    return site.render(
-        "listing.html",
-        here="trials",
-        facets=facets,
-        rows=[row | {"facets": of} for row, of in zip(rows, of_row, strict=True)],
-        sorts={},
-        sort="",
-        kept={},
-        sparkline=sparkline,
-        scale=speed_range(rows),
-        cells=embedded(_packed(behind)),
-        inlined=inlined(LISTING),
-    )
 
 
 @contextmanager
@@ -226,50 +200,57 @@ def _opened(
         site.close()
 
 
-def _packed(value: object) -> str:
-    text = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
-    return base64.b64encode(zlib.compress(text.encode(errors="replace"), 9)).decode()
+class _Staged:
+    """Pages that are written beside their folder, and moved there when all of them are good.
 
+    Raises UsageError where a page holds a key or a path of this machine, or cannot be written.
+    """
 
-def _written(
-    folder: Path, pages: Mapping[str, str], replaced: re.Pattern[str] | None = None
-) -> Iterator[Path]:
-    """Write pages; of others in the folder, those whose names are ``replaced`` go."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for path in folder.iterdir():
-            if replaced and replaced.fullmatch(path.name) and path.name not in pages:
-                path.unlink()
-        for name, text in pages.items():
-            (folder / name).write_text(text, encoding="utf-8")
-            yield folder / name
-    except OSError as exc:
-        raise UsageError(f"{folder} cannot be written: {exc}") from exc
+    def __init__(self, folder: Path, leaks: Leaks, replaced: re.Pattern[str] | None = None) -> None:
+        """Of others in the folder, those whose names are ``replaced`` go."""
+        self._folder = folder
+        self._leaks = leaks
+        self._replaced = replaced
+        self._names: list[str] = []
 
+    def __enter__(self) -> _Staged:
+        there = next(
+            path
+            for path in (self._folder.absolute(), *self._folder.absolute().parents)
+            if path.is_dir()
+        )
+        with self._writing():
+            self._stage = Path(tempfile.mkdtemp(prefix=".merge-runner-", dir=there))
+        return self
 
-def _refuse_secrets_of(site: Site, pages: Mapping[str, str]) -> None:
-    for name, text in pages.items():
-        _refuse_secrets(site, name, [_PACKED.sub("", text)])
+    def __exit__(self, *_: object) -> None:
+        shutil.rmtree(self._stage, ignore_errors=True)
 
+    def write(self, name: str, text: str) -> None:
+        """Keep a page for the folder."""
+        self._leaks.refuse(name, [_PACKED.sub("", text)])
+        with self._writing():
+            (self._stage / name).write_text(text, encoding="utf-8")
+        self._names.append(name)
 
-def _refuse_secrets(site: Site, where: str, texts: Sequence[str]) -> None:
-    """Raises UsageError where a text holds a key, or a path of this machine."""
-    folders = (Path.home(), Path.cwd(), site.db.resolve().parent, PROJECT, tempfile.gettempdir())
-    paths = {str(folder) for folder in folders} - {"/"}  # in a container the home may be "/"
-    secrets = {
-        value: name
-        for name, value in os.environ.items()
-        if name.endswith(_SECRET_NAMES) and len(value) >= SHORTEST_SECRET
-    }
-    for text in texts:
-        for value, name in secrets.items():
-            if value in text:
-                raise UsageError(f"nothing was written: {where} holds the value of {name}")
-        if found := _KEYS.search(text):
-            raise UsageError(
-                f"nothing was written: {where} holds what looks like a key: {found[0][:6]}..."
-            )
-        named = [path for path in sorted(paths) if f"{path}/" in text]
-        named += [found[0] for found in _HOMES.finditer(text)]
-        if named:
-            raise UsageError(f"nothing was written: {where} names the path {named[0]}")
+    def finish(self) -> None:
+        """Put the pages where they belong."""
+        with self._writing():
+            self._folder.mkdir(parents=True, exist_ok=True)
+            for path in self._folder.iterdir():
+                if self._replaced and self._replaced.fullmatch(path.name):
+                    path.unlink()
+            for name in self._names:
+                (self._stage / name).replace(self._folder / name)
+
+    @property
+    def paths(self) -> list[Path]:
+        """The pages in their folder."""
+        return [self._folder / name for name in self._names]
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as exc:
+            raise UsageError(f"{self._folder} cannot be written: {exc}") from exc

@@ -75,10 +75,11 @@ def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
 
 def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
     """Points of a step line from -1 to 1, ``steps`` across the width."""
-    x, y = Scale(0, steps, 0.0, width), Scale(-1.0, 1.0, height, 0.0)
-    return " ".join(
-        f"{x(i):.1f},{y(value):.1f} {x(i + 1):.1f},{y(value):.1f}" for i, value in enumerate(values)
-    )
+    # A page has thousands of them: without Scale this takes a third of the time.
+    step, half = width / max(steps, 1), height / 2
+    edges = [f"{min(step * i, width):.1f}" for i in range(len(values) + 1)]
+    heights = [f"{half - half * min(max(value, -1.0), 1.0):.1f}" for value in values]
+    return " ".join([f"{edges[i]},{y} {edges[i + 1]},{y}" for i, y in enumerate(heights)])
 
 
 @dataclass(frozen=True, slots=True)

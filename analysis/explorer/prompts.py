@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
+from functools import cache
 from typing import Literal
 
 from merge_runner.prompts.blocks import BLOCKS
@@ -69,12 +70,18 @@ def _begun(paragraphs: Sequence[str]) -> tuple[str, int] | None:
     agreeing = []
     for name, block in BLOCKS.items():
         for template in filter(None, (block.merge, block.straight)):
-            beginnings = [part.partition("{")[0] for part in template.split("\n\n")]
-            pairs = zip(beginnings, paragraphs, strict=False)
-            agrees = [paragraph.startswith(beginning) for beginning, paragraph in pairs]
-            if beginnings[0] and agrees[0]:
-                agreeing.append((len(beginnings[0]), sum(agrees), name, len(beginnings) - 1))
+            beginnings = _beginnings(template)
+            if beginnings[0] and paragraphs[0].startswith(beginnings[0]):
+                pairs = zip(beginnings, paragraphs, strict=False)
+                agree = sum(paragraph.startswith(beginning) for beginning, paragraph in pairs)
+                agreeing.append((len(beginnings[0]), agree, name, len(beginnings) - 1))
     return max(agreeing)[2:] if agreeing else None
+
+
+@cache
+def _beginnings(template: str) -> list[str]:
+    """What each paragraph of a block begins with, up to its first value."""
+    return [part.partition("{")[0] for part in template.split("\n\n")]
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
@@ -99,7 +106,7 @@ def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
 def _runs(old: list[str], new: list[str]) -> list[tuple[int, int, int, int, bool]]:
     """Where two lines are equal and where not; a comma between two changes is changed as well."""
     runs: list[tuple[int, int, int, int, bool]] = []
-    for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
+    for kind, i1, i2, j1, j2 in _opcodes(old, new):
         changed = kind != "equal"
         if changed and len(runs) > 1 and "".join(new[slice(*runs[-1][2:4])]).strip() in {"", ","}:
             start = runs[-2]
@@ -107,3 +114,23 @@ def _runs(old: list[str], new: list[str]) -> list[tuple[int, int, int, int, bool
         else:
             runs.append((i1, i2, j1, j2, changed))
     return runs
+
+
+def _opcodes(old: list[str], new: list[str]) -> Iterator[tuple[str, int, int, int, int]]:
+    """How a line becomes another; matching takes long, and most lines begin and end alike."""
+    begin = _alike(old, new)
+    end = _alike(old[begin:][::-1], new[begin:][::-1])
+    last_old, last_new = len(old) - end, len(new) - end
+    if begin:
+        yield "equal", 0, begin, 0, begin
+    matcher = SequenceMatcher(None, old[begin:last_old], new[begin:last_new], autojunk=False)
+    for kind, i1, i2, j1, j2 in matcher.get_opcodes():
+        yield kind, begin + i1, begin + i2, begin + j1, begin + j2
+    if end:
+        yield "equal", last_old, len(old), last_new, len(new)
+
+
+def _alike(old: Sequence[str], new: Sequence[str]) -> int:
+    """How many words both begin with."""
+    pairs = enumerate(zip(old, new, strict=False))
+    return next((i for i, (a, b) in pairs if a != b), min(len(old), len(new)))

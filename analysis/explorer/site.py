@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -106,8 +107,12 @@ class Site:
 
     def render(self, template: str, **values: object) -> str:
         """A page, or a part of one."""
+        return "".join(self.pieces(template, **values))
+
+    def pieces(self, template: str, **values: object) -> Iterator[str]:
+        """The same as texts one after another: those of the template, and the values in it."""
         held = self.catalogue.held
-        return self._environment.get_template(template).render({"held": held, **values})
+        return self._environment.get_template(template).generate({"held": held, **values})
 
     def close(self) -> None:
         """Leave nothing behind."""

@@ -86,18 +86,18 @@ class StaticLinks(Links):
     """
 
     def __init__(self, pages: Collection[str] = EXPORTED, alone: str = "") -> None:
-        self._pages = () if alone else pages
-        self._alone = alone
+        self.pages = () if alone else pages
+        self.alone = alone
         self.behind: Collection[str] = ()
 
     def to(self, name: str, /, **state: object) -> str:
         """A page, or nothing where only a server has it."""
-        return f"{name}.html" + query_of(state) if name in self._pages else ""
+        return f"{name}.html" + query_of(state) if name in self.pages else ""
 
     def trial(self, row: Mapping[str, Any], **state: object) -> str:
         """A trial on the page of its condition."""
         named = {"trial": row["trial_id"], "spec": row["spec_hash"], **state}
-        return (quote(self._alone) or bundle_name(row["condition"])) + query_of(named)
+        return (quote(self.alone) or bundle_name(row["condition"])) + query_of(named)
 
     def decision(self, row: Mapping[str, Any], side: str, number: int) -> str:
         """Nothing: the page has it."""

@@ -241,25 +241,6 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
     }
 
 
-def sample_table(trial: Trial) -> dict[str, Any]:
-    """All samples as texts: time, then position, speed and acceleration of each, and headway."""
-    sides = list(trial.states)
-    times = trial.states[sides[0]]["time_s"] if sides else []
-    rows = []
-    for i, time_s in enumerate(times):
-        line = [f"{time_s:.2f}"]
-        for samples in trial.states.values():
-            line += [
-                f"{samples['position_m'][i]:.2f}",
-                f"{samples['velocity_mps'][i]:.2f}",
-                f"{samples['acceleration_mps2'][i]:+.2f}",
-            ]
-        places = [samples["position_m"][i] for samples in trial.states.values()]
-        line.append(f"{places[0] - places[1]:+.2f}" if len(places) > 1 else "")
-        rows.append(line)
-    return {"sides": sides, "rows": rows}
-
-
 def label(row: Row) -> str:
     """A trial in a few words."""
     if row["source"] == "human":

@@ -11,6 +11,7 @@ import pytest
 from playwright.sync_api import expect
 
 from analysis.explorer.export import export_folder, export_page
+from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from tests.explorer.axe import serious
 
@@ -167,3 +168,52 @@ def test_a_secret_or_a_path_in_a_reply_stops_the_export(study, tmp_path, monkeyp
 def test_names_that_fit_no_trial_are_told(study, tmp_path):
     with pytest.raises(UsageError, match="holds no trial called o5/"):
         list(export_page(study, tmp_path / "one.html", ["o5/*"]))
+
+
+def test_the_list_shows_a_page_at_a_time_of_all_that_are_found(page, study, tmp_path, monkeypatch):
+    monkeypatch.setattr("analysis.explorer.exported_list.PAGE", 2)
+    monkeypatch.setattr("analysis.explorer.exported_list.PACKED_ROWS", 3)
+    list(export_folder(study, tmp_path / "pages", ["*/N_0_0/*", "*/L_4_0/*"]))
+    page.goto(f"file://{tmp_path}/pages/trials.html")
+    listed = page.locator("tbody tr")
+    expect(page.locator("#paging")).to_contain_text("page 1 of 5")
+    expect(listed).to_have_count(2)
+    first = listed.first.inner_text()
+    page.get_by_role("link", name="next").click()
+    expect(page.locator("#paging")).to_contain_text("page 2 of 5")
+    assert listed.first.inner_text() != first
+    page.reload()
+    expect(page.locator("#paging")).to_contain_text("page 2 of 5")
+    page.get_by_label("search").fill("rep02")
+    expect(listed).to_have_count(2)
+    expect(page.locator("#paging")).to_be_hidden()
+    expect(page.locator("#listed")).to_have_text("2")
+    page.keyboard.press("Escape")
+    page.keyboard.press("j")
+    page.keyboard.press("Enter")
+    expect(page.locator("h1")).to_contain_text("rep02")
+
+
+def test_charts_are_tables_too_as_soon_as_they_are_opened(page, study, tmp_path):
+    file = tmp_path / "one.html"
+    list(export_page(study, file, ["emulator/baseline/N_0_0/*"]))
+    with duckdb.connect(str(study), read_only=True) as connection:
+        (last, samples) = connection.execute(
+            "SELECT max(position_m) FILTER (side = 'left'), count(*) // 2 FROM states "
+            "WHERE trial_id = 'emulator/baseline/N_0_0/rep01'"
+        ).fetchone()
+        (plan,) = connection.execute(
+            "SELECT plan FROM decisions WHERE trial_id = 'emulator/baseline/N_0_0/rep01' "
+            "AND side = 'left' AND decision = 0"
+        ).fetchone()
+    for address in (f"file://{file}", "/trials/emulator/baseline/N_0_0/rep01"):
+        page.goto(address)
+        page.locator("#samples summary").click()
+        rows = page.locator("#samples tbody tr")
+        expect(rows).to_have_count(samples)
+        expect(rows.last.locator("td").nth(1)).to_have_text(f"{last:.2f}")
+        page.locator("a.decision[data-side=left]").first.click()
+        page.locator(".plan-table summary").click()
+        expect(page.locator(".plan-table tbody tr")).to_have_count(len(plan))
+        value = page.locator(".plan-table tbody tr").first.locator("td").nth(1)
+        expect(value).to_have_text(f"{plan[0] * ScenarioConfig().max_acceleration_mps2:+.2f}")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from markupsafe import Markup, escape
 
 from analysis.explorer import views
-from analysis.explorer.details import Decision, Trial, read_decisions, read_trial
+from analysis.explorer.details import Decision, Trial, read_decision, read_trial
 from analysis.explorer.display_text import shortened
 from analysis.explorer.pictures import step_points
 from analysis.explorer.reading import Row
@@ -56,7 +56,6 @@ def shown(row: Row, trial: Trial) -> dict[str, Any]:
         "data": embedded(views.replay_data(row, trial)) if trial.states else None,
         "account": views.account_of(row, trial),
         "lines": views.summary(row, trial),
-        "samples": views.sample_table(trial),
         "trial_decisions": decided,
         "last_words": [
             said[-1] for mine in decided.values() if (said := [d for d in mine if d["tactical"]])
@@ -74,39 +73,41 @@ def decision_fragment(site: Site, trial_id: str, asked: Mapping[str, str]) -> st
 
 def decision_panel(site: Site, row: Row, trial: Trial, side: str, number: int) -> str:
     """What a driver was told, said, planned and did; raises NotThere."""
-    found = read_decisions(site.db, row["trial_id"], row["spec_hash"], side, number)
-    if (side, number) not in found:
+    found = read_decision(site.db, row["trial_id"], row["spec_hash"], side, number)
+    if found is None:
         raise NotThere(f"{row['trial_id']} has no decision {number} of the {side} driver")
-    return rendered(site, row, trial, found[side, number])
+    values = panel_values(site, row, trial, found, site.catalogue.others)
+    return site.render("_decision.html", **values)
 
 
-def rendered(site: Site, row: Row, trial: Trial, found: Decision) -> str:
-    """A decision's panel."""
+def panel_values(
+    site: Site, row: Row, trial: Trial, found: Decision, others: Collection[tuple[str, str]]
+) -> dict[str, Any]:
+    """What the template shows of a decision; ``others`` are the catalogue's."""
     body = next((a["reply"] for a in reversed(found.attempts) if a["reply"]), None)
     text, more = shortened(body or "")
-    return site.render(
-        "_decision.html",
-        d=found.row,
-        before=found.before,
-        parts=found.parts,
-        meaning=views.block_meaning,
-        attempts=found.attempts,
-        others=site.catalogue.others,
-        reply=None if body is None else {"text": text, "more": more},
-        raw=site.at.raw(row, found.row["side"], found.row["decision"]),
-        chart=views.plan_chart(found, trial),
-        points=step_points,
-        aftermath=views.aftermath(trial, found),
-        perceived=views.perceived(trial, found),
-    )
+    return {
+        "d": found.row,
+        "before": found.before,
+        "parts": found.parts,
+        "meaning": views.block_meaning,
+        "attempts": found.attempts,
+        "others": others,
+        "reply": None if body is None else {"text": text, "more": more},
+        "raw": site.at.raw(row, found.row["side"], found.row["decision"]),
+        "chart": views.plan_chart(found, trial),
+        "points": step_points,
+        "aftermath": views.aftermath(trial, found),
+        "perceived": views.perceived(trial, found),
+    }
 
 
 def raw_reply(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     """The body of the last reply to a call, whole."""
     row = find(site, trial_id, asked)
     side, number = _decision_of(asked)
-    found = read_decisions(site.db, row["trial_id"], row["spec_hash"], side, number)
-    bodies = [a["reply"] for one in found.values() for a in one.attempts if a["reply"]]
+    found = read_decision(site.db, row["trial_id"], row["spec_hash"], side, number)
+    bodies = [a["reply"] for a in found.attempts if a["reply"]] if found else []
     if not bodies:
         raise NotThere(f"{trial_id} has no reply to decision {number} of the {side} driver")
     body: str = bodies[-1]

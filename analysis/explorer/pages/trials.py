@@ -50,6 +50,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         totals=totals,
         trials=trials,
         rows=rows,
+        leveled=any(row["levels"] for row in rows),
         scale=speed_range(rows),
         news=at_of(site, asked, seen=state),
         page=number,
