@@ -15,6 +15,9 @@ STYLES = (
     "vendor/uplot-1.6.32.min.css",
     *(f"styles/{name}.css" for name in ("colours", "base", "trial", "sql", "tables", "sweeps")),
 )
+# What draws and moves a trial, in the order in which it is loaded.
+_PARTS = "moment track marks charts ribbons panel clock comparison start"
+REPLAY = ("vendor/uplot-1.6.32.min.js", *(f"replay/{part}.js" for part in _PARTS.split()))
 
 
 @dataclass(frozen=True, slots=True)

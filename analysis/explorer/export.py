@@ -15,15 +15,16 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from analysis.explorer.assets import inlined
+from analysis.explorer.assets import REPLAY, inlined
 from analysis.explorer.catalogue import FACETS, FACTOR, SEVERAL, Filter
 from analysis.explorer.details import read_decisions, read_trial
 from analysis.explorer.pages.ablations import ablations_page
+from analysis.explorer.pages.comparing import At, offered
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
 from analysis.explorer.pages.tables import table_page, tables_page
-from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
+from analysis.explorer.pages.trial import embedded, rendered, shown
 from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
@@ -33,9 +34,9 @@ from analysis.tables import TABLES
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
 
-PLAIN = ("keys.js",)
-LISTING = ("keys.js", "unpacked.js", "listing.js")
-BUNDLE = ("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js", "replay.js", "bundle.js")
+PLAIN = ("lists.js", "keys.js")
+LISTING = (*PLAIN, "unpacked.js", "listing.js")
+BUNDLE = (*PLAIN, "unpacked.js", *REPLAY, "bundle.js")
 # A link that only a server can follow.
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 # What looks like a key, wherever it is from; the values of this machine's keys are looked for too.
@@ -100,6 +101,15 @@ def export_page(
     yield from _written(file.parent, pages)
 
 
+def page_of_trials(site: Site, rows: Sequence[Row], name: str) -> str:
+    """One page with trials of a served site, for a file of that name; raises UsageError."""
+    alone = Site(site.db, StaticLinks(alone=name), shared={"inlined": inlined(PLAIN)})
+    alone.catalogue = site.catalogue
+    page = bundle_page(alone, rows, "Trials", unwatched)
+    _refuse_secrets_of(alone, {name: page})
+    return page
+
+
 def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
     """The pages of the whole study: its sweeps, the newest first, and what is computed of it."""
     at = site.at
@@ -122,7 +132,15 @@ def _index(pages: Mapping[str, str]) -> str:
 
 def bundle_page(site: Site, rows: Sequence[Row], name: str, watch: Watch) -> str:
     """A page with several trials, of which it shows one."""
-    trials = {site.at.data(row): _packed(_trial(site, row, rows)) for row in watch(rows, name)}
+    offers: dict[At, dict[str, At]] = {}
+    for condition in {row["condition"] for row in rows}:
+        offers |= offered(site, condition)
+    there = {(row["trial_id"], row["spec_hash"]) for row in rows}
+    trials = {}
+    for row in watch(rows, name):
+        at = row["trial_id"], row["spec_hash"]
+        others = {k: "|".join(other) for k, other in offers.get(at, {}).items() if other in there}
+        trials["|".join(at)] = _packed({**_trial(site, row), "offers": others})
     return site.render(
         "bundle.html",
         here="trials",
@@ -133,17 +151,12 @@ def bundle_page(site: Site, rows: Sequence[Row], name: str, watch: Watch) -> str
     )
 
 
-def _trial(site: Site, row: Row, beside: Sequence[Row]) -> dict[str, object]:
+def _trial(site: Site, row: Row) -> dict[str, object]:
     """What the page needs of one trial."""
     trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
     found = read_decisions(site.db, row["trial_id"], row["spec_hash"])
-    values = shown(row, trial)
-    there = {(other["trial_id"], other["spec_hash"]) for other in beside}
-    others = {
-        kind: [other for other in kin if (other["trial_id"], other["spec_hash"]) in there]
-        for kind, kin in alternatives(site, row).items()
-    }
-    html = site.render("_trial.html", here="trials", **values, alternatives=others, panel="")
+    values = shown(site, row, trial)
+    html = site.render("_trial.html", here="trials", **values, panel="")
     panels = {
         f"{side}/{number}": rendered(site, row, trial, decision)
         for (side, number), decision in found.items()
