@@ -5,7 +5,7 @@ from __future__ import annotations
 import unicodedata
 
 SHOWN = 20_000
-BEGINNING = 1_500
+BEGINNING = 800
 # Formats that show nothing, among them those that turn the direction of writing.
 _HIDDEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 # Letters and marks that show nothing either: fillers, joiners, and selectors of variants.

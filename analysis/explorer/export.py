@@ -132,10 +132,11 @@ def _index(pages: Mapping[str, str]) -> str:
 
 def bundle_page(site: Site, rows: Sequence[Row], name: str, watch: Watch) -> str:
     """A page with several trials, of which it shows one."""
+    there = {(row["trial_id"], row["spec_hash"]): row["condition"] for row in rows}
     offers: dict[At, dict[str, At]] = {}
-    for condition in {row["condition"] for row in rows}:
-        offers |= offered(site, condition)
-    there = {(row["trial_id"], row["spec_hash"]) for row in rows}
+    for condition in set(there.values()):
+        mine = [at for at, of in there.items() if of == condition]
+        offers |= offered(site, condition, mine[0] if len(mine) == 1 else None)
     trials = {}
     for row in watch(rows, name):
         at = row["trial_id"], row["spec_hash"]

@@ -109,6 +109,17 @@ def test_a_name_with_several_specs_is_told_with_its_spec(db, tmp_path):
     assert data["spec"] == "abc"
 
 
+def test_a_page_of_a_trial_with_a_secret_is_refused_with_the_reason(db, tmp_path):
+    secret = shutil.copy(db, tmp_path / "t.duckdb")
+    with duckdb.connect(str(secret)) as connection:
+        connection.execute("UPDATE decisions SET rationale = 'sk-proj-abcdefghijklmnop0123'")
+    client = TestClient(explorer(Site(secret), {HOST}), base_url=f"http://{HOST}")
+    reply = client.get("/trials/o3/A1/N_0_0/rep01", params={"as": "page"})
+    assert reply.status_code == 503
+    assert "holds what looks like a key: sk-pro" in reply.text
+    assert "content-disposition" not in reply.headers
+
+
 def test_a_page_of_a_trial_holds_the_one_it_is_compared_with(page, tmp_path):
     page.goto(f"/trials/{TRIAL}?t=2.5&compare=emulator/baseline/L_4_0/rep01")
     expect(page.locator("#ghost-key")).to_contain_text("L_4_0")

@@ -142,10 +142,16 @@ def test_the_legend_tells_the_time_of_the_slider(page):
     assert f"left {float(said[1]):.1f} m/s" in page.locator("#now").inner_text()
 
 
-def test_a_long_rationale_is_clamped(page):
-    page.goto(f"{LONG}?side=left&decision=1")
-    quote = page.locator("#decision blockquote.said").first
-    assert quote.bounding_box()["height"] < 500
+def test_paper_has_signs_of_the_size_of_the_track(page):
+    page.set_viewport_size({"width": 700, "height": 900})
+    page.goto(TRIAL)
+    sizes = []
+    for media in ("screen", "print"):
+        page.emulate_media(media=media)
+        sizes.append(
+            page.eval_on_selector("#track .sign", "sign => getComputedStyle(sign).fontSize")
+        )
+    assert sizes == ["5px", "2.6px"]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
