@@ -19,39 +19,50 @@ FOUND = 12
 NAMED = """(SELECT *, if(count(*) OVER (PARTITION BY trial_id) = 1, trial_id,
     trial_id || '@' || spec_hash) AS key FROM listed)"""
 WORDS = "lower(concat_ws(' ', trial_id, model, variant, outcome))"
-# Of each trial of a condition, or of one: the others as [name, spec].
+# Of each trial of a condition, or of one, by the numbers that they have in the list.
 BESIDE = f"""
-WITH near AS (SELECT *, [trial_id, spec_hash] AS who FROM listed WHERE condition = $1)
-SELECT who, '{REPETITION}' AS kind,
-    coalesce(lead(who) OVER alike, first_value(who) OVER alike) AS other
-FROM near WINDOW alike AS (PARTITION BY model, variant, pair, spec_hash ORDER BY rep, trial_id)
-QUALIFY other <> who AND ($2 IS NULL OR who = [$2, $3])
-UNION ALL BY NAME
-SELECT one.who, '{DRIVER}' AS kind, arg_min(two.who, (two.variant IS DISTINCT FROM one.variant,
-    two.rep <> one.rep, two.model <= one.model, two.model, two.who)) AS other
-FROM near AS one JOIN near AS two ON two.model <> one.model AND two.source <> 'human'
-WHERE ($2 IS NULL OR one.who = [$2, $3]) GROUP BY ALL
+WITH near AS (FROM listed WHERE condition = $1), beside AS (
+    SELECT number, '{REPETITION}' AS kind,
+        coalesce(lead(number) OVER alike, first_value(number) OVER alike) AS other
+    FROM near
+    WINDOW alike AS (PARTITION BY model, variant, pair, spec_hash ORDER BY rep, trial_id)
+    UNION ALL BY NAME
+    SELECT one.number, '{DRIVER}' AS kind, arg_min(two.number, (two.variant IS DISTINCT FROM
+        one.variant, two.rep <> one.rep, two.model <= one.model, two.model, two.number)) AS other
+    FROM near AS one JOIN near AS two ON two.model <> one.model AND two.source <> 'human'
+    WHERE $2 IS NULL OR (one.trial_id = $2 AND one.spec_hash = $3) GROUP BY one.number
+)
+SELECT one.trial_id, one.spec_hash, kind, two.trial_id AS other_id, two.spec_hash AS other_hash
+FROM beside JOIN near AS one USING (number) JOIN near AS two ON two.number = beside.other
+WHERE one.number <> two.number AND ($2 IS NULL OR (one.trial_id = $2 AND one.spec_hash = $3))
 """  # noqa: S608 # constants
 # Times are compared in ms: drivers and recordings have steps of their own. A human trial counts
 # that lasts as long as what it is compared with.
-NEAREST = """
-WITH told AS (
-    SELECT [trial_id, spec_hash] AS who, source = 'human' AS human,
-        round(1000 * time_s)::BIGINT AS ms,
+NEAREST = f"""
+WITH near AS (
+    SELECT row_number() OVER (ORDER BY trial_id, spec_hash) AS number, trial_id, spec_hash,
+        source = 'human' AS human,
+        $trial IS NULL OR (trial_id = $trial AND spec_hash = $spec) AS wanted
+    FROM trials WHERE condition = $condition AND (human OR wanted)
+), told AS (
+    SELECT number, human, wanted, round(1000 * time_s)::INTEGER AS ms,
         sum(if(side = 'left', position_m, -position_m)) AS headway_m, max(position_m) AS first_m
-    FROM states JOIN trials USING (trial_id, spec_hash)
-    WHERE condition = $condition AND time_s >= 0
-        AND (human OR $trial IS NULL OR who = [$trial, $spec])
-    GROUP BY ALL HAVING count(*) = 2
+    FROM states JOIN near USING (trial_id, spec_hash)
+    WHERE time_s >= 0 GROUP BY ALL HAVING count(*) = 2
 ), one AS (
-    SELECT *, max(ms) OVER (PARTITION BY who) AS last_ms FROM told
-    WHERE first_m < $merge_m AND ($trial IS NULL OR who = [$trial, $spec])
-), other AS (SELECT *, max(ms) OVER (PARTITION BY who) AS last_ms FROM told WHERE human)
-SELECT one.who, other.who AS other FROM one JOIN other
-    ON one.ms = other.ms AND other.last_ms >= one.last_ms AND one.who <> other.who
-GROUP BY one.who, other.who QUALIFY row_number() OVER (
-    PARTITION BY one.who ORDER BY avg((one.headway_m - other.headway_m) ** 2), other.who) = 1
-"""
+    SELECT *, max(ms) OVER (PARTITION BY number) AS last_ms FROM told
+    WHERE wanted AND first_m < $merge_m
+), other AS (SELECT *, max(ms) OVER (PARTITION BY number) AS last_ms FROM told WHERE human),
+nearest AS (
+    SELECT one.number AS number, other.number AS other FROM one JOIN other
+        ON one.ms = other.ms AND other.last_ms >= one.last_ms AND one.number <> other.number
+    GROUP BY one.number, other.number QUALIFY row_number() OVER (PARTITION BY one.number
+        ORDER BY avg((one.headway_m - other.headway_m) ** 2), other.number) = 1
+)
+SELECT one.trial_id, one.spec_hash, '{HUMAN}' AS kind, two.trial_id AS other_id,
+    two.spec_hash AS other_hash
+FROM nearest JOIN near AS one USING (number) JOIN near AS two ON two.number = nearest.other
+"""  # noqa: S608 # constants
 
 
 def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any] | str | None:
@@ -130,6 +141,6 @@ def offered(site: Site, condition: str, only: At | None = None) -> dict[At, dict
         rows = records(connection, NEAREST, told)
     found: dict[At, dict[str, At]] = {}
     for row in (*site.catalogue.ask(BESIDE, condition, trial, spec), *rows):
-        (name, of), (other_name, other_of) = row["who"], row["other"]
-        found.setdefault((name, of), {})[row.get("kind", HUMAN)] = (other_name, other_of)
+        others_of = found.setdefault((row["trial_id"], row["spec_hash"]), {})
+        others_of[row["kind"]] = row["other_id"], row["other_hash"]
     return found
