@@ -122,7 +122,8 @@ class Following:
                 # It was somebody else's.
                 followed.fetching, followed.status = False, None
                 batch = followed.batch
-                followed.batch = replace(batch, others=(*batch.others, batch.batch_id))
+                others = (*batch.others, batch.batch_id)
+                followed.batch = replace(batch, others=others, ended_at="")
                 if not await self.found_patiently(followed):
                     followed.end(LineEnd(None, outcome="not_created", singly=True))
         except BatchFailed as exc:
@@ -214,7 +215,8 @@ class Following:
     async def _handed_out(self, followed: Followed) -> bool:
         """Hand the results of a batch out; False where it was somebody else's."""
         batch, left_out = followed.batch, ""
-        began_s, is_last = asyncio.get_running_loop().time(), False
+        began_s = asyncio.get_running_loop().time() - await self._ended_s_ago(followed)
+        is_last = False
         for tries in itertools.count(1):
             try:
                 async for result in self._services[batch.model].results(followed.batch.batch_id):
@@ -245,6 +247,13 @@ class Following:
             )
         )
         return True
+
+    async def _ended_s_ago(self, followed: Followed) -> float:
+        """How long ago a batch was first seen to have ended, by whatever process."""
+        if not followed.batch.ended_at:
+            followed.batch = replace(followed.batch, ended_at=now())
+            await self._journal.note(followed.batch)
+        return _s_ago(followed.batch.ended_at)
 
     def _hand_out(self, followed: Followed, result: LineResult) -> None:
         if result.key in followed.seen or result.key not in followed.keys:
@@ -330,10 +339,11 @@ def answered(followed: Followed, result: LineResult) -> LineEnd:
 
 def _takes_too_long(batch: OpenBatch) -> bool:
     """Whether a batch that was asked to end should have done so by now."""
-    if not batch.cancelled_at:
-        return False
-    ago = datetime.now(UTC) - datetime.fromisoformat(batch.cancelled_at)
-    return ago.total_seconds() > ENDING_S
+    return bool(batch.cancelled_at) and _s_ago(batch.cancelled_at) > ENDING_S
+
+
+def _s_ago(moment: str) -> float:
+    return (datetime.now(UTC) - datetime.fromisoformat(moment)).total_seconds()
 
 
 def backoff_s(tries: int) -> float:

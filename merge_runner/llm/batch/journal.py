@@ -43,8 +43,8 @@ class OpenBatch:
     ``mark`` is its name at the provider. ``batch_id`` is empty until the provider has told it, and
     may be somebody else's while it is not ``sure``; ``others`` are ids that turned out to be so.
     ``model`` is its name in the registry, ``ledger`` that of the money. ``number`` is the round:
-    which decision its trials wait for at most, counted from 1. ``submitted_at`` and
-    ``cancelled_at`` are UTC in ISO 8601; empty: it was not asked to end.
+    which decision its trials wait for at most, counted from 1. ``submitted_at``, ``cancelled_at``
+    and ``ended_at`` are UTC in ISO 8601; empty: it was not asked to end, or not seen to have ended.
     """
 
     mark: str
@@ -58,6 +58,7 @@ class OpenBatch:
     sure: bool = True
     others: tuple[str, ...] = ()
     cancelled_at: str = ""
+    ended_at: str = ""
 
     @property
     def since(self) -> datetime:

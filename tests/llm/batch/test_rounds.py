@@ -540,6 +540,19 @@ async def test_results_that_never_come_are_waited_for_in_bounds_and_may_have_bee
 
 
 @in_virtual_time
+async def test_the_bound_on_results_that_never_come_counts_from_the_first_run_that_waited(
+    cache,
+):
+    service = WithoutResults()
+    await left_with(cache, service)
+    await note(cache, ended_at=HOURS_AGO)
+    run, began_s = Run(cache, service), asyncio.get_running_loop().time()
+    (reply,) = await run.ask()
+    assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
+    assert asyncio.get_running_loop().time() - began_s < 60
+
+
+@in_virtual_time
 async def test_a_cancelled_batch_that_does_not_end_is_waited_for_in_bounds(cache):
     service = Endless()
     await left_with(cache, service)
