@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator, Callable, Collection, Mapping
+import re
+from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any
@@ -23,9 +24,11 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from analysis.explorer.assets import STATIC
+from analysis.explorer.export import page_of_trials
 from analysis.explorer.guard import Guard, from_elsewhere
 from analysis.explorer.pages import (
     ablations,
+    comparing,
     conditions,
     home,
     humans,
@@ -46,6 +49,8 @@ FIRST_TIME = (
     "back by itself."
 )
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
+# What a name of a trial may hold and the name of a file had better not.
+FILE_NAME = re.compile(r"[^A-Za-z0-9_.-]+")
 # Nothing in a reply runs, whatever a browser takes it for.
 SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
 
@@ -101,12 +106,22 @@ def _trial_routes(site: Site) -> list[Route]:
         text = trial.raw_reply(site, request.path_params["trial"], request.query_params)
         return PlainTextResponse(text, headers=SEALED)
 
-    def data(request: Request) -> Response:
+    def others(request: Request) -> Response:
         named = request.path_params["trial"]
-        return JSONResponse(trial.replay_json(site, named, request.query_params))
+        return JSONResponse(comparing.others(site, named, request.query_params))
 
-    def of_trial(render: Callable[[Site, str, Mapping[str, str]], str]) -> Callable[..., Response]:
-        return _page(site, lambda r: render(site, r.path_params["trial"], r.query_params))
+    def one(request: Request) -> str | Response:
+        named, asked = request.path_params["trial"], request.query_params
+        if asked.get("as") != "page":
+            return trial.trial_page(site, named, asked)
+        rows = [trial.find(site, named, asked), comparing.named(site, asked.get("compare", ""))]
+        file = f"{FILE_NAME.sub('-', named)}.html"
+        page = page_of_trials(site, [row for row in rows if row is not None], file)
+        headers = {"content-disposition": f'attachment; filename="{file}"'}
+        return HTMLResponse(page, headers=headers)
+
+    def fragment(request: Request) -> str:
+        return trial.decision_fragment(site, request.path_params["trial"], request.query_params)
 
     def page_of_all(request: Request) -> Response:
         return RedirectResponse(site.at.to("trials", **request.query_params))
@@ -116,9 +131,9 @@ def _trial_routes(site: Site) -> list[Route]:
         Route("/trials", listing),
         Route("/trials/", page_of_all),
         Route("/trials.{form}", export),
-        Route("/trials/{trial:path}", of_trial(trial.trial_page)),
-        Route("/decisions/{trial:path}", of_trial(trial.decision_fragment)),
-        Route("/data/{trial:path}", _page(site, data)),
+        Route("/trials/{trial:path}", _page(site, one)),
+        Route("/decisions/{trial:path}", _page(site, fragment)),
+        Route("/others/{trial:path}", _page(site, others)),
         Route("/raw/{trial:path}", _page(site, raw)),
     ]
 

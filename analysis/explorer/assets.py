@@ -18,6 +18,9 @@ STYLES = (
         for name in ("colours", "base", "trial", "sql", "tables", "sweeps", "home", "conditions")
     ),
 )
+# What draws and moves a trial, in the order in which it is loaded.
+_PARTS = "moment track marks charts ribbons panel clock comparison start"
+REPLAY = ("vendor/uplot-1.6.32.min.js", *(f"replay/{part}.js" for part in _PARTS.split()))
 
 
 @dataclass(frozen=True, slots=True)

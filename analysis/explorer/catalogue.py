@@ -225,7 +225,6 @@ SORTS = {
 }
 SHOWN = "* EXCLUDE (flaws, posed, tried)"
 SPEEDS = "left_mps, right_mps, left_range_mps, right_range_mps"
-WITHOUT_SPEEDS = f"* EXCLUDE (flaws, posed, tried, {SPEEDS})"
 EXPORTED = (
     f"* EXCLUDE (who, flaws, posed, tried, levels, number, model_left, model_right, {SPEEDS})"
 )
@@ -417,19 +416,6 @@ class Catalogue:
             spec_hash,
         )
         return found[0] if found else None
-
-    def near(self, row: Row, limit: int) -> list[Row]:
-        """Some trials to lay beside one, of its condition: of each model and variant the first.
-
-        Equal repetitions come first, since they are the ones that are compared.
-        """
-        return self.ask(
-            f"SELECT {WITHOUT_SPEEDS} FROM listed "  # noqa: S608 # constants
-            "WHERE condition = ? AND (trial_id, spec_hash) <> (?, ?) QUALIFY row_number() OVER ("
-            "PARTITION BY model, variant, spec_hash ORDER BY rep <> ?, trial_id) <= ? "
-            "ORDER BY model, variant, trial_id, spec_hash",
-            *(row["condition"], row["trial_id"], row["spec_hash"], row["rep"], limit),
-        )
 
     def account_counts(self, wanted: Filter) -> list[Row]:
         """How many trials of a filter have which account: model, variant, account, trials."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import unicodedata
 
 SHOWN = 20_000
+BEGINNING = 800
 # Formats that show nothing, among them those that turn the direction of writing.
 _HIDDEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 # Letters and marks that show nothing either: fillers, joiners, and selectors of variants.
@@ -28,3 +29,9 @@ def _shows(c: str) -> bool:
 def shortened(text: str) -> tuple[str, int]:
     """The beginning of a text, and how many characters are left out."""
     return visible(text[:SHOWN]), max(0, len(text) - SHOWN)
+
+
+def clamped(text: str) -> tuple[str, str, int]:
+    """What a text begins with, as much more as is shown, and how many characters are left out."""
+    shown, more = shortened(text[BEGINNING:])
+    return visible(text[:BEGINNING]), shown, more

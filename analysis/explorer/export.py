@@ -12,12 +12,13 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from analysis.explorer.assets import inlined
+from analysis.explorer.assets import REPLAY, inlined
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.exported_list import listing_page
 from analysis.explorer.leaks import Leaks
 from analysis.explorer.packing_processes import AT_ONCE, Block, packed_blocks
 from analysis.explorer.pages.ablations import ablations_page
+from analysis.explorer.pages.comparing import At, offered
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.conditions import condition_page, conditions_page
 from analysis.explorer.pages.home import home_page
@@ -32,11 +33,8 @@ from analysis.explorer.urls import EXPORTED, HOME, StaticLinks, bundle_name
 from analysis.tables import TABLES
 from merge_runner.errors import UsageError
 
-PLAIN = ("keys.js", "sorting.js", "traces.js")
-BUNDLE = (
-    *("keys.js", "unpacked.js", "vendor/uplot-1.6.32.min.js"),
-    *("replay.js", "value_tables.js", "bundle.js"),
-)
+PLAIN = ("lists.js", "keys.js", "sorting.js", "traces.js")
+BUNDLE = (*PLAIN, "unpacked.js", *REPLAY, "value_tables.js", "bundle.js")
 # A link that only a server can follow.
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 # The names of an export's pages: those of an earlier one are deleted, and nothing else.
@@ -108,6 +106,15 @@ def _condition(row: Row) -> str:
     return condition
 
 
+def page_of_trials(site: Site, rows: Sequence[Row], name: str) -> str:
+    """One page with trials of a served site, for a file of that name; raises UsageError."""
+    alone = Site(site.db, StaticLinks(alone=name), shared={"inlined": inlined(PLAIN)})
+    alone.catalogue = site.catalogue
+    (page,) = _bundles(alone, {"": rows}, unwatched)
+    Leaks(site.db).refuse(name, [_PACKED.sub("", page)])
+    return page
+
+
 def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
     """The pages of the whole study: at a glance, its sweeps, and what is computed of it."""
     at = site.at
@@ -147,6 +154,7 @@ def _bundle_page(site: Site, condition: str, rows: Sequence[Row], blocks: Sequen
         driver = "humans" if row["source"] == "human" else f"{row['model']}, {row['variant']}"
         groups.setdefault(driver, []).append(row)
     bundle = {
+        "offers": _offers(site, rows),
         "blocks": [block["shared"] for block in blocks],
         "trials": {
             key: [number, text]
@@ -162,6 +170,20 @@ def _bundle_page(site: Site, condition: str, rows: Sequence[Row], blocks: Sequen
         bundle=embedded(bundle),
         inlined=inlined(BUNDLE),
     )
+
+
+def _offers(site: Site, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
+    """What is offered beside each trial of a page, of what it holds: by kind, as it is called."""
+    there = {(row["trial_id"], row["spec_hash"]): row["condition"] for row in rows}
+    found: dict[At, dict[str, At]] = {}
+    for condition in dict.fromkeys(there.values()):
+        mine = [at for at, of in there.items() if of == condition]
+        found |= offered(site, condition, mine[0] if len(mine) == 1 else None)
+    return {
+        "|".join(at): {kind: "|".join(other) for kind, other in kinds.items() if other in there}
+        for at, kinds in found.items()
+        if at in there
+    }
 
 
 def _behind(site: Site, rows: list[Row]) -> dict[str, Any]:

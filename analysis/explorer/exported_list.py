@@ -14,7 +14,7 @@ from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
 
-LISTING = ("keys.js", "unpacked.js", "listing.js")
+LISTING = ("lists.js", "keys.js", "unpacked.js", "listing.js")
 # The list unpacks so many rows for each page that has one of them.
 PACKED_ROWS = 500
 

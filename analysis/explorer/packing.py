@@ -77,12 +77,12 @@ def pack_trials(
     """
     leaks, shared, trials = Leaks(site.db), SharedTexts(), {}
     keys = [(row["trial_id"], row["spec_hash"]) for row in rows]
-    for row, (trial, decisions) in zip(rows, read_whole(site.db, keys), strict=True):
+    for row, key, (trial, decisions) in zip(rows, keys, read_whole(site.db, keys), strict=True):
         found = _trial(site, shared, row, trial, decisions, others)
         # What is shared was searched where it came first.
         texts = [_own(pieces) for pieces in (found["html"], *found["panels"].values())]
         leaks.refuse(row["trial_id"], texts)
-        trials[site.at.data(row)] = packed(found)
+        trials["|".join(key)] = packed(found)
     return {"shared": packed(shared.texts), "trials": trials}
 
 
@@ -98,8 +98,8 @@ def _trial(
     decisions: dict[tuple[str, int], Decision],
     others: Collection[tuple[str, str]],
 ) -> dict[str, Any]:
-    """A trial and its decisions in pieces; the page has the trials to compare with."""
-    values = {**shown(row, trial), "alternatives": {}, "panel": ""}
+    """A trial and its decisions in pieces."""
+    values = {**shown(site, row, trial), "panel": ""}
     return {
         "html": shared.pieces(site.pieces("_trial.html", here="trials", **values)),
         "panels": {

@@ -33,9 +33,9 @@ class Links:
         state = {"spec": row["spec_hash"], "side": side, "decision": number}
         return f"/decisions/{quote(row['trial_id'])}" + query_of(state)
 
-    def data(self, row: Mapping[str, Any]) -> str:
-        """What a replay draws of a trial, as JSON."""
-        return f"/data/{quote(row['trial_id'])}" + query_of({"spec": row["spec_hash"]})
+    def others(self, row: Mapping[str, Any]) -> str:
+        """Where a trial's page asks for others to lay beside it."""
+        return f"/others/{quote(row['trial_id'])}" + query_of({"spec": row["spec_hash"]})
 
     def raw(self, row: Mapping[str, Any], side: str, number: int) -> str:
         """A reply as a plain text."""
@@ -103,9 +103,9 @@ class StaticLinks(Links):
         """Nothing: the page has it."""
         return ""
 
-    def data(self, row: Mapping[str, Any]) -> str:
-        """How the page calls a trial."""
-        return f"{row['trial_id']}|{row['spec_hash']}"
+    def others(self, row: Mapping[str, Any]) -> str:
+        """Nothing: a page lays its own trials beside each other."""
+        return ""
 
     def raw(self, row: Mapping[str, Any], side: str, number: int) -> str:
         """Nothing: no server has it."""
@@ -134,7 +134,7 @@ class StaticLinks(Links):
 
     def condition(self, name: str, **state: object) -> str:
         """All trials of a condition in one picture, or nothing where only trials are exported."""
-        there = "conditions" in self._pages
+        there = "conditions" in self.pages
         return f"condition-{_ODD.sub('_', name)}.html" + query_of(state) if there else ""
 
 

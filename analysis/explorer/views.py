@@ -241,6 +241,36 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
     }
 
 
+def marks(row: Row, trial: Trial) -> list[dict[str, Any]]:
+    """The moments that matter, in order: merges, a collision, and those of the account."""
+    found = [
+        {"t": round(reached_s, 3), "side": side, "kind": "merge", "text": f"{side} merges"}
+        for side, samples in trial.states.items()
+        if (reached_s := reaches_s(samples, trial.track.merge_point_m)) is not None
+    ]
+    if row["status"] == "collided":
+        found.append({"t": round(trial.end_s, 3), "side": "", "kind": "collision",
+                      "text": "collision"})  # fmt: skip
+    if account := account_of(row, trial):
+        found += [
+            {"t": round(mark.time_s, 3), "side": mark.side, "kind": mark.kind, "text": mark.text}
+            for mark in account.marks
+        ]
+    return sorted(found, key=lambda mark: mark["t"])
+
+
+def reaches_s(samples: Row, place_m: float) -> float | None:
+    """When a vehicle is at a place, between two samples in proportion; None where it never is."""
+    places, times = samples["position_m"], samples["time_s"]
+    for i, reached_m in enumerate(places):
+        if reached_m >= place_m:
+            if i == 0:
+                return float(times[0])
+            part = (place_m - places[i - 1]) / (reached_m - places[i - 1])
+            return float(times[i - 1] + part * (times[i] - times[i - 1]))
+    return None
+
+
 def label(row: Row) -> str:
     """A trial in a few words."""
     if row["source"] == "human":
@@ -280,15 +310,6 @@ def _bound(scenario: ScenarioConfig, track: Track, left_m: float, right_m: float
     return round(high, 3)
 
 
-def marks(row: Row, trial: Trial) -> list[dict[str, Any]]:
-    """What the charts of a trial mark."""
-    found = account_of(row, trial)
-    return [
-        {"t": round(mark.time_s, 3), "side": mark.side, "kind": mark.kind, "text": mark.text}
-        for mark in (found.marks if found else [])
-    ]
-
-
 def _rounded(values: Sequence[float], digits: int) -> list[float]:
     return [round(value, digits) for value in values]
 
@@ -314,6 +335,29 @@ def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
         "most_mps2": scenario.max_acceleration_mps2,
         "steps": pace.plan_actions,
     }
+
+
+def older_plan(trial: Trial, row: Row) -> str:
+    """On which plan a driver went on whose reply held none, and from which of its steps."""
+    side, number, scenario = row["side"], row["decision"], trial.scenario
+    pace = trial.paces[side]
+    old = next(
+        (d for d in reversed(trial.decisions)
+         if d["side"] == side and d["decision"] < number and d["plan"]), None,
+    )  # fmt: skip
+    if old is None:
+        return "it had no earlier plan, and kept its speed"
+    since = 0 if scenario.fallback == "restart" else number - old["decision"]
+    begun, steps = since * pace.executed_actions, len(old["plan"])
+    if begun >= steps:
+        return f"its last plan, of decision {old['decision']}, had ended, and it kept its speed"
+    last = min(begun + pace.executed_actions, steps)
+    ended = "" if last - begun == pace.executed_actions else ", and then kept its speed"
+    return (
+        f"it drove steps {begun + 1} to {last} of the {steps} that it had planned in decision "
+        f"{old['decision']}, starting {clock(begun * pace.action_steps * scenario.step_s)} s into "
+        f"that plan{ended}"
+    )
 
 
 def perceived(trial: Trial, decision: Decision) -> list[tuple[str, float, float | None]]:

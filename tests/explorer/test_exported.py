@@ -47,8 +47,17 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     assert "decision=1" in page.url
     page.reload()
     expect(page.locator(".decision-panel h2")).to_contain_text("decision 1 at 1.0 s")
-    page.locator("#compare").select_option(index=1)
+    page.get_by_role("button", name="next repetition").click()
     expect(page.locator("#ghost-key")).to_contain_text("dashed")
+    expect(page.locator("#decision .decision-panel h2")).to_have_count(1)
+    page.keyboard.press("Escape")
+    expect(page.locator("#decision .decision-panel h2")).to_have_count(4)
+    page.locator("#compare").fill("human")
+    page.locator("#others button").click()
+    expect(page.locator("#ghost-key")).to_contain_text("human P1")
+    page.keyboard.press("Escape")
+    page.wait_for_url("**/trials.html?*outcome=collided")
+    expect(page.locator("tr.chosen")).to_contain_text("rep03")
     page.goto(f"file://{exported}/trials.html?sweep=hostile")
     expect(page.locator("tbody tr:visible")).to_have_count(3)
 
@@ -79,7 +88,7 @@ def test_no_link_of_an_export_leads_nowhere(page, exported):
         if name.startswith("trials-"):
             expect(page.locator("#track")).to_be_visible()
         addresses = page.eval_on_selector_all(
-            "a", "links => links.map(a => a.getAttribute('href'))"
+            "a[href]", "links => links.map(a => a.getAttribute('href'))"
         )
         files = {address.partition("?")[0].partition("#")[0] for address in addresses}
         of_tables = {file for file in files if file.startswith("table-")}
@@ -94,7 +103,9 @@ def test_a_page_of_its_own_leads_nowhere_else_and_is_accessible(page, study, tmp
     expect(page.locator("#track")).to_be_visible()
     assert serious(page) == []
     expect(page.locator("header nav a")).to_have_count(0)
-    addresses = page.eval_on_selector_all("a", "links => links.map(a => a.getAttribute('href'))")
+    addresses = page.eval_on_selector_all(
+        "a[href]", "links => links.map(a => a.getAttribute('href'))"
+    )
     assert {address.partition("?")[0] for address in addresses} <= {"#main", "one%20two.html"}
     page.keyboard.press("Escape")
     expect(page.locator("#track")).to_be_visible()

@@ -110,7 +110,6 @@ def test_a_sparkline_cuts_nothing_and_the_page_says_its_scale(client, db):
         "/trials",
         "/trials?model=none%E2%80%AE",
         f"/trials/{HIDDEN}/baseline/N_0_0/rep01",
-        "/trials/o3/baseline/N_0_0/rep01",
         f"/trials/{HIDDEN}",
         f"/discordant?model={HIDDEN}&variant=A1",
     ],
@@ -119,6 +118,11 @@ def test_a_name_that_hides_something_is_neutral(client, address):
     said = "".join(Texts(client.get(address).text).said)
     assert "[U+202E]" in said
     assert not {"\u202e", "\u200b"} & set(said)
+
+
+def test_a_name_that_hides_something_is_neutral_where_it_is_found_to_compare_with(client):
+    found = client.get("/others/o3/baseline/N_0_0/rep01", params={"q": "gpj"}).json()["found"]
+    assert [one["name"] for one in found] == ["o3[U+202E]gpj[U+200B]/baseline/N_0_0/rep01"]
 
 
 @pytest.mark.slow

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Collection, Mapping
 from typing import Any
 
 from markupsafe import Markup, escape
 
 from analysis.explorer import views
+from analysis.explorer.assets import REPLAY
 from analysis.explorer.details import Decision, Trial, read_decision, read_trial
-from analysis.explorer.display_text import shortened
+from analysis.explorer.display_text import clamped, shortened
 from analysis.explorer.pictures import step_points
 from analysis.explorer.reading import Row
 from analysis.explorer.site import NotThere, Site
 from analysis.explorer.urls import whole
 from merge_runner.records import SIDES
 
-# So many trials of a kind are offered to compare with.
-OFFERED = 100
+# What is offered to lay beside a trial, and by what rule.
+HUMAN, REPETITION, DRIVER = "nearest human", "next repetition", "other driver"
+OFFERS = {
+    HUMAN: "the human trial of this condition whose headway stays closest to this one's until its "
+    "first vehicle has merged (root mean square)",
+    REPETITION: "the next repetition with the same driver, prompt and condition",
+    DRIVER: "the same condition, and if possible the same prompt and repetition, with the next "
+    "driver by name",
+}
 
 
 def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
@@ -32,35 +39,50 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
             panel = decision_panel(site, row, trial, asked["side"], number)
         except NotThere as exc:
             panel = f"<p>{escape(exc)}</p>"
-    values = shown(row, trial)
     return site.render(
         "trial.html",
         here="trials",
-        **values,
-        alternatives=alternatives(site, row),
+        **shown(site, row, trial),
+        scripts=REPLAY,
         panel=Markup(panel),  # noqa: S704 # rendered by a template of ours, which escapes
     )
 
 
-def shown(row: Row, trial: Trial) -> dict[str, Any]:
+def shown(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
     """What the template shows of a trial."""
-    decided = {
-        side: mine for side in SIDES if (mine := [d for d in trial.decisions if d["side"] == side])
-    }
+    decided = decisions_by_side(trial)
     return {
         "row": row,
         "outcome": views.outcome_text(row, trial.scenario),
         "facts": [*views.facts(row), *([f"Note: {trial.caution}."] if trial.caution else [])],
         "judged": views.judged_text(trial.scenario),
         "view_box": views.view_box(trial.track),
-        "data": embedded(views.replay_data(row, trial)) if trial.states else None,
+        "data": embedded(replayed(site, row, trial)) if trial.states else None,
         "account": views.account_of(row, trial),
         "lines": views.summary(row, trial),
         "trial_decisions": decided,
+        "offers": OFFERS,
+        "clamped": clamped,
         "last_words": [
             said[-1] for mine in decided.values() if (said := [d for d in mine if d["tactical"]])
         ],
     }
+
+
+def replayed(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
+    """What a replay draws of a trial, with the address of its page."""
+    return {**views.replay_data(row, trial), "page": site.at.trial(row)}
+
+
+def ribbons(site: Site, row: Row, trial: Trial) -> str:
+    """The ribbons of a trial's decisions."""
+    return site.render("_ribbons.html", row=row, trial_decisions=decisions_by_side(trial))
+
+
+def decisions_by_side(trial: Trial) -> dict[str, list[Row]]:
+    """The decisions of each side that has any."""
+    decided = {side: [d for d in trial.decisions if d["side"] == side] for side in SIDES}
+    return {side: mine for side, mine in decided.items() if mine}
 
 
 def decision_fragment(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
@@ -88,6 +110,8 @@ def panel_values(
     text, more = shortened(body or "")
     return {
         "d": found.row,
+        "clamped": clamped,
+        "went_on": views.older_plan(trial, found.row) if found.row.get("fallback") else "",
         "before": found.before,
         "parts": found.parts,
         "meaning": views.block_meaning,
@@ -114,12 +138,6 @@ def raw_reply(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     return body
 
 
-def replay_json(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any]:
-    """What a replay draws of a trial."""
-    row = find(site, trial_id, asked)
-    return views.replay_data(row, read_trial(site.db, row["trial_id"], row["spec_hash"]))
-
-
 def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
     """The trial that an address names; raises NotThere."""
     row = site.catalogue.find(trial_id, asked.get("spec") or None)
@@ -128,37 +146,12 @@ def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
     return row
 
 
-def alternatives(site: Site, row: Row) -> dict[str, list[Row]]:
-    """Trials to compare with, by what they differ in.
-
-    ``key`` names one in an address: by its name, and its spec where that name has several.
-    """
-    found = site.catalogue.near(row, OFFERED)
-    times = Counter(other["trial_id"] for other in found)
-    kinds: dict[str, list[Row]] = {}
-    for other in found:
-        name = other["trial_id"]
-        other["key"] = name if times[name] == 1 else f"{name}@{other['spec_hash']}"
-        kinds.setdefault(_differs(row, other), []).append(other)
-    return dict(sorted(kinds.items()))
-
-
 def embedded(data: dict[str, Any] | str) -> Markup:
     """Data for a script, as JSON that no HTML can end."""
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return Markup(text)  # noqa: S704 # it holds no character of HTML
-
-
-def _differs(row: Row, other: Row) -> str:
-    if other["source"] == "human":
-        return "humans"
-    if other["model"] != row["model"]:
-        return "another model"
-    if other["variant"] != row["variant"]:
-        return "another prompt"
-    return "another repetition"
 
 
 def _decision_of(asked: Mapping[str, str]) -> tuple[str, int]:

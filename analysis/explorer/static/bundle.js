@@ -2,7 +2,7 @@
 // An exported page holds many trials, each compressed by itself, and what they share beside them;
 // the address names the one shown.
 (async () => {
-  const { blocks, trials } = JSON.parse(document.getElementById("bundle").textContent);
+  const { blocks, trials, offers } = JSON.parse(document.getElementById("bundle").textContent);
   const texts = [];
   const opened = async (key) => {
     const [block, text] = trials[key];
@@ -26,27 +26,37 @@
     location.search = new URLSearchParams({ trial, spec });
   });
   const trial = await opened(chosen.value);
+  // An address names another trial of the page by its name alone, or as NAME@SPEC.
+  const named = (key) => options.find((o) => o.value === key.replace(/@([0-9a-f]+)$/, "|$1"))
+    ?? options.find((o) => o.value.startsWith(`${key}|`));
+  const keyOf = (option) => {
+    const [name, spec] = option.value.split("|");
+    return options.filter((o) => o.value.startsWith(`${name}|`)).length > 1 ? `${name}@${spec}` : name;
+  };
+  const part = (html, id) => new DOMParser().parseFromString(html, "text/html").getElementById(id);
+  const OFFERED = 12;
   window.explorer = {
-    panel: async (link) => trial.panel(`${link.dataset.side}/${link.dataset.n}`),
-    data: async (option) => {
-      const { html } = await opened(option.dataset.url);
-      return JSON.parse(new DOMParser().parseFromString(html, "text/html").getElementById("replay-data").textContent);
+    panel: async (link, other) => (other ?? trial).panel(`${link.dataset.side}/${link.dataset.n}`),
+    data: async (key) => {
+      const option = named(key), other = option && await opened(option.value);
+      const data = other && part(other.html, "replay-data");
+      return data ? { ...JSON.parse(data.textContent), ribbons: part(other.html, "ribbons")?.innerHTML ?? "", panel: other.panel } : null;
+    },
+    search: async (text) => {
+      const words = text.toLowerCase().split(/\s+/);
+      const fit = options.filter((o) => o !== chosen && words.every((word) => o.text.toLowerCase().includes(word)));
+      const found = fit.slice(0, OFFERED).map((o) => {
+        const [, name, outcome] = o.text.match(/^(.*): ([^:]*)$/);
+        return { key: keyOf(o), name, outcome, note: "" };
+      });
+      return { found, more: fit.length - found.length };
+    },
+    offer: async (kind) => {
+      const option = options.find((o) => o.value === offers[chosen.value]?.[kind]);
+      return option ? keyOf(option) : null;
     },
   };
   document.getElementById("shown").innerHTML = trial.html;
-  // To compare with there are the other trials of the page, each by its name, and its spec where
-  // that name has several.
-  const names = options.map((o) => o.value.split("|")[0]);
-  for (const group of chooser.children) {
-    const offered = group.cloneNode(true);
-    for (const option of [...offered.children]) {
-      const [name, spec] = option.value.split("|");
-      option.dataset.url = option.value;
-      if (option.value === chosen.value) option.remove();
-      option.value = names.indexOf(name) === names.lastIndexOf(name) ? name : `${name}@${spec}`;
-    }
-    document.getElementById("compare")?.append(offered);
-  }
   document.title = `${chosen.text.replace(/: [^:]*$/, "")} · merge-runner`;
   startReplay();
 })();

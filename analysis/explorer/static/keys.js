@@ -16,25 +16,6 @@
   };
   document.getElementById("help-button").addEventListener("click", explain);
 
-  let chosen = -1, address = null;
-  const leads = (row) => row.querySelector("a")?.getAttribute("href");
-  const choose = (step) => {
-    const rows = [...document.querySelectorAll("[data-list] tbody tr")];
-    if (!rows.length) return;
-    rows[chosen]?.classList.remove("chosen");
-    chosen = Math.min(Math.max(chosen + step, 0), rows.length - 1);
-    rows[chosen].classList.add("chosen");
-    address = leads(rows[chosen]);
-    rows[chosen].querySelector("a")?.focus({ preventScroll: true });
-    rows[chosen].scrollIntoView({ block: "nearest" });
-  };
-  // Rows that come anew are the same where only something in them has changed.
-  document.addEventListener("htmx:afterSwap", () => {
-    const rows = [...document.querySelectorAll("[data-list] tbody tr")];
-    chosen = rows.findIndex((row) => address && leads(row) === address);
-    rows[chosen]?.classList.add("chosen");
-  });
-
   document.addEventListener("keydown", (event) => {
     if (isCommand(event) || typing(event.target)) {
       if (event.key === "Escape") event.target.blur();
@@ -44,8 +25,8 @@
     const search = document.getElementById("search");
     if (event.key === "?") explain();
     else if (event.key === "/" && search) search.focus();
-    else if (event.key === "j") choose(1);
-    else if (event.key === "k") choose(-1);
+    else if (event.key === "j") place.step(1);
+    else if (event.key === "k") place.step(-1);
     else return;
     event.preventDefault();
   });

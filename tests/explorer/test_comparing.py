@@ -1,0 +1,174 @@
+"""A second trial is found by its words or offered, and laid beside the first."""
+
+from __future__ import annotations
+
+import shutil
+
+import duckdb
+import pytest
+from playwright.sync_api import expect
+from starlette.testclient import TestClient
+
+from analysis.explorer.app import explorer
+from analysis.explorer.pages.comparing import offered
+from analysis.explorer.site import Site
+from tests.analysis.studies import Drive, write_study
+
+HOST = "127.0.0.1:8700"
+TRIAL = "emulator/baseline/N_0_0/rep01"
+# Humans of whom the second keeps its distance as the model does; the last ends too early.
+DRIVES = (
+    Drive("o3", "baseline", "N_0_0", 1, (0.5, 0.5), (-0.5, -0.5)),
+    Drive("o3", "baseline", "N_0_0", 2, (0.0,), (-0.8,) * 3),
+    Drive("o3", "A1", "N_0_0", 1, (0.4,), (-0.8,) * 3),
+    Drive("o4", "A1", "N_0_0", 1, (0.5, 0.5), (-0.5, -0.5)),
+    Drive("o4", "baseline", "N_0_0", 2, (0.5, 0.5), (-0.5, -0.5)),
+    Drive("human", "far", "N_0_0", 1, (-0.5, -0.5), (0.5, 0.5)),
+    Drive("human", "near", "N_0_0", 1, (0.5, 0.4), (-0.5, -0.5)),
+    Drive("human", "short", "N_0_0", 1, (0.5, 0.5), (-0.5, -0.5)),
+)
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    """Two drivers and three humans of one condition."""
+    path = tmp_path_factory.mktemp("comparing") / "t.duckdb"
+    write_study(path, list(DRIVES))
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(
+            "UPDATE trials SET source = 'human', pair = variant, variant = NULL "
+            "WHERE trial_id LIKE 'human/%';"
+            "DELETE FROM states WHERE trial_id LIKE 'human/short/%' AND time_s > 2"
+        )
+    return path
+
+
+@pytest.fixture(scope="module")
+def client(db):
+    return TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+
+
+def ask(client, trial, **asked):
+    return client.get(f"/others/{trial}", params=asked).json()
+
+
+def test_the_nearest_human_is_the_one_with_the_closest_headway_and_not_one_who_ended(client):
+    assert ask(client, "o3/baseline/N_0_0/rep01", offer="nearest human") == (
+        "human/near/N_0_0/rep01"
+    )
+    assert ask(client, "human/near/N_0_0/rep01", offer="nearest human") == "human/far/N_0_0/rep01"
+
+
+def test_the_next_repetition_goes_round(client):
+    names = ["o3/baseline/N_0_0/rep01", "o3/baseline/N_0_0/rep02"]
+    assert [ask(client, name, offer="next repetition") for name in names] == names[::-1]
+    assert ask(client, "o3/A1/N_0_0/rep01", offer="next repetition") is None
+
+
+def test_another_driver_has_the_same_prompt_if_it_can(client):
+    assert ask(client, "o3/A1/N_0_0/rep01", offer="other driver") == "o4/A1/N_0_0/rep01"
+    assert ask(client, "o3/baseline/N_0_0/rep01", offer="other driver") == (
+        "o4/baseline/N_0_0/rep02"
+    )
+    assert ask(client, "human/near/N_0_0/rep01", offer="other driver").startswith("o3/")
+
+
+def test_what_is_offered_to_all_of_a_condition_is_what_is_offered_to_each(db, client):
+    site = Site(db)
+    site.catalogue.refresh()
+    for (name, _), offers in offered(site, "N_0_0").items():
+        for kind, (other, _) in offers.items():
+            assert ask(client, name, offer=kind) == other
+
+
+def test_all_words_of_a_search_count_and_the_own_trial_is_not_found(client):
+    found = ask(client, "o3/baseline/N_0_0/rep01", q="O3 rep01")
+    assert [one["name"] for one in found["found"]] == ["o3/A1/N_0_0/rep01"]
+    assert ask(client, "o3/baseline/N_0_0/rep01", q="nobody has this") == {"found": [], "more": 0}
+
+
+def test_an_offer_that_is_unknown_names_the_others(client):
+    reply = client.get("/others/o3/baseline/N_0_0/rep01", params={"offer": "best"})
+    assert reply.status_code == 404
+    assert "nearest human, next repetition, other driver" in reply.text
+
+
+def test_a_name_with_several_specs_is_told_with_its_spec(db, tmp_path):
+    twice = shutil.copy(db, tmp_path / "t.duckdb")
+    with duckdb.connect(str(twice)) as connection:
+        for table in ("trials", "states"):
+            connection.execute(
+                f"INSERT INTO {table} BY NAME SELECT * REPLACE ('abc' AS spec_hash) FROM {table} "
+                "WHERE trial_id = 'o4/A1/N_0_0/rep01'"
+            )
+    client = TestClient(explorer(Site(twice), {HOST}), base_url=f"http://{HOST}")
+    keys = {one["key"] for one in ask(client, "o3/A1/N_0_0/rep01", q="o4 a1")["found"]}
+    assert "o4/A1/N_0_0/rep01@abc" in keys
+    assert len(keys) == 2
+    data = ask(client, "o3/A1/N_0_0/rep01", compare="o4/A1/N_0_0/rep01@abc")
+    assert data["spec"] == "abc"
+
+
+def test_a_page_of_a_trial_with_a_secret_is_refused_with_the_reason(db, tmp_path):
+    secret = shutil.copy(db, tmp_path / "t.duckdb")
+    with duckdb.connect(str(secret)) as connection:
+        connection.execute("UPDATE decisions SET rationale = 'sk-proj-abcdefghijklmnop0123'")
+    client = TestClient(explorer(Site(secret), {HOST}), base_url=f"http://{HOST}")
+    reply = client.get("/trials/o3/A1/N_0_0/rep01", params={"as": "page"})
+    assert reply.status_code == 503
+    assert "holds what looks like a key: sk-pro" in reply.text
+    assert "content-disposition" not in reply.headers
+
+
+def test_a_page_of_a_trial_holds_the_one_it_is_compared_with(page, tmp_path):
+    page.goto(f"/trials/{TRIAL}?t=2.5&compare=emulator/baseline/L_4_0/rep01")
+    expect(page.locator("#ghost-key")).to_contain_text("L_4_0")
+    with page.expect_download() as begun:
+        page.get_by_role("link", name="export this trial").click()
+    file = tmp_path / begun.value.suggested_filename
+    begun.value.save_as(file)
+    assert file.name == "emulator-baseline-N_0_0-rep01.html"
+    page.goto(f"file://{file}?compare=emulator/baseline/L_4_0/rep01&t=2.5")
+    expect(page.locator("h1")).to_have_text(TRIAL)
+    expect(page.locator("#ghost-key")).to_contain_text("L_4_0")
+    expect(page.locator("#decision .decision-panel")).to_have_count(4)
+
+
+def test_both_ribbons_and_both_words_stand_beside_each_other(page):
+    other = "emulator/baseline/L_4_0/rep02"
+    page.goto(f"/trials/{TRIAL}?t=2.5&compare={other}")
+    expect(page.locator("#other-ribbons .ribbon")).to_have_count(2)
+    expect(page.locator("#decision h2.of")).to_have_count(2)
+    expect(page.locator("#decision .decision-panel")).to_have_count(4)
+    own, others = page.locator("#ribbons a.now"), page.locator("#other-ribbons a.now")
+    assert own.first.bounding_box()["x"] == pytest.approx(others.first.bounding_box()["x"], abs=1)
+    others.first.click()
+    expect(page.locator("#decision .decision-panel h2")).to_have_count(1)
+    assert "of=other" in page.url
+    page.reload()
+    expect(page.locator("#other-ribbons a[aria-current]")).to_have_count(1)
+    page.locator("#ghost-key a").click()
+    expect(page.locator("h1")).to_have_text(other)
+
+
+def test_the_other_is_found_by_keyboard_alone(page):
+    page.goto(f"/trials/{TRIAL}")
+    page.keyboard.press("c")
+    page.keyboard.type("l_4_0 rep02")
+    expect(page.locator("#others button")).to_have_count(1)
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    expect(page.locator("#ghost-key")).to_contain_text("L_4_0, rep 2")
+    assert "compare=emulator" in page.url
+    page.keyboard.press(" ")
+    expect(page.locator("#play")).to_have_text("Pause")
+
+
+def test_offers_are_a_click_away(page):
+    page.goto(f"/trials/{TRIAL}")
+    page.get_by_role("button", name="next repetition").click()
+    expect(page.locator("#ghost-key")).to_contain_text("rep 2")
+    page.get_by_role("button", name="nearest human").click()
+    expect(page.locator("#ghost-key")).to_contain_text("human P1")
+    page.go_back()
+    expect(page.locator("#ghost-key")).to_contain_text("rep 2")

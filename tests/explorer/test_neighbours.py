@@ -1,0 +1,75 @@
+"""A trial leads to the next one of the list that led to it, and the list keeps its place."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import expect
+
+LIST = "/trials?q=emulator&sort=-end"
+
+
+def opened(page, name):
+    """Wait until a trial is shown, with its neighbours."""
+    expect(page.locator("h1")).to_have_text(name)
+    expect(page.locator("#next-trial")).to_be_visible()
+
+
+@pytest.fixture
+def names(page):
+    """The names of a list, of which the second is open now."""
+    page.goto(LIST)
+    found = page.locator("tbody th a").all_inner_texts()
+    page.locator("tbody th a").nth(1).click()
+    opened(page, found[1])
+    return found
+
+
+def test_keys_and_links_go_to_the_neighbours_as_the_list_was_sorted(page, names):
+    page.keyboard.press("j")
+    opened(page, names[2])
+    page.locator("#previous-trial").click()
+    opened(page, names[1])
+    page.keyboard.press("k")
+    expect(page.locator("h1")).to_have_text(names[0])
+    expect(page.locator("#previous-trial")).to_be_hidden()
+    expect(page.locator("#next-trial")).to_be_visible()
+
+
+def test_the_list_keeps_its_place_and_goes_on_from_there(page, names):
+    page.keyboard.press("j")
+    opened(page, names[2])
+    page.keyboard.press("Escape")
+    page.wait_for_url(f"**{LIST}")
+    expect(page.locator("tr.chosen th a")).to_have_text(names[2])
+    page.keyboard.press("j")
+    expect(page.locator("tr.chosen th a")).to_have_text(names[3])
+
+
+def test_a_trial_that_no_list_led_to_has_no_neighbours(page):
+    page.goto("/trials/emulator/baseline/N_0_0/rep01")
+    expect(page.locator("#track")).to_be_visible()
+    expect(page.locator("#next-trial")).to_be_hidden()
+
+
+def test_the_next_page_of_the_list_follows_its_last_row(page, monkeypatch):
+    monkeypatch.setattr("analysis.explorer.catalogue.PAGE", 2)
+    monkeypatch.setattr("analysis.explorer.pages.trials.PAGE", 2)
+    page.goto(f"{LIST}&page=2")
+    before = page.locator("tbody th a").all_inner_texts()
+    page.goto(LIST)
+    first = page.locator("tbody th a").all_inner_texts()
+    assert len(first) == len(before) == 2
+    page.locator("tbody th a").last.click()
+    opened(page, first[1])
+    page.keyboard.press("j")
+    opened(page, before[0])
+    page.keyboard.press("k")
+    expect(page.locator("h1")).to_have_text(first[1])
+
+
+def test_a_link_is_copied_as_the_page_stands(page):
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    page.goto("/trials/emulator/baseline/N_0_0/rep01?t=2.5&side=left&decision=2")
+    page.get_by_role("button", name="copy link").click()
+    expect(page.locator("#copied")).to_have_text("copied")
+    assert page.evaluate("navigator.clipboard.readText()") == page.url
