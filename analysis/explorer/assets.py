@@ -13,7 +13,10 @@ from markupsafe import Markup
 STATIC = Path(__file__).with_name("static")
 STYLES = (
     "vendor/uplot-1.6.32.min.css",
-    *(f"styles/{name}.css" for name in ("colours", "base", "trial", "sql", "tables", "sweeps")),
+    *(
+        f"styles/{name}.css"
+        for name in ("colours", "base", "trial", "sql", "tables", "sweeps", "words")
+    ),
 )
 
 

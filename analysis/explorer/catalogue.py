@@ -59,6 +59,8 @@ CREATE TABLE listed (
 CREATE TABLE levels (number INTEGER, factor VARCHAR, level VARCHAR);
 CREATE VIEW new_levels AS {LEVELS};
 CREATE VIEW tried AS SELECT number, unnest(tried, recursive := true) FROM listed;
+CREATE TABLE noted (trial_id VARCHAR, spec_hash VARCHAR, tag VARCHAR);
+CREATE VIEW tagged AS SELECT number, tag FROM noted JOIN listed USING (trial_id, spec_hash);
 CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
 CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
@@ -177,7 +179,7 @@ SEMI JOIN (FROM listed WHERE caution IS NULL) USING (spec_hash) WHERE contains(s
 # Before the name of a factor: its facet.
 FACTOR = "factor."
 # Facets of which a trial may have several values, and the tables that hold these.
-SEVERAL = {"sweep": "members", "cause": "causes"}
+SEVERAL = {"sweep": "members", "cause": "causes", "tag": "tagged"}
 SORTS = {
     "trial": "trial_id",
     "outcome": "outcome",
@@ -208,6 +210,7 @@ class Filter:
     outcome: str = ""
     validity: str = ""
     cause: str = ""
+    tag: str = ""
     q: str = ""
     levels: tuple[tuple[str, str], ...] = ()
     trials: tuple[tuple[str, str], ...] | None = None
@@ -262,6 +265,7 @@ class Catalogue:
     _stamp: tuple[int, ...] | None = None
     """The stamp of the database when it was last read to the end."""
     _lock: threading.RLock = field(default_factory=threading.RLock)
+    _tags: tuple[tuple[str, str, str], ...] = ()
 
     def refresh(self) -> bool:
         """Take in what is new in the database; returns whether anything was.
@@ -413,6 +417,31 @@ class Catalogue:
         with self._lock:
             return records(self._memory, sql, values)
 
+    def cursor(self) -> duckdb.DuckDBPyConnection:
+        """Another connection to what is in memory: its queries keep no page waiting."""
+        with self._lock:
+            return self._memory.cursor()
+
+    def copy(self, sql: str) -> None:
+        """Run statements of ours that copy from the database; raises UsageError and StoreError."""
+        try:
+            with reading(self.db, self._instance) as connection:
+                connection.execute(sql)
+        except StoreLocked:
+            raise
+        except MergeRunnerError:
+            self._file = self._stamp = None  # as in refresh
+            raise
+
+    def tag(self, tags: tuple[tuple[str, str, str], ...]) -> None:
+        """Know the tags that readers gave: (trial, spec, tag), each once."""
+        with self._lock:
+            if tags != self._tags:
+                self._memory.execute("TRUNCATE noted")
+                if tags:
+                    self._memory.executemany("INSERT INTO noted VALUES (?, ?, ?)", tags)
+                self._tags = tags
+
     def export(self, wanted: Filter, sort: str, form: str) -> bytes:
         """All trials of a filter as CSV or Parquet."""
         where, values = wanted.where()
@@ -447,7 +476,7 @@ class Catalogue:
         self._connection = self._instance.confined(self.db)
         self._connection.execute(schema_sql())
         self._connection.execute(LISTED + GROUPED)
-        self._file, self._stamp = file, None
+        self._file, self._stamp, self._tags = file, None, ()
 
     def _reading(self, sql: str) -> int:
         """Run statements on the database and ours; returns how many trials wait to be listed."""

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,11 @@ from analysis.explorer.details import read_decisions, read_trial
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.humans import humans_page
+from analysis.explorer.pages.notes import notes_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
 from analysis.explorer.pages.tables import table_page, tables_page
 from analysis.explorer.pages.trial import alternatives, embedded, rendered, shown
+from analysis.explorer.pages.words import exported_words
 from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
@@ -52,7 +55,7 @@ SHORTEST_SECRET = 8
 _OURS = re.compile(rf"(?:index|{'|'.join(EXPORTED)}|(?:sweep|table|trials)-.*)\.html")
 # Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
-    r'<script type="application/json" id="(?:bundle|cells)">.*?</script>', re.DOTALL
+    r'<script type="application/json" id="(?:bundle|cells|said)">.*?</script>', re.DOTALL
 )
 
 
@@ -74,11 +77,14 @@ def export_folder(
     the whole study. An earlier export in the folder goes. Nothing is written where a page holds a
     key or a path of this machine. Raises UsageError.
     """
-    links = StaticLinks(["trials"]) if wanted else StaticLinks()
+    links = StaticLinks(["trials", "words", "notes"]) if wanted else StaticLinks()
     with _opened(db, wanted, links) as (site, rows):
         behind = {"cells": {}, "sets": []} if wanted else _behind(site, rows)
         links.behind = behind["cells"]
         pages = {site.at.to("trials"): _listing(site, rows, behind)}
+        pages[site.at.to("words")] = exported_words(site, rows, partial(_searched, site))
+        shown = {(row["trial_id"], row["spec_hash"]) for row in rows}
+        pages[site.at.to("notes")] = notes_page(site, shown)
         for condition in sorted({row["condition"] for row in rows}):
             mine = [row for row in rows if row["condition"] == condition]
             title = f"Trials of {condition}"
@@ -207,7 +213,7 @@ def _opened(
 ) -> Iterator[tuple[Site, list[Row]]]:
     """A site of files and the wanted trials, by name; raises UsageError where there is none."""
     site = Site(db, links, shared={"inlined": inlined(PLAIN)})
-    site.catalogue.refresh()
+    site.refresh()
     every = site.catalogue.every(Filter())
     rows = [
         row
@@ -226,6 +232,12 @@ def _opened(
 def _packed(value: object) -> str:
     text = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
     return base64.b64encode(zlib.compress(text.encode(errors="replace"), 9)).decode()
+
+
+def _searched(site: Site, value: object) -> str:
+    """Packed words, after a look for secrets."""
+    _refuse_secrets(site, "words.html", [json.dumps(value, ensure_ascii=False)])
+    return _packed(value)
 
 
 def _written(

@@ -59,7 +59,7 @@ class Links:
 
 
 # The pages that the export of a whole study has beside the trials, each as a file of this name.
-EXPORTED = ("sweeps", "trials", "tables", "ablations", "humans")
+EXPORTED = ("sweeps", "trials", "words", "notes", "tables", "ablations", "humans")
 
 
 class StaticLinks(Links):
