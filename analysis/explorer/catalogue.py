@@ -17,7 +17,7 @@ from merge_runner.drivers.human_replay import HUMAN_REPLAY, unresponsive
 from merge_runner.drivers.registry import language_models, stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
-from merge_runner.results.database import Instance, schema_sql, spill_folder
+from merge_runner.results.database import Instance, room_for_texts, schema_sql, spill_folder
 from merge_runner.results.levels import LEVELS
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer, quoted
@@ -425,7 +425,7 @@ class Catalogue:
     def copy(self, sql: str) -> None:
         """Run statements of ours that copy from the database; raises UsageError and StoreError."""
         try:
-            with reading(self.db, self._instance) as connection:
+            with reading(self.db, self._instance) as connection, room_for_texts(connection):
                 connection.execute(sql)
         except StoreLocked:
             raise

@@ -27,15 +27,17 @@ from merge_runner.text_safety import quoted
 PAGE = 50
 LONGEST = 65_536  # characters of a reply that are searched
 READING_S = 1.0  # a page waits so long for words that are not copied yet
-# What is searched, as SQL over a decision and the last reply to its call.
+REPLIES = f"""
+LEFT JOIN (SELECT trial_id, spec_hash, side, decision, max_by(left(reply, {LONGEST}), attempt)
+        AS reply
+    FROM calls SEMI JOIN wanted USING (trial_id, spec_hash) WHERE reply IS NOT NULL GROUP BY ALL)
+USING (trial_id, spec_hash, side, decision)
+"""  # noqa: S608 # a constant
+# What is searched, as SQL over a decision and the last reply to its call, and of how many trials
+# it is copied at once: the file is not held for longer than that takes.
 KINDS = {
-    "rationales": ("rationale", ""),
-    "replies": (
-        f"left(reply, {LONGEST})",
-        "LEFT JOIN (SELECT trial_id, spec_hash, side, decision, max_by(reply, attempt) AS reply "
-        "FROM calls SEMI JOIN wanted USING (trial_id, spec_hash) WHERE reply IS NOT NULL "
-        "GROUP BY ALL) USING (trial_id, spec_hash, side, decision)",
-    ),
+    "rationales": ("rationale", "", 1_000),
+    "replies": ("reply", REPLIES, 100),
 }
 # A change of mind is between what a driver said and what it had said before.
 DECISIONS = """
@@ -56,8 +58,7 @@ DELETE FROM words.{kind} WHERE number NOT IN (SELECT number FROM words.taken_{ki
 WAITING = """
 FROM memory.listed WHERE decisions > 0 AND number NOT IN (SELECT number FROM words.taken_{kind})
 """
-# The next 1,000 trials: the file is not held for longer than that takes. A line break is a space
-# to whoever looks for a phrase.
+# A line break is a space to whoever looks for a phrase.
 TAKE = """
 BEGIN;
 INSERT INTO words.{kind} BY NAME
@@ -68,7 +69,7 @@ FROM (SELECT decided.* EXCLUDE rationale, {text} AS text FROM ({decisions}) AS d
 INSERT INTO words.taken_{kind} SELECT number {waiting};
 COMMIT;
 """
-AT_ONCE = 1_000
+WITHOUT_A_LOG = "RECOVERY_MODE no_wal_writes, ROW_GROUP_SIZE 16384"
 OWN_FACETS = ("tactical", "switch", "failure")
 TRIAL_FACETS = ("model", "variant", "condition", "outcome", "tag")
 
@@ -180,14 +181,15 @@ class Words:
         if ("words",) not in names:  # the catalogue has begun anew, or we begin
             self.close()
             self._folder = tempfile.TemporaryDirectory(dir=spill_folder())
-            connection.execute(f"ATTACH {quoted(f'{self._folder.name}/words.duckdb')} AS words")
+            file = quoted(f"{self._folder.name}/words.duckdb")
+            connection.execute(f"ATTACH {file} AS words ({WITHOUT_A_LOG})")
         connection.execute(TABLES.format(kind=kind))
 
     def _take(self, connection: duckdb.DuckDBPyConnection, kind: str) -> None:
         """Copy words, for a moment; raises UsageError and StoreError."""
         until = time.monotonic() + READING_S
-        text, replies = KINDS[kind]
-        some = f"{WAITING.format(kind=kind)} ORDER BY number LIMIT {AT_ONCE}"
+        text, replies, at_once = KINDS[kind]
+        some = f"{WAITING.format(kind=kind)} ORDER BY number LIMIT {at_once}"
         take = TAKE.format(kind=kind, text=text, replies=replies, decisions=DECISIONS, waiting=some)
         while time.monotonic() < until and _unread(connection, kind):
             self.catalogue.copy(take)
@@ -221,9 +223,8 @@ def _page(connection: duckdb.DuckDBPyConnection, wanted: Wanted, number: int) ->
         "ON said.rowid = place ORDER BY trial_id, spec_hash, chosen.decision, chosen.side",
         [*values, PAGE * (number - 1)],
     )
-    ((terms,),) = connection.execute(
-        "SELECT list_transform(?::VARCHAR[], lambda term: lower(term))", [list(wanted.terms)]
-    ).fetchall()
+    folded = connection.execute("SELECT lower(unnest(?::VARCHAR[]))", [wanted.terms]).fetchall()
+    terms = [term for (term,) in folded]
     return [
         Hit(row, None if row["text"] is None else snippet(row["text"], row["folded"], terms))
         for row in rows

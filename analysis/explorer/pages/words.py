@@ -30,7 +30,7 @@ def words_page(site: Site, asked: Mapping[str, str]) -> str:
     """A page of the decisions that an address asks for."""
     wanted = wanted_of(asked)
     found = site.words.search(wanted, whole(asked.get("page", "")) or 1)
-    chosen = {name: asked[name] for name in (*OWN_FACETS, *TRIAL_FACETS, "q") if asked.get(name)}
+    chosen = {**wanted.trials.chosen, **wanted.own, "q": asked.get("q", "")}
     return _rendered(
         site,
         found=found,
