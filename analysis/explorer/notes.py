@@ -131,6 +131,8 @@ class Notes:
         notes: dict[str, Note] = {}
         damage = []
         for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
+            if not line.strip():
+                continue
             try:
                 entry = ENTRY.validate_json(line)
             except ValidationError:
