@@ -199,6 +199,10 @@ def view(
             "--trials", help="Which trials to write: names separated by commas, * for anything."
         ),
     ] = None,
+    reader: Annotated[
+        str | None,
+        typer.Option("--reader", metavar="NAME", help="Who writes notes; else your user name."),
+    ] = None,
     db: DbOption = DEFAULT_DB,
     study_file: StudyOption = None,
 ) -> None:
@@ -206,21 +210,22 @@ def view(
     if export is None and single is None:
         if trials is not None:
             raise UsageError("--trials goes with --export DIR or --single FILE.html")
-        _serve(db, port, bind)
+        _serve(db, port, bind, reader)
     elif single is not None and trials is None:
         raise UsageError("--single FILE.html needs --trials: name some, or all with '*'")
     else:
         _export(db, export, single, listed(trials) or [])
 
 
-def _serve(db: Path, port: int, bind: str) -> None:
+def _serve(db: Path, port: int, bind: str, reader: str | None) -> None:
+    from analysis.explorer.notes import reader_of
     from analysis.explorer.server import serve
 
     def announce(address: str) -> None:
         print_out(address)
         say("open this address in a browser; Ctrl-C ends the explorer")
 
-    serve(db, port, bind, announce)
+    serve(db, port, bind, announce, reader_of(reader))
 
 
 def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[str]) -> None:

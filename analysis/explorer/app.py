@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any
+from urllib.parse import parse_qs
 
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
@@ -32,14 +34,16 @@ from analysis.explorer.pages import (
     conditions,
     home,
     humans,
+    notes,
     sql,
     sweep,
     tables,
     trial,
     trials,
+    words,
 )
 from analysis.explorer.site import NothingNew, NotThere, Site
-from merge_runner.errors import MergeRunnerError
+from merge_runner.errors import MergeRunnerError, UsageError
 
 LOG = logging.getLogger(__name__)
 # The browser asks for the page again after this many s.
@@ -51,6 +55,7 @@ FIRST_TIME = (
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 # What a name of a trial may hold and the name of a file had better not.
 FILE_NAME = re.compile(r"[^A-Za-z0-9_.-]+")
+MOST_NOTED = 65_536  # bytes of a form with a note
 # Nothing in a reply runs, whatever a browser takes it for.
 SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
 
@@ -69,6 +74,7 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             *_trial_routes(site),
             *_computed_routes(site),
             *_sql_routes(site),
+            *_words_routes(site),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
@@ -92,7 +98,7 @@ def _sweep_routes(site: Site) -> list[Route]:
 
 def _trial_routes(site: Site) -> list[Route]:
     def export(request: Request) -> Response:
-        site.catalogue.refresh()
+        site.refresh()
         form = request.path_params["form"]
         if form not in KINDS:
             raise NotThere(f"trials come as {' or '.join(KINDS)}")
@@ -181,7 +187,7 @@ def _page(site: Site, render: Callable[[Request], str | Response]) -> Callable[[
     def answer(request: Request) -> Response:
         if site.beginning:
             return HTMLResponse(_message(site, "Reading the trials", FIRST_TIME), headers=AGAIN)
-        site.catalogue.refresh()
+        site.refresh()
         try:
             rendered = render(request)
         except NothingNew:
@@ -237,3 +243,42 @@ def _sql_routes(site: Site) -> list[Route]:
         return Response(content, media_type=KINDS["csv"], headers=name)
 
     return [Route("/sql", sql_query), Route("/sql.csv", sql_download)]
+
+
+def _words_routes(site: Site) -> list[Route]:
+    """Search in words, and what readers note; see ``Guard`` for who may write."""
+
+    def as_csv(_: Request) -> Response:
+        name = {"content-disposition": 'attachment; filename="notes.csv"'}
+        return Response(notes.notes_csv(site), media_type=KINDS["csv"], headers=name)
+
+    def write(request: Request, form: Mapping[str, str]) -> Response:
+        site.refresh()
+        try:
+            if "withdraws" in form:
+                site.notes.withdraw(form["withdraws"])
+                return RedirectResponse(site.at.to("notes"), 303)
+            row = notes.add_note(site, form)
+        except UsageError as exc:
+            return PlainTextResponse(str(exc), 400)
+        if "hx-request" in request.headers:
+            return HTMLResponse(site.render("_noted.html", row=row))
+        return RedirectResponse(site.at.trial(row), 303)
+
+    async def written(request: Request) -> Response:
+        body = b""
+        async for part in request.stream():
+            body += part
+            if len(body) > MOST_NOTED:
+                return PlainTextResponse("nothing was noted: the form is too large", 413)
+        given = parse_qs(body.decode(errors="replace"), max_num_fields=10)
+        form = {name: values[-1] for name, values in given.items()}
+        return await run_in_threadpool(write, request, form)
+
+    page = partial(_page, site)
+    return [
+        Route("/words", page(lambda r: words.words_page(site, r.query_params))),
+        Route("/notes", page(lambda _: notes.notes_page(site))),
+        Route("/notes", written, methods=["POST"]),
+        Route("/notes.csv", as_csv),
+    ]

@@ -15,7 +15,10 @@ STYLES = (
     "vendor/uplot-1.6.32.min.css",
     *(
         f"styles/{name}.css"
-        for name in ("colours", "base", "trial", "sql", "tables", "sweeps", "home", "conditions")
+        for name in (
+            *("colours", "base", "trial", "sql", "tables", "sweeps"),
+            *("home", "conditions", "words"),
+        )
     ),
 )
 # What draws and moves a trial, in the order in which it is loaded.

@@ -23,7 +23,7 @@ from merge_runner.drivers.human_replay import HUMAN_REPLAY, unresponsive
 from merge_runner.drivers.registry import language_models, stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
-from merge_runner.results.database import Instance, schema_sql, spill_folder
+from merge_runner.results.database import Instance, room_for_texts, schema_sql, spill_folder
 from merge_runner.results.levels import LEVELS
 from merge_runner.scenarios.merge.geometry import Track, track_of
 from merge_runner.served_model import ALIASES, others_among
@@ -67,6 +67,8 @@ CREATE TABLE listed (
 CREATE TABLE levels (number INTEGER, factor VARCHAR, level VARCHAR);
 CREATE VIEW new_levels AS {LEVELS};
 CREATE VIEW tried AS SELECT number, unnest(tried, recursive := true) FROM listed;
+CREATE TABLE noted (trial_id VARCHAR, spec_hash VARCHAR, tag VARCHAR);
+CREATE VIEW tagged AS SELECT number, tag FROM noted JOIN listed USING (trial_id, spec_hash);
 CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
 CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
@@ -213,7 +215,7 @@ SEMI JOIN (FROM listed WHERE caution IS NULL) USING (spec_hash) WHERE contains(s
 # Before the name of a factor: its facet.
 FACTOR = "factor."
 # Facets of which a trial may have several values, and the tables that hold these.
-SEVERAL = {"sweep": "members", "cause": "causes"}
+SEVERAL = {"sweep": "members", "cause": "causes", "tag": "tagged"}
 SORTS = {
     "trial": "trial_id",
     "outcome": "outcome",
@@ -247,6 +249,7 @@ class Filter:
     account: str = ""
     validity: str = ""
     cause: str = ""
+    tag: str = ""
     q: str = ""
     levels: tuple[tuple[str, str], ...] = ()
     trials: tuple[tuple[str, str], ...] | None = None
@@ -301,6 +304,7 @@ class Catalogue:
     _stamp: tuple[int, ...] | None = None
     """The stamp of the database when it was last read to the end."""
     _lock: threading.RLock = field(default_factory=threading.RLock)
+    _tags: tuple[tuple[str, str, str], ...] = ()
 
     def refresh(self) -> bool:
         """Take in what is new in the database; returns whether anything was.
@@ -448,6 +452,31 @@ class Catalogue:
         with self._lock:
             return records(self._memory, sql, values)
 
+    def cursor(self) -> duckdb.DuckDBPyConnection:
+        """Another connection to what is in memory: its queries keep no page waiting."""
+        with self._lock:
+            return self._memory.cursor()
+
+    def copy(self, sql: str) -> None:
+        """Run statements of ours that copy from the database; raises UsageError and StoreError."""
+        try:
+            with reading(self.db, self._instance) as connection, room_for_texts(connection):
+                connection.execute(sql)
+        except StoreLocked:
+            raise
+        except MergeRunnerError:
+            self._file = self._stamp = None  # as in refresh
+            raise
+
+    def tag(self, tags: tuple[tuple[str, str, str], ...]) -> None:
+        """Know the tags that readers gave: (trial, spec, tag), each once."""
+        with self._lock:
+            if tags != self._tags:
+                self._memory.execute("TRUNCATE noted")
+                if tags:
+                    self._memory.executemany("INSERT INTO noted VALUES (?, ?, ?)", tags)
+                self._tags = tags
+
     def export(self, wanted: Filter, sort: str, form: str) -> bytes:
         """All trials of a filter as CSV or Parquet."""
         where, values = wanted.where()
@@ -482,7 +511,7 @@ class Catalogue:
         self._connection = self._instance.confined(self.db)
         self._connection.execute(schema_sql())
         self._connection.execute(LISTED + GROUPED)
-        self._file, self._stamp = file, None
+        self._file, self._stamp, self._tags = file, None, ()
 
     def _reading(self, sql: str) -> int:
         """Run statements on the database and ours; returns how many trials wait to be listed."""

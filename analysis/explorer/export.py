@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from analysis.explorer.assets import REPLAY, inlined
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.exported_list import listing_page
 from analysis.explorer.leaks import Leaks
+from analysis.explorer.packing import packed
 from analysis.explorer.packing_processes import AT_ONCE, Block, packed_blocks
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.comparing import At, offered
@@ -23,9 +26,11 @@ from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.conditions import condition_page, conditions_page
 from analysis.explorer.pages.home import home_page
 from analysis.explorer.pages.humans import humans_page
+from analysis.explorer.pages.notes import notes_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
 from analysis.explorer.pages.tables import FILES, table_files, table_page, tables_page
 from analysis.explorer.pages.trial import embedded
+from analysis.explorer.pages.words import exported_words
 from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import list_sweeps
@@ -43,7 +48,7 @@ _OURS = re.compile(
 )
 # Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
-    r'<script type="application/json" id="(?:bundle|packed-list)">.*?</script>', re.DOTALL
+    r'<script type="application/json" id="(?:bundle|packed-list|said)">.*?</script>', re.DOTALL
 )
 # What the numbers of all tables are made of: it takes longest, and goes on while trials are packed.
 CELLS = ("cells", *TABLES)
@@ -67,7 +72,7 @@ def export_folder(
     the whole study. An earlier export in the folder goes. Nothing is written where a page holds a
     key or a path of this machine. Raises UsageError.
     """
-    links = StaticLinks(["trials"]) if wanted else StaticLinks()
+    links = StaticLinks(["trials", "words", "notes"]) if wanted else StaticLinks()
     with _opened(db, wanted, links) as (site, rows), _Staged(folder, Leaks(db), _OURS) as staged:
         if not wanted:
             site.computing.ask(CELLS, site.catalogue.state())
@@ -78,9 +83,14 @@ def export_folder(
         behind = {"cells": {}, "sets": []} if wanted else _behind(site, rows)
         links.behind = behind["cells"]
         listing = listing_page(site, rows, behind)
-        pages = {}
+        pages = {
+            site.at.to("words"): exported_words(site, rows, partial(_packed, Leaks(db))),
+            site.at.to("notes"): notes_page(
+                site, {(row["trial_id"], row["spec_hash"]) for row in rows}
+            ),
+        }
         if not wanted:
-            pages = {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site, watch)}
+            pages |= {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site, watch)}
         pages[site.at.to("trials")] = listing
         pages.setdefault("index.html", listing)  # of some trials
         for name, text in pages.items():
@@ -206,7 +216,7 @@ def _opened(
 ) -> Iterator[tuple[Site, list[Row]]]:
     """A site of files and the wanted trials, by name; raises UsageError where there is none."""
     site = Site(db, links, shared={"inlined": inlined(PLAIN)})
-    site.catalogue.refresh()
+    site.refresh()
     every = site.catalogue.every(Filter())
     rows = [
         row
@@ -220,6 +230,12 @@ def _opened(
         yield site, rows
     finally:
         site.close()
+
+
+def _packed(leaks: Leaks, value: object) -> str:
+    """Words, packed after a look for what must not be in them."""
+    leaks.refuse("words.html", [json.dumps(value, ensure_ascii=False)])
+    return packed(value)
 
 
 class _Staged:

@@ -98,6 +98,8 @@ class Guard:
         origin = headers.get("origin")
         if origin not in {None, f"http://{host}"}:
             return "another site's page may not ask here"
+        if scope["method"] not in {"GET", "HEAD"} and (origin is None or from_elsewhere(headers)):
+            return "only a page of the explorer may write here"
         if from_elsewhere(headers) and headers.get("sec-fetch-mode", "navigate") != "navigate":
             return "another site's page may not ask here"
         if self._token is None:

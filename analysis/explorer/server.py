@@ -21,9 +21,9 @@ LOOPBACK = "127.0.0.1"
 EVERYWHERE = {"0.0.0.0": LOOPBACK, "::": "::1"}  # noqa: S104 # compared, not bound
 
 
-def serve(db: Path, port: int, bind: str, say: Callable[[str], None]) -> None:
-    """Serve a database; ``say`` gets the address to open. Raises UsageError."""
-    site = Site(db, program=_program())
+def serve(db: Path, port: int, bind: str, say: Callable[[str], None], reader: str) -> None:
+    """Serve a database to a reader; ``say`` gets the address to open. Raises UsageError."""
+    site = Site(db, program=_program(), reader=reader)
     with reading(db):
         pass  # what is wrong with it is said at once
     listener = listen(bind, port)

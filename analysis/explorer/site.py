@@ -16,7 +16,9 @@ from analysis.explorer.assets import STYLES
 from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.display_text import visible
 from analysis.explorer.glossary import sections
+from analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
 from analysis.explorer.query_process import Sandbox
+from analysis.explorer.search import Words
 from analysis.explorer.urls import HOME, Links, StaticLinks
 from analysis.explorer.views import clock, condition_text
 from analysis.metrics import METRICS
@@ -29,6 +31,8 @@ PAGES = {
     "Runs": "sweeps",
     "Trials": "trials",
     "Conditions": "conditions",
+    "Words": "words",
+    "Notes": "notes",
     "Tables": "tables",
     "Ablations": "ablations",
     "Humans": "humans",
@@ -52,6 +56,8 @@ class Site:
     at: Links = field(default_factory=Links)
     program: str = "merge-runner"
     """What to type to run this program."""
+    reader: str = "reader"
+    """Who writes notes."""
     shared: dict[str, object] = field(default_factory=dict)
     """What else all templates see."""
 
@@ -61,6 +67,8 @@ class Site:
         self.catalogue = Catalogue(self.db)
         self.sandbox = Sandbox(self.db)
         self.computing = Computing(self.db)
+        self.words = Words(self.catalogue)
+        self.notes = Notes(self.db, self.reader)
         self._environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(TEMPLATES),
             autoescape=True,
@@ -71,6 +79,8 @@ class Site:
         self._environment.globals.update(
             at=self.at,
             metrics=METRICS,
+            notes=self.notes,
+            note_limits={"text": LONGEST_TEXT, "tags": MOST_TAGS * (LONGEST_TAG + 2)},
             pages={name: page for name, page in PAGES.items() if self.at.to(page)},
             share=self.share,
             program=self.program,
@@ -93,7 +103,12 @@ class Site:
     def _read_first(self) -> None:
         # The first page tries again, and says what is wrong.
         with contextlib.suppress(MergeRunnerError):
-            self.catalogue.refresh()
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Take in what is new: in the database, and in the notes beside it."""
+        self.catalogue.refresh()
+        self.catalogue.tag(self.notes.kept().tags)
 
     @property
     def beginning(self) -> bool:
@@ -116,5 +131,6 @@ class Site:
 
     def close(self) -> None:
         """Leave nothing behind."""
+        self.words.close()
         self.sandbox.close()
         self.computing.close()

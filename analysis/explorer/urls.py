@@ -75,7 +75,10 @@ class Links:
 
 
 # The pages that the export of a whole study has beside the trials, each as a file of this name.
-EXPORTED = (HOME, "sweeps", "trials", "conditions", "tables", "ablations", "humans", "glossary")
+EXPORTED = (
+    *(HOME, "sweeps", "trials", "conditions", "words", "notes", "tables", "ablations", "humans"),
+    "glossary",
+)
 
 
 class StaticLinks(Links):

@@ -1,0 +1,210 @@
+"""What readers note of trials and decisions: lines of a file beside the database, never in it.
+
+Lines are only added, so that two explorers may write at once and nothing is lost.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import getpass
+import os
+import secrets
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AwareDatetime, Field, StringConstraints, TypeAdapter, ValidationError
+
+from merge_runner.errors import UsageError
+from merge_runner.records import Side
+
+LONGEST_TEXT, LONGEST_TAG, MOST_TAGS, LONGEST_NAME = 4_000, 40, 10, 60
+MOST_BYTES = 2**26  # of the file: all of it is read for a page
+Name = Annotated[str, StringConstraints(min_length=1, max_length=LONGEST_NAME)]
+Tag = Annotated[str, StringConstraints(min_length=1, max_length=LONGEST_TAG)]
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """What a reader noted, of a trial or, with ``side`` and ``decision``, of a decision.
+
+    The spec says which trial is meant in a copy of the study, too.
+    """
+
+    id: str
+    at: AwareDatetime
+    reader: Name
+    trial_id: str
+    spec_hash: str
+    side: Side | None
+    decision: int | None
+    tags: Annotated[tuple[Tag, ...], Field(max_length=MOST_TAGS)]
+    text: Annotated[str, StringConstraints(max_length=LONGEST_TEXT)]
+
+    @property
+    def trial(self) -> tuple[str, str]:
+        """The trial and its spec."""
+        return self.trial_id, self.spec_hash
+
+
+@dataclass(frozen=True, slots=True)
+class Withdrawal:
+    """A reader takes back what they noted; the line of the note stays."""
+
+    withdraws: str
+    at: AwareDatetime
+    reader: Name
+
+
+ENTRY: TypeAdapter[Note | Withdrawal] = TypeAdapter(Note | Withdrawal)
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What a file holds: the notes that stand, the earliest first, and what could not be read."""
+
+    notes: tuple[Note, ...] = ()
+    damage: tuple[str, ...] = ()
+    of_trial: dict[tuple[str, str], list[Note]] = field(default_factory=dict)
+    tags: tuple[tuple[str, str, str], ...] = ()
+    """Of each trial and its decisions: (trial, spec, tag), each once."""
+
+
+class Notes:
+    """The notes beside a database, and the reader who adds to them."""
+
+    def __init__(self, db: Path, reader: str = "") -> None:
+        self.path = db.with_name(f"{db.stem}.notes.jsonl")
+        self.reader = reader
+        self._lock = threading.Lock()
+        self._read: tuple[tuple[int, ...], Kept] = (), Kept()
+
+    def kept(self) -> Kept:
+        """What the file holds now: the same object while the file is the same."""
+        try:
+            stat = self.path.stat()
+            stamp = (stat.st_ino, stat.st_mtime_ns, stat.st_size)
+            with self._lock:
+                if stamp != self._read[0]:
+                    self._read = stamp, self._parsed(stat.st_size)
+                return self._read[1]
+        except FileNotFoundError:
+            return Kept()
+        except OSError as exc:
+            return Kept(damage=(f"{self.path.name} cannot be read: {exc.strerror}",))
+
+    def of(self, trial_id: str, spec_hash: str) -> list[Note]:
+        """The notes of a trial."""
+        return self.kept().of_trial.get((trial_id, spec_hash), [])
+
+    def add(
+        self,
+        trial: tuple[str, str],
+        at: tuple[Side, int] | None,
+        tags: Sequence[str],
+        text: str,
+    ) -> None:
+        """Note something of a trial, or of a decision by its side and number; raises UsageError."""
+        if not tags and not text:
+            raise UsageError("nothing was noted: write a note, or a tag")
+        side, decision = at or (None, None)
+        now = datetime.now(UTC)
+        self._append(
+            Note(secrets.token_hex(8), now, self.reader, *trial, side, decision, tuple(tags), text)
+        )
+
+    def withdraw(self, name: str) -> None:
+        """Take back a note of this reader; raises UsageError."""
+        mine = [note for note in self.kept().notes if note.id == name]
+        if not mine or mine[0].reader != self.reader:
+            raise UsageError(f"there is no note {name} of {self.reader}")
+        self._append(Withdrawal(name, datetime.now(UTC), self.reader))
+
+    def _parsed(self, size: int) -> Kept:
+        if size > MOST_BYTES:
+            most = f"{MOST_BYTES >> 20} MB"
+            return Kept(damage=(f"{self.path.name} is larger than {most}, and is not read",))
+        notes: dict[str, Note] = {}
+        damage = []
+        for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
+            if not line.strip():
+                continue
+            try:
+                entry = ENTRY.validate_json(line)
+            except ValidationError:
+                damage.append(f"line {number} of {self.path.name} is damaged, and is left out")
+                continue
+            if isinstance(entry, Note):
+                notes.setdefault(entry.id, entry)
+            elif entry.withdraws in notes and notes[entry.withdraws].reader == entry.reader:
+                del notes[entry.withdraws]
+        of_trial: dict[tuple[str, str], list[Note]] = {}
+        for note in notes.values():
+            of_trial.setdefault(note.trial, []).append(note)
+        tags = sorted({(*note.trial, tag) for note in notes.values() for tag in note.tags})
+        return Kept(tuple(notes.values()), tuple(damage), of_trial, tuple(tags))
+
+    def _append(self, entry: Note | Withdrawal) -> None:
+        """Add a line, whole or not at all; raises UsageError."""
+        try:
+            line = ENTRY.dump_json(entry)
+            ENTRY.validate_json(line)
+        except ValueError as exc:  # also of letters that are none
+            raise UsageError(
+                f"nothing was noted: a note has up to {LONGEST_TEXT:,} characters and up to "
+                f"{MOST_TAGS} tags of up to {LONGEST_TAG}"
+            ) from exc
+        try:
+            with _alone(self.path) as file:
+                size = os.fstat(file).st_size
+                torn = size > 0 and os.pread(file, 1, size - 1) != b"\n"
+                try:
+                    _write(file, (b"\n" if torn else b"") + line + b"\n")
+                except OSError:
+                    os.ftruncate(file, size)
+                    raise
+        except OSError as exc:
+            raise UsageError(f"nothing was noted: {self.path}: {exc.strerror}") from exc
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[int]:
+    """The open file, while no other explorer writes into it."""
+    file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield file
+    finally:
+        os.close(file)
+
+
+def _write(file: int, content: bytes) -> None:
+    while content:
+        content = content[os.write(file, content) :]
+    os.fsync(file)
+
+
+def reader_of(given: str | None) -> str:
+    """Who writes: the name that is given, or the system's; raises UsageError."""
+    name = " ".join((_user() if given is None else given).split())
+    if not 0 < len(name) <= LONGEST_NAME:
+        raise UsageError(f"--reader needs a name of up to {LONGEST_NAME} characters")
+    return name
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # the system knows no name, as in some containers
+        return "reader"
+
+
+def tags_of(text: str) -> list[str]:
+    """The tags in a text, separated by commas, without regard to case."""
+    return list(
+        dict.fromkeys(tag for part in text.split(",") if (tag := " ".join(part.split()).lower()))
+    )

@@ -1,0 +1,65 @@
+"""What readers noted, all of it, and how far they agree."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Collection, Mapping
+
+from analysis.explorer.agreement import agreements
+from analysis.explorer.notes import Note, tags_of
+from analysis.explorer.pages.trial import find
+from analysis.explorer.query_worker import csv_cell
+from analysis.explorer.reading import Row
+from analysis.explorer.site import Site
+from analysis.explorer.urls import whole
+from merge_runner.errors import UsageError
+from merge_runner.records import SIDES
+from merge_runner.text_safety import csv_writer
+
+COLUMNS = ("at", "reader", "trial_id", "spec_hash", "side", "decision", "tags", "text")
+
+
+def notes_page(site: Site, among: Collection[tuple[str, str]] | None = None) -> str:
+    """All notes, the latest first, or those of some trials."""
+    kept = site.notes.kept()
+    shown = [note for note in kept.notes if among is None or note.trial in among]
+    return site.render(
+        "notes.html",
+        here="notes",
+        kept=kept,
+        shown=[(note, _address(site, note)) for note in reversed(shown)],
+        agreements=list(agreements(shown)),
+        readers=sorted({note.reader for note in shown if note.tags}),
+    )
+
+
+def notes_csv(site: Site) -> str:
+    """All notes as CSV, the earliest first; tags are separated by commas."""
+    lines = io.StringIO()
+    writer = csv_writer(lines)
+    writer.writerow(COLUMNS)
+    for note in site.notes.kept().notes:
+        texts = {"at": note.at.isoformat(), "tags": ", ".join(note.tags)}
+        writer.writerow(csv_cell(texts.get(name, getattr(note, name))) for name in COLUMNS)
+    return lines.getvalue()
+
+
+def add_note(site: Site, given: Mapping[str, str]) -> Row:
+    """Note what a form gives; returns the trial. Raises NotThere and UsageError."""
+    row = find(site, given.get("trial", ""), given)
+    side, number = given.get("side", ""), whole(given.get("decision", ""))
+    if side not in {"", *SIDES} or (number is None) != (side == ""):
+        raise UsageError("a note is of a trial, or of a decision: side left or right, and a number")
+    text = given.get("text", "").replace("\r\n", "\n").strip()
+    at = None if number is None else (SIDES[SIDES.index(side)], number)
+    site.notes.add((row["trial_id"], row["spec_hash"]), at, tags_of(given.get("tags", "")), text)
+    return row
+
+
+def _address(site: Site, note: Note) -> str:
+    """Where a note belongs; nothing where the trial is not in this database."""
+    row = site.catalogue.find(*note.trial)
+    if row is None:
+        return ""
+    at = {} if note.decision is None else {"side": note.side, "decision": note.decision}
+    return site.at.trial(row, **at)

@@ -1,0 +1,36 @@
+"use strict";
+// Notes on a trial from the keyboard: of the decision that is chosen, or of the trial.
+(() => {
+  const form = document.getElementById("note");
+  if (!form) return;
+  const { text, tags, side, decision } = form.elements;
+  const about = () => {
+    const chosen = document.querySelector("a.decision[aria-current]")?.dataset;
+    side.value = chosen?.side ?? "";
+    decision.value = chosen?.n ?? "";
+    document.getElementById("note-about").textContent = chosen ? `on the ${chosen.side} decision ${chosen.n}` : "on the trial";
+  };
+  // While something is written, what it is about stays.
+  form.addEventListener("focusin", () => { if (!text.value && !tags.value) about(); });
+  text.addEventListener("keydown", (event) => {
+    if (event.key !== "Enter" || event.shiftKey || event.isComposing) return;
+    event.preventDefault();
+    form.requestSubmit();
+  });
+  form.addEventListener("htmx:afterRequest", (event) => {
+    const said = document.getElementById("note-said");
+    said.textContent = event.detail.successful ? "saved" : event.detail.xhr.responseText || "not saved: no answer";
+    said.classList.toggle("bad", !event.detail.successful);
+    if (!event.detail.successful) return;
+    text.value = tags.value = "";
+    document.activeElement.blur();
+  });
+  document.addEventListener("keydown", (event) => {
+    if (isCommand(event) || document.querySelector("dialog[open]") || event.target.matches("input:not([type=range]), select, textarea")) return;
+    const field = { n: text, t: tags }[event.key];
+    if (!field) return;
+    event.preventDefault();
+    field.focus();
+    field.scrollIntoView({ block: "nearest" });
+  });
+})();

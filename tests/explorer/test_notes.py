@@ -1,0 +1,359 @@
+"""What readers note: who may, where it is kept, what is shown of it, and how far they agree."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import shutil
+from concurrent.futures import ProcessPoolExecutor
+from datetime import UTC, datetime
+from multiprocessing import get_context
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from playwright.sync_api import expect
+from starlette.testclient import TestClient
+from statsmodels.stats.inter_rater import cohens_kappa
+
+from analysis.explorer.agreement import Agreement, agreements
+from analysis.explorer.app import MOST_NOTED, explorer
+from analysis.explorer.export import export_folder
+from analysis.explorer.notes import LONGEST_NAME, LONGEST_TEXT, Note, Notes, reader_of
+from analysis.explorer.site import Site
+from merge_runner.errors import UsageError
+from tests.explorer.axe import serious
+from tests.explorer.hostile import HOSTILE
+from tests.explorer.serving import served
+from tests.explorer.test_listing import HOST, Texts
+
+TRIAL = "emulator/baseline/N_0_0/rep01"
+OURS = {"origin": f"http://{HOST}"}
+
+
+@pytest.fixture
+def db(study, tmp_path):
+    """A copy of the study, with nothing noted."""
+    return shutil.copy(study, tmp_path / "study.duckdb")
+
+
+def asking(db, reader="anna"):
+    app = explorer(Site(db, reader=reader), {HOST})
+    return TestClient(app, base_url=f"http://{HOST}", headers=OURS, follow_redirects=False)
+
+
+def noted(client, **given):
+    return client.post("/notes", data={"trial": TRIAL, **given})
+
+
+def lines(db):
+    path = Notes(db).path
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def test_a_note_is_a_line_beside_the_database_and_the_database_stays_as_it_was(db):
+    before = db.read_bytes()
+    reply = noted(asking(db), text="It hesitates.", tags="Late,  too  careful", side="left",
+                  decision="2")  # fmt: skip
+    assert reply.status_code == 303
+    (line,) = lines(db)
+    assert line["spec_hash"]
+    assert {name: line[name] for name in ("reader", "trial_id", "side", "decision")} == {
+        "reader": "anna", "trial_id": TRIAL, "side": "left", "decision": 2
+    }  # fmt: skip
+    assert (line["tags"], line["text"]) == (["late", "too careful"], "It hesitates.")
+    assert db.read_bytes() == before
+    assert Notes(db).path == db.with_name("study.notes.jsonl")
+
+
+def test_notes_are_shown_on_the_trial_in_the_list_and_on_a_page_of_their_own(db):
+    client = asking(db)
+    noted(client, text="It hesitates.", tags="late")
+    assert "It hesitates." in client.get(f"/trials/{TRIAL}").text
+    assert "It hesitates." not in client.get("/trials/emulator/baseline/N_0_0/rep02").text
+    assert "It hesitates." in client.get("/notes").text
+    listed = client.get("/trials?tag=late").text
+    assert "<strong>1</strong> trials" in listed
+    assert TRIAL in listed
+    assert '<option value="late">late (1)</option>' in client.get("/trials").text
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": f"http://{HOST}", "sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"},
+        {"origin": f"http://{HOST}", "sec-fetch-site": "same-site"},
+        {"origin": "http://evil.example:8700", "host": "evil.example:8700"},
+        {"referer": f"http://{HOST}/"},
+    ],
+)
+def test_only_a_page_of_ours_writes(db, headers):
+    client = asking(db)
+    client.headers.pop("origin")
+    assert (
+        client.post("/notes", data={"trial": TRIAL, "text": "x"}, headers=headers).status_code
+        == 403
+    )
+    assert lines(db) == []
+
+
+def test_at_another_address_only_who_has_the_token_writes(db):
+    app = explorer(Site(db), {HOST}, token="the-token")
+    client = TestClient(app, base_url=f"http://{HOST}", headers=OURS, follow_redirects=False)
+    assert noted(client, text="x").status_code == 403
+    client.get("/?token=the-token")
+    assert noted(client, text="x").status_code == 303
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({}, "write a note, or a tag"),
+        ({"text": "  ", "tags": " , "}, "write a note, or a tag"),
+        ({"text": "x" * (LONGEST_TEXT + 1)}, "up to 4,000 characters"),
+        ({"tags": "x" * 41}, "tags of up to 40"),
+        ({"tags": ",".join(map(str, range(11)))}, "up to 10 tags"),
+        ({"text": "x", "side": "left"}, "a decision"),
+        ({"text": "x", "side": "up", "decision": "1"}, "a decision"),
+        ({"withdraws": "nothing"}, "there is no note nothing of anna"),
+    ],
+)
+def test_what_is_no_note_is_told_and_not_kept(db, given, told):
+    reply = noted(asking(db), **given)
+    assert reply.status_code == 400
+    assert told in reply.text
+    assert lines(db) == []
+
+
+def test_a_form_is_bounded_and_a_trial_must_be_there(db):
+    client = asking(db)
+    assert noted(client, text="x" * MOST_NOTED).status_code == 413
+    assert client.post("/notes", data={"trial": "no/such", "text": "x"}).status_code == 404
+    assert lines(db) == []
+
+
+def test_what_a_reader_wrote_is_text_everywhere(db):
+    client = asking(db, HOSTILE[:LONGEST_NAME])
+    noted(client, text=HOSTILE, tags="<b>\u202e")
+    for address in (f"/trials/{TRIAL}", "/notes", "/trials"):
+        text = client.get(address).text
+        assert "<script>document" not in text
+        assert "\u202e" not in "".join(Texts(text).said)
+
+
+def test_a_spreadsheet_runs_nothing_of_the_csv(db):
+    client = asking(db)
+    noted(client, text="=1+1", tags="a,b")
+    noted(client, text="one\ntwo", side="right", decision="0")
+    rows = list(csv.DictReader(io.StringIO(client.get("/notes.csv").text)))
+    assert [(row["text"], row["tags"], row["side"], row["decision"]) for row in rows] == [
+        ("'=1+1", "a, b", "", ""),
+        ("one\ntwo", "", "right", "0"),
+    ]
+    assert {(row["reader"], row["trial_id"]) for row in rows} == {("anna", TRIAL)}
+
+
+def test_a_reader_withdraws_their_own_notes_and_nobody_elses(db):
+    anna, ben = asking(db), asking(db, "ben")
+    noted(anna, text="mine", tags="late")
+    (line,) = lines(db)
+    assert noted(ben, withdraws=line["id"]).status_code == 400
+    assert "mine" in ben.get("/notes").text
+    assert "withdraw</button>" not in ben.get("/notes").text
+    assert noted(anna, withdraws=line["id"]).status_code == 303
+    assert "mine" not in ben.get("/notes").text
+    assert "<strong>0</strong> trials" in ben.get("/trials?tag=late").text
+    assert lines(db)[0] == line
+
+
+@pytest.mark.parametrize("damage", [b'{"id": "1', b"\xff\xfe", b'{"withdraws": 3}', b"null", b""])
+def test_a_damaged_line_is_told_and_skipped_and_kept(db, damage):
+    client = asking(db)
+    noted(client, text="before")
+    with Notes(db).path.open("ab") as file:
+        file.write(damage)  # as by a process that died amid a line
+    noted(client, text="after")
+    text = client.get("/notes").text
+    assert "before" in text
+    assert "after" in text
+    assert ("line 2 of study.notes.jsonl is damaged" in text) == bool(damage)
+    assert damage in Notes(db).path.read_bytes()
+
+
+def test_where_nothing_can_be_written_a_line_says_so(db):
+    Notes(db).path.mkdir()
+    client = asking(db)
+    reply = noted(client, text="x")
+    assert reply.status_code == 400
+    assert "nothing was noted" in reply.text
+    assert "study.notes.jsonl cannot be read" in client.get("/notes").text
+    assert client.get(f"/trials/{TRIAL}").status_code == 200
+
+
+def _write(db, reader):
+    notes = Notes(db, reader)
+    for number in range(100):
+        notes.add((TRIAL, "spec"), None, [f"t{number}"], "x" * 3000)
+
+
+def test_two_explorers_that_write_at_once_lose_nothing(tmp_path):
+    db = tmp_path / "t.duckdb"
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        list(pool.map(_write, [db, db], ["anna", "ben"]))
+    kept = Notes(db).kept()
+    assert kept.damage == ()
+    assert sorted((note.reader, note.tags) for note in kept.notes) == sorted(
+        (reader, (f"t{number}",)) for reader in ("anna", "ben") for number in range(100)
+    )
+
+
+def test_notes_fit_a_copy_of_the_study_and_tell_where_a_trial_is_not_in_it(db, tmp_path):
+    noted(asking(db), text="It hesitates.")
+    copy = tmp_path / "copy" / "other.duckdb"
+    copy.parent.mkdir()
+    shutil.copy(db, copy)
+    line = Notes(db).path.read_text()
+    Notes(copy).path.write_text(
+        line + line.replace(TRIAL, "gone/rep01").replace('"id":"', '"id":"2')
+    )
+    text = asking(copy, "ben").get("/notes").text
+    assert f"{TRIAL}</a>" in text
+    assert 'gone/rep01 <span class="quiet small">not in this database' in text
+
+
+def test_a_reader_has_a_name():
+    assert reader_of(" Anna  B ") == "Anna B"
+    assert reader_of(None)
+    for odd in ("", " ", "x" * (LONGEST_NAME + 1)):
+        with pytest.raises(UsageError, match="--reader needs a name"):
+            reader_of(odd)
+
+
+# ---- agreement
+
+
+def note(reader, trial, tags, decision=None):
+    side = None if decision is None else "left"
+    return Note(
+        os.urandom(4).hex(), datetime.now(UTC), reader, trial, "s", side, decision, tags, ""
+    )
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([(), ("x",)]), st.sampled_from([(), ("x",)])), max_size=12)
+)
+def test_kappa_is_that_of_statsmodels(pairs):
+    notes = [
+        note(reader, str(i), (*tags, "seen"))
+        for i, pair in enumerate(pairs)
+        for reader, tags in zip(("anna", "ben"), pair, strict=True)
+    ]
+    found = {a.tag: a for a in agreements(notes)}
+    if "x" not in found:
+        assert not all(any(pair[i] for pair in pairs) for i in (0, 1))
+        return
+    a = found["x"]
+    assert a.common == len(pairs)
+    if a.both == len(pairs):
+        assert a.kappa is None
+    else:
+        table = [[a.both, a.first], [a.second, a.neither]]
+        assert a.kappa == pytest.approx(cohens_kappa(table, return_results=False))
+    assert found["seen"].kappa is None
+    assert "all of them" in found["seen"].undefined
+
+
+def test_readers_are_compared_on_what_both_have_tagged_alone():
+    notes = [
+        *(note("anna", t, ("x",)) for t in "ab"),
+        *(note("ben", t, ("x",)) for t in "bc"),
+        note("ben", "b", ("y",), decision=1),
+        note("anna", "d", ()),
+        note("carl", "d", ("x",)),
+    ]
+    found = {
+        (a.readers, a.tag, a.units): (a.both, a.first, a.second, a.neither, a.undefined)
+        for a in agreements(notes)
+    }
+    alike = "both gave it to all of them: there is nothing to tell apart"
+    nothing = "there are no trials that both have tagged"
+    assert found == {
+        (("anna", "ben"), "x", "trials"): (1, 0, 0, 0, alike),
+        (("anna", "carl"), "x", "trials"): (0, 0, 0, 0, nothing),
+        (("ben", "carl"), "x", "trials"): (0, 0, 0, 0, nothing),
+    }  # fmt: skip
+
+
+def test_what_two_readers_agree_on_stands_on_the_page(db):
+    for reader, tags in (("anna", ("x", "x", "y", "y")), ("ben", ("x", "y", "y", "y"))):
+        client = asking(db, reader)
+        for number, tag in enumerate(tags):
+            noted(client, tags=tag, side="left", decision=str(number))
+    text = " ".join(" ".join(Texts(client.get("/notes").text).said).split())
+    assert "x anna, ben 4 decisions 1 1 0 2 0.50" in text
+    assert Agreement("x", "decisions", ("anna", "ben"), 1, 1, 0, 2).kappa == pytest.approx(0.5)
+
+
+# ---- in a browser
+
+
+@pytest.fixture
+def site(db):
+    """An explorer of this test's own copy."""
+    with served(db) as address:
+        yield address
+
+
+def test_notes_are_written_from_the_keyboard(page, db):
+    page.goto(f"/trials/{TRIAL}")
+    page.keyboard.press("n")
+    expect(page.locator("#note-text")).to_be_focused()
+    page.keyboard.type("The whole trial")
+    page.keyboard.press("Enter")
+    expect(page.locator("#noted")).to_contain_text("The whole trial")
+    page.keyboard.press("]")
+    page.keyboard.press("t")
+    expect(page.locator("#note-about")).to_have_text("on the left decision 0")
+    page.keyboard.type("late, odd")
+    page.keyboard.press("Enter")
+    expect(page.locator("#noted .tag")).to_have_text(["late", "odd"])
+    assert [(line["side"], line["decision"], line["text"]) for line in lines(db)] == [
+        (None, None, "The whole trial"),
+        ("left", 0, ""),
+    ]
+    page.keyboard.press("n")
+    page.keyboard.press("Escape")
+    expect(page.locator("#note-text")).not_to_be_focused()
+    assert serious(page) == []
+    page.keyboard.press("]")
+    page.locator("#noted a").click()
+    expect(page.locator(".decision-panel h2")).to_contain_text("left decision 0")
+    page.goto("/notes")
+    assert serious(page) == []
+    page.get_by_role("button", name="withdraw").first.click()
+    expect(page.locator(".all-notes tbody tr")).to_have_count(1)
+
+
+def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(
+    page, db, tmp_path, monkeypatch
+):
+    client = asking(db)
+    noted(client, text="It hesitates.", tags="late", side="left", decision="1")
+    noted(asking(db, "ben"), trial="emulator/baseline/L_4_0/rep01", text="not exported")
+    list(export_folder(db, tmp_path / "pages", ["emulator/baseline/N_0_0/*"]))
+    page.goto(f"file://{tmp_path}/pages/notes.html")
+    expect(page.locator(".all-notes tbody tr")).to_have_count(1)
+    page.locator(".all-notes tbody a").click()
+    expect(page.locator("#noted")).to_contain_text("It hesitates.")
+    expect(page.locator("#note")).to_have_count(0)
+    page.goto(f"file://{tmp_path}/pages/trials.html?tag=late")
+    expect(page.locator("tbody tr:visible")).to_have_count(1)
+    noted(client, text="sk-proj-abcdefghijklmnop0123")
+    with pytest.raises(UsageError, match="looks like a key"):
+        list(export_folder(db, tmp_path / "more", ["emulator/baseline/N_0_0/*"]))
+    assert not (tmp_path / "more").exists()
