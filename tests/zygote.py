@@ -78,6 +78,7 @@ class Zygote:
         subprocess.run(
             [sys.executable, "-m", "tests.zygote", self._folder, *self._more],
             env=environment(PYTHONPATH=str(PROJECT), **ALONE),
+            stdin=subprocess.DEVNULL,
             check=True,
         )
 
