@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -34,25 +32,26 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(scope="session")
-def zygote():
+def shared(tmp_path_factory, worker_id):
+    """The folder that all processes of this run of the tests have in common."""
+    own = tmp_path_factory.getbasetemp()
+    return own if worker_id == "master" else own.parent
+
+
+@pytest.fixture(scope="session")
+def zygote(shared):
     """What the program is forked from."""
-    with Zygote() as forking:
+    with Zygote(shared / "zygote") as forking:
         yield forking
 
 
 @pytest.fixture(scope="session")
-def emulator_url():
+def emulator_url(zygote, tmp_path_factory):
     """An emulator without faults, for all tests that need no other."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "merge_runner", "emulate", "--port", "0", "--until-stdin-closes"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        env=environment(),
-        text=True,
-    )
-    yield process.stdout.readline().strip() + "/v1"
-    process.stdin.close()
-    process.wait()
+    command = ("emulate", "--port", 0, "--until-stdin-closes")
+    folder = tmp_path_factory.mktemp("emulator")
+    with zygote.serving(command, cwd=folder, env=environment()) as url:
+        yield url.strip() + "/v1"
 
 
 @pytest.fixture

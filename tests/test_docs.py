@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
 import os
 import pty
 import re
-import shlex
 import shutil
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import typer.main
 
-from analysis.commands import app, main
+from analysis.commands import app
 from analysis.data.reference_data import published
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.recordings import drive, write_folder
-from tests.harness import CONFIGURING, PROJECT, environment, watched
+from tests.harness import PROJECT, environment, watched
 
 DOCS = PROJECT / "docs"
 TUTORIAL = DOCS / "tutorial.md"
@@ -40,11 +37,8 @@ PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
 # The environment is the project's own: a make in another folder must not install into it.
 INSTALLED = (
     "make() { command make -o .venv/python -o .venv/runtime -o .venv/dev -o .venv/dask "
-    '-o .venv-peer/installed "$@"; }\n'
+    '-o .venv-peer/installed ${RUN:+RUN="$RUN"} "$@"; }\n'
 )
-# Of our program these run in the test's own process, where the libraries are loaded already: they
-# ask no question and start no event loop. All else runs in a shell.
-HERE = ("audit", "digest", "explain", "human", "recording", "tables")
 SERVES = re.compile(r" emulate |make view$| view$| view --(port|bind)")
 NEEDS_MAKE = pytest.mark.skipif(
     not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv"
@@ -109,7 +103,7 @@ async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
     process = await asyncio.create_subprocess_shell(
         INSTALLED + command,
         cwd=folder,
-        env=environment(PATH=PATH, **changes),
+        env=environment(**{"PATH": PATH, **changes}),
         stdin=terminal,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
@@ -130,25 +124,15 @@ async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
 
 
 @pytest.fixture
-def here(folder, monkeypatch, capfd):
-    """Runs one of our commands in this process as a shell would: its exit code and output."""
-    monkeypatch.chdir(folder)
-    for name in [name for name in os.environ if name.endswith(CONFIGURING)]:
-        monkeypatch.delenv(name)
-
-    def run(words: list[str]) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", words)
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code or 0, "".join(capfd.readouterr())
-
-    return run
+def forked(zygote, tmp_path_factory):
+    """Variables under which shells, and make, fork the program: most of its time is imports."""
+    found = zygote.on_path(tmp_path_factory.mktemp("bin"))
+    return {**found, "PATH": f"{found['PATH']}:{PATH}", "RUN": "merge-runner"}
 
 
 @pytest.mark.slow
 @NEEDS_MAKE
-async def test_every_command_of_the_docs_does_what_it_says(folder, here):
+async def test_every_command_of_the_docs_does_what_it_says(folder, forked):
     """What stands on the pages twice is run once, where the later pages need nothing of it."""
     done: list[str] = []
     async with watched() as server:
@@ -158,11 +142,7 @@ async def test_every_command_of_the_docs_does_what_it_says(folder, here):
             for command in commands(page):
                 if command in {"make test", "make check", *done}:
                     continue
-                words = shlex.split(command)
-                if words[0] == "merge-runner" and words[1] in HERE:
-                    code, out = here(words)
-                else:
-                    code, out = await shell(command, folder, **account)
+                code, out = await shell(command, folder, **account, **forked)
                 assert code == 0, f"{page.name}: {command}\n{out}"
                 assert "Traceback" not in out
                 done.append(command)
@@ -191,14 +171,6 @@ async def test_the_tutorial_shows_what_its_commands_say(checkout):
             assert code == 0, f"{command}\n{out}"
             said += out
     assert (checkout / "results/figures/figure2.pdf").exists()
-
-
-def test_commands_that_run_in_the_tests_own_process_are_ours_and_start_no_event_loop():
-    group = typer.main.get_command(app)
-    for name in HERE:
-        command = group.commands[name]
-        for part in getattr(command, "commands", {name: command}).values():
-            assert "asyncio" not in inspect.getsource(inspect.unwrap(part.callback))
 
 
 @NEEDS_MAKE

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 import signal
+import subprocess
+import time
 
 import pytest
 
-from tests.harness import watched
+from tests.harness import environment, watched
+from tests.zygote import Zygote
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--conditions", "R_-4_8", "--json")
 
@@ -51,3 +55,57 @@ async def test_a_forked_program_is_told_by_its_signal(merge_runner):
         assert process.returncode is None
         process.kill()
         assert await process.wait() == process.returncode == -signal.SIGKILL
+
+
+def test_a_shell_forks_it_by_name_with_its_streams_and_its_folder(zygote, tmp_path):
+    (tmp_path / "bin").mkdir()
+    variables = environment(**zygote.on_path(tmp_path / "bin"))
+    done = subprocess.run(
+        "merge-runner digest --db nowhere; echo $?; merge-runner init 'my study' | cat",
+        shell=True, cwd=tmp_path, env=variables, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.splitlines()[0] == "2"
+    assert done.stdout.splitlines()[1].startswith("go on: cd 'my study'")
+    assert done.stderr.startswith("error: there is no database nowhere")
+    assert (tmp_path / "my study/study.toml").exists()
+
+
+def test_a_shells_forked_program_is_stopped_as_the_shell_is(zygote, tmp_path):
+    (tmp_path / "bin").mkdir()
+    process = subprocess.Popen(
+        ["merge-runner", "emulate", "--port", "0"],
+        env=environment(**zygote.on_path(tmp_path / "bin")), cwd=tmp_path,
+        executable=tmp_path / "bin/merge-runner", stdout=subprocess.PIPE,
+    )  # fmt: skip
+    with process.stdout as said:
+        assert said.readline().startswith(b"http://")
+        process.terminate()
+        assert said.read() == b"", "nobody writes any more"
+    assert process.wait() == 128 + signal.SIGTERM
+
+
+def is_read(pipe):
+    """Whether somebody waits for it to be closed."""
+    try:
+        os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
+    except OSError:
+        return False
+    return True
+
+
+def test_what_is_forked_from_ends_with_the_last_that_holds_it_and_is_started_anew(tmp_path):
+    def works(zygote):
+        return zygote.run_blocking(["--version"], cwd=tmp_path, env=environment())[0] == 0
+
+    with Zygote(tmp_path / "z") as first:
+        with Zygote(tmp_path / "z") as second:
+            begun = (tmp_path / "z/socket").stat().st_mtime_ns
+            assert works(second)
+        assert works(first)
+    with Zygote(tmp_path / "z") as just_then:
+        assert works(just_then)
+    while is_read(tmp_path / "z/held"):
+        time.sleep(0.01)
+    with Zygote(tmp_path / "z") as later:
+        assert works(later)
+        assert (tmp_path / "z/socket").stat().st_mtime_ns != begun

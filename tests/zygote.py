@@ -1,13 +1,15 @@
 """Starts the program by forking a process that has imported it already.
 
 Most of what a short command takes is imports, and their teardown. A test gets a real process with
-arguments, environment, folder and streams of its own, without those.
+arguments, environment, folder and streams of its own, without those. All processes of a run of
+the tests fork from the same one.
 """
 
 from __future__ import annotations
 
 import asyncio
 import atexit
+import fcntl
 import gc
 import importlib
 import json
@@ -19,9 +21,13 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+from tests import forked_program
+from tests.forked_program import DIGITS, asked
 from tests.harness import PROGRAM, PROJECT, environment
 
 # What commands import where they need it; nothing of it may start a thread.
@@ -33,33 +39,58 @@ WARM = (
     "merge_runner.run.summary",
     "rich.live",
     "rich.table",
+    "matplotlib.backends.backend_agg",
+    "matplotlib.backends.backend_pdf",
+    "matplotlib.backends.backend_svg",
+    "firthmodels",
+    "statsmodels.formula.api",
 )
-DIGITS = 10  # of a process id, as it is sent
+# So that linear algebra starts none.
+ALONE = {"OPENBLAS_NUM_THREADS": "1"}
 
 
 class Zygote:
-    """A process that forks the program on demand; it imports ``more`` too."""
+    """A process that forks the program on demand; it imports ``more`` too.
 
-    def __init__(self, *more: str) -> None:
+    Those with the same ``folder`` are one: the first starts it, and it ends with the last.
+    """
+
+    def __init__(self, folder: Path, *more: str) -> None:
+        self._folder = folder
+        self._address = str(folder / "socket")
         self._more = more
 
     def __enter__(self) -> Zygote:
-        self._folder = tempfile.TemporaryDirectory(prefix="zygote")
-        self._address = str(Path(self._folder.name) / "socket")
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.zygote", self._address, *self._more],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=environment(PYTHONPATH=str(PROJECT)),
-            start_new_session=True,
-        )
-        assert self._process.stdout.readline() == b"ready\n"
+        self._folder.mkdir(exist_ok=True)
+        with (self._folder / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            try:
+                self._held = os.open(self._folder / "held", os.O_WRONLY | os.O_NONBLOCK)
+            except OSError:  # nobody reads it
+                self._start()
+                self._held = os.open(self._folder / "held", os.O_WRONLY)
         return self
 
+    def _start(self) -> None:
+        for name in ("held", "socket"):
+            (self._folder / name).unlink(missing_ok=True)
+        os.mkfifo(self._folder / "held")
+        subprocess.run(
+            [sys.executable, "-m", "tests.zygote", self._folder, *self._more],
+            env=environment(PYTHONPATH=str(PROJECT), **ALONE),
+            stdin=subprocess.DEVNULL,
+            check=True,
+        )
+
     def __exit__(self, *_) -> None:
-        self._process.stdin.close()
-        self._process.wait()
-        self._folder.cleanup()
+        os.close(self._held)
+
+    def on_path(self, folder: Path) -> dict[str, str]:
+        """Variables under which shells find a merge-runner in ``folder`` that is forked."""
+        script = folder / "merge-runner"
+        script.write_text(f'#!/bin/sh\nexec {sys.executable} -IS {forked_program.__file__} "$@"\n')
+        script.chmod(0o755)
+        return {"PATH": f"{folder}{os.pathsep}{os.environ['PATH']}", "ZYGOTE": self._address}
 
     async def run(self, arguments, *, cwd, env) -> tuple[int, str, str]:
         """Run the program to its end; returns its exit code and what it wrote."""
@@ -77,19 +108,32 @@ class Zygote:
     async def start(self, arguments, *, cwd, env, module="") -> Forked:
         """Start the program, or a module in its place as ``python -m`` does; to be waited for."""
         out, err = (tempfile.TemporaryFile() for _ in "oe")  # noqa: SIM115 # closed at its end
-        link = self._request(arguments, cwd, env, out, err, module)
+        link = self._request(arguments, cwd, env, out, err, module=module)
         link.setblocking(False)
         pid = int(await asyncio.get_running_loop().sock_recv(link, DIGITS))
         return Forked(pid, link, out, err)
 
-    def _request(self, arguments, cwd, env, out, err, module="") -> socket.socket:
-        request = {"arguments": list(map(str, arguments)), "cwd": str(cwd), "env": env}
-        request["module"] = module
-        link = socket.socket(socket.AF_UNIX)
-        link.connect(self._address)
-        socket.send_fds(link, [json.dumps(request).encode()], [out.fileno(), err.fileno()])
-        link.shutdown(socket.SHUT_WR)
-        return link
+    @contextmanager
+    def serving(self, arguments, *, cwd, env) -> Iterator[str]:
+        """Runs a server until its standard input closes; gives the first line that it writes."""
+        ours, theirs = socket.socketpair()
+        with theirs:
+            link = self._request(arguments, cwd, env, theirs, theirs, stdin=theirs)
+        with link:
+            with ours, ours.makefile() as said:
+                yield said.readline()
+            link.recv(2 * DIGITS, socket.MSG_WAITALL)  # until it has ended
+
+    def _request(self, arguments, cwd, env, out, err, *, module="", stdin=None) -> socket.socket:
+        with open(os.devnull) as nothing:
+            return asked(
+                self._address,
+                list(map(str, arguments)),
+                cwd=str(cwd),
+                env=env,
+                streams=[file.fileno() for file in (stdin or nothing, out, err)],
+                module=module,
+            )
 
 
 class Forked:
@@ -130,18 +174,20 @@ def _content(file) -> bytes:
     return file.read()
 
 
-def serve(address: str, *more: str) -> None:
-    """Fork a process for each request until standard input closes."""
+def serve(folder: str, *more: str) -> None:
+    """Return once requests are taken; fork a process for each until nobody holds the folder."""
     for name in (*WARM, *more):
         importlib.import_module(name)
     # What is imported stays shared with the forked: their collector does not look at it.
     gc.collect()
     gc.freeze()
     listener = socket.socket(socket.AF_UNIX)
-    listener.bind(address)
+    listener.bind(f"{folder}/socket")
     listener.listen(64)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-    os.write(1, b"ready\n")
+    if os.fork():
+        os._exit(0)
+    os.setsid()
     if os.fork() == 0:
         while True:
             link, _ = listener.accept()
@@ -149,8 +195,25 @@ def serve(address: str, *more: str) -> None:
                 listener.close()
                 _attend(link)
             link.close()
-    sys.stdin.read()
+    _wait_until_nobody_holds(folder)
     os.killpg(0, signal.SIGTERM)
+
+
+def _wait_until_nobody_holds(folder: str) -> None:
+    held = os.open(f"{folder}/held", os.O_RDONLY)
+    lock = os.open(f"{folder}/lock", os.O_RDWR)
+    while True:
+        os.set_blocking(held, True)
+        os.read(held, 1)
+        # Somebody may have come just now; while it is locked nobody does, and then all ends.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        os.set_blocking(held, False)
+        try:
+            os.read(held, 1)
+        except BlockingIOError:
+            fcntl.flock(lock, fcntl.LOCK_UN)
+        else:
+            return
 
 
 def _attend(link: socket.socket) -> None:
@@ -158,7 +221,7 @@ def _attend(link: socket.socket) -> None:
     from analysis.commands import main
 
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    data, streams, _, _ = socket.recv_fds(link, 2**16, 2)
+    data, streams, _, _ = socket.recv_fds(link, 2**16, 3)
     while part := link.recv(2**16):
         data += part
     request = json.loads(data)
@@ -202,7 +265,7 @@ def _folders(env) -> list[str]:
 
 def _become_the_program(request, streams) -> None:
     os.setsid()
-    for number, stream in enumerate((os.open(os.devnull, os.O_RDONLY), *streams)):
+    for number, stream in enumerate(streams):
         os.dup2(stream, number)
     os.chdir(request["cwd"])
     os.environ.clear()

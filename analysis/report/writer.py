@@ -54,12 +54,13 @@ def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
 
 def finished_figures(study: Study, options: str) -> dict[str, str]:
     """Every figure by name as SVG in Base64: read from the database where stored, else drawn."""
-    found = finished(study.db, study.state, options, list(FIGURES))
+    files = {f"{name}.svg": name for name in FIGURES}  # a table may have the name alone
+    found = finished(study.db, study.state, options, list(files))
     drawn = {
-        name: base64.b64encode(rendered(study, name, "svg")).decode()
-        for name in FIGURES
-        if name not in found
+        file: base64.b64encode(rendered(study, name, "svg")).decode()
+        for file, name in files.items()
+        if file not in found
     }
     if drawn:
         keep_finished(study.db, study.state, options, drawn)
-    return found | drawn
+    return {name: (found | drawn)[file] for file, name in files.items()}

@@ -32,7 +32,7 @@ def test_a_miss_by_its_tolerance_costs_one_and_a_number_without_a_fit_much():
 def test_a_search_looks_only_for_thresholds_that_a_study_may_set():
     edge = replace(SETS["K0"], lower_spread=0.0, upper_spread=0.0, upper_mean=1.0)
     for found in search(
-        edge, experiment(), targets(), generations=2, size=6, seed=1, trials_of_a_pair=1
+        edge, experiment(), targets(), generations=1, size=6, seed=1, trials_of_a_pair=1
     ):
         check({"pair": 0, **asdict(found.thresholds)})
 
@@ -41,7 +41,7 @@ def test_a_search_looks_only_for_thresholds_that_a_study_may_set():
 @pytest.mark.parametrize("name", SETS)
 def test_the_search_for_a_set_can_be_repeated(name):
     def last():
-        *_, found = replace(SEARCHES[name], generations=1, size=4, trials_of_a_pair=2).run()
+        *_, found = replace(SEARCHES[name], generations=1, size=3, trials_of_a_pair=1).run()
         return found
 
     found = last()

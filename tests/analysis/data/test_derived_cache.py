@@ -178,6 +178,15 @@ def test_beside_another_program_tables_are_made_and_not_kept(db, made, caplog):
     assert to_text(held[0]) == to_text(free[0])
 
 
+def test_a_figure_is_not_taken_for_the_table_of_its_name(db, monkeypatch):
+    monkeypatch.setattr("analysis.report.writer.FIGURES", {"attempts": None})
+    monkeypatch.setattr("analysis.report.writer.rendered", lambda *_: b"<svg/>")
+    (table,) = finished_tables(db, None, ["attempts"])
+    assert finished_figures(Study(db), options_text(db, None)) == {"attempts": "PHN2Zy8+"}
+    (again,) = finished_tables(db, None, ["attempts"])
+    assert to_text(again) == to_text(table)
+
+
 @pytest.mark.slow
 def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
     drawn = []
@@ -193,6 +202,7 @@ def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
     assert drawn == [("figure2", "svg"), ("distributions", "svg")] * 2
 
 
+@pytest.mark.slow
 def test_a_warm_table_waits_for_no_heavy_library(db, tmp_path):
     check = (
         "import sys; from analysis.commands import app; "

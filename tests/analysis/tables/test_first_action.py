@@ -193,6 +193,7 @@ def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_actions(
     prepare, tmp_path
 ):

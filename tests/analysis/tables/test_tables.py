@@ -214,6 +214,7 @@ TROUBLE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize("case", TROUBLE)
 def test_trouble_gives_tables_with_a_stated_reason(case, tmp_path, recwarn):

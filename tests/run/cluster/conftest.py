@@ -13,9 +13,9 @@ from tests.zygote import Zygote
 
 
 @pytest.fixture(scope="session")
-def zygote():
+def zygote(shared):
     """What the program is forked from; here it has imported Dask too."""
-    with Zygote("merge_runner.run.cluster.coordinator") as forking:
+    with Zygote(shared / "zygote-dask", "merge_runner.run.cluster.coordinator") as forking:
         yield forking
 
 
