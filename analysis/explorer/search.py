@@ -71,7 +71,7 @@ COMMIT;
 """
 WITHOUT_A_LOG = "RECOVERY_MODE no_wal_writes, ROW_GROUP_SIZE 16384"
 OWN_FACETS = ("tactical", "switch", "failure")
-TRIAL_FACETS = ("model", "variant", "condition", "outcome", "tag")
+TRIAL_FACETS = ("model", "variant", "condition", "outcome", "account", "tag")
 
 
 @dataclass(frozen=True, slots=True)

@@ -160,13 +160,13 @@ def test_a_spreadsheet_runs_nothing_of_the_csv(db):
 
 def test_a_reader_withdraws_their_own_notes_and_nobody_elses(db):
     anna, ben = asking(db), asking(db, "ben")
-    noted(anna, text="mine", tags="late")
+    noted(anna, text="too shy", tags="late")
     (line,) = lines(db)
     assert noted(ben, withdraws=line["id"]).status_code == 400
-    assert "mine" in ben.get("/notes").text
+    assert "too shy" in ben.get("/notes").text
     assert "withdraw</button>" not in ben.get("/notes").text
     assert noted(anna, withdraws=line["id"]).status_code == 303
-    assert "mine" not in ben.get("/notes").text
+    assert "too shy" not in ben.get("/notes").text
     assert "<strong>0</strong> trials" in ben.get("/trials?tag=late").text
     assert lines(db)[0] == line
 

@@ -79,7 +79,8 @@ def test_packed_panels_are_those_that_a_server_shows(exporting):
     shared, panels = unpacked(found["shared"]), 0
     for row in rows:
         trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
-        for name, pieces in unpacked(found["trials"][site.at.data(row)])["panels"].items():
+        key = f"{row['trial_id']}|{row['spec_hash']}"
+        for name, pieces in unpacked(found["trials"][key])["panels"].items():
             side, number = name.split("/")
             one = read_decision(site.db, row["trial_id"], row["spec_hash"], side, int(number))
             values = panel_values(site, row, trial, one, site.catalogue.others)
