@@ -119,7 +119,8 @@ def test_an_earlier_export_in_the_folder_goes_and_nothing_else(study, tmp_path):
     list(export_page(study, tmp_path / "one.html", ["emulator/baseline/N_0_0/rep01"]))
     list(export_folder(study, tmp_path, ["emulator/baseline/L_4_0/*"]))
     assert {path.name for path in tmp_path.iterdir()} == {
-        *("index.html", "mine.html", "one.html", "trials.html", "trials-L_4_0.html")
+        *("index.html", "mine.html", "one.html", "trials.html", "trials-L_4_0.html"),
+        *("notes.html", "words.html"),
     }
 
 

@@ -71,5 +71,5 @@ def test_a_link_is_copied_as_the_page_stands(page):
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     page.goto("/trials/emulator/baseline/N_0_0/rep01?t=2.5&side=left&decision=2")
     page.get_by_role("button", name="copy link").click()
-    expect(page.locator("#copied")).to_have_text("copied")
+    expect(page.locator("#copy-link")).to_have_text("copied")
     assert page.evaluate("navigator.clipboard.readText()") == page.url

@@ -62,5 +62,6 @@
     number += by;
     list().then(() => document.querySelector("[data-list]").scrollIntoView());
   });
-  list();
+  await list();
+  place.restore();
 })();

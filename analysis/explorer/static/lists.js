@@ -3,7 +3,8 @@
 (() => {
   const rowsOf = (page) => [...page.querySelectorAll("[data-list] tbody tr:not([hidden])")];
   const leads = (row) => row.querySelector("a")?.href;
-  const turn = (page, rel) => page.querySelector(`.paging a[rel=${rel}]`)?.href;
+  // The list of an export turns its pages by itself: no other page can ask it for the next one.
+  const turn = (page, rel) => (location.protocol === "file:" ? undefined : page.querySelector(`.paging a[rel=${rel}]`)?.href);
   const kept = () => JSON.parse(sessionStorage.getItem("list") ?? "null");
   const keep = (list) => sessionStorage.setItem("list", JSON.stringify(list));
   const listed = (page, address) => ({ address, rows: rowsOf(page).map(leads), next: turn(page, "next"), prev: turn(page, "prev") });
@@ -31,12 +32,13 @@
     const row = event.target.closest("[data-list] tbody tr");
     if (row && event.target.closest("a") === row.querySelector("a")) keep({ ...listed(document, location.href), open: leads(row) });
   });
-  addEventListener("pageshow", () => {
+  const restore = () => {
     const list = kept();
     if (list?.address !== location.href) return;
     const place = rowsOf(document).findIndex((row) => leads(row) === list.open);
     if (place >= 0) choose(place, false);
-  });
+  };
+  addEventListener("pageshow", restore);
 
   // ---- on the page of a trial
 
@@ -88,7 +90,7 @@
     return here(list) >= 0 ? list.address : document.getElementById("trial").dataset.back;
   };
   window.place = {
-    lead, back,
+    lead, back, restore,
     step: (by) => (document.getElementById("trial") ? go(by) : choose(chosen + by, true)),
   };
 })();
