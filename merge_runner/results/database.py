@@ -37,6 +37,9 @@ ROWS_OF_A_GROUP = 8_192
 # the states. By how much the file may exceed that for its row groups still to be merged, and for
 # its texts to be read without more memory.
 BYTES_OF_A_CALL, MERGED_BYTES, SHORT_BYTES = 3_000, 2**26, 2**23
+MANY_BYTES = 2**28
+"""A file of that size has so many rows that joining them takes more memory: 45,000 trials of 8
+calls, or 20,000 of 20."""
 LOG = logging.getLogger(__name__)
 Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
@@ -235,11 +238,16 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
 
 @contextmanager
 def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
-    """Allow more memory while long texts are read: a thread unpacks those of 2,048 rows at once."""
-    if _bytes_of_texts(connection) <= SHORT_BYTES:
+    """Allow more memory while long texts are read, or very many rows.
+
+    Of long texts a thread unpacks those of 2,048 rows at once: then there is only one.
+    """
+    long = _bytes_of_texts(connection) > SHORT_BYTES
+    if not (long or _calls_and_bytes(connection)[1] > MANY_BYTES):
         yield
         return
-    connection.execute(f"SET memory_limit = '{TEXTS['memory_limit']}'; SET threads = 1")
+    threads = "SET threads = 1" if long else "RESET threads"
+    connection.execute(f"SET memory_limit = '{TEXTS['memory_limit']}'; {threads}")
     try:
         yield
     finally:
@@ -248,11 +256,17 @@ def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
 
 def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
     """How much larger the open file is than it would be with short replies."""
+    calls, size = _calls_and_bytes(connection)
+    return size - calls * BYTES_OF_A_CALL
+
+
+def _calls_and_bytes(connection: duckdb.DuckDBPyConnection) -> tuple[int, int]:
+    """How many calls the open file has, about, and its size; of no file (0, 0)."""
     row = connection.execute(
         "SELECT path, estimated_size FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
     ).fetchone()
-    return Path(row[0]).stat().st_size - row[1] * BYTES_OF_A_CALL if row else 0
+    return (row[1], Path(row[0]).stat().st_size) if row else (0, 0)
 
 
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:

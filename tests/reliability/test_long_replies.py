@@ -17,6 +17,7 @@ from merge_runner.cli import app
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.database import (
     BYTES_OF_A_CALL,
+    MANY_BYTES,
     MERGED_BYTES,
     ROWS_OF_A_GROUP,
     SETTINGS,
@@ -139,7 +140,9 @@ def test_small_groups_are_merged_to_ones_that_fit_into_memory(tmp_path):
     assert max(groups) <= (ROWS_OF_A_GROUP,)
 
 
-def test_small_groups_of_rows_are_merged_and_texts_read_as_short_unless_they_are_long(tmp_path):
+def test_small_groups_are_merged_unless_texts_are_long_and_long_or_many_rows_have_more_memory(
+    tmp_path,
+):
     def told(size):
         """The tasks of merging, and the memory for texts, where the file has this size."""
         os.truncate(file, size)
@@ -160,3 +163,7 @@ def test_small_groups_of_rows_are_merged_and_texts_read_as_short_unless_they_are
     assert told(of_calls + SHORT_BYTES + 1) == (100, long)
     assert told(of_calls + MERGED_BYTES + 1) == (0, long)
     assert connection.execute("SELECT current_setting('memory_limit')").fetchone() == (short,)
+    connection.execute("CREATE OR REPLACE TABLE calls AS SELECT * FROM range(100_000)")
+    connection.execute("CHECKPOINT")
+    assert told(MANY_BYTES) == (100, short)
+    assert told(MANY_BYTES + 1) == (100, long)
