@@ -422,10 +422,10 @@ class Catalogue:
         return found[0] if found else None
 
     def account_counts(self, wanted: Filter) -> list[Row]:
-        """How many trials of a filter have which account: model, variant, account, trials."""
+        """How many trials of a filter have which account: who, model, variant, account, trials."""
         where, values = wanted.where()
         return self.ask(
-            "SELECT model, variant, account, count(*) AS trials FROM listed "  # noqa: S608 # constants
+            "SELECT who, model, variant, account, count(*) AS trials FROM listed "  # noqa: S608 # constants
             f"WHERE {where} AND account IS NOT NULL GROUP BY ALL ORDER BY ALL",
             *values,
         )

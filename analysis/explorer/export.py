@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import tempfile
@@ -234,8 +233,17 @@ def _opened(
 
 def _packed(leaks: Leaks, value: object) -> str:
     """Words, packed after a look for what must not be in them."""
-    leaks.refuse("words.html", [json.dumps(value, ensure_ascii=False)])
+    leaks.refuse("words.html", list(_texts_in(value)))
     return packed(value)
+
+
+def _texts_in(value: object) -> Iterator[str]:
+    """All texts of a value that JSON holds, as they are."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping | list):
+        for part in value.values() if isinstance(value, Mapping) else value:
+            yield from _texts_in(part)
 
 
 class _Staged:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from analysis.explorer.assets import inlined
 from analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SEVERAL
+from analysis.explorer.leaks import Leaks
 from analysis.explorer.packing import packed
 from analysis.explorer.pages.trial import embedded
 from analysis.explorer.pictures import sparkline, speed_range
@@ -42,6 +44,7 @@ def listing_page(site: Site, rows: list[Row], behind: Mapping[str, Any]) -> str:
         "levels": {name: _numbered(values) for name, values in levels.items()},
         **behind,
     }
+    Leaks(site.db).refuse(site.at.to("trials"), [*every, json.dumps(index, ensure_ascii=False)])
     blocks = [packed(every[i : i + PACKED_ROWS]) for i in range(0, len(every), PACKED_ROWS)]
     return site.render(
         "listing.html",

@@ -161,6 +161,10 @@ class Notes:
         try:
             with _alone(self.path) as file:
                 size = os.fstat(file).st_size
+                if size + len(line) > MOST_BYTES:
+                    raise UsageError(
+                        f"nothing was noted: {self.path.name} is full; move it away to begin anew"
+                    )
                 torn = size > 0 and os.pread(file, 1, size - 1) != b"\n"
                 try:
                     _write(file, (b"\n" if torn else b"") + line + b"\n")

@@ -206,16 +206,19 @@ def test_an_exported_study_begins_with_it_and_says_nothing_of_runs(db):
 def test_classes_of_collisions_stand_beside_the_published_ones():
     published = {"humans": {"same action": 14, "no action": 5, "other": 4}}
     found = [
-        {"model": "o3", "variant": "baseline", "account": "both gave way", "trials": 3},
-        {"model": "o3", "variant": None, "account": "invalid plan", "trials": 1},
+        {"who": "drivers", "model": "o3", "variant": "baseline"}
+        | {"account": "both gave way", "trials": 3},
+        {"who": "stand-ins", "model": "o3", "variant": None}
+        | {"account": "invalid plan", "trials": 1},
     ]
     rows = account_rows(found, published)
     assert list(rows["classes"]) == [
         *("both insisted", "both gave way", "no action", "other", "invalid plan")
     ]
-    assert rows["classes"]["both gave way"] == {("o3", "baseline"): 3}
-    assert rows["classes"]["invalid plan"] == {("o3", ""): 1}
-    assert (rows["same"], rows["groups"]) == ({"humans": 14}, [("o3", "baseline"), ("o3", "")])
+    drivers, stand_ins = ("drivers", "o3", "baseline"), ("stand-ins", "o3", "")
+    assert rows["classes"]["both gave way"] == {drivers: 3}
+    assert rows["classes"]["invalid plan"] == {stand_ins: 1}
+    assert (rows["same"], rows["groups"]) == ({"humans": 14}, [drivers, stand_ins])
     assert account_rows([], published) is None
 
 

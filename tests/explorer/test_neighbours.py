@@ -45,6 +45,19 @@ def test_the_list_keeps_its_place_and_goes_on_from_there(page, names):
     expect(page.locator("tr.chosen th a")).to_have_text(names[3])
 
 
+def test_a_list_of_decisions_leads_on_by_trials(page):
+    page.goto("/words?q=merge")
+    every = [row.split(" ")[0] for row in page.locator(".hits tbody th").all_inner_texts()]
+    names = list(dict.fromkeys(row.split("\n")[0] for row in every))
+    assert 2 < len(names) < len(every)
+    page.locator(".hits tbody th a").first.click()
+    opened(page, names[0])
+    page.keyboard.press("j")
+    opened(page, names[1])
+    page.keyboard.press("j")
+    expect(page.locator("h1")).to_have_text(names[2])
+
+
 def test_a_trial_that_no_list_led_to_has_no_neighbours(page):
     page.goto("/trials/emulator/baseline/N_0_0/rep01")
     expect(page.locator("#track")).to_be_visible()

@@ -93,8 +93,9 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         task=task_picture(),
         groups=groups,
         first=ranking(groups),
-        humans=human_cells(humans),
+        humans=(published := human_cells(humans)),
         rows=(rows := worst_first(groups)),
+        beside=_sum_of([published[row["name"]] for row in rows if row["name"] in published]),
         condition_texts=condition_texts(site.catalogue, [row["name"] for row in rows]),
         accounts=account_rows(
             site.catalogue.account_counts(Filter(outcome="collided")), published_accounts()
@@ -158,6 +159,11 @@ def human_cells(imported: Sequence[Row]) -> dict[str, dict[str, Any]]:
         }
         for name, of in human_counts().items()
     }
+
+
+def _sum_of(cells: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """The humans of all conditions that were played."""
+    return {name: sum(cell[name] for cell in cells) for name in ("collided", "ended")}
 
 
 def ranking(groups: Sequence[Played]) -> Played | None:
@@ -237,13 +243,14 @@ def account_rows(
     """
     if not found:
         return None
-    classes: dict[str, dict[tuple[str, str], int]] = {name: {} for name in SAME_ACTION}
+    classes: dict[str, dict[tuple[str, str, str], int]] = {name: {} for name in SAME_ACTION}
     for name in (name for of in published.values() for name in of if name != SAME):
         classes.setdefault(name, {})
-    for row in found:
-        classes.setdefault(row["account"], {})[row["model"], row["variant"] or ""] = row["trials"]
+    groups = [(row["who"], row["model"], row["variant"] or "") for row in found]
+    for group, row in zip(groups, found, strict=True):
+        classes.setdefault(row["account"], {})[group] = row["trials"]
     return {
-        "groups": list(dict.fromkeys((row["model"], row["variant"] or "") for row in found)),
+        "groups": list(dict.fromkeys(groups)),
         "classes": classes,
         "published": published,
         "same": {who: of[SAME] for who, of in published.items()},

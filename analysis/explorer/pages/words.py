@@ -23,7 +23,7 @@ HEADINGS = {
     "model": "driver",
     "variant": "prompt",
 }
-SCRIPTS = ("keys.js", "unpacked.js", "words.js")
+SCRIPTS = ("lists.js", "keys.js", "unpacked.js", "words.js")
 
 
 def words_page(site: Site, asked: Mapping[str, str]) -> str:

@@ -5,7 +5,7 @@
   window.isCommand = (event) => (event.ctrlKey || event.metaKey || event.altKey) && !event.getModifierState("AltGraph");
   const typing = (target) => target.matches("input:not([type=range]), select, textarea, [contenteditable]");
   const help = document.getElementById("help");
-  const words = [...document.querySelectorAll("#words > div")].map((entry) => {
+  const words = [...document.querySelectorAll("#page-words > div")].map((entry) => {
     const names = entry.querySelector("dt").textContent.split(", ").map((name) => name.replace(/[^\w ]/g, "\\$&"));
     return [entry, new RegExp(`(?<![\\w-])(${names.join("|")})(s|es)?(?![\\w-])`, "i")];
   });

@@ -4,10 +4,19 @@
   const rowsOf = (page) => [...page.querySelectorAll("[data-list] tbody tr:not([hidden])")];
   const leads = (row) => row.querySelector("a")?.href;
   // The list of an export turns its pages by itself: no other page can ask it for the next one.
-  const turn = (page, rel) => (location.protocol === "file:" ? undefined : page.querySelector(`.paging a[rel=${rel}]`)?.href);
+  const turn = (page, rel) => (document.documentElement.dataset.static ? undefined : page.querySelector(`.paging a[rel=${rel}]`)?.href);
   const kept = () => JSON.parse(sessionStorage.getItem("list") ?? "null");
   const keep = (list) => sessionStorage.setItem("list", JSON.stringify(list));
-  const listed = (page, address) => ({ address, rows: rowsOf(page).map(leads), next: turn(page, "next"), prev: turn(page, "prev") });
+  // An exported page holds many trials; a name may have several specs.
+  const same = (one, other) => {
+    const [a, b] = [one, other].map((text) => new URL(text));
+    const spec = [a, b].map((url) => url.searchParams.get("spec"));
+    return a.pathname === b.pathname && a.searchParams.get("trial") === b.searchParams.get("trial")
+      && (!spec[0] || !spec[1] || spec[0] === spec[1]);
+  };
+  // Where several rows are of one trial, as its decisions are, it counts once.
+  const distinct = (hrefs) => hrefs.filter((href, i) => href && hrefs.findIndex((other) => other && same(other, href)) === i);
+  const listed = (page, address) => ({ address, rows: distinct(rowsOf(page).map(leads)), next: turn(page, "next"), prev: turn(page, "prev") });
 
   // ---- in a list
 
@@ -42,13 +51,6 @@
 
   // ---- on the page of a trial
 
-  // An exported page holds many trials; a name may have several specs.
-  const same = (one, other) => {
-    const [a, b] = [one, other].map((text) => new URL(text));
-    const spec = [a, b].map((url) => url.searchParams.get("spec"));
-    return a.pathname === b.pathname && a.searchParams.get("trial") === b.searchParams.get("trial")
-      && (!spec[0] || !spec[1] || spec[0] === spec[1]);
-  };
   const here = (list) => list?.rows.findIndex((row) => row && same(row, location.href)) ?? -1;
   const lead = () => {
     const list = kept(), place = here(list);

@@ -2,8 +2,8 @@
 // Says so where the server does not answer any more, until it does again.
 (() => {
   const lost = document.getElementById("lost");
-  for (const name of ["htmx:sendError", "htmx:responseError"]) {
-    document.addEventListener(name, () => { lost.hidden = false; });
-  }
+  document.addEventListener("htmx:sendError", () => { lost.hidden = false; });
+  // What is refused was answered.
+  document.addEventListener("htmx:responseError", (event) => { if (event.detail.xhr.status >= 500) lost.hidden = false; });
   document.addEventListener("htmx:afterOnLoad", (event) => { if (event.detail.successful) lost.hidden = true; });
 })();

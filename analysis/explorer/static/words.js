@@ -80,4 +80,5 @@
   form.addEventListener("input", () => { page = 1; show(); });
   form.addEventListener("submit", (event) => event.preventDefault());
   show();
+  place.restore();
 })();
