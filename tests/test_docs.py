@@ -126,8 +126,7 @@ async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
 @pytest.fixture
 def forked(zygote, tmp_path_factory):
     """Variables under which shells, and make, fork the program: most of its time is imports."""
-    found = zygote.on_path(tmp_path_factory.mktemp("bin"))
-    return {**found, "PATH": f"{found['PATH']}:{PATH}", "RUN": "merge-runner"}
+    return {**zygote.on_path(tmp_path_factory.mktemp("bin"), PATH), "RUN": "merge-runner"}
 
 
 @pytest.mark.slow

@@ -85,12 +85,12 @@ class Zygote:
     def __exit__(self, *_) -> None:
         os.close(self._held)
 
-    def on_path(self, folder: Path) -> dict[str, str]:
-        """Variables under which shells find a merge-runner in ``folder`` that is forked."""
+    def on_path(self, folder: Path, path: str = os.environ["PATH"]) -> dict[str, str]:
+        """Variables under which shells find in ``folder``, before ``path``, a forked program."""
         script = folder / "merge-runner"
         script.write_text(f'#!/bin/sh\nexec {sys.executable} -IS {forked_program.__file__} "$@"\n')
         script.chmod(0o755)
-        return {"PATH": f"{folder}{os.pathsep}{os.environ['PATH']}", "ZYGOTE": self._address}
+        return {"PATH": f"{folder}{os.pathsep}{path}", "ZYGOTE": self._address}
 
     async def run(self, arguments, *, cwd, env) -> tuple[int, str, str]:
         """Run the program to its end; returns its exit code and what it wrote."""

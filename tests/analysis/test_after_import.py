@@ -108,7 +108,7 @@ def test_the_ceiling_of_humans_is_left_out_where_their_indicators_rest_on_both(i
 def test_the_panels_have_published_outcomes_and_imported_gaps(imported):
     found = human_panels(imported)
     human = found["groups"][0]
-    assert human["driver"] == "humans (66 of 990 imported)"
+    assert human["label"] == "humans (66 of 990 imported)"
     tie = human["conditions"]["N_0_0"]
     boxes = tie["collided_boxes_percent"]
     assert (boxes["all"], boxes["n"], boxes["k"]) == (90, 90, 5)
