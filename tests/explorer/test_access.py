@@ -66,7 +66,7 @@ def test_exported_pages_fit_and_axe_finds_nothing_serious(page, exported):
 def test_the_dialog_of_a_page_has_its_words_and_leads_to_all(page):
     page.goto("/trials")
     page.locator("#help-button").click()
-    words = page.locator("#words dt:visible")
+    words = page.locator("#page-words dt:visible")
     expect(words.get_by_text("gap", exact=True)).to_be_visible()
     assert "tunnel" not in words.all_inner_texts()
     for scheme, _ in LOOKS:
