@@ -194,7 +194,7 @@ def account_of(row: Row, trial: Trial) -> Account | None:
     return account(course, trial.decisions, row)
 
 
-def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
+def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, Any]:
     """What the replay draws: samples, decisions, the track, the bounds of a collision."""
     return {
         "id": row["trial_id"],
@@ -214,7 +214,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
             for side, samples in trial.states.items()
         },
         "bounds": collision_bounds(trial),
-        "marks": marks(row, trial),
+        "marks": marks(row, trial, account),
         "decisions": [
             {
                 "n": d["decision"],
@@ -241,7 +241,7 @@ def replay_data(row: Row, trial: Trial) -> dict[str, Any]:
     }
 
 
-def marks(row: Row, trial: Trial) -> list[dict[str, Any]]:
+def marks(row: Row, trial: Trial, account: Account | None) -> list[dict[str, Any]]:
     """The moments that matter, in order: merges, a collision, and those of the account."""
     found = [
         {"t": round(reached_s, 3), "side": side, "kind": "merge", "text": f"{side} merges"}
@@ -251,7 +251,7 @@ def marks(row: Row, trial: Trial) -> list[dict[str, Any]]:
     if row["status"] == "collided":
         found.append({"t": round(trial.end_s, 3), "side": "", "kind": "collision",
                       "text": "collision"})  # fmt: skip
-    if account := account_of(row, trial):
+    if account:
         found += [
             {"t": round(mark.time_s, 3), "side": mark.side, "kind": mark.kind, "text": mark.text}
             for mark in account.marks

@@ -10,6 +10,7 @@ from analysis.explorer.display_text import visible
 from analysis.explorer.pages.trial import DRIVER, HUMAN, OFFERS, REPETITION, find, replayed, ribbons
 from analysis.explorer.reading import Row, reading, records
 from analysis.explorer.site import NotThere, Site
+from analysis.explorer.views import account_of
 from merge_runner.scenarios.merge.geometry import TRACK
 
 At = tuple[str, str]
@@ -84,7 +85,8 @@ def _laid(site: Site, other: Row) -> dict[str, Any] | None:
     trial = read_trial(site.db, other["trial_id"], other["spec_hash"])
     if not trial.states:
         return None
-    return {**replayed(site, other, trial), "ribbons": ribbons(site, other, trial)}
+    account = account_of(other, trial)
+    return {**replayed(site, other, trial, account), "ribbons": ribbons(site, other, trial)}
 
 
 def _offer(site: Site, at: At, condition: str, kind: str) -> str | None:

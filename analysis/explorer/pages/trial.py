@@ -8,6 +8,7 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
+from analysis.accounts.account import Account
 from analysis.explorer import views
 from analysis.explorer.assets import REPLAY
 from analysis.explorer.details import Decision, Trial, read_decision, read_trial
@@ -50,15 +51,15 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
 
 def shown(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
     """What the template shows of a trial."""
-    decided = decisions_by_side(trial)
+    decided, account = decisions_by_side(trial), views.account_of(row, trial)
     return {
         "row": row,
         "outcome": views.outcome_text(row, trial.scenario),
         "facts": [*views.facts(row), *([f"Note: {trial.caution}."] if trial.caution else [])],
         "judged": views.judged_text(trial.scenario),
         "view_box": views.view_box(trial.track),
-        "data": embedded(replayed(site, row, trial)) if trial.states else None,
-        "account": views.account_of(row, trial),
+        "data": embedded(replayed(site, row, trial, account)) if trial.states else None,
+        "account": account,
         "lines": views.summary(row, trial),
         "trial_decisions": decided,
         "offers": OFFERS,
@@ -69,9 +70,9 @@ def shown(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
     }
 
 
-def replayed(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
+def replayed(site: Site, row: Row, trial: Trial, account: Account | None) -> dict[str, Any]:
     """What a replay draws of a trial, with the address of its page."""
-    return {**views.replay_data(row, trial), "page": site.at.trial(row)}
+    return {**views.replay_data(row, trial, account), "page": site.at.trial(row)}
 
 
 def ribbons(site: Site, row: Row, trial: Trial) -> str:
