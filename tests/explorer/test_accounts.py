@@ -18,7 +18,7 @@ from analysis.explorer.site import Site
 from merge_runner.results.store import Store
 from tests.analysis.accounts.crashes import CLOSING_IN, EXAMPLES, drive
 from tests.analysis.studies import played, write_study
-from tests.explorer.test_packing import unpacked
+from tests.explorer.packed import unpacked
 
 HOST = "127.0.0.1:8700"
 

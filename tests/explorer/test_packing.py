@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import json
-import zlib
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,6 +16,7 @@ from analysis.explorer.prompts import parts_of
 from analysis.explorer.site import Site
 from analysis.explorer.urls import StaticLinks
 from merge_runner.errors import UsageError
+from tests.explorer.packed import unpacked
 
 TEXTS = st.lists(st.sampled_from(["a", "b" * SHARED, "c" * SHARED, "d" * 2 * SHARED, ""]))
 WORDS = st.lists(st.sampled_from(["give", "way", ",", "3.5", "\n", "m/s"])).map(" ".join)
@@ -32,11 +29,6 @@ def exporting(study):
     site.catalogue.refresh()
     yield site, site.catalogue.every(Filter())
     site.close()
-
-
-def unpacked(text):
-    """What a script reads of a packed text."""
-    return json.loads(zlib.decompress(base64.b64decode(text)))
 
 
 def whole(pieces, shared):
