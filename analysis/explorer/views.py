@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from analysis.accounts.account import Account, account
+from analysis.accounts.classes import ACTED_MPS
 from analysis.accounts.course import Course
 from analysis.explorer.details import Decision, Trial
 from analysis.explorer.display_text import visible
@@ -169,7 +170,27 @@ def _hardest(samples: Row) -> str:
     controlled = [a for t, a in zip(times, accelerations, strict=True) if t > 0]
     if not controlled:
         return ""
-    return f"; its hardest acceleration was {max(controlled, key=abs):+.1f} m/s²"
+    return f"; its hardest acceleration was {max(controlled, key=abs):+z.1f} m/s²"
+
+
+def actions(trial: Trial) -> dict[Side, str]:
+    """How each driver first acted, and when it was at the merge point: all that humans tell."""
+    return {side: _action(samples, trial.track) for side, samples in trial.states.items()}
+
+
+def _action(samples: Row, track: Track) -> str:
+    times, speeds = samples["time_s"], samples["velocity_mps"]
+    controlled = [(t, v) for t, v in zip(times, speeds, strict=True) if t >= 0]
+    acted = (at for at in controlled if abs(at[1] - controlled[0][1]) >= ACTED_MPS)
+    when_s, speed_mps = next(acted, (None, 0.0))
+    if when_s is None:
+        said = f"it kept its speed to within {ACTED_MPS:g} m/s"
+    else:
+        compared = "faster" if speed_mps > controlled[0][1] else "slower"
+        said = f"after {when_s:.1f} s it was {ACTED_MPS:g} m/s {compared} than at the start"
+    merges_s = reaches_s(samples, track.merge_point_m)
+    merged = "it never merged" if merges_s is None else f"it merged after {merges_s:.1f} s"
+    return f"{said}; {merged}"
 
 
 def account_of(row: Row, trial: Trial) -> Account | None:

@@ -77,12 +77,13 @@ def test_the_nearest_human_is_the_one_with_the_closest_headway_and_not_one_who_e
 )
 def test_only_a_human_with_the_same_task_is_near(db, tmp_path, other_task):
     path = shutil.copy(db, tmp_path / "t.duckdb")
-    human = "(SELECT spec_hash FROM trials WHERE source = 'human')"
+    humans = "(SELECT spec_hash FROM trials WHERE source = 'human')"
 
     def nearest(which):
         with duckdb.connect(str(path)) as connection:
             connection.execute(
-                f"UPDATE specs SET spec = json_merge_patch(spec, ?) WHERE spec_hash {which} {human}",
+                "UPDATE specs SET spec = json_merge_patch(spec, ?) "
+                f"WHERE spec_hash {which} {humans}",
                 [json.dumps(other_task)],
             )
         client = TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}")
