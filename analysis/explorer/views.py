@@ -23,10 +23,7 @@ BISECTIONS = 14
 # What a picture shows of the plane around the track, in m.
 BEFORE_M, BEYOND_M, BESIDE_M = 3.0, 5.8, 4.5
 UNKNOWN = "no meaning is known here"
-DRAWN = (
-    *(("t", "time_s"), ("x", "position_m")),
-    *(("v", "velocity_mps"), ("a", "acceleration_mps2")),
-)
+DRAWN = {"t": "time_s", "x": "position_m", "v": "velocity_mps", "a": "acceleration_mps2"}
 
 
 def condition_text(headway: float, velocity: float) -> str:
@@ -220,7 +217,7 @@ def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, An
         "end": trial.end_s,
         "every": {side: trial.interval_s(side) for side in SIDES},
         "sides": {
-            side: {letter: [round(value, 3) for value in samples[name]] for letter, name in DRAWN}
+            side: {short: [round(x, 3) for x in samples[name]] for short, name in DRAWN.items()}
             for side, samples in trial.states.items()
         },
         "bounds": collision_bounds(trial),
