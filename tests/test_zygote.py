@@ -8,11 +8,12 @@ import re
 import signal
 import subprocess
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from tests.harness import environment, watched
-from tests.zygote import Zygote
+from tests.zygote import Zygote, wait_until_nobody_holds
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--conditions", "R_-4_8", "--json")
 
@@ -91,6 +92,17 @@ def is_read(pipe):
     except OSError:
         return False
     return True
+
+
+def test_who_comes_when_nobody_holds_it_any_more_does_not_hold_what_is_about_to_end(tmp_path):
+    held = tmp_path / "held"
+    os.mkfifo(held)
+    (tmp_path / "lock").touch()
+    with ThreadPoolExecutor() as threads:
+        ended = threads.submit(wait_until_nobody_holds, tmp_path)
+        os.close(os.open(held, os.O_WRONLY))
+        ended.result()
+    assert not is_read(held)
 
 
 def test_what_is_forked_from_ends_with_the_last_that_holds_it_and_is_started_anew(tmp_path):

@@ -195,11 +195,12 @@ def serve(folder: str, *more: str) -> None:
                 listener.close()
                 _attend(link)
             link.close()
-    _wait_until_nobody_holds(folder)
+    wait_until_nobody_holds(folder)
     os.killpg(0, signal.SIGTERM)
 
 
-def _wait_until_nobody_holds(folder: str) -> None:
+def wait_until_nobody_holds(folder: str | Path) -> None:
+    """Return, locked, when the last holder is gone and nobody can become one any more."""
     held = os.open(f"{folder}/held", os.O_RDONLY)
     lock = os.open(f"{folder}/lock", os.O_RDWR)
     while True:
@@ -213,6 +214,9 @@ def _wait_until_nobody_holds(folder: str) -> None:
         except BlockingIOError:
             fcntl.flock(lock, fcntl.LOCK_UN)
         else:
+            # At its end a process gives the lock back before it closes this: who came in between
+            # would hold what is about to end.
+            os.close(held)
             return
 
 
