@@ -17,7 +17,7 @@ from analysis.explorer.export import export_folder
 from analysis.explorer.site import Site
 from merge_runner.results.store import Store
 from tests.analysis.accounts.crashes import CLOSING_IN, EXAMPLES, drive
-from tests.analysis.studies import played, write_study
+from tests.analysis.studies import as_humans, played, write_study
 from tests.explorer.packed import unpacked
 
 HOST = "127.0.0.1:8700"
@@ -30,11 +30,7 @@ def db(tmp_path_factory):
     write_study(path, [*(drive(account) for account in EXAMPLES), CLOSING_IN])
     others = [played(drive("both insisted", "o4")), played(drive("no action", "human"))]
     Store(path).write("sweep-1", others, patience_s=5)
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE trials SET source = 'human', pair = 'P1', variant = NULL "
-            "WHERE trial_id LIKE 'human/%'"
-        )
+    as_humans(path)
     return path
 
 

@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from analysis.explorer.app import explorer
 from analysis.explorer.pages.comparing import offered
 from analysis.explorer.site import Site
-from tests.analysis.studies import Drive, write_study
+from tests.analysis.studies import Drive, as_humans, write_study
 
 HOST = "127.0.0.1:8700"
 TRIAL = "emulator/baseline/N_0_0/rep01"
@@ -34,12 +34,9 @@ def db(tmp_path_factory):
     """Two drivers and three humans of one condition."""
     path = tmp_path_factory.mktemp("comparing") / "t.duckdb"
     write_study(path, list(DRIVES))
+    as_humans(path)
     with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE trials SET source = 'human', pair = variant, variant = NULL "
-            "WHERE trial_id LIKE 'human/%';"
-            "DELETE FROM states WHERE trial_id LIKE 'human/short/%' AND time_s > 2"
-        )
+        connection.execute("DELETE FROM states WHERE trial_id LIKE 'human/short/%' AND time_s > 2")
     return path
 
 

@@ -15,7 +15,7 @@ from analysis.explorer.export import export_folder
 from analysis.explorer.pages import conditions
 from analysis.explorer.site import Site
 from analysis.explorer.traces import POINTS, read_band, read_traces
-from tests.analysis.studies import Drive, write_study, yielding
+from tests.analysis.studies import Drive, as_humans, write_study, yielding
 from tests.explorer.serving import served
 
 HOST = "127.0.0.1:8700"
@@ -36,11 +36,7 @@ def db(tmp_path_factory):
     path = tmp_path_factory.mktemp("conditions") / "t.duckdb"
     others = [*yielding("o3", "A1", reps=2), *yielding("o4", reps=2)]
     write_study(path, [*yielding("o3", reps=2), CRASH, *others, *HUMANS])
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE trials SET source = 'human', pair = 'P1', variant = NULL "
-            "WHERE trial_id LIKE 'human/%'"
-        )
+    as_humans(path)
     return path
 
 

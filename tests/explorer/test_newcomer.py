@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import duckdb
 import pytest
 from playwright.sync_api import expect
 
 from analysis.explorer.export import export_folder
 from merge_runner.results.store import Store
-from tests.analysis.studies import Drive, played, write_study
+from tests.analysis.studies import Drive, as_humans, played, write_study
 from tests.explorer.serving import served
 
 CRASHED = Drive("o3", "baseline", "N_0_0", 1, (0.5,) * 5, (0.4,) * 5, {})
@@ -34,11 +33,7 @@ def db(tmp_path_factory):
     path = tmp_path_factory.mktemp("newcomer") / "study.duckdb"
     write_study(path, [DECIDED])
     Store(path).write("sweep-1", [in_words(CRASHED), played(HUMAN)], patience_s=5)
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE trials SET source = 'human', pair = 'P1', variant = NULL, model_left = NULL, "
-            "model_right = NULL WHERE trial_id LIKE 'human/%'"
-        )
+    as_humans(path)
     return path
 
 
