@@ -6,12 +6,16 @@ import asyncio
 import os
 import re
 import signal
+import socket
 import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from tests import forked_program
+from tests.forked_program import DIGITS
 from tests.harness import environment, watched
 from tests.zygote import Zygote, wait_until_nobody_holds
 
@@ -83,6 +87,24 @@ def test_a_shells_forked_program_is_stopped_as_the_shell_is(zygote, tmp_path):
         process.terminate()
         assert said.read() == b"", "nobody writes any more"
     assert process.wait() == 128 + signal.SIGTERM
+
+
+def test_a_signal_that_comes_before_the_forked_program_is_known_reaches_it(tmp_path):
+    child = subprocess.Popen(["sleep", "1000"])
+    with socket.socket(socket.AF_UNIX) as zygote:
+        zygote.bind(str(tmp_path / "zygote"))
+        zygote.listen()
+        shell = subprocess.Popen(
+            [sys.executable, "-IS", forked_program.__file__],
+            env=environment(ZYGOTE=str(tmp_path / "zygote")),
+        )
+        link, _ = zygote.accept()
+        with link:
+            shell.terminate()
+            link.sendall(f"{child.pid:{DIGITS}}".encode())
+            assert child.wait(timeout=60) == -signal.SIGTERM
+            link.sendall(str(child.returncode).encode())
+    assert shell.wait() == 128 + signal.SIGTERM
 
 
 def is_read(pipe):

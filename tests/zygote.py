@@ -141,6 +141,7 @@ class Forked:
 
     def __init__(self, pid, link, *streams):
         self.pid = pid
+        self._err = streams[1]
         self.returncode: int | None = None
         self._ended = asyncio.create_task(self._end(link, streams))
 
@@ -151,6 +152,12 @@ class Forked:
         for stream in streams:
             stream.close()
         return written
+
+    async def said(self, words: str) -> None:
+        """Wait until it has written these words to its standard error."""
+        while words.encode() not in os.pread(self._err.fileno(), 2**20, 0):
+            assert self.returncode is None
+            await asyncio.sleep(0.01)
 
     async def communicate(self) -> tuple[bytes, ...]:
         return await asyncio.shield(self._ended)

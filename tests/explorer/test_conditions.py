@@ -163,7 +163,7 @@ def test_a_click_on_a_trace_opens_its_trial_and_a_choice_changes_the_picture(bro
         page.goto(f"{address}/conditions/N_0_0")
         page.locator("#choice-model").select_option("o4")
         expect(page.locator(".overlay path")).to_have_count(2)
-        assert page.url.endswith("model=o4")
+        expect(page).to_have_url(re.compile("model=o4$"))
         page.locator("#choice-model").select_option("o3")
         expect(page.locator(".overlay path")).to_have_count(5)
         page.locator("#choice-variant").select_option("baseline")

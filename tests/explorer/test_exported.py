@@ -44,7 +44,7 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     expect(page.locator(".decision-panel h2")).to_contain_text("decision 1 at 1.0 s")
     expect(page.locator(".decision-panel .block").first).to_contain_text("You drive a car")
     assert page.locator("#track .own.left").get_attribute("transform") != start
-    assert "decision=1" in page.url
+    expect(page).to_have_url(re.compile("decision=1"))
     page.reload()
     expect(page.locator(".decision-panel h2")).to_contain_text("decision 1 at 1.0 s")
     page.get_by_role("button", name="next repetition").click()

@@ -9,6 +9,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import duckdb
 import pytest
+from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
@@ -100,7 +101,7 @@ def test_an_exported_list_filters_by_factor(played, tmp_path, browser):
     list(export_folder(played.db, tmp_path / "out", ["cheap*"]))
     page = browser.new_page()
     page.goto(f"file://{tmp_path}/out/trials.html?factor.temperature=0.2")
-    assert page.inner_text("#listed") == "12"
+    expect(page.locator("#listed")).to_have_text("12")
     page.select_option("[name='factor.opponent']", "sleepy")
-    assert page.inner_text("#listed") == "6"
+    expect(page.locator("#listed")).to_have_text("6")
     page.close()

@@ -32,7 +32,7 @@ from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.test_humans_page import import_some
-from tests.explorer.test_tables_pages import Addresses, InProcess, listed
+from tests.explorer.test_tables_pages import Addresses, Awaited, InProcess, listed
 
 HOST = "127.0.0.1:8700"
 WORST = "L_0_-8"
@@ -60,7 +60,7 @@ def db(tmp_path_factory):
 @pytest.fixture(scope="module")
 def own(db):
     site = Site(db)
-    site.computing = Computing(db, InProcess)
+    site.computing = Awaited(db, InProcess)
     site.catalogue.refresh()
     yield site
     site.computing.close()
@@ -73,13 +73,6 @@ def client_of(site):
 @pytest.fixture(scope="module")
 def client(own):
     return client_of(own)
-
-
-def whole(client, address="/"):
-    """The page once all has arrived."""
-    while 'class="computing"' in (text := client.get(address).text):
-        pass
-    return text
 
 
 def test_counts_are_there_before_anything_is_computed_and_lead_to_their_trials(db):
@@ -107,10 +100,10 @@ def test_counts_are_there_before_anything_is_computed_and_lead_to_their_trials(d
 
 @pytest.mark.slow
 def test_points_verdicts_and_values_lead_to_their_trials(client):
-    text = unescape(whole(client))
+    text = unescape(client.get("/").text)
     point = re.search(r'<a href="([^"]+)"[^>]*aria-label="o3, baseline, L_4_0: 100[^"]*n 3"', text)
     assert point, text
-    assert listed(whole(client, point[1])) == 3
+    assert listed(client.get(point[1]).text) == 3
     verdict = re.search(r'<a href="([^"]+)" aria-label="I1 of o3: (.)"', text)
     assert verdict[2] in "✓✗–"
     assert parse_qs(urlsplit(verdict[1]).query)["cell"] == ["indicators/o3/baseline/I1:n"]
@@ -133,8 +126,10 @@ def test_a_study_is_grouped_by_any_of_its_factors(client, own):
     groups = [g["id"] for g in own.computing.ask(("home", "prompt", "0"), (0, 0), wait_s=60)
               .content["groups"]]  # fmt: skip
     assert groups == ["human", "prompt=baseline", "prompt=A1"]
-    point = re.search(r'<a href="([^"]+)"[^>]*aria-label="A1, L_4_0:', whole(client, "/?by=prompt"))
-    assert listed(whole(client, unescape(point[1]))) == 1
+    point = re.search(
+        r'<a href="([^"]+)"[^>]*aria-label="A1, L_4_0:', client.get("/?by=prompt").text
+    )
+    assert listed(client.get(unescape(point[1])).text) == 1
 
 
 def test_levels_of_a_factor_are_groups_with_their_trials(played):
@@ -237,7 +232,7 @@ def test_a_table_comes_as_a_file(client, db, suffix, form):
     reply = client.get(f"/tables/attempts.{suffix}")
     assert reply.text == render(make_tables(Study(db), ["attempts"]), form) + "\n"
     assert f'filename="attempts.{suffix}"' in reply.headers["content-disposition"]
-    assert f'href="/tables/attempts.{suffix}" download' in whole(client, "/tables/attempts")
+    assert f'href="/tables/attempts.{suffix}" download' in client.get("/tables/attempts").text
     assert client.get("/tables/attempts.exe").status_code == 404
     assert client.get(f"/tables/nothing.{suffix}").status_code == 404
 
@@ -256,14 +251,14 @@ def test_every_figure_is_offered_and_comes_as_svg(client):
 
 
 def test_rows_of_fallbacks_in_which_nothing_differs_are_folded(client):
-    text = whole(client, "/tables/fallbacks")
+    text = client.get("/tables/fallbacks").text
     (rows,) = re.findall(r"<summary>(\d+) rows in which nothing differs", text)
     assert text.count("<tr id=") == int(rows)
     assert 'id="table"' not in text
 
 
 def test_no_head_of_a_table_is_empty(client):
-    heads = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", whole(client, "/tables/indicators"))
+    heads = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", client.get("/tables/indicators").text)
     assert heads
     assert all(re.sub("<[^>]*>", "", head).strip() for head in heads)
 
@@ -271,21 +266,24 @@ def test_no_head_of_a_table_is_empty(client):
 def test_heads_sort_and_the_address_keeps_it(page):
     page.goto("/tables")
     page.goto("/")
+    # What is computed comes into the page, whose rows are sorted anew a moment later.
+    expect(page.locator(".computing")).to_have_count(0)
     column = page.locator("#costs tbody td:nth-child(2)")
     page.locator("#costs thead").get_by_role("button", name="trials").click()
     down = [int(text) for text in column.all_inner_texts()]
     assert down == sorted(down, reverse=True)
     assert len(set(down)) > 1
     expect(page.locator("#costs th[aria-sort=descending]")).to_have_text("trials")
+    expect(page).to_have_url(re.compile("sorted=-costs.1"))
     page.reload()
-    assert [int(text) for text in column.all_inner_texts()] == down
+    expect(column).to_have_text(list(map(str, down)))
     page.locator("#costs thead").get_by_role("button", name="trials").click()
-    assert [int(text) for text in column.all_inner_texts()] == sorted(down)
+    expect(column).to_have_text(list(map(str, sorted(down))))
+    expect(page).to_have_url(re.compile("sorted=costs.1"))
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     page.locator("#copy-link").click()
     expect(page.locator("#copy-link")).to_have_text("copied")
     assert page.evaluate("navigator.clipboard.readText()") == page.url
-    assert "sorted=costs.1" in page.url
 
 
 @pytest.mark.parametrize("address", ["/", "/humans"])

@@ -9,7 +9,6 @@ import pytest
 from starlette.testclient import TestClient
 
 from analysis.data.study import Study
-from analysis.explorer.analysis_process import Computing
 from analysis.explorer.analysis_worker import HUMAN, Numbers
 from analysis.explorer.app import explorer
 from analysis.explorer.charts import chart, marks
@@ -25,7 +24,7 @@ from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import Drive, write_study, yielding
-from tests.explorer.test_tables_pages import InProcess
+from tests.explorer.test_tables_pages import Awaited, InProcess
 
 HOST = "127.0.0.1:8700"
 # A sweep that was killed: two trials of one condition that have nothing in common.
@@ -47,15 +46,10 @@ def db(tmp_path):
 @pytest.fixture
 def ask(db):
     site = Site(db)
-    site.computing = Computing(db, InProcess)
+    site.computing = Awaited(db, InProcess)
     client = TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
 
-    def get(address="/humans"):
-        while 'class="computing"' in (text := client.get(address).text):
-            pass
-        return unescape(text)
-
-    yield get
+    yield lambda: unescape(client.get("/humans").text)
     site.computing.close()
 
 
