@@ -11,11 +11,11 @@ from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
-from analysis.explorer.export import export_folder
 from analysis.explorer.pages import conditions
 from analysis.explorer.site import Site
 from analysis.explorer.traces import POINTS, read_band, read_traces
 from tests.analysis.studies import Drive, as_humans, write_study, yielding
+from tests.explorer.packed import export_with_a_table
 from tests.explorer.serving import served
 
 HOST = "127.0.0.1:8700"
@@ -180,9 +180,7 @@ def test_a_click_on_a_trace_opens_its_trial_and_a_choice_changes_the_picture(bro
 
 
 def test_an_export_has_the_same_picture_and_chooses_without_a_server(page, db, tmp_path):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("analysis.explorer.export.TABLES", ["attempts"])
-        list(export_folder(db, tmp_path / "pages", []))
+    export_with_a_table(db, tmp_path / "pages")
     page.context.set_offline(True)
     page.goto(f"file://{tmp_path}/pages/conditions.html")
     page.get_by_role("link", name="N_0_0", exact=True).click()

@@ -14,15 +14,14 @@ from analysis.explorer.export import export_folder, export_page
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from tests.explorer.axe import serious
+from tests.explorer.packed import export_with_a_table
 
 
 @pytest.fixture(scope="session")
 def exported(study, tmp_path_factory):
     """The study as a folder, elsewhere than it was written."""
     made = tmp_path_factory.mktemp("made") / "pages"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("analysis.explorer.export.TABLES", ["attempts"])  # one stands for all
-        written = list(export_folder(study, made, []))
+    written = export_with_a_table(study, made)
     assert {path.name for path in written} >= {"index.html", "trials.html", "trials-N_0_0.html"}
     return made.rename(made.with_name("moved"))
 

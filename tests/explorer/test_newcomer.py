@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 from playwright.sync_api import expect
 
-from analysis.explorer.export import export_folder
 from merge_runner.results.store import Store
 from tests.analysis.studies import Drive, as_humans, played, write_study
+from tests.explorer.packed import export_with_a_table
 from tests.explorer.serving import served
 
 CRASHED = Drive("o3", "baseline", "N_0_0", 1, (0.5,) * 5, (0.4,) * 5, {})
@@ -83,7 +83,7 @@ def test_a_newcomer_finds_why_it_collides_most_and_a_colleague_sees_the_same(pag
 
     # A colleague opens the folder.
     folder = tmp_path / "pages"
-    list(export_folder(db, folder, []))
+    export_with_a_table(db, folder)
     page.goto((folder / "index.html").as_uri())
     watch_the_worst(page)
     expect(page.locator("details", has_text="Why it collided")).to_be_visible()
