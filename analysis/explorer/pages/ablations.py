@@ -11,7 +11,6 @@ from typing import Any
 
 from analysis.explorer import views
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.conditions import condition_texts
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pictures import Scale, marker
 from analysis.explorer.site import NotThere, Site
@@ -262,7 +261,6 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
         left_out=left_out(site, variant),
         by=fate,
         said=_fate,
-        condition_texts=condition_texts(site.catalogue, {pair["condition"] for pair in pairs}),
         pairs=pairs,
         differing=differing,
         counted=_fate(COUNTED[fate]),
