@@ -128,10 +128,9 @@ def chart(
 ) -> dict[str, Any]:
     """A panel for each condition: where everything is drawn, in the units of the panel.
 
-    ``cut`` names the intervals that go on beyond the axis.
+    ``cut``: an interval goes on beyond the axis.
     """
     printed: dict[str, float] = published.get(kind.name, {}).get("values", {})
-    labels = {group["id"]: group["label"] for group in groups}
     known = [
         found
         for group in groups
@@ -163,12 +162,7 @@ def chart(
         "axis": axis,
         "panels": panels,
         "printed": printed,
-        "cut": [
-            f"{labels[point['group']]} in {panel['name']}: {value_text(point['of'], kind.digits)}"
-            for panel in panels
-            for point in panel["points"]
-            if point["arrows"]
-        ],
+        "cut": any(point["arrows"] for panel in panels for point in panel["points"]),
     }
 
 

@@ -127,10 +127,10 @@ def test_a_study_is_grouped_by_any_of_its_factors(client, own):
     assert '<strong aria-current="true">prompt</strong>' in text
     heads = text.split('id="collisions"')[1].split("</thead>")[0]
     assert [name.strip() for name in re.findall(r'<th scope="col">([^<]+)', heads)][2:] == [
+        "humans",
         "all drivers",
         "A1",
         "baseline",
-        "humans",
     ]
     assert "grouped by prompt" in client.get("/?by=mood").text
     groups = [g["id"] for g in own.computing.ask(("home", "prompt", "0"), (0, 0), wait_s=60)
