@@ -224,6 +224,14 @@ def test_the_list_leads_to_every_condition_and_counts_by_driver(ask, db):
     assert "<strong>1</strong> trials" in ask(html.unescape(link)).text
 
 
+@pytest.mark.parametrize("address", ["/", "/trials", "/conditions", "/sweeps/sweep-1"])
+def test_the_code_of_a_condition_says_itself_in_words_on_every_page(ask, address):
+    text = ask(address).text
+    (told,) = set(re.findall(r'title="([^"]*)"[^>]*>(?:<[^>]*>\s*)*R_-2_8[< ]', text)) or {None}
+    assert told == "the right vehicle would be 2 m ahead at the merge point, and the left one is " \
+        "0.8 m/s faster"  # fmt: skip
+
+
 def test_a_condition_that_nobody_drove_is_not_there(ask):
     reply = ask("/conditions/nothing")
     assert reply.status_code == 404

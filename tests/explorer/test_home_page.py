@@ -20,6 +20,7 @@ from analysis.data.reference_data import published
 from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.app import explorer
+from analysis.explorer.assets import STATIC, STYLES
 from analysis.explorer.child import NoAnswer
 from analysis.explorer.pages.home import account_rows, home_page
 from analysis.explorer.pages.tables import FIGURES
@@ -27,6 +28,8 @@ from analysis.explorer.site import NothingNew, Site
 from analysis.explorer.task_picture import task_picture
 from analysis.explorer.urls import StaticLinks
 from analysis.figures.gallery import FIGURES as DRAWN
+from analysis.figures.styles import COLOURS
+from analysis.metrics import shown_in
 from analysis.table_format import TableFormat
 from analysis.tables import make_tables
 from analysis.tables.formats import render
@@ -34,6 +37,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK, Track
 from tests.analysis.studies import Said, write_study, yielding
+from tests.explorer.serving import served
 from tests.explorer.test_humans_page import import_some
 from tests.explorer.test_tables_pages import Addresses, InProcess, listed
 
@@ -326,6 +330,44 @@ def test_heads_sort_and_the_address_keeps_it(page):
     expect(page.locator("#copy-link")).to_have_text("copied")
     assert page.evaluate("navigator.clipboard.readText()") == page.url
     assert "sorted=costs.1" in page.url
+
+
+def test_every_measure_of_the_ablations_is_explained_above_them(client):
+    above = unescape(whole(client, "/ablations").split("<table")[0])
+    for metric in shown_in("tables"):
+        assert f"<strong>{metric.heading}</strong>: {metric.meaning}" in above
+
+
+def test_the_colours_of_drivers_are_those_of_the_figures():
+    styles = (STATIC / "styles/colours.css").read_text()
+    light, _, _ = styles.partition("@media")
+    assert re.findall(r"--tint-\d: (#\w+);", light) == list(COLOURS)
+    used = (STATIC / "styles/tables.css").read_text()
+    assert re.findall(r"\.tint-(\d) ", used) == [str(i) for i in range(len(COLOURS))]
+
+
+def test_captions_of_all_tables_have_one_rule():
+    rules = [
+        name
+        for name in STYLES
+        for _ in re.findall(r"(?:^|\} )caption \{", (STATIC / name).read_text(), re.MULTILINE)
+    ]
+    assert rules == ["styles/base.css"]
+
+
+def test_ablations_are_whole_at_1024_pixels_and_numbers_look_like_links(browser, db):
+    with served(db) as address:
+        page = browser.new_page(viewport={"width": 1024, "height": 800})
+        page.goto(f"{address}/ablations")
+        table = page.locator("table.ablations")
+        expect(table).to_be_visible()
+        assert page.eval_on_selector(".scroll", "e => e.scrollWidth <= e.clientWidth")
+        page.goto(f"{address}/tables/attempts")
+        number = page.locator("table.of-report td a").first
+        looks = "e => [getComputedStyle(e).color, getComputedStyle(e).textDecorationStyle]"
+        assert number.evaluate(looks) == page.locator("main p a").first.evaluate(looks)
+        assert number.evaluate(looks)[1] == "solid"
+        page.close()
 
 
 @pytest.mark.parametrize("address", ["/", "/humans"])
