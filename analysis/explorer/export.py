@@ -135,7 +135,7 @@ def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
     yield at.to("conditions"), conditions_page(site, {})
     for row in site.catalogue.ask("SELECT DISTINCT condition FROM listed ORDER BY ALL"):
         name = row["condition"]
-        for by in views_of(site, name):
+        for by in views_of(site, name).values():
             yield at.condition(name, by=by), condition_page(site, name, {"by": by})
     yield at.to("glossary"), site.render("glossary.html", here="glossary")
     yield at.to("tables"), tables_page(site)

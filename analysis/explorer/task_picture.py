@@ -17,44 +17,36 @@ from merge_runner.scenarios.merge.geometry import TRACK, Track, track_of
 
 # What the trials of drivers were driven on, the commonest last.
 GEOMETRIES = """
-SELECT spec->>'$.track' AS track, length_m, width_m, count(*) AS trials
+SELECT (spec->'$.track')::VARCHAR AS track, length_m, width_m, count(*) AS trials
 FROM listed JOIN specs USING (spec_hash) JOIN geometry USING (spec_hash)
 WHERE who <> 'humans' GROUP BY ALL ORDER BY trials, track, length_m, width_m
 """
-PLAYED = """
-SELECT condition, any_value(projected_headway_m) AS headway, any_value(relative_velocity_mps)
-    AS velocity FROM listed WHERE who <> 'humans' GROUP BY ALL
+CONDITIONS = """
+SELECT condition, any_value(projected_headway_m), any_value(relative_velocity_mps)
+FROM listed WHERE who <> 'humans' GROUP BY ALL
 """
-# The condition that is shown, if it was played.
+# The condition that is shown where it was played, or nothing was.
 USUAL = "L_4_0"
 
 
 def task_picture(catalogue: Catalogue) -> dict[str, Any]:
     """The geometry of most trials of drivers, in m; as in a replay all drive to the right.
 
-    ``geometries`` is how many there are, ``of`` how many trials have which share in them.
+    ``meet``: at constant speeds the vehicles collide in all conditions that were played.
     """
+    usual = ScenarioConfig()
+    track, length_m, width_m, trials = TRACK, usual.vehicle_length_m, usual.vehicle_width_m, 0
     rows = catalogue.ask(GEOMETRIES)
-    track, row = (
-        TRACK,
-        {
-            "length_m": (usual := ScenarioConfig()).vehicle_length_m,
-            "width_m": usual.vehicle_width_m,
-            "trials": 0,
-        },
-    )
-    for found in rows:
+    for row in rows:
         with suppress(UsageError):  # the audit tells of a spec without a track
-            track = track_of(
-                {} if found["track"] is None else {"track": json.loads(found["track"])}
-            )
-            row = found
-    played = {one["condition"]: (one["headway"], one["velocity"]) for one in catalogue.ask(PLAYED)}
-    name = USUAL if USUAL in played or not played else ordered(played)[0]
-    usual_one = HUMAN_CONDITIONS[USUAL]
-    headway, velocity = played.get(
-        name, (usual_one.projected_headway_m, usual_one.relative_velocity_mps)
-    )
+            track = track_of({} if row["track"] is None else {"track": json.loads(row["track"])})
+            length_m, width_m, trials = row["length_m"], row["width_m"], row["trials"]
+    played = {
+        name: Condition(headway, velocity, max(MEAN_SPEED_MPS, abs(velocity)))
+        for name, headway, velocity in map(dict.values, catalogue.ask(CONDITIONS))
+    } or {USUAL: HUMAN_CONDITIONS[USUAL]}
+    name = USUAL if USUAL in played else ordered(played)[0]
+    shown = played[name]
     return {
         "view_box": view_box(track),
         "branches": {side: _path(track, side) for side in SIDES},
@@ -62,22 +54,21 @@ def task_picture(catalogue: Catalogue) -> dict[str, Any]:
             side: [_point(track, side, at) for at in (0.0, track.tunnel_exit_m)] for side in SIDES
         },
         "merge_m": round(track.merge_y_m, 2),
-        "vehicles": _vehicles(track, headway, velocity),
-        "length_m": row["length_m"],
-        "width_m": row["width_m"],
+        "vehicles": _vehicles(track, shown),
+        "length_m": length_m,
+        "width_m": width_m,
         "alone_m": track.merge_point_m - track.tunnel_exit_m,
         "condition": name,
-        "words": condition_text(headway, velocity),
-        "meet": all(abs(headway) < row["length_m"] for headway, _ in played.values()),
+        "words": condition_text(shown.projected_headway_m, shown.relative_velocity_mps),
+        "meet": all(abs(one.projected_headway_m) < length_m for one in played.values()),
         "geometries": len(rows),
-        "trials": row["trials"],
-        "all_trials": sum(one["trials"] for one in rows),
+        "trials": trials,
+        "all_trials": sum(row["trials"] for row in rows),
     }
 
 
-def _vehicles(track: Track, headway_m: float, velocity_mps: float) -> list[dict[str, Any]]:
+def _vehicles(track: Track, condition: Condition) -> list[dict[str, Any]]:
     """Where both are at constant speeds, a third of the way from the tunnels to the merge."""
-    condition = Condition(headway_m, velocity_mps, max(MEAN_SPEED_MPS, abs(velocity_mps)))
     speeds, starts = condition.speeds_mps, condition.starts_m(track)
     merge_s = min(
         (track.merge_point_m - start) / speed for start, speed in zip(starts, speeds, strict=True)

@@ -180,7 +180,7 @@ def test_two_different_drivers_are_told_apart_whichever_side_they_sat_on(mixed, 
         "/conditions/N_0_0?by=driver"
     )
     assert reply.status_code == 404
-    assert "told apart by order, or with by=side" in reply.text
+    assert "told apart with by=order or by=side" in reply.text
     alone.close()
 
 

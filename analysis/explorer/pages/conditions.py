@@ -29,62 +29,43 @@ FROM listed WHERE {where} GROUP BY ALL ORDER BY ALL
 """
 
 
-# What joins the names of two different drivers.
-MIXED = "contains(model, '+')"
-
-
 @dataclass(frozen=True, slots=True)
 class View:
-    """By what the vehicles of a trial are told apart: its name, its panels, and who goes first.
+    """How the vehicles of a trial are told apart: its name, what the first and the second are.
 
-    The panels show MEASURES; ``outcomes`` are in words that the first vehicle, or the second one,
-    went first.
+    ``outcomes`` say of a line in the first and in the second colour who went first.
     """
 
     name: str
-    panels: tuple[str, str, str]
-    outcomes: tuple[str, str]
+    first: str
+    second: str
     meaning: str = ""
+    outcomes: tuple[str, str] = ("left first", "right first")
+
+    @property
+    def headings(self) -> dict[str, str]:
+        """What its panels show, by MEASURES."""
+        speed, headway = "Speed of {} (m/s)", "Headway: how far {} is ahead (m)"
+        texts = (speed.format(self.first), speed.format(self.second), headway.format(self.first))
+        return dict(zip(MEASURES, texts, strict=True))
 
 
-SIDES_APART = ("left first", "right first")
-# The humans' median is that of one way of driving only by order: elsewhere those who go first and
-# those who yield are in one.
-ORDER = "order"
+# The first is what a page shows that asks for none: in the others the humans' median is of those
+# who go first and of those who yield together, which nobody drives.
 VIEWS = {
-    "": View(
-        "who merged first",
-        (
-            "Speed of the vehicle that merged first",
-            "Speed of the second one",
-            "Headway: how far the first one is ahead",
-        ),
-        SIDES_APART,
+    "order": View(
+        *("who merged first", "the vehicle that merged first", "the second one"),
         "Where nobody merged first it is the vehicle that was ahead at the end.",
     ),
-    "side": View(
-        "side",
-        (
-            "Speed of the left vehicle",
-            "Speed of the right vehicle",
-            "Headway: how far the left vehicle is ahead",
-        ),
-        SIDES_APART,
-    ),
+    "side": View("side", "the left vehicle", "the right vehicle"),
     "driver": View(
-        "who drives",
-        (
-            "Speed of the driver that is named first",
-            "Speed of the other driver",
-            "Headway: how far the driver named first is ahead",
-        ),
-        ("the driver named first went first", "the other one did"),
+        *("who drives", "the driver that is named first", "the other driver"),
         "Shown are pairs of two different drivers; of the humans, the vehicles on the same sides.",
+        ("the driver named first went first", "the other one did"),
     ),
 }
 # By driver a line has the look of who went first: the driver that is named first, or the other one.
 TURNED_KIND = {"left-first": "right-first", "right-first": "left-first"}
-UNITS = dict(zip(MEASURES, ("m/s", "m/s", "m"), strict=True))
 
 
 def conditions_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -114,15 +95,18 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     groups = _counted(site, "model, variant", Filter(condition=name))
     if not groups:
         raise NotThere(f"no trial of the condition {name} is here")
-    by, views = asked.get("by", ""), views_of(site, name)
+    views = views_of(site, name)
+    by = asked.get("by") or next(iter(views))
     if by not in views:
-        raise NotThere(f"vehicles are told apart by order, or with by={' or by='.join(views[1:])}")
+        raise NotThere(f"vehicles are told apart with by={' or by='.join(views)}")
     wanted = Filter(condition=name, model=asked.get("model", ""), variant=asked.get("variant", ""))
     chosen = {key: value for key, value in wanted.chosen.items() if key != "condition"}
     alone = all(row["model"] == HUMAN for row in groups)
-    rows = _rows(site, wanted, with_humans=site.static or alone, mixed=by == "driver")
+    rows = _rows(site, wanted, with_humans=site.static or alone)
+    if by == "driver":
+        rows = [row for row in rows if _mixed(row["model"])]
     drawn = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
-    traces = read_traces(site.db, [_key(row) for row in drawn], by or ORDER)
+    traces = read_traces(site.db, [_key(row) for row in drawn], by)
     drawn = [row for row in drawn if _key(row) in traces]
     humans = _rows(site, Filter(condition=name, model=HUMAN), with_humans=True)
     return site.render(
@@ -132,7 +116,8 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         by=by,
         view=VIEWS[by],
         choices=[
-            (VIEWS[key].name, site.at.condition(name, by=key, **chosen), key == by) for key in views
+            (VIEWS[key].name, site.at.condition(name, by=shown, **chosen), key == by)
+            for key, shown in views.items()
         ],
         state=state,
         groups=groups,
@@ -145,13 +130,18 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     )
 
 
-def views_of(site: Site, condition: str) -> list[str]:
-    """The views of a condition: by driver where two different ones drove."""
-    found = site.catalogue.ask(
-        f"SELECT 1 FROM listed WHERE condition = ? AND {MIXED} LIMIT 1",  # noqa: S608 # constant
-        condition,
-    )
-    return [key for key in VIEWS if found or key != "driver"]
+def views_of(site: Site, condition: str) -> dict[str, str]:
+    """The views of a condition, by driver where two different ones drove, as its address has them.
+
+    The first one is what is shown where the address says nothing.
+    """
+    models = site.catalogue.ask("SELECT DISTINCT model FROM listed WHERE condition = ?", condition)
+    there = [key for key in VIEWS if key != "driver" or any(_mixed(row["model"]) for row in models)]
+    return {key: key if i else "" for i, key in enumerate(there)}
+
+
+def _mixed(model: str) -> bool:
+    return "+" in model  # joins the names of two different drivers
 
 
 def _band_of(site: Site, humans: Sequence[Row], by: str, traces: Mapping[Any, Row]) -> list[Row]:
@@ -161,7 +151,7 @@ def _band_of(site: Site, humans: Sequence[Row], by: str, traces: Mapping[Any, Ro
     keys = [_key(row) for row in humans]
     if by == "driver":
         return read_band(site.db, keys, seats={trace["turned"] for trace in traces.values()})
-    return read_band(site.db, keys, by or ORDER)
+    return read_band(site.db, keys, by)
 
 
 def picture(
@@ -195,11 +185,11 @@ def picture(
         "time": time,
         "panels": [
             {
-                "heading": f"{heading} ({UNITS[name]})",
+                "heading": heading,
                 "axis": axes[name],
                 "band": _band(name, band, time.scale, axes[name].scale),
             }
-            for name, heading in zip(MEASURES, view.panels, strict=True)
+            for name, heading in view.headings.items()
         ],
         "lines": lines,
     }
@@ -218,11 +208,10 @@ def _counted(site: Site, columns: str, wanted: Filter) -> list[Row]:
     return site.catalogue.ask(COUNTED.format(columns=columns, where=where), *values)
 
 
-def _rows(site: Site, wanted: Filter, *, with_humans: bool, mixed: bool = False) -> list[Row]:
-    """The trials of a filter, the mixed ones alone or all; humans if they alone are wanted."""
+def _rows(site: Site, wanted: Filter, *, with_humans: bool) -> list[Row]:
+    """The trials of a filter; humans are among them if they alone are wanted."""
     where, values = wanted.where()
     others = "" if with_humans or wanted.model else " AND source <> 'human'"
-    others += f" AND {MIXED}" if mixed else ""
     return site.catalogue.ask(
         "SELECT trial_id, spec_hash, condition, model, variant, outcome, end_time_s "  # noqa: S608 # constants
         f"FROM listed WHERE {where}{others} ORDER BY trial_id, spec_hash",

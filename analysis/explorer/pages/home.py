@@ -20,7 +20,7 @@ from analysis.explorer.sweeps import standing_of
 from analysis.explorer.task_picture import task_picture
 from analysis.explorer.urls import HOME
 from analysis.metrics import GAP, LEFT_FIRST
-from analysis.tables.formats import notes_of, shown_value
+from analysis.tables.formats import notes_of, printed
 from analysis.tables.model import Table, from_text
 from merge_runner.study.crossing import PROMPT
 
@@ -216,20 +216,15 @@ def verdicts_of(site: Site, table: Table) -> dict[str, Any]:
 
     ``ceiling`` is the share of human data sets that pass, ``link`` leads to the trials.
     """
-    columns = {column.name: column for column in table.columns}
     drivers: dict[str, dict[str, Any]] = {}
     for row in table.rows:
         if row.values.get("paper") is None and row.values.get("robust") is None:
             continue
-        said = {
-            name: shown_value(columns[name], row.values.get(name))
-            for name in ("paper", "robust", "ceiling_paper")
-        }
-        known = row.values.get("ceiling_paper") is not None
+        said = printed(table, row)
         drivers.setdefault(str(row.values["driver"]), {})[str(row.values["indicator"])] = {
             "paper": said["paper"],
             "robust": said["robust"] if row.values.get("differ") else "",
-            "ceiling": said["ceiling_paper"] if known else "",
+            "ceiling": "" if row.values.get("ceiling_paper") is None else said["ceiling_paper"],
             "link": site.at.cell(table.name, row.id, "n") if row.groups != (HUMAN,) else "",
             "note": row.note,
         }
