@@ -22,8 +22,8 @@ from analysis.explorer.packing_processes import AT_ONCE, Block, packed_blocks
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.comparing import At, offered
 from analysis.explorer.pages.computed import computed
-from analysis.explorer.pages.conditions import condition_page, conditions_page
-from analysis.explorer.pages.home import home_page
+from analysis.explorer.pages.conditions import condition_page, conditions_page, views_of
+from analysis.explorer.pages.home import groupings, home_page
 from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.notes import notes_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
@@ -43,7 +43,7 @@ BUNDLE = (*PLAIN, "unpacked.js", *REPLAY, "value_tables.js", "bundle.js")
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 # The names of an export's pages: those of an earlier one are deleted, and nothing else.
 _OURS = re.compile(
-    rf"(?:{'|'.join(EXPORTED)}|(?:condition|sweep|table|trials)-.*)\.html|table-.*\.(?:{'|'.join(FILES)})"
+    rf"(?:{'|'.join(EXPORTED)}|(?:condition|index|sweep|table|trials)-.*)\.html|table-.*\.(?:{'|'.join(FILES)})"
 )
 # Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
@@ -127,13 +127,16 @@ def page_of_trials(site: Site, rows: Sequence[Row], name: str) -> str:
 def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
     """The pages of the whole study: at a glance, its sweeps, and what is computed of it."""
     at = site.at
-    yield at.to(HOME), home_page(site, {})
+    for by in groupings(site):
+        yield at.to(HOME, by=by), home_page(site, {"by": by})
     for entry in list_sweeps(site.catalogue):
         yield at.sweep(entry.sweep_id), sweep_page(site, entry.sweep_id)
     yield at.to("sweeps"), sweeps_page(site)
     yield at.to("conditions"), conditions_page(site, {})
     for row in site.catalogue.ask("SELECT DISTINCT condition FROM listed ORDER BY ALL"):
-        yield at.condition(row["condition"]), condition_page(site, row["condition"], {})
+        name = row["condition"]
+        for by in views_of(site, name).values():
+            yield at.condition(name, by=by), condition_page(site, name, {"by": by})
     yield at.to("glossary"), site.render("glossary.html", here="glossary")
     yield at.to("tables"), tables_page(site)
     for name in watch(list(TABLES), "tables"):

@@ -89,6 +89,23 @@ class Axis:
     scale: Scale
     ticks: Sequence[float]
 
+    @classmethod
+    def of(
+        cls,
+        ends: tuple[float, float],
+        places: tuple[float, float],
+        lowest: float | None = None,
+        highest: float | None = None,
+    ) -> Axis:
+        """An axis between two places that shows at least these ends; see ``ends_and_ticks``."""
+        low, high, ticks = ends_and_ticks(*ends, lowest, highest)
+        return cls(Scale(low, high, *places), ticks)
+
+    @property
+    def marks(self) -> list[tuple[float, str]]:
+        """Where the ticks are drawn, and as what."""
+        return [(self.y(tick), f"{tick:g}") for tick in self.ticks]
+
     def y(self, value: float) -> float:
         """Where a value is drawn."""
         return round(self.scale(value), 1)

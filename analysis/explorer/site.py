@@ -14,6 +14,7 @@ import jinja2
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.assets import STYLES
 from analysis.explorer.catalogue import Catalogue
+from analysis.explorer.conditions import condition_texts
 from analysis.explorer.display_text import visible
 from analysis.explorer.glossary import sections
 from analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
@@ -64,6 +65,7 @@ class Site:
     def __post_init__(self) -> None:
         self.static = isinstance(self.at, StaticLinks)
         self._first_reading: threading.Thread | None = None
+        self._conditions: dict[str, str] = {}
         self.catalogue = Catalogue(self.db)
         self.sandbox = Sandbox(self.db)
         self.computing = Computing(self.db)
@@ -91,6 +93,7 @@ class Site:
             visible=visible,
             clock=clock,
             condition_text=condition_text,
+            in_words=self.in_words,
             glossary=sections(),
             **self.shared,
         )
@@ -107,8 +110,15 @@ class Site:
 
     def refresh(self) -> None:
         """Take in what is new: in the database, and in the notes beside it."""
-        self.catalogue.refresh()
+        if self.catalogue.refresh():
+            self._conditions = {}
         self.catalogue.tag(self.notes.kept().tags)
+
+    def in_words(self, condition: str) -> str:
+        """What a condition's name says; empty where no human drove it and it has no trial."""
+        if condition not in self._conditions:
+            self._conditions = condition_texts(self.catalogue)
+        return self._conditions.get(condition, "")
 
     @property
     def beginning(self) -> bool:

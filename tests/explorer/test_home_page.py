@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html import unescape
+from math import sqrt
 from urllib.parse import parse_qs, urlsplit
 
 import duckdb
@@ -18,19 +20,24 @@ from analysis.data.reference_data import published
 from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.app import explorer
+from analysis.explorer.assets import STATIC, STYLES
 from analysis.explorer.child import NoAnswer
-from analysis.explorer.pages.home import account_rows, home_page, task_picture
+from analysis.explorer.pages.home import account_rows, home_page
 from analysis.explorer.pages.tables import FIGURES
 from analysis.explorer.site import NothingNew, Site
+from analysis.explorer.task_picture import task_picture
 from analysis.explorer.urls import StaticLinks
 from analysis.figures.gallery import FIGURES as DRAWN
+from analysis.figures.styles import COLOURS
+from analysis.metrics import shown_in
 from analysis.table_format import TableFormat
 from analysis.tables import make_tables
 from analysis.tables.formats import render
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided
-from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.geometry import TRACK, Track
 from tests.analysis.studies import Said, write_study, yielding
+from tests.explorer.serving import served
 from tests.explorer.test_humans_page import import_some
 from tests.explorer.test_tables_pages import Addresses, Awaited, InProcess, listed
 
@@ -117,10 +124,10 @@ def test_a_study_is_grouped_by_any_of_its_factors(client, own):
     assert '<strong aria-current="true">prompt</strong>' in text
     heads = text.split('id="collisions"')[1].split("</thead>")[0]
     assert [name.strip() for name in re.findall(r'<th scope="col">([^<]+)', heads)][2:] == [
+        "humans",
         "all drivers",
         "A1",
         "baseline",
-        "humans",
     ]
     assert "grouped by prompt" in client.get("/?by=mood").text
     groups = [g["id"] for g in own.computing.ask(("home", "prompt", "0"), (0, 0), wait_s=60)
@@ -217,14 +224,51 @@ def test_classes_of_collisions_stand_beside_the_published_ones():
     assert account_rows([], published) is None
 
 
-def test_the_picture_of_the_task_shows_a_moment_before_the_merge():
-    task = task_picture()
+def test_the_picture_of_the_task_shows_a_moment_before_the_merge(own):
+    task = task_picture(own.catalogue)
     left, right = task["vehicles"]
+    assert task["condition"] == "L_4_0"
     assert left["x"] > right["x"]
     assert left["y"] < 0 < right["y"]
     for one in (left, right):
         assert TRACK.tunnel_exit_m * TRACK.branch_cosine < one["x"] < task["merge_m"]
     assert not collided(ScenarioConfig(), TRACK, left["x"], right["x"])
+
+
+def on_a_longer_track(db, folder, whose):
+    """The study with these trials on another track, of longer vehicles."""
+    changed = {"track": asdict(Track(60, 120, 170, 40)), "scenario": {"vehicle_length_m": 6}}
+    with duckdb.connect(shutil.copy(db, folder / "longer.duckdb")) as connection:
+        connection.execute(
+            f"UPDATE specs SET spec = json_merge_patch(spec, ?) WHERE {whose}",
+            [json.dumps(changed)],
+        )
+    site = Site(folder / "longer.duckdb")
+    site.computing = Computing(site.db, Never)
+    return site
+
+
+def test_the_picture_shows_the_studys_own_track(db, tmp_path):
+    site = on_a_longer_track(db, tmp_path, "true")
+    text = client_of(site).get("/").text
+    task = task_picture(site.catalogue)
+    assert f'x1="{120 * sqrt(1 - (20 / 120) ** 2):.2f}"' in text
+    assert "60 m before the merge point" in text
+    assert task["length_m"] == 6
+    assert text.count('width="6.0" height="1.8"') == 2
+    assert "the commonest" not in text
+    site.close()
+
+
+def test_of_several_tracks_the_commonest_is_shown_and_the_page_says_so(db, tmp_path):
+    site = on_a_longer_track(db, tmp_path, "spec_hash LIKE '%A1'")
+    text = client_of(site).get("/").text
+    assert "50 m before the merge point" in text
+    assert (
+        "It is the commonest of 2 geometries (tracks, or sizes of vehicles), that of 33 of 44"
+        in text
+    )
+    site.close()
 
 
 @pytest.mark.parametrize(("suffix", "form"), [("csv", TableFormat.CSV), ("tex", TableFormat.LATEX)])
@@ -284,6 +328,44 @@ def test_heads_sort_and_the_address_keeps_it(page):
     page.locator("#copy-link").click()
     expect(page.locator("#copy-link")).to_have_text("copied")
     assert page.evaluate("navigator.clipboard.readText()") == page.url
+
+
+def test_every_measure_of_the_ablations_is_explained_above_them(client):
+    above = unescape(whole(client, "/ablations").split("<table")[0])
+    for metric in shown_in("tables"):
+        assert f"<strong>{metric.heading}</strong>: {metric.meaning}" in above
+
+
+def test_the_colours_of_drivers_are_those_of_the_figures():
+    styles = (STATIC / "styles/colours.css").read_text()
+    light, _, _ = styles.partition("@media")
+    assert re.findall(r"--tint-\d: (#\w+);", light) == list(COLOURS)
+    used = (STATIC / "styles/tables.css").read_text()
+    assert re.findall(r"\.tint-(\d) ", used) == [str(i) for i in range(len(COLOURS))]
+
+
+def test_captions_of_all_tables_have_one_rule():
+    rules = [
+        name
+        for name in STYLES
+        for _ in re.findall(r"(?:^|\} )caption \{", (STATIC / name).read_text(), re.MULTILINE)
+    ]
+    assert rules == ["styles/base.css"]
+
+
+def test_ablations_are_whole_at_1024_pixels_and_numbers_look_like_links(browser, db):
+    with served(db) as address:
+        page = browser.new_page(viewport={"width": 1024, "height": 800})
+        page.goto(f"{address}/ablations")
+        table = page.locator("table.ablations")
+        expect(table).to_be_visible()
+        assert page.eval_on_selector(".scroll", "e => e.scrollWidth <= e.clientWidth")
+        page.goto(f"{address}/tables/attempts")
+        number = page.locator("table.of-report td a").first
+        looks = "e => [getComputedStyle(e).color, getComputedStyle(e).textDecorationStyle]"
+        assert number.evaluate(looks) == page.locator("main p a").first.evaluate(looks)
+        assert number.evaluate(looks)[1] == "solid"
+        page.close()
 
 
 @pytest.mark.parametrize("address", ["/", "/humans"])

@@ -117,10 +117,10 @@ def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
     assert huge["low"] < -30
     assert huge["high"] > 50
     drawn = chart(gap, content["groups"], list(content["conditions"]), content["published"])
-    ticks = [float(text) for _, text in drawn["ticks"]]
+    ticks = [float(text) for _, text in drawn["axis"].marks]
     assert ticks[0] >= -10
     assert ticks[-1] <= 30
-    assert f"killed in L_4_0: {huge['value']:.2f} [{huge['low']:.2f}" in drawn["cut"][0]
+    assert drawn["cut"]
     (point,) = (
         point
         for panel in drawn["panels"]
@@ -128,8 +128,10 @@ def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
         if point["group"] == "killed/baseline"
     )
     assert [shape for shape, _ in point["arrows"]] == ["down", "triangle"]
-    assert drawn["top"] <= point["ends"][1] <= point["y"] <= point["ends"][0] <= drawn["bottom"]
-    assert chart(rmse, content["groups"], [], {})["ticks"][0][1] == "0"
+    scale = drawn["axis"].scale
+    assert scale.to <= point["ends"][1] <= point["y"] <= point["ends"][0] <= scale.from_
+    assert chart(rmse, content["groups"], [], {})["axis"].marks[0][1] == "0"
     text = ask()
     assert len(re.findall(r'class="cut"', text)) >= 2
-    assert "An arrow at the edge: an interval goes on beyond the axis. killed in" in text
+    assert "An arrow at the edge: an interval goes on beyond the axis. Its ends are in" in text
+    assert f"{huge['value']:.2f} [{huge['low']:.2f}, {huge['high']:.2f}], n 2</" in text

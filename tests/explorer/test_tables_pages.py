@@ -287,7 +287,7 @@ def test_an_ablation_has_the_numbers_of_both_tables(ask, db):
     for cell, base in zip(drivers["o3"]["A1"], drivers["o3"]["baseline"], strict=True):
         found = rows[f"o3/A1/baseline/{cell.measure}"]
         assert cell.difference.value == found["difference"]
-        assert (cell.difference.low, cell.difference.high) == found["ci"]
+        assert cell.difference.limits == found["ci"]
         assert (cell.n, base.n) == (found["n"], found["n_reference"])
         assert base.difference is None
     text = ask("/ablations")
