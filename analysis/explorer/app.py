@@ -248,9 +248,10 @@ def _sql_routes(site: Site) -> list[Route]:
 def _words_routes(site: Site) -> list[Route]:
     """Search in words, and what readers note; see ``Guard`` for who may write."""
 
-    def as_csv(_: Request) -> Response:
-        name = {"content-disposition": 'attachment; filename="notes.csv"'}
-        return Response(notes.notes_csv(site), media_type=KINDS["csv"], headers=name)
+    def as_csv(request: Request) -> Response:
+        file = request.url.path.removeprefix("/")
+        name = {"content-disposition": f'attachment; filename="{file}"'}
+        return Response(notes.notes_file(site, file), media_type=KINDS["csv"], headers=name)
 
     def write(request: Request, form: Mapping[str, str]) -> Response:
         site.refresh()
@@ -280,5 +281,5 @@ def _words_routes(site: Site) -> list[Route]:
         Route("/words", page(lambda r: words.words_page(site, r.query_params))),
         Route("/notes", page(lambda _: notes.notes_page(site))),
         Route("/notes", written, methods=["POST"]),
-        Route("/notes.csv", as_csv),
+        *(Route(f"/{name}", as_csv) for name in notes.FILES),
     ]

@@ -23,7 +23,7 @@ from merge_runner.drivers.human_replay import HUMAN_REPLAY, unresponsive
 from merge_runner.drivers.registry import language_models, stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
-from merge_runner.results.database import Instance, room_for_texts, schema_sql, spill_folder
+from merge_runner.results.database import Instance, more_memory, schema_sql, spill_folder
 from merge_runner.results.levels import LEVELS
 from merge_runner.scenarios.merge.geometry import Track, track_of
 from merge_runner.served_model import ALIASES, others_among
@@ -458,9 +458,12 @@ class Catalogue:
             return self._memory.cursor()
 
     def copy(self, sql: str) -> None:
-        """Run statements of ours that copy from the database; raises UsageError and StoreError."""
+        """Run statements of ours that copy texts from the database; raises UsageError, StoreError."""
         try:
-            with reading(self.db, self._instance) as connection, room_for_texts(connection):
+            with (
+                reading(self.db, self._instance) as connection,
+                more_memory(connection, one_thread=True),
+            ):
                 connection.execute(sql)
         except StoreLocked:
             raise

@@ -21,33 +21,29 @@ from analysis.explorer.catalogue import SEVERAL, Catalogue, Filter
 from analysis.explorer.reading import Row, records
 from analysis.explorer.snippets import Snippet, snippet
 from merge_runner.errors import StoreLocked
-from merge_runner.results.database import spill_folder
+from merge_runner.results.database import more_memory, spill_folder
 from merge_runner.text_safety import quoted
 
 PAGE = 50
-LONGEST = 65_536  # characters of a reply that are searched
+LONGEST = 65_536  # characters of a text that are searched
+AT_ONCE = 500  # trials whose words are copied while the file is held
 READING_S = 1.0  # a page waits so long for words that are not copied yet
-REPLIES = f"""
-LEFT JOIN (SELECT trial_id, spec_hash, side, decision, max_by(left(reply, {LONGEST}), attempt)
-        AS reply
-    FROM calls SEMI JOIN wanted USING (trial_id, spec_hash) WHERE reply IS NOT NULL GROUP BY ALL)
-USING (trial_id, spec_hash, side, decision)
-"""  # noqa: S608 # a constant
-# What is searched, as SQL over a decision and the last reply to its call, and of how many trials
-# it is copied at once: the file is not held for longer than that takes.
+# What is searched: a column of a table, and the row of a decision that holds it, which of a call is
+# that of the last reply.
 KINDS = {
-    "rationales": ("rationale", "", 1_000),
-    "replies": ("reply", REPLIES, 100),
+    "rationales": (
+        "decisions",
+        "rationale",
+        "SELECT trial_id, spec_hash, side, decision, rowid AS place FROM decisions "
+        "SEMI JOIN wanted USING (trial_id, spec_hash)",
+    ),
+    "replies": (
+        "calls",
+        "reply",
+        "SELECT trial_id, spec_hash, side, decision, arg_max(rowid, attempt) AS place FROM calls "
+        "SEMI JOIN wanted USING (trial_id, spec_hash) WHERE reply IS NOT NULL GROUP BY ALL",
+    ),
 }
-# A change of mind is between what a driver said and what it had said before.
-DECISIONS = """
-SELECT number, trial_id, spec_hash, side, decision, time_s, coalesce(tactical, 'none') AS tactical,
-    CASE WHEN tactical <> lag(tactical IGNORE NULLS) OVER said
-        THEN lag(tactical IGNORE NULLS) OVER said || ' to ' || tactical END AS switch,
-    failure, rationale
-FROM decisions JOIN wanted USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
-WINDOW said AS (PARTITION BY number, side ORDER BY decision)
-"""
 TABLES = """
 CREATE TABLE IF NOT EXISTS words.taken_{kind} (number INTEGER);
 CREATE TABLE IF NOT EXISTS words.{kind} (number INTEGER, side VARCHAR, decision INTEGER,
@@ -58,17 +54,32 @@ DELETE FROM words.{kind} WHERE number NOT IN (SELECT number FROM words.taken_{ki
 WAITING = """
 FROM memory.listed WHERE decisions > 0 AND number NOT IN (SELECT number FROM words.taken_{kind})
 """
-# A line break is a space to whoever looks for a phrase.
-TAKE = """
+# Texts are read by the numbers of their rows: else all are read, to find a few. A change of mind is
+# between what a driver said and what it had said before. A line break is a space to whoever looks
+# for a phrase.
+TAKE = f"""
 BEGIN;
-INSERT INTO words.{kind} BY NAME
-WITH wanted AS MATERIALIZED (SELECT number, trial_id, spec_hash {waiting})
-SELECT * EXCLUDE (trial_id, spec_hash), lower(translate(text, chr(10) || chr(13) || chr(9), '   '))
-    AS folded
-FROM (SELECT decided.* EXCLUDE rationale, {text} AS text FROM ({decisions}) AS decided {replies});
-INSERT INTO words.taken_{kind} SELECT number {waiting};
+INSERT INTO words.{{kind}} BY NAME
+WITH wanted AS MATERIALIZED (SELECT number, trial_id, spec_hash {{waiting}}),
+places AS MATERIALIZED ({{places}}),
+texts AS (SELECT rowid AS place, left({{column}}, {LONGEST}) AS text
+    FROM {{table}} WHERE rowid IN (SELECT place FROM places)),
+decided AS (
+    SELECT number, trial_id, spec_hash, side, decision, time_s,
+        coalesce(tactical, 'none') AS tactical,
+        CASE WHEN tactical <> lag(tactical IGNORE NULLS) OVER said
+            THEN lag(tactical IGNORE NULLS) OVER said || ' to ' || tactical END AS switch,
+        failure
+    FROM decisions JOIN wanted USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
+    WINDOW said AS (PARTITION BY number, side ORDER BY decision)
+)
+SELECT decided.* EXCLUDE (trial_id, spec_hash), text,
+    lower(translate(text, chr(10) || chr(13) || chr(9), '   ')) AS folded
+FROM decided LEFT JOIN places USING (trial_id, spec_hash, side, decision)
+    LEFT JOIN texts USING (place);
+INSERT INTO words.taken_{{kind}} SELECT number {{waiting}};
 COMMIT;
-"""
+"""  # noqa: S608 # constants
 WITHOUT_A_LOG = "RECOVERY_MODE no_wal_writes, ROW_GROUP_SIZE 16384"
 OWN_FACETS = ("tactical", "switch", "failure")
 TRIAL_FACETS = ("model", "variant", "condition", "outcome", "account", "tag")
@@ -136,19 +147,8 @@ class Words:
             self._prepare(connection, wanted.kind)
             with suppress(StoreLocked):  # what is read is searched
                 self._take(connection, wanted.kind)
-            _look(connection, wanted)
-            where, values = wanted.where()
-            (totals,) = records(
-                connection,
-                "SELECT count(*) AS decisions, count(DISTINCT number) AS trials "  # noqa: S608 # constants
-                f"FROM hits JOIN listed USING (number) WHERE {where}",
-                values,
-            )
-            number = min(page, max(1, -(-totals["decisions"] // PAGE)))
-            hits, facets = _page(connection, wanted, number), _facets(connection, wanted)
-            return Found(
-                hits, **totals, page=number, facets=facets, unread=_unread(connection, wanted.kind)
-            )
+            with more_memory(connection):
+                return _searched(connection, wanted, page)
 
     def every(self, kind: str) -> list[Row]:
         """What all drivers said, in the order of the trials; raises StoreError."""
@@ -156,13 +156,14 @@ class Words:
             self._prepare(connection, kind)
             while _unread(connection, kind):
                 self._take(connection, kind)
-            return records(
-                connection,
-                "SELECT number, side, decision, time_s, tactical, switch, failure, text "  # noqa: S608 # constants
-                f"FROM words.{kind} JOIN listed USING (number) "
-                "ORDER BY trial_id, spec_hash, decision, side",
-                (),
-            )
+            with more_memory(connection):
+                return records(
+                    connection,
+                    "SELECT number, side, decision, time_s, tactical, switch, failure, text "  # noqa: S608 # constants
+                    f"FROM words.{kind} JOIN listed USING (number) "
+                    "ORDER BY trial_id, spec_hash, decision, side",
+                    (),
+                )
 
     @property
     def folder(self) -> Path | None:
@@ -188,9 +189,9 @@ class Words:
     def _take(self, connection: duckdb.DuckDBPyConnection, kind: str) -> None:
         """Copy words, for a moment; raises UsageError and StoreError."""
         until = time.monotonic() + READING_S
-        text, replies, at_once = KINDS[kind]
-        some = f"{WAITING.format(kind=kind)} ORDER BY number LIMIT {at_once}"
-        take = TAKE.format(kind=kind, text=text, replies=replies, decisions=DECISIONS, waiting=some)
+        table, column, places = KINDS[kind]
+        some = f"{WAITING.format(kind=kind)} ORDER BY number LIMIT {AT_ONCE}"
+        take = TAKE.format(kind=kind, table=table, column=column, places=places, waiting=some)
         while time.monotonic() < until and _unread(connection, kind):
             self.catalogue.copy(take)
 
@@ -208,6 +209,26 @@ def _look(connection: duckdb.DuckDBPyConnection, wanted: Wanted) -> None:
         "CREATE TEMP TABLE hits AS SELECT rowid AS place, number, side, decision, tactical, "  # noqa: S608 # constants
         f"switch, failure FROM words.{wanted.kind} WHERE true{holds}",
         wanted.terms,
+    )
+    connection.execute(
+        "CREATE TEMP TABLE counted AS SELECT number, tactical, switch, failure, count(*) AS times "
+        "FROM hits GROUP BY ALL"
+    )
+
+
+def _searched(connection: duckdb.DuckDBPyConnection, wanted: Wanted, page: int) -> Found:
+    _look(connection, wanted)
+    where, values = wanted.where()
+    (totals,) = records(
+        connection,
+        "SELECT coalesce(sum(times), 0)::BIGINT AS decisions, count(DISTINCT number) AS trials "  # noqa: S608 # constants
+        f"FROM counted JOIN listed USING (number) WHERE {where}",
+        values,
+    )
+    number = min(page, max(1, -(-totals["decisions"] // PAGE)))
+    hits, facets = _page(connection, wanted, number), _facets(connection, wanted)
+    return Found(
+        hits, **totals, page=number, facets=facets, unread=_unread(connection, wanted.kind)
     )
 
 
@@ -240,7 +261,7 @@ def _facets(
         where, values = wanted.where(leave_out=name)
         table = f"listed JOIN {SEVERAL[name]} USING (number)" if name in SEVERAL else "listed"
         found[name] = connection.execute(
-            f"SELECT {name}, count(*) FROM hits JOIN {table} USING (number) "  # noqa: S608 # constants
+            f"SELECT {name}, sum(times)::BIGINT FROM counted JOIN {table} USING (number) "  # noqa: S608 # constants
             f"WHERE {where} AND {name} IS NOT NULL GROUP BY ALL ORDER BY ALL",
             values,
         ).fetchall()

@@ -246,7 +246,16 @@ def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
     if not (long or _calls_and_bytes(connection)[1] > MANY_BYTES):
         yield
         return
-    threads = "SET threads = 1" if long else "RESET threads"
+    with more_memory(connection, one_thread=long):
+        yield
+
+
+@contextmanager
+def more_memory(
+    connection: duckdb.DuckDBPyConnection, *, one_thread: bool = False
+) -> Iterator[None]:
+    """Allow as much memory as texts of 64 KB take, however small a file they are in."""
+    threads = "SET threads = 1" if one_thread else "RESET threads"
     connection.execute(f"SET memory_limit = '{TEXTS['memory_limit']}'; {threads}")
     try:
         yield

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import duckdb
@@ -57,6 +58,54 @@ def test_the_nearest_human_is_the_one_with_the_closest_headway_and_not_one_who_e
         "human/near/N_0_0/rep01"
     )
     assert ask(client, "human/near/N_0_0/rep01", offer="nearest human") == "human/far/N_0_0/rep01"
+
+
+@pytest.mark.parametrize(
+    "other_task",
+    [
+        {"track": {"tunnel_exit_m": 30, "merge_point_m": 60, "end_m": 110, "start_distance_m": 20}},
+        {
+            "track": {
+                "tunnel_exit_m": 50,
+                "merge_point_m": 100,
+                "end_m": 180,
+                "start_distance_m": 25,
+            }
+        },
+        {"mean_speed_mps": 15},
+    ],
+)
+def test_only_a_human_with_the_same_task_is_near(db, tmp_path, other_task):
+    path = shutil.copy(db, tmp_path / "t.duckdb")
+    human = "(SELECT spec_hash FROM trials WHERE source = 'human')"
+
+    def nearest(which):
+        with duckdb.connect(str(path)) as connection:
+            connection.execute(
+                f"UPDATE specs SET spec = json_merge_patch(spec, ?) WHERE spec_hash {which} {human}",
+                [json.dumps(other_task)],
+            )
+        client = TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}")
+        return ask(client, "o3/baseline/N_0_0/rep01", offer="nearest human")
+
+    assert nearest("NOT IN") is None
+    assert nearest("IN") == "human/near/N_0_0/rep01"
+
+
+def test_a_human_is_compared_until_the_first_vehicle_is_at_the_merge_point_of_its_own_track(
+    db, tmp_path
+):
+    path = shutil.copy(db, tmp_path / "t.duckdb")
+    near = {"tunnel_exit_m": 50, "merge_point_m": 70, "end_m": 150, "start_distance_m": 20}
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(
+            "UPDATE specs SET spec = json_merge_patch(spec, ?)", [json.dumps({"track": near})]
+        )
+    client = TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}")
+    # It ended before the other merge point alone.
+    assert ask(client, "o3/baseline/N_0_0/rep01", offer="nearest human") == (
+        "human/short/N_0_0/rep01"
+    )
 
 
 def test_the_next_repetition_goes_round(client):

@@ -299,6 +299,25 @@ def test_what_two_readers_agree_on_stands_on_the_page(db):
     assert Agreement("x", "decisions", ("anna", "ben"), 1, 1, 0, 2).kappa == pytest.approx(0.5)
 
 
+def test_what_two_readers_agree_on_is_a_csv(db):
+    for reader in ("anna", "=ben"):
+        noted(asking(db, reader), tags="x")
+        noted(asking(db, reader), tags="x" if reader == "anna" else "y", side="left", decision="1")
+    noted(asking(db, "anna"), tags="y", side="left", decision="2")
+    noted(asking(db, "=ben"), tags="x", side="left", decision="2")
+    client = asking(db)
+    assert 'href="/agreement.csv"' in client.get("/notes").text
+    reply = client.get("/agreement.csv")
+    assert 'filename="agreement.csv"' in reply.headers["content-disposition"]
+    rows = list(csv.DictReader(io.StringIO(reply.text)))
+    alike = "both gave it to all of them: there is nothing to tell apart"
+    assert [tuple(row.values()) for row in rows] == [
+        ("trials", "x", "'=ben", "anna", "1", "0", "0", "0", "", alike),
+        ("decisions", "x", "'=ben", "anna", "0", "1", "1", "0", "-1.0", ""),
+        ("decisions", "y", "'=ben", "anna", "0", "1", "1", "0", "-1.0", ""),
+    ]
+
+
 # ---- in a browser
 
 

@@ -11,7 +11,6 @@ from analysis.explorer.pages.trial import DRIVER, HUMAN, OFFERS, REPETITION, fin
 from analysis.explorer.reading import Row, reading, records
 from analysis.explorer.site import NotThere, Site
 from analysis.explorer.views import account_of
-from merge_runner.scenarios.merge.geometry import TRACK
 
 At = tuple[str, str]
 """A trial: its name and its spec."""
@@ -41,25 +40,29 @@ FROM beside JOIN near AS one USING (number) JOIN near AS two ON two.number = bes
 WHERE one.number <> two.number AND one.wanted
 """  # noqa: S608 # constants
 # Times are compared in ms: drivers and recordings have steps of their own. A human trial counts
-# that lasts as long as what it is compared with.
+# whose task is the same, and that lasts as long as what it is compared with.
 NEAREST = f"""
 WITH near AS (
     SELECT row_number() OVER (ORDER BY trial_id, spec_hash) AS number, trial_id, spec_hash,
-        source = 'human' AS human,
+        source = 'human' AS human, coalesce(merge_point_m, merge_point_m()) AS merge_m,
+        dense_rank() OVER (ORDER BY projected_headway_m, relative_velocity_mps, merge_m,
+            coalesce(end_m, track_end_m()),
+            coalesce((spec->>'$.mean_speed_mps')::DOUBLE, mean_speed_mps())) AS task,
         (trial_id, spec_hash) IN (SELECT unnest($trials), unnest($specs)) AS wanted
-    FROM trials WHERE condition = $condition AND (human OR wanted)
+    FROM trials LEFT JOIN specs USING (spec_hash) LEFT JOIN geometry USING (spec_hash)
+    WHERE condition = $condition AND (human OR wanted)
 ), told AS (
-    SELECT number, human, wanted, round(1000 * time_s)::INTEGER AS ms,
+    SELECT number, human, task, merge_m, wanted, round(1000 * time_s)::INTEGER AS ms,
         sum(if(side = 'left', position_m, -position_m)) AS headway_m, max(position_m) AS first_m
     FROM states JOIN near USING (trial_id, spec_hash)
     WHERE time_s >= 0 GROUP BY ALL HAVING count(*) = 2
 ), one AS (
     SELECT *, max(ms) OVER (PARTITION BY number) AS last_ms FROM told
-    WHERE wanted AND first_m < $merge_m
+    WHERE wanted AND first_m < merge_m
 ), other AS (SELECT *, max(ms) OVER (PARTITION BY number) AS last_ms FROM told WHERE human),
 nearest AS (
     SELECT one.number AS number, other.number AS other FROM one JOIN other
-        ON one.ms = other.ms AND other.last_ms >= one.last_ms AND one.number <> other.number
+        USING (task, ms) WHERE other.last_ms >= one.last_ms AND one.number <> other.number
     GROUP BY one.number, other.number QUALIFY row_number() OVER (PARTITION BY one.number
         ORDER BY avg((one.headway_m - other.headway_m) ** 2), other.number) = 1
 )
@@ -143,7 +146,7 @@ def offered(site: Site, condition: str, beside: Sequence[At]) -> dict[At, dict[s
     trials, specs = [trial for trial, _ in beside], [spec for _, spec in beside]
     told = {"condition": condition, "trials": trials, "specs": specs}
     with reading(site.db) as connection:
-        rows = records(connection, NEAREST, {**told, "merge_m": TRACK.merge_point_m})
+        rows = records(connection, NEAREST, told)
     found: dict[At, dict[str, At]] = {}
     for row in (*site.catalogue.ask(BESIDE, condition, trials, specs), *rows):
         others_of = found.setdefault((row["trial_id"], row["spec_hash"]), {})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from analysis.explorer.agreement import agreements
 from analysis.explorer.notes import Note, tags_of
@@ -16,32 +16,50 @@ from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.text_safety import csv_writer
 
+Trials = Collection[tuple[str, str]]
+"""Some trials, each as its name and its spec."""
 COLUMNS = ("at", "reader", "trial_id", "spec_hash", "side", "decision", "tags", "text")
+READERS = ("first_reader", "second_reader")
+COUNTS = ("both", "only_first", "only_second", "neither")
 
 
-def notes_page(site: Site, among: Collection[tuple[str, str]] | None = None) -> str:
+def notes_page(site: Site, among: Trials | None = None) -> str:
     """All notes, the latest first, or those of some trials."""
-    kept = site.notes.kept()
-    shown = [note for note in kept.notes if among is None or note.trial in among]
+    shown = _notes(site, among)
     return site.render(
         "notes.html",
         here="notes",
-        kept=kept,
+        kept=site.notes.kept(),
         shown=[(note, _address(site, note)) for note in reversed(shown)],
         agreements=list(agreements(shown)),
         readers=sorted({note.reader for note in shown if note.tags}),
     )
 
 
-def notes_csv(site: Site) -> str:
-    """All notes as CSV, the earliest first; tags are separated by commas."""
+def notes_file(site: Site, name: str, among: Trials | None = None) -> str:
+    """One of ``FILES`` as CSV, of all trials or of some."""
     lines = io.StringIO()
-    writer = csv_writer(lines)
-    writer.writerow(COLUMNS)
-    for note in site.notes.kept().notes:
-        texts = {"at": note.at.isoformat(), "tags": ", ".join(note.tags)}
-        writer.writerow(csv_cell(texts.get(name, getattr(note, name))) for name in COLUMNS)
+    csv_writer(lines).writerows(map(csv_cell, row) for row in FILES[name](_notes(site, among)))
     return lines.getvalue()
+
+
+def note_rows(notes: Sequence[Note]) -> Iterator[Sequence[object]]:
+    """The notes under their columns, the earliest first; tags are separated by commas."""
+    yield COLUMNS
+    for note in notes:
+        texts = {"at": note.at.isoformat(), "tags": ", ".join(note.tags)}
+        yield [texts.get(name, getattr(note, name)) for name in COLUMNS]
+
+
+def agreement_rows(notes: Sequence[Note]) -> Iterator[Sequence[object]]:
+    """Under their columns how often two readers gave a tag, and Cohen's kappa, or why none."""
+    yield ("units", "tag", *READERS, *COUNTS, "kappa", "undefined")
+    for a in agreements(notes):
+        counts = (a.both, a.first, a.second, a.neither)
+        yield (a.units, a.tag, *a.readers, *counts, a.kappa, a.undefined)
+
+
+FILES = {"notes.csv": note_rows, "agreement.csv": agreement_rows}
 
 
 def add_note(site: Site, given: Mapping[str, str]) -> Row:
@@ -63,3 +81,7 @@ def _address(site: Site, note: Note) -> str:
         return ""
     at = {} if note.decision is None else {"side": note.side, "decision": note.decision}
     return site.at.trial(row, **at)
+
+
+def _notes(site: Site, among: Trials | None) -> list[Note]:
+    return [note for note in site.notes.kept().notes if among is None or note.trial in among]

@@ -22,8 +22,8 @@ from merge_runner.records import SIDES
 # What is offered to lay beside a trial, and by what rule.
 HUMAN, REPETITION, DRIVER = "nearest human", "next repetition", "other driver"
 OFFERS = {
-    HUMAN: "the human trial of this condition whose headway stays closest to this one's until its "
-    "first vehicle has merged (root mean square)",
+    HUMAN: "the human trial of this condition, on such a track and at such speeds, whose headway "
+    "stays closest to this one's until its first vehicle has merged (root mean square)",
     REPETITION: "the next repetition with the same driver, prompt and condition",
     DRIVER: "the same condition, and if possible the same prompt and repetition, with the next "
     "driver by name",

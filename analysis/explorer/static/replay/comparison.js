@@ -35,7 +35,7 @@ replay.comparison = (scene, { changed }) => {
     if (button.dataset.offer) {
       const key = await explorer.offer(button.dataset.offer).catch(() => null);
       if (key) lay(key, true);
-      else say(`${button.textContent}: there is none here`);
+      else say(`${button.textContent}: there is none here. It would be ${button.title}.`);
     } else if (button.dataset.key !== undefined) lay(button.dataset.key, true);
   });
   return { lay };
