@@ -121,6 +121,7 @@ class Site:
 
     def begin(self) -> None:
         """Read the trials for the first time in the background, since it may take a while."""
+        self.computing.begin()
         self._first_reading = threading.Thread(target=self._read_first, daemon=True)
         self._first_reading.start()
 

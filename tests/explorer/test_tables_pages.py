@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import threading
 from dataclasses import replace
@@ -200,6 +201,33 @@ def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_
     computing.ask(table, (2, 2), wait_s=5)
     assert computing.ask(cell, (2, 2), wait_s=5).content == found[2, 2]
     computing.close()
+
+
+def test_the_trials_are_read_before_anything_is_asked_and_again_where_the_database_changed(db):
+    asked = []
+
+    class Noting(InProcess):
+        def __init__(self, path):
+            super().__init__(path)
+            asked.append("a process")
+
+        def ask(self, request, **limits):
+            asked.append(request[0])
+            return super().ask(request)
+
+    for changed in (False, True):
+        asked.clear()
+        computing = Computing(db, Noting)
+        computing.begin()
+        while asked != ["a process", "study"]:
+            pass
+        computing._pool.submit(int).result()
+        if changed:
+            os.utime(db)
+        found = computing.ask(("tables", "attempts"), (1, 1), wait_s=60)
+        assert isinstance(found, Result)
+        assert asked[2:] == (["a process", "tables"] if changed else ["tables"])
+        computing.close()
 
 
 @pytest.mark.slow
