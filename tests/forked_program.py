@@ -26,10 +26,14 @@ def main() -> int:
     """Run the program with our arguments, folder, variables and streams, and hand signals on."""
     here = os.getcwd()
     env = dict(os.environ)
+    told = (signal.SIGINT, signal.SIGTERM)
+    # A signal that comes before the child is known waits for it.
+    signal.pthread_sigmask(signal.SIG_BLOCK, told)
     with asked(env["ZYGOTE"], sys.argv[1:], cwd=here, env=env, streams=[0, 1, 2]) as link:
         child = int(link.recv(DIGITS, socket.MSG_WAITALL))
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in told:
             signal.signal(number, lambda sent, _: os.kill(child, sent))
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, told)
         code = int(link.recv(DIGITS))
     return code if code >= 0 else 128 - code
 

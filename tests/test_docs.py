@@ -113,7 +113,7 @@ async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
     if SERVES.search(command):  # runs until it is stopped: its first line is all there is
         out = await process.stdout.readline()
         os.killpg(process.pid, signal.SIGTERM)
-        await process.wait()
+        await process.communicate()  # until nobody writes any more: its port is free
         code = 0
     else:
         out, _ = await process.communicate()

@@ -6,13 +6,18 @@ import asyncio
 import os
 import re
 import signal
+import socket
 import subprocess
+import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from tests import forked_program
+from tests.forked_program import DIGITS
 from tests.harness import environment, watched
-from tests.zygote import Zygote
+from tests.zygote import Zygote, wait_until_nobody_holds
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--conditions", "R_-4_8", "--json")
 
@@ -84,6 +89,24 @@ def test_a_shells_forked_program_is_stopped_as_the_shell_is(zygote, tmp_path):
     assert process.wait() == 128 + signal.SIGTERM
 
 
+def test_a_signal_that_comes_before_the_forked_program_is_known_reaches_it(tmp_path):
+    child = subprocess.Popen(["sleep", "1000"])
+    with socket.socket(socket.AF_UNIX) as zygote:
+        zygote.bind(str(tmp_path / "zygote"))
+        zygote.listen()
+        shell = subprocess.Popen(
+            [sys.executable, "-IS", forked_program.__file__],
+            env=environment(ZYGOTE=str(tmp_path / "zygote")),
+        )
+        link, _ = zygote.accept()
+        with link:
+            shell.terminate()
+            link.sendall(f"{child.pid:{DIGITS}}".encode())
+            assert child.wait(timeout=60) == -signal.SIGTERM
+            link.sendall(str(child.returncode).encode())
+    assert shell.wait() == 128 + signal.SIGTERM
+
+
 def is_read(pipe):
     """Whether somebody waits for it to be closed."""
     try:
@@ -91,6 +114,17 @@ def is_read(pipe):
     except OSError:
         return False
     return True
+
+
+def test_who_comes_when_nobody_holds_it_any_more_does_not_hold_what_is_about_to_end(tmp_path):
+    held = tmp_path / "held"
+    os.mkfifo(held)
+    (tmp_path / "lock").touch()
+    with ThreadPoolExecutor() as threads:
+        ended = threads.submit(wait_until_nobody_holds, tmp_path)
+        os.close(os.open(held, os.O_WRONLY))
+        ended.result()
+    assert not is_read(held)
 
 
 def test_what_is_forked_from_ends_with_the_last_that_holds_it_and_is_started_anew(tmp_path):

@@ -141,6 +141,7 @@ class Forked:
 
     def __init__(self, pid, link, *streams):
         self.pid = pid
+        self._err = streams[1]
         self.returncode: int | None = None
         self._ended = asyncio.create_task(self._end(link, streams))
 
@@ -151,6 +152,12 @@ class Forked:
         for stream in streams:
             stream.close()
         return written
+
+    async def said(self, words: str) -> None:
+        """Wait until it has written these words to its standard error."""
+        while words.encode() not in os.pread(self._err.fileno(), 2**20, 0):
+            assert self.returncode is None
+            await asyncio.sleep(0.01)
 
     async def communicate(self) -> tuple[bytes, ...]:
         return await asyncio.shield(self._ended)
@@ -195,11 +202,12 @@ def serve(folder: str, *more: str) -> None:
                 listener.close()
                 _attend(link)
             link.close()
-    _wait_until_nobody_holds(folder)
+    wait_until_nobody_holds(folder)
     os.killpg(0, signal.SIGTERM)
 
 
-def _wait_until_nobody_holds(folder: str) -> None:
+def wait_until_nobody_holds(folder: str | Path) -> None:
+    """Return, locked, when the last holder is gone and nobody can become one any more."""
     held = os.open(f"{folder}/held", os.O_RDONLY)
     lock = os.open(f"{folder}/lock", os.O_RDWR)
     while True:
@@ -213,6 +221,9 @@ def _wait_until_nobody_holds(folder: str) -> None:
         except BlockingIOError:
             fcntl.flock(lock, fcntl.LOCK_UN)
         else:
+            # At its end a process gives the lock back before it closes this: who came in between
+            # would hold what is about to end.
+            os.close(held)
             return
 
 

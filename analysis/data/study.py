@@ -285,10 +285,11 @@ class Study:
         """The groups whose speeds are known: all, but for humans before an import."""
         return [group for group in self.groups if group.measured]
 
-    @cached_property
-    def profiles(self) -> pd.DataFrame:
-        """One row a vehicle: whether it acted, and how far its acceleration is held."""
-        return measure_profiles(self._read(SPEEDS))
+    def profiles_of(self, group: Group) -> pd.DataFrame:
+        """One row a vehicle of a group: whether it acted, and how far its acceleration is held."""
+        specs = ", ".join(quoted(name) for name in group.trials["spec_hash"].unique())
+        speeds = self._read(f"FROM ({SPEEDS}) WHERE list_contains([{specs}], spec_hash)")
+        return measure_profiles(of_group(speeds, group, group.trials))
 
     @cached_property
     def ego_speeds(self) -> pd.DataFrame:

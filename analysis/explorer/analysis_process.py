@@ -6,12 +6,14 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.explorer.catalogue import State
+from analysis.explorer.catalogue import State, stamp_of
 from analysis.explorer.child import Child, Ended, NoAnswer
+from merge_runner.errors import MergeRunnerError
 from merge_runner.study.parts import adopted
 
 Request = tuple[str, ...]
@@ -59,7 +61,13 @@ class Computing:
         self._jobs: dict[Request, tuple[Future[Result], float]] = {}
         self._child: Child | None = None
         self._state: State | None = None
+        self._ahead: tuple[int, ...] | None = None
+        """The stamp of the database of which a process read the trials before it was asked."""
         self._closed = False
+
+    def begin(self) -> None:
+        """Read the trials before anything is asked: the first page shows what is made of them."""
+        self._pool.submit(self._read_ahead)
 
     def ask(
         self, request: Request, state: State, *, since: float = 0.0, wait_s: float = 0.0
@@ -102,17 +110,25 @@ class Computing:
         """Whether an answer still holds: what was absent may be there in another state."""
         return "absent" not in result.content or result.state == self._state
 
+    def _read_ahead(self) -> None:
+        # Whatever is asked first begins anew, and says what is wrong.
+        with suppress(MergeRunnerError, NoAnswer, Ended):
+            stamp = stamp_of(self.db)
+            self._start().ask(("study",), seconds=LONGEST_S, most_bytes=MOST_BYTES)
+            self._ahead = stamp
+
     def _run(self, request: Request, state: State, since: float) -> Result:
+        if self._ahead is not None and self._ahead == stamp_of(self.db):
+            self._state = state
+        self._ahead = None
         # A cell is looked up in the state that its table shows, unless a later one is wanted.
-        stays = self._state == state or (request[0] == "cell" and not since)
+        is_cell = self._state is not None and request[0] == "cell" and not since
         alive = self._child is not None and self._child.alive
-        if not (alive and stays):
+        if not alive or not (is_cell or self._state == state):
             self._end()
             # Another process for another state: all that was made of the old one ends with it.
-            self._child, self._state = self.start(self.db), state
-        if self._closed:
-            self._end()
-            raise NoAnswer("the explorer ends")
+            self._start()
+            self._state = state
         assert self._child is not None
         assert self._state is not None
         made_in = self._state
@@ -125,6 +141,13 @@ class Computing:
                 "`merge-runner view` was started"
             ) from exc
         return Result(content, made_in, time.time())
+
+    def _start(self) -> Child:
+        self._child = self.start(self.db)
+        if self._closed:
+            self._end()
+            raise NoAnswer("the explorer ends")
+        return self._child
 
     def _end(self) -> None:
         if self._child is not None:

@@ -42,11 +42,16 @@ class Numbers:
 
         Where no table has the cell, the answer says so as ``absent``.
 
-        ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``, ``figure NAME``,
-        ``humans``, or ``home FACTOR`` with an empty factor for drivers and prompts; what follows
-        the last two is ignored. Raises MergeRunnerError.
+        ``study``, which reads it, ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``,
+        ``figure NAME``, ``humans``, or ``home FACTOR`` with an empty factor for drivers and
+        prompts; what follows the last two is ignored. Raises MergeRunnerError.
         """
         match list(request):
+            case ["study"]:
+                import firthmodels  # noqa: F401 # as the next: what the first table is made with
+                import statsmodels.regression.linear_model  # noqa: F401
+
+                return {"groups": len(self.study.groups)}
             case ["tables", *names]:
                 return self._tables(names)
             case ["cell", table, row, column]:

@@ -6,6 +6,7 @@ import base64
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from markupsafe import Markup
@@ -22,8 +23,11 @@ STYLES = (
     ),
 )
 # What draws and moves a trial, in the order in which it is loaded.
-_PARTS = "moment track marks charts ribbons panel clock comparison start"
+_PARTS = "moment track marks charts ribbons panel clock finding comparison start"
 REPLAY = ("vendor/uplot-1.6.32.min.js", *(f"replay/{part}.js" for part in _PARTS.split()))
+
+
+ON_ALL = ("lists.js", "keys.js", "sorting.js")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +39,14 @@ class Inlined:
     hashes: str
 
 
+@cache
 def inlined(scripts: Sequence[str]) -> Inlined:
-    """Our styles and these scripts, to stand within a page."""
+    """Our styles, and these scripts after those of all pages, to stand within a page."""
 
     def texts(names: Sequence[str]) -> list[str]:
         return [(STATIC / name).read_text(encoding="utf-8") for name in names]
 
-    styles, code = texts(STYLES), texts(scripts)
+    styles, code = texts(STYLES), texts((*ON_ALL, *scripts))
     hashes = " ".join(
         f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
         for text in (*styles, *code)

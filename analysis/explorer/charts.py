@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import quote
 
 from analysis.explorer.analysis_worker import FACTORS, HUMAN
-from analysis.explorer.pictures import Axis, Scale, ends_and_ticks, reach
+from analysis.explorer.pictures import Axis, reach
 from analysis.explorer.urls import Links
 from analysis.explorer.views import condition_text
 from analysis.figures.styles import COLOURS, HUMAN_STYLE, Style, driver_style
@@ -128,10 +128,9 @@ def chart(
 ) -> dict[str, Any]:
     """A panel for each condition: where everything is drawn, in the units of the panel.
 
-    ``cut`` names the intervals that go on beyond the axis.
+    ``cut``: an interval goes on beyond the axis.
     """
     printed: dict[str, float] = published.get(kind.name, {}).get("values", {})
-    labels = {group["id"]: group["label"] for group in groups}
     known = [
         found
         for group in groups
@@ -139,10 +138,9 @@ def chart(
         if (found := of_condition.get(kind.name)) is not None and found["value"] is not None
     ]
     metric = kind.metric
-    low, high, ticks = ends_and_ticks(
-        *reach(known, list(printed.values())), metric.lowest, metric.highest
+    axis = Axis.of(
+        reach(known, list(printed.values())), (TOP + HEIGHT, TOP), metric.lowest, metric.highest
     )
-    axis = Axis(Scale(low, high, TOP + HEIGHT, TOP), ticks)
     wide = max(LEAST, STEP * (len(groups) + 1))
     panels: list[dict[str, Any]] = []
     for name in conditions:
@@ -159,19 +157,12 @@ def chart(
         "kind": kind,
         "width": LEFT + wide + RIGHT,
         "height": TOP + HEIGHT + FOOT,
-        "top": TOP,
-        "bottom": TOP + HEIGHT,
         "left": LEFT,
         "right": LEFT + wide,
-        "ticks": [(axis.y(tick), f"{tick:g}") for tick in axis.ticks],
+        "axis": axis,
         "panels": panels,
         "printed": printed,
-        "cut": [
-            f"{labels[point['group']]} in {panel['name']}: {value_text(point['of'], kind.digits)}"
-            for panel in panels
-            for point in panel["points"]
-            if point["arrows"]
-        ],
+        "cut": any(point["arrows"] for panel in panels for point in panel["points"]),
     }
 
 

@@ -9,18 +9,14 @@ from analysis.explorer.views import condition_text
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 
-def condition_texts(catalogue: Catalogue, names: Iterable[str]) -> dict[str, str]:
-    """Conditions in words; empty for one that no human drove and that has no trial yet."""
-    known = {
-        name: (one.projected_headway_m, one.relative_velocity_mps)
+def condition_texts(catalogue: Catalogue) -> dict[str, str]:
+    """In words: the conditions that humans drove, and those of all trials."""
+    numbers = "condition, projected_headway_m, relative_velocity_mps"
+    played = catalogue.ask(f"SELECT DISTINCT {numbers} FROM listed")  # noqa: S608 # constants
+    return {
+        name: condition_text(one.projected_headway_m, one.relative_velocity_mps)
         for name, one in HUMAN_CONDITIONS.items()
-    } | {
-        row["condition"]: (row["projected_headway_m"], row["relative_velocity_mps"])
-        for row in catalogue.ask(
-            "SELECT DISTINCT condition, projected_headway_m, relative_velocity_mps FROM listed"
-        )
-    }
-    return {name: condition_text(*known[name]) if name in known else "" for name in names}
+    } | {name: condition_text(*of) for name, *of in map(dict.values, played)}
 
 
 def ordered(names: Iterable[str], usual: Iterable[str] = HUMAN_CONDITIONS) -> list[str]:

@@ -16,11 +16,12 @@ from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.geometry import Track, track_of
 
-# One trial, or all of some lists, of a table.
+# One trial, or all of some lists, of a table; by the numbers of their rows, since else what is long
+# is read of all, to find a few.
 ONE = "WHERE trial_id = $trial AND spec_hash = $spec"
-MANY = """SEMI JOIN (
+MANY = """WHERE rowid IN (SELECT rowid FROM {table} SEMI JOIN (
     SELECT unnest($trials::VARCHAR[]) AS trial_id, unnest($specs::VARCHAR[]) AS spec_hash
-) USING (trial_id, spec_hash)"""
+) USING (trial_id, spec_hash))"""
 STATES = """
 SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
     list(position_m ORDER BY step) AS position_m, list(velocity_mps ORDER BY step) AS velocity_mps,
@@ -49,6 +50,7 @@ UNDECIDED = dict.fromkeys(
 HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
 DECIDED = "SELECT * FROM decisions {which} ORDER BY decision, side"
 ATTEMPTS = "SELECT * FROM calls {which} ORDER BY decision, side, attempt"
+WHOLE = {TASKS: "trials", STATES: "states", DECIDED: "decisions", ATTEMPTS: "calls"}
 # One decision, of those with the one before it.
 NUMBERED = f"{ONE} AND side = $side AND decision IN ($number, $number - $before)"
 
@@ -115,8 +117,8 @@ def read_whole(
     wanted = {"trials": [trial for trial, _ in keys], "specs": [spec for _, spec in keys]}
     with reading(db) as connection:
         tasks, states, decided, attempts = (
-            _by_trial(records(connection, sql.format(which=MANY), wanted))
-            for sql in (TASKS, STATES, DECIDED, ATTEMPTS)
+            _by_trial(records(connection, sql.format(which=MANY.format(table=table)), wanted))
+            for sql, table in WHOLE.items()
         )
     for key in keys:
         decisions = _decisions(decided.get(key, []), attempts.get(key, []))

@@ -15,6 +15,7 @@ from typing import Any
 
 from analysis.explorer.assets import REPLAY, inlined
 from analysis.explorer.catalogue import Filter
+from analysis.explorer.display_text import visible
 from analysis.explorer.exported_list import listing_page
 from analysis.explorer.leaks import Leaks
 from analysis.explorer.packing import packed
@@ -22,8 +23,8 @@ from analysis.explorer.packing_processes import AT_ONCE, Block, packed_blocks
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.comparing import At, offered
 from analysis.explorer.pages.computed import computed
-from analysis.explorer.pages.conditions import condition_page, conditions_page
-from analysis.explorer.pages.home import home_page
+from analysis.explorer.pages.conditions import condition_page, conditions_page, views_of
+from analysis.explorer.pages.home import groupings, home_page
 from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.notes import notes_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
@@ -37,13 +38,13 @@ from analysis.explorer.urls import EXPORTED, HOME, StaticLinks, bundle_name
 from analysis.tables import TABLES
 from merge_runner.errors import UsageError
 
-PLAIN = ("lists.js", "keys.js", "sorting.js", "traces.js")
-BUNDLE = (*PLAIN, "unpacked.js", *REPLAY, "value_tables.js", "bundle.js")
+# So many trials of a page are listed; of more one is searched.
+FEW = 12
 # A link that only a server can follow.
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 # The names of an export's pages: those of an earlier one are deleted, and nothing else.
 _OURS = re.compile(
-    rf"(?:{'|'.join(EXPORTED)}|(?:condition|sweep|table|trials)-.*)\.html|table-.*\.(?:{'|'.join(FILES)})"
+    rf"(?:{'|'.join(EXPORTED)}|(?:condition|index|sweep|table|trials)-.*)\.html|table-.*\.(?:{'|'.join(FILES)})"
 )
 # Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
@@ -83,7 +84,9 @@ def export_folder(
         links.behind = behind["cells"]
         listing = listing_page(site, rows, behind)
         pages = {
-            site.at.to("words"): exported_words(site, rows, partial(_packed, Leaks(db))),
+            site.at.to("words"): exported_words(
+                site, rows, partial(packed, leaks=Leaks(db), where="words.html")
+            ),
             site.at.to("notes"): notes_page(
                 site, {(row["trial_id"], row["spec_hash"]) for row in rows}
             ),
@@ -117,7 +120,7 @@ def _condition(row: Row) -> str:
 
 def page_of_trials(site: Site, rows: Sequence[Row], name: str) -> str:
     """One page with trials of a served site, for a file of that name; raises UsageError."""
-    alone = Site(site.db, StaticLinks(alone=name), shared={"inlined": inlined(PLAIN)})
+    alone = Site(site.db, StaticLinks(alone=name), shared={"inline": inlined})
     alone.catalogue = site.catalogue
     (page,) = _bundles(alone, {"": rows}, unwatched)
     Leaks(site.db).refuse(name, [_PACKED.sub("", page)])
@@ -127,13 +130,16 @@ def page_of_trials(site: Site, rows: Sequence[Row], name: str) -> str:
 def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
     """The pages of the whole study: at a glance, its sweeps, and what is computed of it."""
     at = site.at
-    yield at.to(HOME), home_page(site, {})
+    for by in groupings(site):
+        yield at.to(HOME, by=by), home_page(site, {"by": by})
     for entry in list_sweeps(site.catalogue):
         yield at.sweep(entry.sweep_id), sweep_page(site, entry.sweep_id)
     yield at.to("sweeps"), sweeps_page(site)
     yield at.to("conditions"), conditions_page(site, {})
     for row in site.catalogue.ask("SELECT DISTINCT condition FROM listed ORDER BY ALL"):
-        yield at.condition(row["condition"]), condition_page(site, row["condition"], {})
+        name = row["condition"]
+        for by in views_of(site, name).values():
+            yield at.condition(name, by=by), condition_page(site, name, {"by": by})
     yield at.to("glossary"), site.render("glossary.html", here="glossary")
     yield at.to("tables"), tables_page(site)
     for name in watch(list(TABLES), "tables"):
@@ -158,41 +164,51 @@ def _bundles(site: Site, parts: Mapping[str, Sequence[Row]], watch: Watch) -> It
 
 
 def _bundle_page(site: Site, condition: str, rows: Sequence[Row], blocks: Sequence[Block]) -> str:
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        driver = "humans" if row["source"] == "human" else f"{row['model']}, {row['variant']}"
-        groups.setdefault(driver, []).append(row)
+    name = f"Trials of {condition}" if condition else "Trials"
     bundle = {
+        "listed": packed([_listed(row) for row in rows], Leaks(site.db), name),
         "offers": _offers(site, rows),
         "blocks": [block["shared"] for block in blocks],
-        "trials": {
-            key: [number, text]
-            for number, block in enumerate(blocks)
-            for key, text in block["trials"].items()
-        },
+        "trials": [
+            [number, text] for number, block in enumerate(blocks) for text in block["trials"]
+        ],
     }
     return site.render(
         "bundle.html",
         here="trials",
-        name=f"Trials of {condition}" if condition else "Trials",
-        groups=groups,
+        name=name,
+        rows=rows,
+        few=FEW,
         bundle=embedded(bundle),
-        inlined=inlined(BUNDLE),
+        scripts_within=("unpacked.js", *REPLAY, "value_tables.js", "bundle.js"),
     )
 
 
-def _offers(site: Site, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
-    """What is offered beside each trial of a page, of what it holds: by kind, as it is called."""
-    there = {(row["trial_id"], row["spec_hash"]): row["condition"] for row in rows}
-    found: dict[At, dict[str, At]] = {}
-    for condition in dict.fromkeys(there.values()):
-        mine = [at for at, of in there.items() if of == condition]
-        found |= offered(site, condition, mine[0] if len(mine) == 1 else None)
+def _listed(row: Row) -> dict[str, str]:
+    """What a page of trials has to know of each, and the ``words`` by which it is found."""
+    words = (row[name] for name in ("trial_id", "model", "variant", "condition", "outcome"))
     return {
-        "|".join(at): {kind: "|".join(other) for kind, other in kinds.items() if other in there}
-        for at, kinds in found.items()
-        if at in there
+        "trial": row["trial_id"],
+        "spec": row["spec_hash"],
+        "name": visible(row["trial_id"]),
+        "outcome": row["outcome"],
+        "words": " ".join(filter(None, words)).lower(),
     }
+
+
+def _offers(site: Site, rows: Sequence[Row]) -> list[dict[str, int]]:
+    """What is offered beside each trial of a page, of what it holds: by kind, its place there."""
+    conditions: dict[str, list[At]] = {}
+    for row in rows:
+        conditions.setdefault(row["condition"], []).append((row["trial_id"], row["spec_hash"]))
+    found: dict[At, dict[str, At]] = {}
+    for condition, mine in conditions.items():
+        found |= offered(site, condition, mine)
+    places = {(row["trial_id"], row["spec_hash"]): place for place, row in enumerate(rows)}
+    return [
+        {kind: places[other] for kind, other in found.get(at, {}).items() if other in places}
+        for at in ((row["trial_id"], row["spec_hash"]) for row in rows)
+    ]
 
 
 def _behind(site: Site, rows: list[Row]) -> dict[str, Any]:
@@ -214,7 +230,7 @@ def _opened(
     db: Path, wanted: Sequence[str], links: StaticLinks
 ) -> Iterator[tuple[Site, list[Row]]]:
     """A site of files and the wanted trials, by name; raises UsageError where there is none."""
-    site = Site(db, links, shared={"inlined": inlined(PLAIN)})
+    site = Site(db, links, shared={"inline": inlined})
     site.refresh()
     every = site.catalogue.every(Filter())
     rows = [
@@ -229,21 +245,6 @@ def _opened(
         yield site, rows
     finally:
         site.close()
-
-
-def _packed(leaks: Leaks, value: object) -> str:
-    """Words, packed after a look for what must not be in them."""
-    leaks.refuse("words.html", list(_texts_in(value)))
-    return packed(value)
-
-
-def _texts_in(value: object) -> Iterator[str]:
-    """All texts of a value that JSON holds, as they are."""
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, Mapping | list):
-        for part in value.values() if isinstance(value, Mapping) else value:
-            yield from _texts_in(part)
 
 
 class _Staged:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
-from analysis.explorer.assets import inlined
 from analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SEVERAL
 from analysis.explorer.leaks import Leaks
 from analysis.explorer.packing import packed
@@ -16,7 +15,6 @@ from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
 
-LISTING = ("lists.js", "keys.js", "unpacked.js", "listing.js")
 # The list unpacks so many rows for each page that has one of them.
 PACKED_ROWS = 500
 
@@ -44,18 +42,15 @@ def listing_page(site: Site, rows: list[Row], behind: Mapping[str, Any]) -> str:
         "levels": {name: _numbered(values) for name, values in levels.items()},
         **behind,
     }
-    Leaks(site.db).refuse(site.at.to("trials"), [*every, json.dumps(index, ensure_ascii=False)])
-    blocks = [packed(every[i : i + PACKED_ROWS]) for i in range(0, len(every), PACKED_ROWS)]
+    pack = partial(packed, leaks=Leaks(site.db), where=site.at.to("trials"))
+    blocks = [pack(every[i : i + PACKED_ROWS]) for i in range(0, len(every), PACKED_ROWS)]
     return site.render(
         "listing.html",
         here="trials",
         facets={name: _counted(values) for name, values in levels.items()},
         rows=rows[:PAGE],
         trials=len(rows),
-        listed=embedded(
-            {"index": packed(index), "rows": blocks, "block": PACKED_ROWS, "page": PAGE}
-        ),
-        inlined=inlined(LISTING),
+        listed=embedded({"index": pack(index), "rows": blocks, "block": PACKED_ROWS, "page": PAGE}),
         **shown,
     )
 

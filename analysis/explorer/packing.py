@@ -16,16 +16,34 @@ from analysis.explorer.site import Site
 
 # Shorter texts are repeated: to name them takes as much.
 SHARED = 16
-# Between what is shared, when the rest is searched.
-_GAP = "\n"
+# A higher one takes half as long again for 2 % less.
+LEVEL = 6
 
 Pieces = list[str | int]
 
 
-def packed(value: object) -> str:
-    """Anything that JSON holds as a short text, which ``unpacked.js`` reads."""
+def packed(value: object, leaks: Leaks, where: str) -> str:
+    """Anything that JSON holds as a short text, which ``unpacked.js`` reads.
+
+    Raises UsageError where a text in it holds a key or a path of this machine: afterwards its
+    letters may spell one.
+    """
+    leaks.refuse(where, _texts_in(value))
     text = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
-    return base64.b64encode(zlib.compress(text.encode(errors="replace"), 9)).decode()
+    return base64.b64encode(zlib.compress(text.encode(errors="replace"), LEVEL)).decode()
+
+
+def _texts_in(value: object) -> list[str]:
+    found, waiting = [], [value]
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, str):
+            found.append(one)
+        elif isinstance(one, dict):
+            waiting += [*one, *one.values()]
+        elif isinstance(one, list | tuple):
+            waiting += one
+    return found
 
 
 class SharedTexts:
@@ -70,24 +88,19 @@ class SharedTexts:
 def pack_trials(
     site: Site, rows: Sequence[Row], others: Collection[tuple[str, str]]
 ) -> dict[str, Any]:
-    """Some ``trials`` as their page needs them, by how it calls them, and the texts they ``share``.
+    """Some ``trials`` as their page needs them, in their order, and the texts they have ``shared``.
 
     ``others`` are the models that answered in another one's place. Raises UsageError where a trial
     holds a key or a path of this machine.
     """
-    leaks, shared, trials = Leaks(site.db), SharedTexts(), {}
+    leaks, shared = Leaks(site.db), SharedTexts()
     keys = [(row["trial_id"], row["spec_hash"]) for row in rows]
-    for row, key, (trial, decisions) in zip(rows, keys, read_whole(site.db, keys), strict=True):
-        found = _trial(site, shared, row, trial, decisions, others)
-        # What is shared was searched where it came first.
-        texts = [_own(pieces) for pieces in (found["html"], *found["panels"].values())]
-        leaks.refuse(row["trial_id"], texts)
-        trials["|".join(key)] = packed(found)
-    return {"shared": packed(shared.texts), "trials": trials}
-
-
-def _own(pieces: Pieces) -> str:
-    return _GAP.join(piece for piece in pieces if isinstance(piece, str))
+    whole = zip(rows, read_whole(site.db, keys), strict=True)
+    trials = [
+        packed(_trial(site, shared, row, trial, decisions, others), leaks, row["trial_id"])
+        for row, (trial, decisions) in whole
+    ]
+    return {"shared": packed(shared.texts, leaks, "what trials share"), "trials": trials}
 
 
 def _trial(

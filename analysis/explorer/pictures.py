@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
 from math import ceil, floor, log10
 from statistics import quantiles
 from typing import Any
@@ -68,18 +70,37 @@ def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
 
 
 def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
-    x = Scale(0, max(len(values) - 1, 1), 0.0, SPARK_WIDTH)
-    y = Scale(*speeds, SPARK_HEIGHT, 0.0)
-    return " ".join([f"{x(i):.0f},{y(speed):.1f}" for i, speed in enumerate(values)])
+    # A long list has a million of them: without Scale this takes a third of the time.
+    low, high = speeds
+    heights = [SPARK_HEIGHT - SPARK_HEIGHT * (speed - low) / (high - low) for speed in values]
+    return " ".join([f"{x},{y:.1f}" for x, y in zip(_across(len(values)), heights, strict=True)])
+
+
+@cache
+def _across(count: int) -> list[str]:
+    return [f"{SPARK_WIDTH * i / max(count - 1, 1):.0f}" for i in range(count)]
 
 
 def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
     """Points of a step line from -1 to 1, ``steps`` across the width."""
-    # A page has thousands of them: without Scale this takes a third of the time.
-    step, half = width / max(steps, 1), height / 2
-    edges = [f"{min(step * i, width):.1f}" for i in range(len(values) + 1)]
-    heights = [f"{half - half * min(max(value, -1.0), 1.0):.1f}" for value in values]
-    return " ".join([f"{edges[i]},{y} {edges[i + 1]},{y}" for i, y in enumerate(heights)])
+    # A page has thousands of them: each place and each height is written once.
+    edges, half = _edges(width, max(steps, len(values), 1), max(steps, 1)), height / 2
+    heights = {
+        value: f"{half - half * min(max(value, -1.0), 1.0):.1f}" for value in dict.fromkeys(values)
+    }
+    return " ".join(
+        [
+            f"{left},{heights[value]} {right},{heights[value]}"
+            for value, (left, right) in zip(values, edges, strict=False)
+        ]
+    )
+
+
+@cache
+def _edges(width: float, count: int, steps: int) -> list[tuple[str, str]]:
+    """Where each step begins and ends; what would be beyond the width is at its end."""
+    places = [f"{min(width / steps * i, width):.1f}" for i in range(count + 1)]
+    return list(pairwise(places))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +109,23 @@ class Axis:
 
     scale: Scale
     ticks: Sequence[float]
+
+    @classmethod
+    def of(
+        cls,
+        ends: tuple[float, float],
+        places: tuple[float, float],
+        lowest: float | None = None,
+        highest: float | None = None,
+    ) -> Axis:
+        """An axis between two places that shows at least these ends; see ``ends_and_ticks``."""
+        low, high, ticks = ends_and_ticks(*ends, lowest, highest)
+        return cls(Scale(low, high, *places), ticks)
+
+    @property
+    def marks(self) -> list[tuple[float, str]]:
+        """Where the ticks are drawn, and as what."""
+        return [(self.y(tick), f"{tick:g}") for tick in self.ticks]
 
     def y(self, value: float) -> float:
         """Where a value is drawn."""

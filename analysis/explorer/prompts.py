@@ -6,13 +6,17 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
-from functools import cache
+from functools import lru_cache
+from itertools import compress, count
+from operator import ne
 from typing import Literal
 
 from merge_runner.prompts.blocks import BLOCKS
 
 Change = Literal["same", "new", "gone"]
 _WORDS = re.compile(r"[^\s\[\](),]+\s*|[\[\](),]\s*|\s+")
+# Prompts, or lines of them, are taken apart once: each is first the later and then the earlier one.
+KEPT = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +47,7 @@ def parts_of(prompt: str, before: str | None) -> list[Part]:
     ]
 
 
+@lru_cache(KEPT)
 def _blocks(prompt: str) -> list[tuple[str, str]]:
     """Name and text of each block; what belongs to none that is known here has no name."""
     found: list[tuple[str, str]] = []
@@ -64,24 +69,29 @@ def _blocks(prompt: str) -> list[tuple[str, str]]:
 def _begun(paragraphs: Sequence[str]) -> tuple[str, int] | None:
     """The block whose first paragraph begins like this one, and how many of its own follow.
 
-    A paragraph is known by its text up to its first value. One block may begin with another one's
-    words: the one that agrees farthest, and in the most of its paragraphs, is meant.
+    One block may begin with another one's words: the one that agrees farthest, and in the most of
+    its paragraphs, is meant.
     """
     agreeing = []
-    for name, block in BLOCKS.items():
-        for template in filter(None, (block.merge, block.straight)):
-            beginnings = _beginnings(template)
-            if beginnings[0] and paragraphs[0].startswith(beginnings[0]):
-                pairs = zip(beginnings, paragraphs, strict=False)
-                agree = sum(paragraph.startswith(beginning) for beginning, paragraph in pairs)
-                agreeing.append((len(beginnings[0]), agree, name, len(beginnings) - 1))
+    for name, beginnings in _like(paragraphs[0]):
+        pairs = zip(beginnings, paragraphs, strict=False)
+        agree = sum(paragraph.startswith(beginning) for beginning, paragraph in pairs)
+        agreeing.append((len(beginnings[0]), agree, name, len(beginnings) - 1))
     return max(agreeing)[2:] if agreeing else None
 
 
-@cache
-def _beginnings(template: str) -> list[str]:
-    """What each paragraph of a block begins with, up to its first value."""
-    return [part.partition("{")[0] for part in template.split("\n\n")]
+@lru_cache(KEPT)
+def _like(paragraph: str) -> list[tuple[str, list[str]]]:
+    """The blocks that begin like a paragraph, each with what its paragraphs begin with.
+
+    A paragraph is known by its text up to its first value.
+    """
+    begun = [
+        (name, [part.partition("{")[0] for part in template.split("\n\n")])
+        for name, block in BLOCKS.items()
+        for template in filter(None, (block.merge, block.straight))
+    ]
+    return [(name, texts) for name, texts in begun if texts[0] and paragraph.startswith(texts[0])]
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
@@ -94,7 +104,7 @@ def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
         if line_before == line:
             pieces.append(("same", line))
             continue
-        words_before, words = _WORDS.findall(line_before), _WORDS.findall(line)
+        words_before, words = _words(line_before), _words(line)
         for i1, i2, j1, j2, changed in _runs(words_before, words):
             if changed and i1 < i2:
                 pieces.append(("gone", "".join(words_before[i1:i2]).strip()))
@@ -103,11 +113,15 @@ def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
     return tuple(pieces)
 
 
+@lru_cache(KEPT)
+def _words(line: str) -> list[str]:
+    return _WORDS.findall(line)
+
+
 def _runs(old: list[str], new: list[str]) -> list[tuple[int, int, int, int, bool]]:
     """Where two lines are equal and where not; a comma between two changes is changed as well."""
     runs: list[tuple[int, int, int, int, bool]] = []
-    for kind, i1, i2, j1, j2 in _opcodes(old, new):
-        changed = kind != "equal"
+    for i1, i2, j1, j2, changed in _matched(old, new):
         if changed and len(runs) > 1 and "".join(new[slice(*runs[-1][2:4])]).strip() in {"", ","}:
             start = runs[-2]
             runs[-2:] = [(start[0], i2, start[2], j2, True)]
@@ -116,21 +130,24 @@ def _runs(old: list[str], new: list[str]) -> list[tuple[int, int, int, int, bool
     return runs
 
 
-def _opcodes(old: list[str], new: list[str]) -> Iterator[tuple[str, int, int, int, int]]:
+def _matched(old: list[str], new: list[str]) -> Iterator[tuple[int, int, int, int, bool]]:
     """How a line becomes another; matching takes long, and most lines begin and end alike."""
     begin = _alike(old, new)
     end = _alike(old[begin:][::-1], new[begin:][::-1])
     last_old, last_new = len(old) - end, len(new) - end
     if begin:
-        yield "equal", 0, begin, 0, begin
-    matcher = SequenceMatcher(None, old[begin:last_old], new[begin:last_new], autojunk=False)
-    for kind, i1, i2, j1, j2 in matcher.get_opcodes():
-        yield kind, begin + i1, begin + i2, begin + j1, begin + j2
+        yield 0, begin, 0, begin, False
+    gone, come = old[begin:last_old], new[begin:last_new]
+    if not set(gone).isdisjoint(come):
+        for kind, i1, i2, j1, j2 in SequenceMatcher(None, gone, come, autojunk=False).get_opcodes():
+            yield begin + i1, begin + i2, begin + j1, begin + j2, kind != "equal"
+    elif gone or come:
+        yield begin, last_old, begin, last_new, True
     if end:
-        yield "equal", last_old, len(old), last_new, len(new)
+        yield last_old, len(old), last_new, len(new), False
 
 
 def _alike(old: Sequence[str], new: Sequence[str]) -> int:
     """How many words both begin with."""
-    pairs = enumerate(zip(old, new, strict=False))
-    return next((i for i, (a, b) in pairs if a != b), min(len(old), len(new)))
+    differing = compress(count(), map(ne, old, new))
+    return next(differing, min(len(old), len(new)))

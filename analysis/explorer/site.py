@@ -5,15 +5,17 @@ from __future__ import annotations
 import contextlib
 import shlex
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableMapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import jinja2
 
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.assets import STYLES
 from analysis.explorer.catalogue import Catalogue
+from analysis.explorer.conditions import condition_texts
 from analysis.explorer.display_text import visible
 from analysis.explorer.glossary import sections
 from analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
@@ -40,6 +42,23 @@ PAGES = {
 }
 
 
+OF_DICTS = frozenset(dir(dict))
+
+
+class _Environment(jinja2.Environment):
+    """Templates, quicker in what pages do most: a page of a trial asks for thousands of values."""
+
+    def getattr(self, obj: object, attribute: str) -> object:
+        """An entry of a row at once: Jinja tries attributes first, each with an exception."""
+        if type(obj) is dict and attribute in obj and attribute not in OF_DICTS:
+            return obj[attribute]
+        return super().getattr(obj, attribute)
+
+    def make_globals(self, d: MutableMapping[str, Any] | None) -> MutableMapping[str, Any]:
+        """What all templates see, as it is: Jinja looks it up through a chain of two."""
+        return super().make_globals(d) if d else self.globals
+
+
 class NotThere(Exception):
     """What an address asks for is not there; the text says what is."""
 
@@ -64,18 +83,22 @@ class Site:
     def __post_init__(self) -> None:
         self.static = isinstance(self.at, StaticLinks)
         self._first_reading: threading.Thread | None = None
+        self._conditions: dict[str, str] = {}
         self.catalogue = Catalogue(self.db)
         self.sandbox = Sandbox(self.db)
         self.computing = Computing(self.db)
         self.words = Words(self.catalogue)
         self.notes = Notes(self.db, self.reader)
-        self._environment = jinja2.Environment(
+        self._environment = _Environment(
             loader=jinja2.FileSystemLoader(TEMPLATES),
             autoescape=True,
+            auto_reload=False,
             undefined=jinja2.StrictUndefined,
             trim_blocks=True,
             lstrip_blocks=True,
         )
+        # Jinja's own makes markup of its pattern, and escapes number by number.
+        self._environment.filters["format"] = lambda text, *values: str(text) % values
         self._environment.globals.update(
             at=self.at,
             metrics=METRICS,
@@ -91,12 +114,14 @@ class Site:
             visible=visible,
             clock=clock,
             condition_text=condition_text,
+            in_words=self.in_words,
             glossary=sections(),
             **self.shared,
         )
 
     def begin(self) -> None:
         """Read the trials for the first time in the background, since it may take a while."""
+        self.computing.begin()
         self._first_reading = threading.Thread(target=self._read_first, daemon=True)
         self._first_reading.start()
 
@@ -107,8 +132,15 @@ class Site:
 
     def refresh(self) -> None:
         """Take in what is new: in the database, and in the notes beside it."""
-        self.catalogue.refresh()
+        if self.catalogue.refresh():
+            self._conditions = {}
         self.catalogue.tag(self.notes.kept().tags)
+
+    def in_words(self, condition: str) -> str:
+        """What a condition's name says; empty where no human drove it and it has no trial."""
+        if condition not in self._conditions:
+            self._conditions = condition_texts(self.catalogue)
+        return self._conditions.get(condition, "")
 
     @property
     def beginning(self) -> bool:

@@ -2,35 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
 from analysis.explorer.reading import Row, reading, records
 
-# What is drawn of a trial, each as a list; the headway is left minus right.
-MEASURES = ("left_mps", "right_mps", "headway_m")
+# What is drawn of a trial, each as a list; the headway is that of its first vehicle.
+MEASURES = ("first_mps", "second_mps", "headway_m")
 # A trace has about so many points, and always the last one.
 POINTS = 40
+# Which vehicle of a trial is its first: the left one, or the right one where it is ``turned``. By
+# order it is who is ahead at the end: who merged first, if anybody did.
+TURNED = {
+    "side": "SELECT *, unnest({seats}) AS turned FROM wanted",
+    "order": """SELECT trial_id, spec_hash, arg_max(position_m, step) FILTER (side = 'left')
+            < arg_max(position_m, step) FILTER (side = 'right') AS turned
+        FROM states SEMI JOIN wanted USING (trial_id, spec_hash) GROUP BY ALL""",
+    "driver": """SELECT trial_id, spec_hash, ego = 'right' AS turned
+        FROM trial_drivers SEMI JOIN wanted USING (trial_id, spec_hash)""",
+}
 # Both vehicles at each sample under control, of the trials $1 with the specs $2.
 SAMPLED = """
-WITH sampled AS (
-    SELECT trial_id, spec_hash, step, any_value(time_s) AS time_s,
-        any_value(velocity_mps) FILTER (side = 'left') AS left_mps,
-        any_value(velocity_mps) FILTER (side = 'right') AS right_mps,
-        any_value(position_m) FILTER (side = 'left')
-            - any_value(position_m) FILTER (side = 'right') AS headway_m
-    FROM states SEMI JOIN (
-        SELECT unnest($1::VARCHAR[]) AS trial_id, unnest($2::VARCHAR[]) AS spec_hash
-    ) USING (trial_id, spec_hash)
+WITH wanted AS (
+    SELECT unnest($1::VARCHAR[]) AS trial_id, unnest($2::VARCHAR[]) AS spec_hash
+), sampled AS (
+    SELECT trial_id, spec_hash, turned, step, any_value(time_s) AS time_s,
+        any_value(velocity_mps) FILTER ((side = 'right') = turned) AS first_mps,
+        any_value(velocity_mps) FILTER ((side = 'left') = turned) AS second_mps,
+        any_value(position_m) FILTER ((side = 'right') = turned)
+            - any_value(position_m) FILTER ((side = 'left') = turned) AS headway_m
+    FROM states JOIN ({turned}) USING (trial_id, spec_hash)
     WHERE time_s >= 0 GROUP BY ALL HAVING headway_m IS NOT NULL
 )
 """
 TRACES = f"""
 {SAMPLED}
-SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s,
-    list(left_mps ORDER BY step) AS left_mps, list(right_mps ORDER BY step) AS right_mps,
-    list(headway_m ORDER BY step) AS headway_m
+SELECT trial_id, spec_hash, turned, list(time_s ORDER BY step) AS time_s, {
+    ", ".join(f"list({name} ORDER BY step) AS {name}" for name in MEASURES)
+}
 FROM sampled JOIN (
     SELECT trial_id, spec_hash, min(step) AS first, max(step) AS last,
         1 + (max(step) - min(step)) // {POINTS} AS every FROM sampled GROUP BY ALL
@@ -44,7 +54,7 @@ BAND = f"""
     SELECT *, round(5 * time_s)::INTEGER AS place FROM sampled
 ), nearest AS (
     FROM placed QUALIFY 1 = row_number() OVER (
-        PARTITION BY trial_id, spec_hash, place ORDER BY abs(5 * time_s - place), step)
+        PARTITION BY trial_id, spec_hash, turned, place ORDER BY abs(5 * time_s - place), step)
 )
 SELECT place / 5 AS time_s, {
     ", ".join(f"quantile_cont({name}, [0.1, 0.5, 0.9]) AS {name}" for name in MEASURES)
@@ -56,20 +66,29 @@ HAVING 2 * count(*) >= (SELECT count(*) FROM nearest WHERE place = 0) ORDER BY p
 Key = tuple[str, str]
 
 
-def read_traces(db: Path, keys: Collection[Key]) -> dict[Key, Row]:
+def read_traces(db: Path, keys: Collection[Key], by: str = "side") -> dict[Key, Row]:
     """The traces of trials by name and spec: ``time_s`` and MEASURES, from the start of control.
 
-    A trial has none where a vehicle has no sample.
+    ``by`` is one of TURNED. A trial has none where a vehicle has no sample.
     """
-    return {(row["trial_id"], row["spec_hash"]): row for row in _read(db, TRACES, keys)}
+    rows = _read(db, TRACES, keys, by)
+    return {(row["trial_id"], row["spec_hash"]): row for row in rows}
 
 
-def read_band(db: Path, keys: Collection[Key]) -> list[Row]:
-    """The 10th, 50th and 90th percentile of each of MEASURES over these trials, by ``time_s``."""
-    return _read(db, BAND, keys)
+def read_band(
+    db: Path, keys: Collection[Key], by: str = "side", seats: Iterable[bool] = (False,)
+) -> list[Row]:
+    """The 10th, 50th and 90th percentile of each of MEASURES over these trials, by ``time_s``.
+
+    ``seats`` say whether each trial is turned, by side: with both it counts both ways round.
+    """
+    return _read(db, BAND, keys, by, seats)
 
 
-def _read(db: Path, sql: str, keys: Collection[Key]) -> list[Row]:
+def _read(
+    db: Path, sql: str, keys: Collection[Key], by: str, seats: Iterable[bool] = (False,)
+) -> list[Row]:
     names: Any = [name for name, _ in keys], [spec for _, spec in keys]
+    turned = TURNED[by].format(seats=[*seats])
     with reading(db) as connection:
-        return records(connection, sql, names)
+        return records(connection, sql.format(turned=turned), names)

@@ -94,8 +94,10 @@ class StaticLinks(Links):
         self.behind: Collection[str] = ()
 
     def to(self, name: str, /, **state: object) -> str:
-        """A page, or nothing where only a server has it."""
-        return f"{name}.html" + query_of(state) if name in self.pages else ""
+        """A page, or nothing where only a server has it; grouped otherwise it is another file."""
+        if name not in self.pages:
+            return ""
+        return f"{name}{_grouped(state)}.html" + query_of(state)
 
     def trial(self, row: Mapping[str, Any], **state: object) -> str:
         """A trial on the page of its condition."""
@@ -137,8 +139,15 @@ class StaticLinks(Links):
 
     def condition(self, name: str, **state: object) -> str:
         """All trials of a condition in one picture, or nothing where only trials are exported."""
-        there = "conditions" in self.pages
-        return f"condition-{_ODD.sub('_', name)}.html" + query_of(state) if there else ""
+        if "conditions" not in self.pages:
+            return ""
+        return f"condition{_grouped(state)}-{_ODD.sub('_', name)}.html" + query_of(state)
+
+
+def _grouped(state: dict[str, object]) -> str:
+    """What the name of an exported page says of its grouping, which is taken out of its state."""
+    by = str(state.pop("by", ""))
+    return f"-by-{_ODD.sub('_', by)}" if by else ""
 
 
 def bundle_name(condition: str) -> str:

@@ -276,21 +276,23 @@ def collision_bounds(trial: Trial) -> list[float | None]:
     left, right = trial.states.get("left"), trial.states.get("right")
     if left is None or right is None:
         return []
-    return [
-        _bound(trial.scenario, trial.track, a, b)
-        for a, b in zip(left["position_m"], right["position_m"], strict=False)
-    ]
-
-
-def _bound(scenario: ScenarioConfig, track: Track, left_m: float, right_m: float) -> float | None:
-    """At the vehicles' mean position, or on the shared lane once one of them is there.
-
-    By bisection: the further apart two vehicles are along the road, the less they overlap.
-    """
+    scenario, track = trial.scenario, trial.track
+    pairs = list(zip(left["position_m"], right["position_m"], strict=False))
     if scenario.collision_rule == "shared_lane":
-        shared = max(left_m, right_m) >= track.merge_point_m
-        return scenario.vehicle_length_m if shared else None
-    mean_m = (left_m + right_m) / 2
+        length_m = scenario.vehicle_length_m
+        return [length_m if max(pair) >= track.merge_point_m else None for pair in pairs]
+    # From there on the road is straight, and the bound stays the same.
+    straight_m = track.merge_point_m + scenario.vehicle_length_m + scenario.vehicle_width_m
+    means = [min((a + b) / 2, straight_m) for a, b in pairs]
+    bounds = {mean_m: _bound(scenario, track, mean_m) for mean_m in {*means}}
+    return [bounds[mean_m] for mean_m in means]
+
+
+def _bound(scenario: ScenarioConfig, track: Track, mean_m: float) -> float | None:
+    """At the vehicles' mean position; by bisection.
+
+    The further apart two vehicles are along the road, the less they overlap.
+    """
     if not collided(scenario, track, mean_m, mean_m):
         return None
     low, high = 0.0, 2 * (scenario.vehicle_length_m + scenario.vehicle_width_m)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
+from math import ceil
 
 import numpy as np
 import pandas as pd
@@ -106,35 +107,53 @@ def _permutation_p(
 
     ``value`` is centred within each condition; conditions lie one after another, in ``sizes``.
     """
-    rng = np.random.default_rng(SEED)
-    ends = np.cumsum(sizes)
-    parts = [
-        shuffled_sums(rng, value[start:end], int(chosen[start:end].sum()))
-        for start, end in zip(ends - sizes, ends, strict=True)
-    ]
+    starts = np.cumsum(sizes) - sizes
+    counts = np.add.reduceat(chosen.astype(int), starts)
+    shuffles = _shuffles(tuple(zip(sizes.tolist(), counts.tolist(), strict=True)))
+    values = np.split(value, starts[1:])
+    parts = [shuffled_sums(*each) for each in zip(shuffles, values, strict=True)]
     # As large but for rounding is as large.
     extreme = int((np.abs(np.sum(parts, axis=0) / weight) >= abs(observed) - 1e-12).sum())
     # The trials as they are count as a shuffle, so that p is never 0 (Phipson and Smyth 2010).
     return (extreme + 1) / (PERMUTATIONS + 1)
 
 
-def shuffled_sums(
-    rng: np.random.Generator, value: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
-    """Sums of ``count`` of the values, those that come first in each of PERMUTATIONS shuffles.
+@lru_cache(maxsize=16)
+def _shuffles(conditions: tuple[tuple[int, int], ...]) -> list[NDArray[np.uint8]]:
+    """Who comes first in the shuffles of conditions of (size, count); see ``first_in_shuffles``.
+
+    The measures of two groups mostly have values in the same trials, and are shuffled alike.
+    """
+    rng = np.random.default_rng(SEED)
+    return [first_in_shuffles(rng, size, count) for size, count in conditions]
+
+
+def first_in_shuffles(rng: np.random.Generator, size: int, count: int) -> NDArray[np.uint8]:
+    """Which ``count`` come first in each of PERMUTATIONS shuffles, (shuffle, bits of ``size``).
 
     Shuffled is by random draws: the ``count`` smallest come first, in whatever order.
     """
-    sums = np.zeros(PERMUTATIONS)
-    rows = max(1, DRAWN_AT_ONCE // len(value))
-    drawn = np.empty((rows, len(value)))
-    for start in range(0, PERMUTATIONS, rows):
+    found = np.zeros((PERMUTATIONS, ceil(size / 8)), dtype=np.uint8)
+    drawn = np.empty((_rows(size), size))
+    for start in range(0, PERMUTATIONS, len(drawn)):
         draws = drawn[: PERMUTATIONS - start]
         rng.random(out=draws)
         if count:
             last = np.partition(draws, count - 1, axis=1)[:, count - 1]
-            sums[start : start + rows] = (draws <= last[:, None]) @ value
-    return sums
+            found[start : start + len(drawn)] = np.packbits(draws <= last[:, None], axis=1)
+    return found
+
+
+def shuffled_sums(first: NDArray[np.uint8], value: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The sum of the values that come first in each shuffle."""
+    rows = _rows(len(value))
+    parts = [first[start : start + rows] for start in range(0, len(first), rows)]
+    return np.concatenate([np.unpackbits(part, axis=1, count=len(value)) @ value for part in parts])
+
+
+def _rows(size: int) -> int:
+    """How many shuffles of that size are drawn at once."""
+    return max(1, DRAWN_AT_ONCE // size)
 
 
 def corrected(p: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from analysis.data.study import ENOUGH_PER_CONDITION, Group, Study, of_group
+from analysis.data.study import ENOUGH_PER_CONDITION, Group, Study
 from analysis.stats import intervals
 from analysis.stats.indicators import Verdict
 from analysis.stats.intervals import Estimate, finite, mean, standard_error
@@ -30,10 +30,10 @@ NO_ACTION = "no finished trial with control action"
 @cache
 def gains(study: Study, group: Group) -> pd.DataFrame:
     """One row a finished trial: condition, pair, ``steady`` (nobody acted), ``gain`` or NaN."""
-    trials = group.finished[["trial_id", "spec_hash", "condition", "pair"]]
-    by_trial = of_group(study.profiles, group, trials).groupby("trial_id")
+    trials = group.finished[["trial_id", "condition", "pair"]]
+    by_trial = study.profiles_of(group).groupby("trial_id")
     found = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
-    return trials.drop(columns="spec_hash").merge(found, left_on="trial_id", right_index=True)
+    return trials.merge(found, left_on="trial_id", right_index=True)
 
 
 def mean_gain(study: Study, group: Group) -> Estimate:

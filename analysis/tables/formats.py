@@ -154,6 +154,11 @@ def shown_value(column: Column, value: Value) -> str:
     return _text(column, value)
 
 
+def printed(table: Table, row: Row) -> dict[str, str]:
+    """A row's values as a reader sees them, by column."""
+    return {column.name: _text(column, row.values.get(column.name)) for column in table.columns}
+
+
 def shown_columns(table: Table) -> list[Column]:
     """The columns with at least one value."""
     return [c for c in table.columns if any(r.values.get(c.name) is not None for r in table.rows)]

@@ -143,6 +143,16 @@ def answered(drive: Drive, side: Side, number: int, decision: Decision) -> Decis
     )
 
 
+def as_humans(db: Path) -> None:
+    """Let the trials of the driver ``human`` be humans'; their variant names the pair, or P1."""
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(
+            "UPDATE trials SET source = 'human', variant = NULL, model_left = NULL, "
+            "model_right = NULL, pair = CASE variant WHEN 'baseline' THEN 'P1' ELSE variant END "
+            "WHERE trial_id LIKE 'human/%'"
+        )
+
+
 def write_study(
     path: Path,
     drives: Iterable[Drive],

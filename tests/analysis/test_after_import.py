@@ -7,7 +7,7 @@ import pytest
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import SPEEDS
 from analysis.data.provenance import provenance
-from analysis.data.study import Study
+from analysis.data.study import Study, of_group
 from analysis.explain import explain
 from analysis.explorer.analysis_worker import human_panels
 from analysis.figures.gallery import figure_2
@@ -181,11 +181,11 @@ def test_humans_are_not_compared_with_themselves(imported):
 
 
 def test_the_speeds_of_humans_are_judged_without_the_simulators_resistance(imported):
-    profiles = measure_profiles(imported._read(SPEEDS).assign(resisted=True))
-    human = imported.profiles["spec_hash"] == imported.human.spec_hash
-    assert human.sum() == 2 * len(imported.human.trials)
-    assert profiles[human].equals(imported.profiles[human])
-    assert not profiles[~human].equals(imported.profiles[~human])
+    speeds = imported._read(SPEEDS).assign(resisted=True)
+    for group in imported.groups:
+        resisted = measure_profiles(of_group(speeds, group, group.trials))
+        assert len(resisted) == 2 * len(group.trials)
+        assert resisted.equals(imported.profiles_of(group)) == (group is imported.human)
 
 
 def test_ceilings_are_drawn_from_the_published_humans_while_some_are_missing(imported):

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 
-import duckdb
 import pytest
 
 from merge_runner.results.store import Store
-from tests.analysis.studies import Drive, Said, played
+from tests.analysis.studies import Drive, Said, as_humans, played
 from tests.explorer.hostile import hostile_trial
 from tests.explorer.serving import served
 from tests.harness import RECORDING
@@ -44,11 +43,7 @@ def study(prepare, tmp_path_factory):
     human = Drive("human", "baseline", "N_0_0", 1, (0.4, 0.4), (-0.4, -0.4))
     made = [hostile_trial(), played(lost), played(human)]
     Store(folder / "study.duckdb").write("hostile", made, patience_s=5)
-    with duckdb.connect(str(folder / "study.duckdb")) as connection:
-        connection.execute(
-            "UPDATE trials SET source = 'human', pair = 'P1', variant = NULL, model_left = NULL, "
-            "model_right = NULL WHERE trial_id LIKE 'human/%'"
-        )
+    as_humans(folder / "study.duckdb")
     return folder / "study.duckdb"
 
 

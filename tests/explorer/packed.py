@@ -1,4 +1,4 @@
-"""What an exported page holds packed, as its scripts read it."""
+"""A whole study exported, and what its pages hold packed, as their scripts read it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,18 @@ import base64
 import json
 import zlib
 
+import pytest
+
+from analysis.explorer.export import export_folder
+
 
 def unpacked(text):
     """What a script reads of a packed text."""
     return json.loads(zlib.decompress(base64.b64decode(text)))
+
+
+def export_with_a_table(db, folder):
+    """Export the whole study with one table, which stands for all; gives the paths."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("analysis.explorer.export.TABLES", ["attempts"])
+        return list(export_folder(db, folder, []))

@@ -17,7 +17,7 @@ from analysis.explorer.export import export_folder
 from analysis.explorer.site import Site
 from merge_runner.results.store import Store
 from tests.analysis.accounts.crashes import CLOSING_IN, EXAMPLES, drive
-from tests.analysis.studies import played, write_study
+from tests.analysis.studies import as_humans, played, write_study
 from tests.explorer.packed import unpacked
 
 HOST = "127.0.0.1:8700"
@@ -30,11 +30,7 @@ def db(tmp_path_factory):
     write_study(path, [*(drive(account) for account in EXAMPLES), CLOSING_IN])
     others = [played(drive("both insisted", "o4")), played(drive("no action", "human"))]
     Store(path).write("sweep-1", others, patience_s=5)
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE trials SET source = 'human', pair = 'P1', variant = NULL "
-            "WHERE trial_id LIKE 'human/%'"
-        )
+    as_humans(path)
     return path
 
 
@@ -156,7 +152,7 @@ def test_a_replay_is_given_its_marks(client):
 
 
 def test_an_exported_list_is_filtered_by_account_too(db, tmp_path):
-    pages = {path.name: path for path in export_folder(db, tmp_path / "pages", [])}
+    pages = {path.name: path for path in export_folder(db, tmp_path / "pages", ["*"])}
     text = pages["trials.html"].read_text(encoding="utf-8")
     assert '<option value="one too little">one too little (1)</option>' in text
     listed = re.search(r'id="packed-list">(.*?)</script>', text, re.DOTALL)[1]

@@ -11,11 +11,11 @@ from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
-from analysis.explorer.export import export_folder
 from analysis.explorer.pages import conditions
 from analysis.explorer.site import Site
-from analysis.explorer.traces import POINTS, read_band, read_traces
-from tests.analysis.studies import Drive, write_study, yielding
+from analysis.explorer.traces import MEASURES, POINTS, read_band, read_traces
+from tests.analysis.studies import Drive, as_humans, write_study, yielding
+from tests.explorer.packed import export_with_a_table
 from tests.explorer.serving import served
 
 HOST = "127.0.0.1:8700"
@@ -36,11 +36,7 @@ def db(tmp_path_factory):
     path = tmp_path_factory.mktemp("conditions") / "t.duckdb"
     others = [*yielding("o3", "A1", reps=2), *yielding("o4", reps=2)]
     write_study(path, [*yielding("o3", reps=2), CRASH, *others, *HUMANS])
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE trials SET source = 'human', pair = 'P1', variant = NULL "
-            "WHERE trial_id LIKE 'human/%'"
-        )
+    as_humans(path)
     return path
 
 
@@ -69,7 +65,7 @@ def test_the_picture_has_a_line_for_each_trial_that_leads_to_it(ask, db):
         ).fetchall()
     assert traces(text) == dict(there)
     assert traces(text)["o3/baseline/N_0_0/rep09"] == "collided"
-    assert text.count(conditions.CROSS) == len(conditions.PANELS)
+    assert text.count(conditions.CROSS) == len(MEASURES)
 
 
 @pytest.mark.parametrize(
@@ -88,23 +84,100 @@ def test_the_address_chooses_the_driver_and_the_prompt(ask, asked, names):
 
 def test_the_humans_are_a_median_and_a_band(ask, db):
     text = ask("/conditions/N_0_0").text
-    assert text.count('class="median"') == text.count('class="band"') == len(conditions.PANELS)
+    assert text.count('class="median"') == text.count('class="band"') == len(MEASURES)
     assert "median of 3 human trials" in text
     keys = [(f"human/baseline/N_0_0/rep0{i}", "human-baseline") for i in (1, 2, 3)]
     band, own = read_band(db, keys), read_traces(db, keys)
     middle = own[keys[1]]
-    at = {round(t, 3): v for t, v in zip(middle["time_s"], middle["left_mps"], strict=True)}
+    at = {round(t, 3): v for t, v in zip(middle["time_s"], middle["first_mps"], strict=True)}
     assert len(at) > 10
     for row in band[:20]:  # while all of them go on
-        low, median, high = row["left_mps"]
+        low, median, high = row["first_mps"]
         assert median == pytest.approx(at.get(round(row["time_s"], 3), median))
         assert low <= median <= high
     assert band[-1]["time_s"] > 5
     # The 10th percentile of three is a fifth of the way from the first to the second.
-    low, median, high = band[20]["left_mps"]
-    first, last = (own[key]["left_mps"][own[key]["time_s"].index(4.0)] for key in keys[::2])
+    low, median, high = band[20]["first_mps"]
+    first, last = (own[key]["first_mps"][own[key]["time_s"].index(4.0)] for key in keys[::2])
     assert low == pytest.approx(first + (median - first) / 5)
     assert high == pytest.approx(last - (last - median) / 5)
+
+
+def test_by_order_the_vehicles_and_the_humans_are_those_that_merged_first_and_second(ask, db):
+    with duckdb.connect(str(db), read_only=True) as connection:
+        rows = connection.execute(
+            "SELECT trial_id, spec_hash, merged_first FROM trials WHERE merged_first IS NOT NULL"
+        ).fetchall()
+    keys = [(trial, spec) for trial, spec, _ in rows]
+    by_side, by_order = read_traces(db, keys), read_traces(db, keys, "order")
+    assert {first for *_, first in rows} == {"left", "right"}
+    for *key, first in rows:
+        one, other = by_side[tuple(key)], by_order[tuple(key)]
+        assert other["turned"] == (first == "right")
+        assert other["headway_m"][-1] > 0
+        swapped = ("second_mps", "first_mps") if first == "right" else ("first_mps", "second_mps")
+        assert [other["first_mps"], other["second_mps"]] == [one[name] for name in swapped]
+    text = ask("/conditions/N_0_0").text
+    assert "Speed of the vehicle that merged first (m/s)" in text
+    assert text.count('class="median"') == len(MEASURES)
+    assert '<strong aria-current="true">who merged first</strong>' in text
+    text = ask("/conditions/N_0_0?by=side").text
+    assert "Speed of the left vehicle (m/s)" in text
+    assert "by=side" in re.search(r'hx-get="([^"]*seen=[^"]*)"', text)[1]
+
+
+def test_the_human_median_is_of_the_vehicles_that_the_panel_shows(db):
+    """One human pair each way round: their median of the first is neither's left vehicle's."""
+    keys = [(f"human/baseline/N_0_0/rep0{i}", "human-baseline") for i in (1, 2)]
+    turned = [
+        ("o3/baseline/N_0_0/rep01", "o3-baseline"),
+        ("o3/baseline/N_0_0/rep02", "o3-baseline"),
+    ]
+    ends = [trace["headway_m"][-1] for trace in read_traces(db, turned).values()]
+    assert min(ends) < 0 < max(ends)
+    assert read_band(db, turned)[-1]["headway_m"][0] < 0
+    assert read_band(db, turned, "order")[-1]["headway_m"][0] > 0
+    left, right = (read_band(db, keys, seats=[seat]) for seat in (False, True))
+    both = read_band(db, keys, seats=[False, True])
+    for name in MEASURES:
+        assert min(left[20][name] + right[20][name]) <= min(both[20][name])
+    assert right[20]["first_mps"] == left[20]["second_mps"]
+    assert both[20]["headway_m"][1] == pytest.approx(0)
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """A pair of two drivers, each once on either side; the first in the alphabet is named first."""
+    path = tmp_path_factory.mktemp("mixed") / "t.duckdb"
+    write_study(path, [*yielding("o3", reps=2), *yielding("o5", reps=2)])
+    with duckdb.connect(str(path)) as connection:
+        for side, rep in (("left", 1), ("right", 2)):
+            connection.execute(
+                f"UPDATE trials SET model_{side} = 'o6' WHERE trial_id LIKE 'o5/%/rep0{rep}'"
+            )
+    return path
+
+
+def test_two_different_drivers_are_told_apart_whichever_side_they_sat_on(mixed, db):
+    site = Site(mixed)
+    client = TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
+    text = client.get("/conditions/N_0_0?by=driver").text
+    # In the first trial the right one went first, who is named first; in the other the left one.
+    assert traces(text) == {
+        "o5/baseline/N_0_0/rep01": "left-first",
+        "o5/baseline/N_0_0/rep02": "left-first",
+    }
+    found = read_traces(mixed, [(name, "o5-baseline") for name in traces(text)], "driver")
+    assert [trace["turned"] for trace in found.values()] in ([True, False], [False, True])
+    assert "Speed of the driver that is named first (m/s)" in text
+    site.close()
+    alone = Site(db)
+    reply = TestClient(explorer(alone, {HOST}), base_url=f"http://{HOST}").get(
+        "/conditions/N_0_0?by=driver"
+    )
+    assert reply.status_code == 404
+    assert "told apart with by=order or by=side" in reply.text
+    alone.close()
 
 
 def test_without_humans_the_page_says_what_reads_them(ask):
@@ -147,6 +220,14 @@ def test_the_list_leads_to_every_condition_and_counts_by_driver(ask, db):
     assert "<strong>1</strong> trials" in ask(html.unescape(link)).text
 
 
+@pytest.mark.parametrize("address", ["/", "/trials", "/conditions", "/sweeps/sweep-1"])
+def test_the_code_of_a_condition_says_itself_in_words_on_every_page(ask, address):
+    text = ask(address).text
+    (told,) = set(re.findall(r'title="([^"]*)"[^>]*>(?:<[^>]*>\s*)*R_-2_8[< ]', text)) or {None}
+    assert told == "the right vehicle would be 2 m ahead at the merge point, and the left one is " \
+        "0.8 m/s faster"  # fmt: skip
+
+
 def test_a_condition_that_nobody_drove_is_not_there(ask):
     reply = ask("/conditions/nothing")
     assert reply.status_code == 404
@@ -167,7 +248,7 @@ def test_a_click_on_a_trace_opens_its_trial_and_a_choice_changes_the_picture(bro
         page.goto(f"{address}/conditions/N_0_0")
         page.locator("#choice-model").select_option("o4")
         expect(page.locator(".overlay path")).to_have_count(2)
-        assert page.url.endswith("model=o4")
+        expect(page).to_have_url(re.compile("model=o4$"))
         page.locator("#choice-model").select_option("o3")
         expect(page.locator(".overlay path")).to_have_count(5)
         page.locator("#choice-variant").select_option("baseline")
@@ -184,9 +265,7 @@ def test_a_click_on_a_trace_opens_its_trial_and_a_choice_changes_the_picture(bro
 
 
 def test_an_export_has_the_same_picture_and_chooses_without_a_server(page, db, tmp_path):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("analysis.explorer.export.TABLES", ["attempts"])
-        list(export_folder(db, tmp_path / "pages", []))
+    export_with_a_table(db, tmp_path / "pages")
     page.context.set_offline(True)
     page.goto(f"file://{tmp_path}/pages/conditions.html")
     page.get_by_role("link", name="N_0_0", exact=True).click()
@@ -195,6 +274,11 @@ def test_an_export_has_the_same_picture_and_chooses_without_a_server(page, db, t
     expect(page.locator(".overlay .median")).to_have_count(3)
     page.locator("#choice-model").select_option("human")
     expect(page.locator(".overlay path:visible")).to_have_count(3)
+    page.get_by_role("link", name="side", exact=True).click()
+    expect(page.get_by_text("Speed of the left vehicle (m/s)")).to_be_visible()
+    expect(page.locator("#choice-model")).to_have_value("human")
+    expect(page.locator(".overlay path:visible")).to_have_count(3)
+    page.get_by_role("link", name="who merged first").click()
     page.get_by_role("link", name="o4", exact=True).click()
     expect(page.locator(".overlay path:visible")).to_have_count(2)
     page.locator("tbody tr", has_text="o4").locator("td a").first.click()

@@ -14,15 +14,14 @@ from analysis.explorer.export import export_folder, export_page
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from tests.explorer.axe import serious
+from tests.explorer.packed import export_with_a_table
 
 
 @pytest.fixture(scope="session")
 def exported(study, tmp_path_factory):
     """The study as a folder, elsewhere than it was written."""
     made = tmp_path_factory.mktemp("made") / "pages"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("analysis.explorer.export.TABLES", ["attempts"])  # one stands for all
-        written = list(export_folder(study, made, []))
+    written = export_with_a_table(study, made)
     assert {path.name for path in written} >= {"index.html", "trials.html", "trials-N_0_0.html"}
     return made.rename(made.with_name("moved"))
 
@@ -44,7 +43,7 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     expect(page.locator(".decision-panel h2")).to_contain_text("decision 1 at 1.0 s")
     expect(page.locator(".decision-panel .block").first).to_contain_text("You drive a car")
     assert page.locator("#track .own.left").get_attribute("transform") != start
-    assert "decision=1" in page.url
+    expect(page).to_have_url(re.compile("decision=1"))
     page.reload()
     expect(page.locator(".decision-panel h2")).to_contain_text("decision 1 at 1.0 s")
     page.get_by_role("button", name="next repetition").click()
@@ -143,14 +142,48 @@ def test_what_a_model_wrote_is_text_there_too(page, exported):
     assert "owned" not in page.title()
 
 
-def test_a_page_of_chosen_trials_holds_these_alone(page, study, tmp_path):
+def test_a_page_of_few_trials_lists_them(page, study, tmp_path):
     file = tmp_path / "one.html"
     assert list(export_page(study, file, ["emulator/baseline/N_0_0/*"])) == [file]
     page.goto(f"file://{file}")
-    expect(page.locator("#chooser option")).to_have_count(3)
+    listed = page.get_by_label("Trials of this page").get_by_role("link")
+    expect(listed).to_have_count(3)
     expect(page.locator("h1")).to_have_text("emulator/baseline/N_0_0/rep01")
-    page.locator("#chooser").select_option(index=1)
+    expect(listed.nth(0)).to_have_attribute("aria-current", "page")
+    listed.nth(1).click()
     expect(page.locator("h1")).to_have_text("emulator/baseline/N_0_0/rep02")
+    expect(page.locator("#choose")).to_have_count(0)
+
+
+def test_one_of_many_trials_of_a_page_is_found_by_words(page, study, tmp_path, monkeypatch):
+    monkeypatch.setattr("analysis.explorer.export.FEW", 3)
+    file = tmp_path / "many.html"
+    list(export_page(study, file, ["*/N_0_0/*", "*/L_4_0/*"]))
+    page.goto(f"file://{file}")
+    found = page.get_by_label("Trials of this page").get_by_role("button")
+    page.keyboard.press("/")
+    page.keyboard.type("emulator N_0_0 collided")
+    expect(found).to_have_text(["emulator/baseline/N_0_0/rep03: collided"])
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        page.set_viewport_size({"width": 420, "height": 900})
+        assert serious(page) == []
+        assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+    page.keyboard.press("ArrowDown")
+    expect(found.first).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.locator("h1")).to_have_text("emulator/baseline/N_0_0/rep03")
+    address = page.url
+    assert "trial=emulator" in address
+    page.keyboard.press("/")
+    page.keyboard.type("human")
+    expect(found).to_have_count(1)
+    page.keyboard.type("x")
+    expect(page.get_by_label("Trials of this page")).to_contain_text("No trial has these words")
+    page.keyboard.press("Escape")
+    expect(page.locator("#found")).to_be_hidden()
+    page.goto(address)
+    expect(page.locator("h1")).to_have_text("emulator/baseline/N_0_0/rep03")
 
 
 @pytest.mark.parametrize(

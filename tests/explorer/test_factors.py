@@ -9,6 +9,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import duckdb
 import pytest
+from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
@@ -100,7 +101,36 @@ def test_an_exported_list_filters_by_factor(played, tmp_path, browser):
     list(export_folder(played.db, tmp_path / "out", ["cheap*"]))
     page = browser.new_page()
     page.goto(f"file://{tmp_path}/out/trials.html?factor.temperature=0.2")
-    assert page.inner_text("#listed") == "12"
+    expect(page.locator("#listed")).to_have_text("12")
     page.select_option("[name='factor.opponent']", "sleepy")
-    assert page.inner_text("#listed") == "6"
+    expect(page.locator("#listed")).to_have_text("6")
     page.close()
+
+
+@pytest.mark.slow
+def test_an_exported_study_answers_by_any_factor(played, tmp_path, monkeypatch):
+    monkeypatch.setattr("analysis.explorer.export.TABLES", ["attempts"])
+    pages = {path.name: path.read_text() for path in export_folder(played.db, tmp_path / "o", [])}
+    grouped = [name for name in pages if name.startswith("index")]
+    assert grouped == [
+        *("index.html", "index-by-prompt.html"),
+        *(f"index-by-{name}.html" for name in ("model", "opponent", "temperature")),
+    ]
+    for name in grouped:
+        (ways,) = re.findall(r'<p class="groups">(.*?)</p>', pages[name])
+        assert set(re.findall(r'href="([^"]*)"', ways)) == {*grouped} - {name}
+    heads = pages["index-by-temperature.html"].split('id="collisions"')[1].split("</thead>")[0]
+    levels = [head.strip() for head in re.findall(r'<th scope="col">([^<]*)<', heads)]
+    assert {"0.2", "1.0"} < {*levels}
+    assert "The left vehicle merging first" in pages["index-by-temperature.html"]
+    assert 'aria-label="0.2, N_0_0:' in pages["index-by-temperature.html"]
+    assert 'href="trials.html?condition=N_0_0&amp;outcome=' in pages["index-by-temperature.html"]
+    # Pairs of two different drivers were played: a condition has a page for each view of them.
+    views = {
+        "condition-N_0_0.html",
+        "condition-by-side-N_0_0.html",
+        "condition-by-driver-N_0_0.html",
+    }
+    assert views < pages.keys()
+    (ways,) = re.findall(r'<p class="groups">(.*?)</p>', pages["condition-by-side-N_0_0.html"])
+    assert set(re.findall(r'href="([^"]*)"', ways)) == views - {"condition-by-side-N_0_0.html"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import time
 
@@ -80,7 +81,8 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_se
 def test_a_page_says_when_nobody_answers_it_any_more(browser, study, address):
     context = browser.new_context()
     page = context.new_page()
-    with served(study) as site:
+    port = 10_000 + os.getpid() % 20_000  # none that a socket gets that names no port
+    with served(study, port) as site:
         page.goto(f"{site}{address}")
         expect(page.locator("footer")).to_contain_text(f"view --db {study} --export")
         expect(page.locator("#lost")).to_be_hidden()
@@ -90,7 +92,7 @@ def test_a_page_says_when_nobody_answers_it_any_more(browser, study, address):
         page.keyboard.press("]")
     expect(page.locator("#lost")).to_contain_text("merge-runner view has ended")
     expect(page.locator(".decision-panel")).to_have_count(0)
-    with served(study, int(site.rpartition(":")[2])):
+    with served(study, port):
         if address == "/trials":
             page.get_by_label("outcome").select_option("left first")
         else:

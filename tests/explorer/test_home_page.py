@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html import unescape
+from math import sqrt
 from urllib.parse import parse_qs, urlsplit
 
 import duckdb
@@ -18,21 +20,26 @@ from analysis.data.reference_data import published
 from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.app import explorer
+from analysis.explorer.assets import STATIC, STYLES
 from analysis.explorer.child import NoAnswer
-from analysis.explorer.pages.home import account_rows, home_page, task_picture
+from analysis.explorer.pages.home import account_rows, home_page
 from analysis.explorer.pages.tables import FIGURES
 from analysis.explorer.site import NothingNew, Site
+from analysis.explorer.task_picture import task_picture
 from analysis.explorer.urls import StaticLinks
 from analysis.figures.gallery import FIGURES as DRAWN
+from analysis.figures.styles import COLOURS
+from analysis.metrics import shown_in
 from analysis.table_format import TableFormat
 from analysis.tables import make_tables
 from analysis.tables.formats import render
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided
-from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.geometry import TRACK, Track
 from tests.analysis.studies import Said, write_study, yielding
+from tests.explorer.serving import served
 from tests.explorer.test_humans_page import import_some
-from tests.explorer.test_tables_pages import Addresses, InProcess, listed
+from tests.explorer.test_tables_pages import Addresses, Awaited, InProcess, listed
 
 HOST = "127.0.0.1:8700"
 WORST = "L_0_-8"
@@ -60,7 +67,7 @@ def db(tmp_path_factory):
 @pytest.fixture(scope="module")
 def own(db):
     site = Site(db)
-    site.computing = Computing(db, InProcess)
+    site.computing = Awaited(db, InProcess)
     site.catalogue.refresh()
     yield site
     site.computing.close()
@@ -73,13 +80,6 @@ def client_of(site):
 @pytest.fixture(scope="module")
 def client(own):
     return client_of(own)
-
-
-def whole(client, address="/"):
-    """The page once all has arrived."""
-    while 'class="computing"' in (text := client.get(address).text):
-        pass
-    return text
 
 
 def test_counts_are_there_before_anything_is_computed_and_lead_to_their_trials(db):
@@ -107,10 +107,10 @@ def test_counts_are_there_before_anything_is_computed_and_lead_to_their_trials(d
 
 @pytest.mark.slow
 def test_points_verdicts_and_values_lead_to_their_trials(client):
-    text = unescape(whole(client))
+    text = unescape(client.get("/").text)
     point = re.search(r'<a href="([^"]+)"[^>]*aria-label="o3, baseline, L_4_0: 100[^"]*n 3"', text)
     assert point, text
-    assert listed(whole(client, point[1])) == 3
+    assert listed(client.get(point[1]).text) == 3
     verdict = re.search(r'<a href="([^"]+)" aria-label="I1 of o3: (.)"', text)
     assert verdict[2] in "✓✗–"
     assert parse_qs(urlsplit(verdict[1]).query)["cell"] == ["indicators/o3/baseline/I1:n"]
@@ -124,17 +124,19 @@ def test_a_study_is_grouped_by_any_of_its_factors(client, own):
     assert '<strong aria-current="true">prompt</strong>' in text
     heads = text.split('id="collisions"')[1].split("</thead>")[0]
     assert [name.strip() for name in re.findall(r'<th scope="col">([^<]+)', heads)][2:] == [
+        "humans",
         "all drivers",
         "A1",
         "baseline",
-        "humans",
     ]
     assert "grouped by prompt" in client.get("/?by=mood").text
     groups = [g["id"] for g in own.computing.ask(("home", "prompt", "0"), (0, 0), wait_s=60)
               .content["groups"]]  # fmt: skip
     assert groups == ["human", "prompt=baseline", "prompt=A1"]
-    point = re.search(r'<a href="([^"]+)"[^>]*aria-label="A1, L_4_0:', whole(client, "/?by=prompt"))
-    assert listed(whole(client, unescape(point[1]))) == 1
+    point = re.search(
+        r'<a href="([^"]+)"[^>]*aria-label="A1, L_4_0:', client.get("/?by=prompt").text
+    )
+    assert listed(client.get(unescape(point[1])).text) == 1
 
 
 def test_levels_of_a_factor_are_groups_with_their_trials(played):
@@ -222,9 +224,10 @@ def test_classes_of_collisions_stand_beside_the_published_ones():
     assert account_rows([], published) is None
 
 
-def test_the_picture_of_the_task_shows_a_moment_before_the_merge():
-    task = task_picture()
+def test_the_picture_of_the_task_shows_a_moment_before_the_merge(own):
+    task = task_picture(own.catalogue)
     left, right = task["vehicles"]
+    assert task["condition"] == "L_4_0"
     assert left["x"] > right["x"]
     assert left["y"] < 0 < right["y"]
     for one in (left, right):
@@ -232,12 +235,48 @@ def test_the_picture_of_the_task_shows_a_moment_before_the_merge():
     assert not collided(ScenarioConfig(), TRACK, left["x"], right["x"])
 
 
+def on_a_longer_track(db, folder, whose):
+    """The study with these trials on another track, of longer vehicles."""
+    changed = {"track": asdict(Track(60, 120, 170, 40)), "scenario": {"vehicle_length_m": 6}}
+    with duckdb.connect(shutil.copy(db, folder / "longer.duckdb")) as connection:
+        connection.execute(
+            f"UPDATE specs SET spec = json_merge_patch(spec, ?) WHERE {whose}",
+            [json.dumps(changed)],
+        )
+    site = Site(folder / "longer.duckdb")
+    site.computing = Computing(site.db, Never)
+    return site
+
+
+def test_the_picture_shows_the_studys_own_track(db, tmp_path):
+    site = on_a_longer_track(db, tmp_path, "true")
+    text = client_of(site).get("/").text
+    task = task_picture(site.catalogue)
+    assert f'x1="{120 * sqrt(1 - (20 / 120) ** 2):.2f}"' in text
+    assert "60 m before the merge point" in text
+    assert task["length_m"] == 6
+    assert text.count('width="6.0" height="1.8"') == 2
+    assert "the commonest" not in text
+    site.close()
+
+
+def test_of_several_tracks_the_commonest_is_shown_and_the_page_says_so(db, tmp_path):
+    site = on_a_longer_track(db, tmp_path, "spec_hash LIKE '%A1'")
+    text = client_of(site).get("/").text
+    assert "50 m before the merge point" in text
+    assert (
+        "It is the commonest of 2 geometries (tracks, or sizes of vehicles), that of 33 of 44"
+        in text
+    )
+    site.close()
+
+
 @pytest.mark.parametrize(("suffix", "form"), [("csv", TableFormat.CSV), ("tex", TableFormat.LATEX)])
 def test_a_table_comes_as_a_file(client, db, suffix, form):
     reply = client.get(f"/tables/attempts.{suffix}")
     assert reply.text == render(make_tables(Study(db), ["attempts"]), form) + "\n"
     assert f'filename="attempts.{suffix}"' in reply.headers["content-disposition"]
-    assert f'href="/tables/attempts.{suffix}" download' in whole(client, "/tables/attempts")
+    assert f'href="/tables/attempts.{suffix}" download' in client.get("/tables/attempts").text
     assert client.get("/tables/attempts.exe").status_code == 404
     assert client.get(f"/tables/nothing.{suffix}").status_code == 404
 
@@ -256,14 +295,14 @@ def test_every_figure_is_offered_and_comes_as_svg(client):
 
 
 def test_rows_of_fallbacks_in_which_nothing_differs_are_folded(client):
-    text = whole(client, "/tables/fallbacks")
+    text = client.get("/tables/fallbacks").text
     (rows,) = re.findall(r"<summary>(\d+) rows in which nothing differs", text)
     assert text.count("<tr id=") == int(rows)
     assert 'id="table"' not in text
 
 
 def test_no_head_of_a_table_is_empty(client):
-    heads = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", whole(client, "/tables/indicators"))
+    heads = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", client.get("/tables/indicators").text)
     assert heads
     assert all(re.sub("<[^>]*>", "", head).strip() for head in heads)
 
@@ -271,21 +310,62 @@ def test_no_head_of_a_table_is_empty(client):
 def test_heads_sort_and_the_address_keeps_it(page):
     page.goto("/tables")
     page.goto("/")
+    # What is computed comes into the page, whose rows are sorted anew a moment later.
+    expect(page.locator(".computing")).to_have_count(0)
     column = page.locator("#costs tbody td:nth-child(2)")
     page.locator("#costs thead").get_by_role("button", name="trials").click()
     down = [int(text) for text in column.all_inner_texts()]
     assert down == sorted(down, reverse=True)
     assert len(set(down)) > 1
     expect(page.locator("#costs th[aria-sort=descending]")).to_have_text("trials")
+    expect(page).to_have_url(re.compile("sorted=-costs.1"))
     page.reload()
-    assert [int(text) for text in column.all_inner_texts()] == down
+    expect(column).to_have_text(list(map(str, down)))
     page.locator("#costs thead").get_by_role("button", name="trials").click()
-    assert [int(text) for text in column.all_inner_texts()] == sorted(down)
+    expect(column).to_have_text(list(map(str, sorted(down))))
+    expect(page).to_have_url(re.compile("sorted=costs.1"))
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     page.locator("#copy-link").click()
     expect(page.locator("#copy-link")).to_have_text("copied")
     assert page.evaluate("navigator.clipboard.readText()") == page.url
-    assert "sorted=costs.1" in page.url
+
+
+def test_every_measure_of_the_ablations_is_explained_above_them(client):
+    above = unescape(client.get("/ablations").text.split("<table")[0])
+    for metric in shown_in("tables"):
+        assert f"<strong>{metric.heading}</strong>: {metric.meaning}" in above
+
+
+def test_the_colours_of_drivers_are_those_of_the_figures():
+    styles = (STATIC / "styles/colours.css").read_text()
+    light, _, _ = styles.partition("@media")
+    assert re.findall(r"--tint-\d: (#\w+);", light) == list(COLOURS)
+    used = (STATIC / "styles/tables.css").read_text()
+    assert re.findall(r"\.tint-(\d) ", used) == [str(i) for i in range(len(COLOURS))]
+
+
+def test_captions_of_all_tables_have_one_rule():
+    rules = [
+        name
+        for name in STYLES
+        for _ in re.findall(r"(?:^|\} )caption \{", (STATIC / name).read_text(), re.MULTILINE)
+    ]
+    assert rules == ["styles/base.css"]
+
+
+def test_ablations_are_whole_at_1024_pixels_and_numbers_look_like_links(browser, db):
+    with served(db) as address:
+        page = browser.new_page(viewport={"width": 1024, "height": 800})
+        page.goto(f"{address}/ablations")
+        table = page.locator("table.ablations")
+        expect(table).to_be_visible()
+        assert page.eval_on_selector(".scroll", "e => e.scrollWidth <= e.clientWidth")
+        page.goto(f"{address}/tables/attempts")
+        number = page.locator("table.of-report td a").first
+        looks = "e => [getComputedStyle(e).color, getComputedStyle(e).textDecorationStyle]"
+        assert number.evaluate(looks) == page.locator("main p a").first.evaluate(looks)
+        assert number.evaluate(looks)[1] == "solid"
+        page.close()
 
 
 @pytest.mark.parametrize("address", ["/", "/humans"])

@@ -9,7 +9,6 @@ import pytest
 from starlette.testclient import TestClient
 
 from analysis.data.study import Study
-from analysis.explorer.analysis_process import Computing
 from analysis.explorer.analysis_worker import HUMAN, Numbers
 from analysis.explorer.app import explorer
 from analysis.explorer.charts import chart, marks
@@ -25,7 +24,7 @@ from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import Drive, write_study, yielding
-from tests.explorer.test_tables_pages import InProcess
+from tests.explorer.test_tables_pages import Awaited, InProcess
 
 HOST = "127.0.0.1:8700"
 # A sweep that was killed: two trials of one condition that have nothing in common.
@@ -47,15 +46,10 @@ def db(tmp_path):
 @pytest.fixture
 def ask(db):
     site = Site(db)
-    site.computing = Computing(db, InProcess)
+    site.computing = Awaited(db, InProcess)
     client = TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
 
-    def get(address="/humans"):
-        while 'class="computing"' in (text := client.get(address).text):
-            pass
-        return unescape(text)
-
-    yield get
+    yield lambda: unescape(client.get("/humans").text)
     site.computing.close()
 
 
@@ -123,10 +117,10 @@ def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
     assert huge["low"] < -30
     assert huge["high"] > 50
     drawn = chart(gap, content["groups"], list(content["conditions"]), content["published"])
-    ticks = [float(text) for _, text in drawn["ticks"]]
+    ticks = [float(text) for _, text in drawn["axis"].marks]
     assert ticks[0] >= -10
     assert ticks[-1] <= 30
-    assert f"killed in L_4_0: {huge['value']:.2f} [{huge['low']:.2f}" in drawn["cut"][0]
+    assert drawn["cut"]
     (point,) = (
         point
         for panel in drawn["panels"]
@@ -134,8 +128,10 @@ def test_a_driver_of_two_trials_does_not_stretch_the_axes(ask, db):
         if point["group"] == "killed/baseline"
     )
     assert [shape for shape, _ in point["arrows"]] == ["down", "triangle"]
-    assert drawn["top"] <= point["ends"][1] <= point["y"] <= point["ends"][0] <= drawn["bottom"]
-    assert chart(rmse, content["groups"], [], {})["ticks"][0][1] == "0"
+    scale = drawn["axis"].scale
+    assert scale.to <= point["ends"][1] <= point["y"] <= point["ends"][0] <= scale.from_
+    assert chart(rmse, content["groups"], [], {})["axis"].marks[0][1] == "0"
     text = ask()
     assert len(re.findall(r'class="cut"', text)) >= 2
-    assert "An arrow at the edge: an interval goes on beyond the axis. killed in" in text
+    assert "An arrow at the edge: an interval goes on beyond the axis. Its ends are in" in text
+    assert f"{huge['value']:.2f} [{huge['low']:.2f}, {huge['high']:.2f}], n 2</" in text

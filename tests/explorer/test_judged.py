@@ -109,7 +109,7 @@ def test_the_picture_draws_what_the_scenario_judges(page, study_of, rule):
         assert drawn.first.is_visible() == (rule != "shared_lane")
         page.keyboard.press("5")
         page.locator("#play").click()
-        expect(page.locator("#track.collided .crash")).to_be_visible(timeout=20_000)
+        expect(page.locator("#track.collided .crash")).to_be_visible()
         expect(drawn.first).to_be_visible()
         assert ("centres" in page.locator("#track .crash text").text_content()) == (
             rule == "euclid2d"

@@ -14,7 +14,7 @@ from analysis.explorer.catalogue import Filter
 from analysis.explorer.export import export_folder
 from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.site import Site
-from tests.analysis.studies import Drive, write_study, yielding
+from tests.analysis.studies import Drive, as_humans, write_study, yielding
 
 HOST = "127.0.0.1:8700"
 HIDDEN = "o3\u202egpj\u200b"
@@ -43,11 +43,7 @@ def db(tmp_path_factory):
     path = tmp_path_factory.mktemp("listing") / "t.duckdb"
     others = [*yielding("human", reps=1)[:5], *yielding("o3", "A1", reps=1)[:3]]
     write_study(path, [STANDING, *yielding("o3", reps=1), *others])
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE trials SET source = 'human', pair = 'P1', variant = NULL "
-            "WHERE trial_id LIKE 'human/%'"
-        )
+    as_humans(path)
     return path
 
 

@@ -69,10 +69,9 @@ def test_packed_panels_are_those_that_a_server_shows(exporting):
     site, rows = exporting
     found = pack_trials(site, rows, site.catalogue.others)
     shared, panels = unpacked(found["shared"]), 0
-    for row in rows:
+    for row, text in zip(rows, found["trials"], strict=True):
         trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
-        key = f"{row['trial_id']}|{row['spec_hash']}"
-        for name, pieces in unpacked(found["trials"][key])["panels"].items():
+        for name, pieces in unpacked(text)["panels"].items():
             side, number = name.split("/")
             one = read_decision(site.db, row["trial_id"], row["spec_hash"], side, int(number))
             values = panel_values(site, row, trial, one, site.catalogue.others)

@@ -7,7 +7,6 @@ import contextlib
 import json
 import socket
 import threading
-import time
 from uuid import UUID
 
 import pytest
@@ -73,12 +72,14 @@ SURPLUS = {
 async def test_bytes_beyond_an_answer_never_answer_the_next_request(surplus):
     async def late(talk, request):
         await talk.say(ok(chat("a")))
-        await asyncio.sleep(0.01)
+        await taken.wait()
         await talk.say(surplus)
         await talk.left()
 
+    taken = asyncio.Event()
     async with raw_server(late, ok(chat("b"))) as server, transport_to(server.url) as transport:
         assert await ask(transport) == "a"
+        taken.set()
         await until(lambda: server.left == [1])
         assert [await ask(transport), await ask(transport)] == ["b", "b"]
     # From then on, each connection is for one request.
@@ -98,14 +99,14 @@ async def test_bytes_that_come_with_an_answer_never_answer_the_next_request(surp
 
 
 async def test_bytes_that_the_loop_had_no_time_to_read_never_answer_the_next_request():
-    come = threading.Event()
+    taken, come = threading.Event(), threading.Event()
 
     def serve():
         first, _ = listening.accept()
         with first:
             first.recv(65536)
             first.sendall(ok(chat("a")))
-            time.sleep(0.05)  # until the client has read it
+            taken.wait()
             first.sendall(ok(chat("late")))
             come.set()
             second, _ = listening.accept()
@@ -119,6 +120,7 @@ async def test_bytes_that_the_loop_had_no_time_to_read_never_answer_the_next_req
         server.start()
         async with transport_to(f"http://127.0.0.1:{listening.getsockname()[1]}") as transport:
             assert await ask(transport) == "a"
+            taken.set()
             come.wait()  # the loop does nothing meanwhile
             assert await ask(transport) == "b"
             server.join()
@@ -126,15 +128,17 @@ async def test_bytes_that_the_loop_had_no_time_to_read_never_answer_the_next_req
 
 async def test_after_a_timeout_each_connection_is_for_one_request():
     async def late(talk, request):
-        await asyncio.sleep(0.1)
+        await given_up.wait()
         await talk.say(ok(chat("late")))
 
+    given_up = asyncio.Event()
     async with (
         raw_server(ok(chat("a")), late, ok(chat("b"))) as server,
         transport_to(server.url, connections=2) as transport,
     ):
         assert [await ask(transport) for _ in range(1)] == ["a"]
         assert await ask(transport, timeout_s=0.05) == "timeout"
+        given_up.set()
         assert [await ask(transport) for _ in range(2)] == ["b", "b"]
     assert [request.talk for request in server.requests] == [1, 1, 2, 3]
 

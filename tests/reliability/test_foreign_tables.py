@@ -8,6 +8,7 @@ import signal
 import subprocess
 
 import duckdb
+import psutil
 import pytest
 
 from merge_runner.audit import audit_database
@@ -68,7 +69,8 @@ async def test_a_version_that_no_program_wrote_is_told(merge_runner, db):
 async def test_ctrl_c_within_a_query_ends_it_in_one_line(merge_runner, db):
     endless = "SELECT count(*) FROM range(1000000) AS a, range(1000000) AS b WHERE a > b"
     process = await merge_runner.fork("sql", endless, "--db", db)
-    await asyncio.sleep(1)
+    while psutil.Process(process.pid).cpu_times().user < 1:  # more than it takes to begin
+        await asyncio.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, err = await process.communicate()
     assert (process.returncode, "Traceback" in err.decode()) == (130, False), err

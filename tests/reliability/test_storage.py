@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import shutil
 import signal
 import sqlite3
@@ -12,9 +11,9 @@ import sys
 
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import make_plan
+from tests.gate import HANGS_S, Gate
 from tests.harness import watched
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
@@ -29,12 +28,16 @@ while True:
 print("held", flush=True)
 sys.stdin.read()
 """
-LOCK = """
-import duckdb, sys, time
-held = duckdb.connect(sys.argv[1])
-print("held", flush=True)
-time.sleep(float(sys.argv[2]))
-"""
+
+
+async def notebook(db, mode):
+    """Another program that holds a database until its standard input closes."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", NOTEBOOK, db, mode,
+        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    assert await process.stdout.readline() == b"held\n"
+    return process
 
 
 def line(run):
@@ -106,16 +109,13 @@ async def test_a_database_that_another_program_holds_for_a_while_is_waited_for(
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         await merge_runner(*SWEEP, "--conditions", "N_0_0", **env)
-        other = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", LOCK, tmp_path / "results/merge.duckdb", "6",
-            stdout=asyncio.subprocess.PIPE,
-        )  # fmt: skip
-        await other.stdout.readline()
-        run = await merge_runner(*SWEEP, "--conditions", "N_0_0,L_4_8", **env)
-        assert await other.wait() == 0
-    assert run.code == 0, run.err
-    assert f"(PID {other.pid}) to close results/merge.duckdb" in run.err
-    assert run.summary["trials"]["planned"] == 2
+        other = await notebook(tmp_path / "results/merge.duckdb", "write")
+        sweep = await merge_runner.fork(*SWEEP, "--conditions", "N_0_0,L_4_8", **env)
+        await sweep.said(f"(PID {other.pid}) to close results/merge.duckdb")
+        other.stdin.close()
+        out, err = await sweep.communicate()
+    assert sweep.returncode == 0, err
+    assert json.loads(out)["trials"]["planned"] == 2
 
 
 @pytest.mark.slow
@@ -124,29 +124,25 @@ async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_
     merge_runner, tmp_path, mode
 ):
     part = ("sweep", "baseline", "--conditions", "N_0_0", "--json")
-    async with watched(faults=FaultPlan(latency_s=0.2)) as server:
+    gate = Gate(30)  # of three trials of up to 22 calls
+    async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         assert (await merge_runner(*part, "--reps", 1, **env)).code == 0
-        sweep = await merge_runner.start(*part, "--reps", 3, **env)
-        while server.requests <= 22:  # of the trial before
-            await asyncio.sleep(0.1)
-        notebook = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", NOTEBOOK, tmp_path / "results/merge.duckdb", mode,
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
-        )  # fmt: skip
-        await notebook.stdout.readline()
-        said = b""
-        while b"the playing has ended" not in said:
-            said += await asyncio.wait_for(sweep.stderr.readline(), 60)
-        os.kill(sweep.pid, signal.SIGINT)
+        sweep = await merge_runner.fork(*part, "--reps", 3, **env)
+        while not gate.held:
+            await asyncio.sleep(0.02)
+        holder = await notebook(tmp_path / "results/merge.duckdb", mode)
+        gate.open()
+        await sweep.said("the playing has ended")
+        sweep.send_signal(signal.SIGINT)
         _, err = await sweep.communicate()
-        err = (said + err).decode()
+        err = err.decode()
         assert sweep.returncode == 130, err
-        assert f"(PID {notebook.pid}): close it there" in err
+        assert f"(PID {holder.pid}): close it there" in err
         assert "run the same command again" in err
         again = await merge_runner.fork(*part, "--reps", 3, **env)
-        await asyncio.sleep(2)
-        notebook.stdin.close()  # what waits for it goes on
+        await again.said(f"(PID {holder.pid})")
+        holder.stdin.close()  # what waits for it goes on
         out, err = await again.communicate()
         assert again.returncode == 0, err
         assert json.loads(out)["calls"]["live"] == 0

@@ -26,6 +26,7 @@ from merge_runner.run.flusher import (
     SPILLED_BYTES,
     Flusher,
 )
+from tests.gate import HANGS_S
 
 SPEC = TrialSpec("t", "h", "llm", "m", "m", "baseline", "L_4_0", 1, 0, 0)
 MB = 2**20
@@ -76,13 +77,13 @@ async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     store = Slow()
     flusher = Flusher(store, "sweep", lambda line: None)
     while flusher._bytes <= MOST_PENDING_BYTES:
-        await asyncio.wait_for(flusher.room(), 1)
+        await asyncio.wait_for(flusher.room(), HANGS_S)
         flusher.add(trial(10 * MB))
     waiting = asyncio.create_task(flusher.room())
     await asyncio.sleep(0.01)
     assert not waiting.done()
     store.go_on.set()
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(HANGS_S):
         await waiting
     await flusher.close()
     assert sum(store.written) == MOST_PENDING_BYTES // (10 * MB) + 1
@@ -125,14 +126,14 @@ async def test_what_cannot_be_stored_is_spilled_and_stored_whole_and_in_order(tm
     flusher = Flusher(store, "sweep", said.append)
     for record in long_trials(6):
         flusher.add(record)
-        await asyncio.wait_for(flusher.room(), 10)
-    async with asyncio.timeout(20):
+        await asyncio.wait_for(flusher.room(), HANGS_S)
+    async with asyncio.timeout(HANGS_S):
         while flusher._bytes > SPILLED_BYTES:
             await asyncio.sleep(0.05)
     assert flusher.left == 6
     assert flusher.problem == "6 trials wait to be stored: somebody reads"
     closing = asyncio.create_task(flusher.close())
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(HANGS_S):
         while "Ctrl-C ends the waiting" not in said[-1]:
             await asyncio.sleep(0.05)
         store.go_on.set()
@@ -147,8 +148,9 @@ async def test_what_can_neither_be_stored_nor_spilled_fills_the_memory_up_to_a_l
     text = trial(MOST_STUCK_BYTES // 4)
     for _ in range(4):
         flusher.add(text)
-    await asyncio.sleep(0.1)
+    async with asyncio.timeout(HANGS_S):
+        while not flusher._problem:
+            await asyncio.sleep(0.01)
     flusher._task.cancel()
     await asyncio.gather(flusher._task, return_exceptions=True)
-    assert flusher._problem
     assert flusher._is_full()

@@ -13,6 +13,7 @@ from merge_runner.emulator.faults import TRANSIENT, FaultPlan
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.database import open_database
 from merge_runner.results.store import results_digest
+from tests.gate import HANGS_S, Gate
 from tests.harness import FAST, watched
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--json")
@@ -257,18 +258,19 @@ async def test_bad_answers_on_purpose_are_not_kept_as_the_emulators_own(merge_ru
 
 
 async def test_another_process_queries_while_a_sweep_runs(merge_runner):
-    async with watched(faults=FaultPlan(latency_s=0.1)) as server:
-        sweep = ("sweep", "baseline", "--reps", 2, "--in-flight", 8)
+    gate = Gate(200)  # of two trials at a time, of up to 40 calls each
+    async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
+        sweep = ("sweep", "baseline", "--reps", 2, "--in-flight", 2)
         process = await merge_runner.fork(*sweep, EMULATOR_BASE_URL=f"{server.url}/v1")
-        ended = asyncio.create_task(process.communicate())
-        seen = set()
-        while not ended.done():
+        seen = 0
+        while not seen:
             query = await merge_runner("sql", "select count(*) n from trials", "--format", "json")
             if query.code == 0:  # before the sweep has made the database it is 2
-                seen.add(json.loads(query.out)[0]["n"])
-            await asyncio.sleep(0.2)
-    assert process.returncode == 0
-    assert any(0 < n < 22 for n in seen), seen
+                seen = json.loads(query.out)[0]["n"]
+        assert process.returncode is None
+        gate.open()
+        assert await process.wait() == 0
+    assert seen < 22
 
 
 async def test_a_locked_database_is_waited_for(merge_runner, tmp_path):

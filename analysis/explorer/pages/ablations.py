@@ -5,19 +5,18 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from analysis.explorer import views
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.conditions import condition_texts
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pictures import Scale, marker
 from analysis.explorer.site import NotThere, Site
 from analysis.metrics import COLLISIONS
 from analysis.metrics import JOINT as JOINT_RATE
-from analysis.tables.formats import shown_value
+from analysis.tables.formats import printed, shown_value
 from analysis.tables.model import Column, Row, Table, Value, from_text
 from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
 
@@ -39,20 +38,27 @@ WIDTH = 120.0
 
 @dataclass(frozen=True, slots=True)
 class BaselineDifference:
-    """A variant's difference from the baseline: texts, and numbers for its picture."""
+    """A variant's difference from the baseline, for its picture, and its row as printed."""
 
     value: float
-    low: float | None
-    high: float | None
-    text: str
-    interval: str
-    p_holm: str
-    p_bh: str
+    limits: tuple[float, float] | None
+    printed: Mapping[str, str]
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Those of its interval; without one, itself."""
+        return self.limits or (self.value, self.value)
 
     @property
     def apart(self) -> bool:
         """Whether the interval leaves out 0."""
-        return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
+        return self.limits is not None and (self.limits[0] > 0 or self.limits[1] < 0)
+
+    @property
+    def text(self) -> str:
+        """As printed, with its sign."""
+        text = self.printed["difference"]
+        return f"+{text}" if self.value > 0 and float(text) != 0 else text
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,21 +69,32 @@ class Estimate:
     row: str
     estimate: str
     interval: str
-    n: int | None
+    n: Value
     difference: BaselineDifference | None
 
 
 @dataclass(frozen=True, slots=True)
 class DriverVariants:
-    """A driver's variants, the baseline first; ``widest`` by measure: the picture's half range.
-
-    ``label`` is how the driver is shown.
-    """
+    """A driver's variants, the baseline first; ``label`` is how the driver is shown."""
 
     name: str
     label: str
     variants: dict[str, list[Estimate]]
-    widest: dict[str, float] = field(default_factory=dict)
+
+    def place(self, cell: Estimate) -> list[float]:
+        """Where a difference and its ends lie in a picture of WIDTH, 0 in its middle."""
+        assert cell.difference is not None
+        drawn = [
+            abs(end)
+            for cells in self.variants.values()
+            for other in cells
+            if other.measure == cell.measure and other.difference is not None
+            for end in (other.difference.value, *other.difference.ends)
+        ]
+        widest = max(drawn) or 1.0  # where all are 0 any range shows them
+        x = Scale(-widest, widest, 0.03 * WIDTH, 0.97 * WIDTH)
+        low, high = cell.difference.ends
+        return [round(x(value), 1) for value in (low, cell.difference.value, high)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +127,6 @@ def ablations_page(site: Site, asked: Mapping[str, str]) -> str:
         computed=found,
         left_out=partial(left_out, site),
         fates=FATES,
-        bar=bar,
         path=marker,
         width=WIDTH,
         **values,
@@ -162,8 +178,6 @@ def ablations(quantitative: Table, contrasts: Table) -> list[DriverVariants]:
                 _cell(quantitative, contrasts, row, column, compared, of_baseline)
                 for column in measures(quantitative)
             ]
-    for driver in drivers.values():
-        _reach(driver)
     return list(drivers.values())
 
 
@@ -186,53 +200,17 @@ def _cell(
         row.id,
         shown_value(column, row.values.get(column.name)),
         shown_value(interval, limits) if limits is not None else "",
-        n if isinstance(n, int) else None,
+        n,
         _difference(contrasts, found) if found is not None else None,
     )
 
 
-def _reach(driver: DriverVariants) -> None:
-    """How far the differences of each measure reach, with their intervals."""
-    for i, measure in enumerate(cell.measure for cell in next(iter(driver.variants.values()))):
-        found = [cells[i].difference for cells in driver.variants.values()]
-        reach = [
-            abs(limit)
-            for difference in found
-            if difference is not None
-            for limit in (difference.value, difference.low, difference.high)
-            if limit is not None
-        ]
-        # Where all differences are 0 any range shows them.
-        driver.widest[measure] = max(reach, default=0.0) or 1.0
-
-
 def _difference(contrasts: Table, row: Row) -> BaselineDifference:
-    columns = {column.name: column for column in contrasts.columns}
     value, limits = row.values["difference"], row.values.get("ci")
     assert isinstance(value, float)
-    low, high = limits if isinstance(limits, tuple) else (None, None)
-    text = shown_value(columns["difference"], value)
     return BaselineDifference(
-        value,
-        low,
-        high,
-        f"+{text}" if value > 0 and float(text) != 0 else text,
-        shown_value(columns["ci"], limits) if limits is not None else "",
-        shown_value(columns["p_holm"], row.values["p_holm"]),
-        shown_value(columns["p_bh"], row.values["p_bh"]),
+        value, limits if isinstance(limits, tuple) else None, printed(contrasts, row)
     )
-
-
-def bar(difference: BaselineDifference, widest: float) -> dict[str, float]:
-    """Where a difference and its ends lie in a picture of ``WIDTH``, 0 in its middle."""
-    margin = 0.03 * WIDTH
-    x = Scale(-widest, widest, margin, WIDTH - margin)
-    low = difference.value if difference.low is None else difference.low
-    high = difference.value if difference.high is None else difference.high
-    return {
-        name: round(x(value), 1)
-        for name, value in (("low", low), ("at", difference.value), ("high", high))
-    }
 
 
 def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -262,7 +240,6 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
         left_out=left_out(site, variant),
         by=fate,
         said=_fate,
-        condition_texts=condition_texts(site.catalogue, {pair["condition"] for pair in pairs}),
         pairs=pairs,
         differing=differing,
         counted=_fate(COUNTED[fate]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from analysis.explorer.details import read_trial
@@ -19,9 +19,12 @@ FOUND = 12
 NAMED = """(SELECT *, if(count(*) OVER (PARTITION BY trial_id) = 1, trial_id,
     trial_id || '@' || spec_hash) AS key FROM listed)"""
 WORDS = "lower(concat_ws(' ', trial_id, model, variant, outcome))"
-# Of each trial of a condition, or of one, by the numbers that they have in the list.
+# Of some trials of a condition, by the numbers that they have in the list.
 BESIDE = f"""
-WITH near AS (FROM listed WHERE condition = $1), beside AS (
+WITH near AS (
+    SELECT *, (trial_id, spec_hash) IN (SELECT unnest($2), unnest($3)) AS wanted
+    FROM listed WHERE condition = $1
+), beside AS (
     SELECT number, '{REPETITION}' AS kind,
         coalesce(lead(number) OVER alike, first_value(number) OVER alike) AS other
     FROM near
@@ -30,11 +33,11 @@ WITH near AS (FROM listed WHERE condition = $1), beside AS (
     SELECT one.number, '{DRIVER}' AS kind, arg_min(two.number, (two.variant IS DISTINCT FROM
         one.variant, two.rep <> one.rep, two.model <= one.model, two.model, two.number)) AS other
     FROM near AS one JOIN near AS two ON two.model <> one.model AND two.source <> 'human'
-    WHERE $2 IS NULL OR (one.trial_id = $2 AND one.spec_hash = $3) GROUP BY one.number
+    WHERE one.wanted GROUP BY one.number
 )
 SELECT one.trial_id, one.spec_hash, kind, two.trial_id AS other_id, two.spec_hash AS other_hash
 FROM beside JOIN near AS one USING (number) JOIN near AS two ON two.number = beside.other
-WHERE one.number <> two.number AND ($2 IS NULL OR (one.trial_id = $2 AND one.spec_hash = $3))
+WHERE one.number <> two.number AND one.wanted
 """  # noqa: S608 # constants
 # Times are compared in ms: drivers and recordings have steps of their own. A human trial counts
 # whose task is the same, and that lasts as long as what it is compared with.
@@ -45,7 +48,7 @@ WITH near AS (
         dense_rank() OVER (ORDER BY projected_headway_m, relative_velocity_mps, merge_m,
             coalesce(end_m, track_end_m()),
             coalesce((spec->>'$.mean_speed_mps')::DOUBLE, mean_speed_mps())) AS task,
-        $trial IS NULL OR (trial_id = $trial AND spec_hash = $spec) AS wanted
+        (trial_id, spec_hash) IN (SELECT unnest($trials), unnest($specs)) AS wanted
     FROM trials LEFT JOIN specs USING (spec_hash) LEFT JOIN geometry USING (spec_hash)
     WHERE condition = $condition AND (human OR wanted)
 ), told AS (
@@ -95,7 +98,7 @@ def _laid(site: Site, other: Row) -> dict[str, Any] | None:
 def _offer(site: Site, at: At, condition: str, kind: str) -> str | None:
     if kind not in OFFERS:
         raise NotThere(f"there are no other offers than {', '.join(OFFERS)}")
-    other = offered(site, condition, at).get(at, {}).get(kind)
+    other = offered(site, condition, [at]).get(at, {}).get(kind)
     return None if other is None else key_of(site, other)
 
 
@@ -138,14 +141,14 @@ def searched(site: Site, row: Row, text: str) -> dict[str, Any]:
     }
 
 
-def offered(site: Site, condition: str, only: At | None = None) -> dict[At, dict[str, At]]:
-    """What is offered beside each trial of a condition, or beside only one, by kind."""
-    trial, spec = only or (None, None)
-    told = {"condition": condition, "trial": trial, "spec": spec}
+def offered(site: Site, condition: str, beside: Sequence[At]) -> dict[At, dict[str, At]]:
+    """What is offered beside some trials of a condition, by kind."""
+    trials, specs = [trial for trial, _ in beside], [spec for _, spec in beside]
+    told = {"condition": condition, "trials": trials, "specs": specs}
     with reading(site.db) as connection:
         rows = records(connection, NEAREST, told)
     found: dict[At, dict[str, At]] = {}
-    for row in (*site.catalogue.ask(BESIDE, condition, trial, spec), *rows):
+    for row in (*site.catalogue.ask(BESIDE, condition, trials, specs), *rows):
         others_of = found.setdefault((row["trial_id"], row["spec_hash"]), {})
         others_of[row["kind"]] = row["other_id"], row["other_hash"]
     return found

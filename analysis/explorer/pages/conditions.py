@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from math import ceil
 from typing import Any
 
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.conditions import condition_texts, ordered
-from analysis.explorer.pictures import Axis, Scale, ends_and_ticks
+from analysis.explorer.conditions import ordered
+from analysis.explorer.pictures import Axis, Scale
 from analysis.explorer.reading import Row
 from analysis.explorer.site import NothingNew, NotThere, Site
 from analysis.explorer.traces import MEASURES, read_band, read_traces
@@ -18,17 +20,6 @@ HUMAN = "human"
 MOST = 500
 # Sizes in the picture, in its units.
 WIDTH, LEFT, RIGHT, PANEL, BETWEEN, TOP, FOOT = 1000, 42, 8, 170, 34, 24, 42
-PANELS = dict(
-    zip(
-        MEASURES,
-        (
-            ("Speed of the left vehicle", "m/s"),
-            ("Speed of the right vehicle", "m/s"),
-            ("Headway: how far the left vehicle is ahead", "m"),
-        ),
-        strict=True,
-    )
-)
 CROSS = "m-5-5 10 10m0-10-10 10"
 COUNTED = """
 SELECT {columns}, count(*) AS trials, count(*) FILTER (outcome = 'left first') AS left_first,
@@ -36,6 +27,45 @@ SELECT {columns}, count(*) AS trials, count(*) FILTER (outcome = 'left first') A
     count(*) FILTER (outcome = 'collided') AS collided, avg(gap_m) AS gap_m
 FROM listed WHERE {where} GROUP BY ALL ORDER BY ALL
 """
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """How the vehicles of a trial are told apart: its name, what the first and the second are.
+
+    ``outcomes`` say of a line in the first and in the second colour who went first.
+    """
+
+    name: str
+    first: str
+    second: str
+    meaning: str = ""
+    outcomes: tuple[str, str] = ("left first", "right first")
+
+    @property
+    def headings(self) -> dict[str, str]:
+        """What its panels show, by MEASURES."""
+        speed, headway = "Speed of {} (m/s)", "Headway: how far {} is ahead (m)"
+        texts = (speed.format(self.first), speed.format(self.second), headway.format(self.first))
+        return dict(zip(MEASURES, texts, strict=True))
+
+
+# The first is what a page shows that asks for none: in the others the humans' median is of those
+# who go first and of those who yield together, which nobody drives.
+VIEWS = {
+    "order": View(
+        *("who merged first", "the vehicle that merged first", "the second one"),
+        "Where nobody merged first it is the vehicle that was ahead at the end.",
+    ),
+    "side": View("side", "the left vehicle", "the right vehicle"),
+    "driver": View(
+        *("who drives", "the driver that is named first", "the other driver"),
+        "Shown are pairs of two different drivers; of the humans, the vehicles on the same sides.",
+        ("the driver named first went first", "the other one did"),
+    ),
+}
+# By driver a line has the look of who went first: the driver that is named first, or the other one.
+TURNED_KIND = {"left-first": "right-first", "right-first": "left-first"}
 
 
 def conditions_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -52,7 +82,6 @@ def conditions_page(site: Site, asked: Mapping[str, str]) -> str:
         cells=found,
         names=names,
         drivers=sorted({model for _, model in found}, key=lambda model: (model == HUMAN, model)),
-        condition_texts=condition_texts(site.catalogue, names),
         state=state,
     )
 
@@ -66,63 +95,101 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     groups = _counted(site, "model, variant", Filter(condition=name))
     if not groups:
         raise NotThere(f"no trial of the condition {name} is here")
+    views = views_of(site, name)
+    by = asked.get("by") or next(iter(views))
+    if by not in views:
+        raise NotThere(f"vehicles are told apart with by={' or by='.join(views)}")
     wanted = Filter(condition=name, model=asked.get("model", ""), variant=asked.get("variant", ""))
-    drivers = [row for row in groups if row["model"] != HUMAN]
-    rows = _rows(site, wanted, with_humans=site.static or not drivers)
+    chosen = {key: value for key, value in wanted.chosen.items() if key != "condition"}
+    alone = all(row["model"] == HUMAN for row in groups)
+    rows = _rows(site, wanted, with_humans=site.static or alone)
+    if by == "driver":
+        rows = [row for row in rows if _mixed(row["model"])]
     drawn = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
-    traces = read_traces(site.db, [_key(row) for row in drawn])
-    humans = _rows(site, Filter(condition=name, model=HUMAN), with_humans=True)
-    band = read_band(site.db, [_key(row) for row in humans]) if humans else []
+    traces = read_traces(site.db, [_key(row) for row in drawn], by)
     drawn = [row for row in drawn if _key(row) in traces]
-    facets = site.catalogue.facets(wanted)
+    humans = _rows(site, Filter(condition=name, model=HUMAN), with_humans=True)
     return site.render(
         "condition.html",
         here="conditions",
         name=name,
-        text=condition_texts(site.catalogue, [name])[name],
+        by=by,
+        view=VIEWS[by],
+        choices=[
+            (VIEWS[key].name, site.at.condition(name, by=shown, **chosen), key == by)
+            for key, shown in views.items()
+        ],
         state=state,
         groups=groups,
-        chosen={key: value for key, value in wanted.chosen.items() if key != "condition"},
-        facets={key: facets[key] for key in ("model", "variant")},
+        chosen=chosen,
+        facets=site.catalogue.facets(wanted),
         sampled=len(rows) if len(rows) > MOST else 0,
         humans=len(humans),
         drawn=len(drawn),
-        picture=picture(drawn, traces, band),
+        picture=picture(drawn, traces, _band_of(site, humans, by, traces), VIEWS[by]),
     )
 
 
-def picture(drawn: Sequence[Row], traces: Mapping[Any, Row], band: Sequence[Row]) -> dict[str, Any]:
+def views_of(site: Site, condition: str) -> dict[str, str]:
+    """The views of a condition, by driver where two different ones drove, as its address has them.
+
+    The first one is what is shown where the address says nothing.
+    """
+    models = site.catalogue.ask("SELECT DISTINCT model FROM listed WHERE condition = ?", condition)
+    there = [key for key in VIEWS if key != "driver" or any(_mixed(row["model"]) for row in models)]
+    return {key: key if i else "" for i, key in enumerate(there)}
+
+
+def _mixed(model: str) -> bool:
+    return "+" in model  # joins the names of two different drivers
+
+
+def _band_of(site: Site, humans: Sequence[Row], by: str, traces: Mapping[Any, Row]) -> list[Row]:
+    """Where the humans' traces lie, in the same view: by driver, those on the drivers' sides."""
+    if not humans:
+        return []
+    keys = [_key(row) for row in humans]
+    if by == "driver":
+        return read_band(site.db, keys, seats={trace["turned"] for trace in traces.values()})
+    return read_band(site.db, keys, by)
+
+
+def picture(
+    drawn: Sequence[Row], traces: Mapping[Any, Row], band: Sequence[Row], view: View
+) -> dict[str, Any]:
     """Three panels over one axis of time: where all lines lie, in the units of the picture."""
     ends = [traces[_key(row)]["time_s"][-1] for row in drawn]
-    time = _axis([0.0, *ends, *(row["time_s"] for row in band)], LEFT, WIDTH - RIGHT)
+    end = max([*ends, *(row["time_s"] for row in band)], default=1.0)
+    time = Axis(Scale(0.0, end, LEFT, WIDTH - RIGHT), range(ceil(end)))
     lines_of = [*(traces[_key(row)] for row in drawn), *band]
     values = {name: [value for line in lines_of for value in line[name]] for name in MEASURES}
-    speeds = [*values["left_mps"], *values["right_mps"]]
+    speeds = [*values["first_mps"], *values["second_mps"]]
     axes = {}
     for place, name in enumerate(MEASURES):
         top = TOP + place * (PANEL + BETWEEN)
         shown = values[name] if name == "headway_m" else speeds  # both speeds can be compared
-        axes[name] = _axis(shown or [0.0], top + PANEL, top)
+        axes[name] = Axis.of((min(shown, default=0.0), max(shown, default=0.0)), (top + PANEL, top))
     lines: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in drawn:
+        trace = traces[_key(row)]
+        kind = str(row["outcome"]).replace(" ", "-")
+        if view is VIEWS["driver"] and trace["turned"]:
+            kind = TURNED_KIND.get(kind, kind)
         of = lines.setdefault((row["model"], row["variant"] or ""), [])
-        of.append({"row": row, "path": _path(row, traces[_key(row)], time.scale, axes)})
+        of.append({"row": row, "kind": kind, "path": _path(row, trace, time.scale, axes)})
     return {
         "width": WIDTH,
         "height": TOP + len(MEASURES) * (PANEL + BETWEEN) - BETWEEN + FOOT,
         "left": LEFT,
         "right": WIDTH - RIGHT,
-        "seconds": [(time.y(tick), f"{tick:g}") for tick in time.ticks],
+        "time": time,
         "panels": [
             {
                 "heading": heading,
-                "unit": unit,
-                "top": axes[name].y(axes[name].scale.high),
-                "bottom": axes[name].y(axes[name].scale.low),
-                "ticks": [(axes[name].y(tick), f"{tick:g}") for tick in axes[name].ticks],
+                "axis": axes[name],
                 "band": _band(name, band, time.scale, axes[name].scale),
             }
-            for name, (heading, unit) in PANELS.items()
+            for name, heading in view.headings.items()
         ],
         "lines": lines,
     }
@@ -154,14 +221,6 @@ def _rows(site: Site, wanted: Filter, *, with_humans: bool) -> list[Row]:
 
 def _key(row: Row) -> tuple[str, str]:
     return row["trial_id"], row["spec_hash"]
-
-
-def _axis(values: Sequence[float], from_: float, to: float) -> Axis:
-    """An axis that ends where the values do, and its ticks between."""
-    low, high = min(values), max(values)
-    first, last, ticks = ends_and_ticks(low, high, low, high)
-    low, high = (low, high) if low < high else (first, last)
-    return Axis(Scale(low, high, from_, to), [tick for tick in ticks if low <= tick <= high])
 
 
 def _path(row: Row, trace: Row, time: Scale, axes: Mapping[str, Axis]) -> str:

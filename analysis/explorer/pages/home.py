@@ -7,30 +7,25 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from analysis.data.human_counts import human_counts, published_accounts
-from analysis.explorer import views
 from analysis.explorer.analysis_worker import HUMAN
 from analysis.explorer.catalogue import FACTOR, Filter
 from analysis.explorer.charts import Kind, drawn
-from analysis.explorer.conditions import condition_texts
+from analysis.explorer.conditions import ordered
 from analysis.explorer.pages.computed import Computed, computed
 from analysis.explorer.pages.sweep import news_of
 from analysis.explorer.pictures import marker
 from analysis.explorer.reading import Row
 from analysis.explorer.site import NotThere, Site
 from analysis.explorer.sweeps import standing_of
+from analysis.explorer.task_picture import task_picture
+from analysis.explorer.urls import HOME
 from analysis.metrics import GAP, LEFT_FIRST
-from analysis.tables.formats import notes_of, shown_value
+from analysis.tables.formats import notes_of, printed
 from analysis.tables.model import Table, from_text
-from merge_runner.config import ScenarioConfig
-from merge_runner.records import SIDES, Side
-from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
-from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.study.crossing import PROMPT
 
 # More groups than these cannot be told apart in a picture.
 DRAWN = 12
-# The condition and the moment that the picture of the task shows, in s from the start of the run.
-PICTURED, PICTURED_S = "L_4_0", 6.5
 # Trials of drivers by group and condition; ``who`` tells those of stand-ins apart.
 PLAYED = """
 SELECT {key} AS key, who, condition, string_agg(DISTINCT stand_in, '; ') AS stand_in,
@@ -71,10 +66,12 @@ class Played:
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
     """The study; raises NotThere, and NothingNew where nothing is new since it was ``seen``."""
     given = {name: value for name, value in asked.items() if name != "seen"}
-    factors = [PROMPT, *site.catalogue.factors()]
-    by = asked.get("by", "")
-    if by not in {"", *factors}:
-        raise NotThere(f"trials are grouped by {', '.join(factors)}, or by driver and prompt")
+    by, ways = asked.get("by", ""), groupings(site)
+    if by not in ways:
+        factors = ", ".join(filter(None, ways))
+        raise NotThere(
+            f"trials are grouped by {factors or 'nothing else'}, or by driver and prompt"
+        )
     standing = standing_of(site.catalogue)
     groups = groups_of(site, by)
     humans = site.catalogue.ask(PLAYED.format(key="who", trials="listed", where="who = 'humans'"))
@@ -89,14 +86,13 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         standing=standing,
         seen=seen,
         by=by,
-        factors=factors,
-        task=task_picture(),
+        choices=[(way or "driver and prompt", site.at.to(HOME, by=way), way == by) for way in ways],
+        task=task_picture(site.catalogue),
         groups=groups,
         first=ranking(groups),
         humans=(published := human_cells(humans)),
         rows=(rows := worst_first(groups)),
         beside=_sum_of([published[row["name"]] for row in rows if row["name"] in published]),
-        condition_texts=condition_texts(site.catalogue, [row["name"] for row in rows]),
         accounts=account_rows(
             site.catalogue.account_counts(Filter(outcome="collided")), published_accounts()
         ),
@@ -107,6 +103,15 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         indicators=_indicators(site, verdicts),
         path=marker,
     )
+
+
+def groupings(site: Site) -> list[str]:
+    """By what trials are grouped: driver and prompt (empty), or a factor where any varies."""
+    factors = site.catalogue.factors()
+    (prompts,) = site.catalogue.ask(
+        "SELECT count(DISTINCT variant) AS n FROM listed WHERE who <> 'humans'"
+    )
+    return ["", PROMPT, *factors] if factors or prompts["n"] > 1 else [""]
 
 
 def groups_of(site: Site, by: str) -> list[Played]:
@@ -176,10 +181,9 @@ def worst_first(groups: Sequence[Played]) -> list[dict[str, Any]]:
     first = ranking(groups)
     if first is None:
         return []
-    played = {name for group in groups for name in group.cells}
-    usual = {name: place for place, name in enumerate(HUMAN_CONDITIONS)}
-    names = sorted(played, key=lambda name: (-first.share(name), usual.get(name, len(usual)), name))
-    most = max((first.share(name) for name in names), default=0.0)
+    names = ordered({name for group in groups for name in group.cells})
+    names.sort(key=first.share, reverse=True)
+    most = max(map(first.share, names), default=0.0)
     return [
         {
             "name": name,
@@ -212,20 +216,15 @@ def verdicts_of(site: Site, table: Table) -> dict[str, Any]:
 
     ``ceiling`` is the share of human data sets that pass, ``link`` leads to the trials.
     """
-    columns = {column.name: column for column in table.columns}
     drivers: dict[str, dict[str, Any]] = {}
     for row in table.rows:
         if row.values.get("paper") is None and row.values.get("robust") is None:
             continue
-        said = {
-            name: shown_value(columns[name], row.values.get(name))
-            for name in ("paper", "robust", "ceiling_paper")
-        }
-        known = row.values.get("ceiling_paper") is not None
+        said = printed(table, row)
         drivers.setdefault(str(row.values["driver"]), {})[str(row.values["indicator"])] = {
             "paper": said["paper"],
             "robust": said["robust"] if row.values.get("differ") else "",
-            "ceiling": said["ceiling_paper"] if known else "",
+            "ceiling": "" if row.values.get("ceiling_paper") is None else said["ceiling_paper"],
             "link": site.at.cell(table.name, row.id, "n") if row.groups != (HUMAN,) else "",
             "note": row.note,
         }
@@ -255,42 +254,3 @@ def account_rows(
         "published": published,
         "same": {who: of[SAME] for who, of in published.items()},
     }
-
-
-def task_picture() -> dict[str, Any]:
-    """The track from above with both vehicles, in m; as in a replay all drive to the right."""
-    scenario = ScenarioConfig()
-    places = CONDITIONS[PICTURED].positions_m(PICTURED_S, TRACK)
-    vehicles = []
-    for side, position_m in zip(SIDES, places, strict=True):
-        across, along = TRACK.place(side, position_m)
-        sine, cosine = TRACK.heading(side, position_m)
-        vehicles.append(
-            {"side": side, "x": round(along, 2), "y": round(across, 2),
-             "matrix": f"{cosine:.4f} {sine:.4f} {-sine:.4f} {cosine:.4f}"}
-        )  # fmt: skip
-    return {
-        "view_box": views.view_box(TRACK),
-        "branches": {side: _path(side) for side in SIDES},
-        "tunnels": {side: [_point(side, 0.0), _point(side, TRACK.tunnel_exit_m)] for side in SIDES},
-        "merge_m": round(TRACK.merge_y_m, 2),
-        "end_m": round(TRACK.end_y_m, 2),
-        "vehicles": vehicles,
-        "length_m": scenario.vehicle_length_m,
-        "width_m": scenario.vehicle_width_m,
-        "alone_m": TRACK.merge_point_m - TRACK.tunnel_exit_m,
-        "condition": PICTURED,
-        "words": views.condition_text(
-            CONDITIONS[PICTURED].projected_headway_m, CONDITIONS[PICTURED].relative_velocity_mps
-        ),
-    }
-
-
-def _path(side: Side) -> str:
-    points = [_point(side, at) for at in (0.0, TRACK.merge_point_m, TRACK.end_m)]
-    return " ".join(f"{x},{y}" for x, y in points)
-
-
-def _point(side: Side, position_m: float) -> tuple[float, float]:
-    across, along = TRACK.place(side, position_m)
-    return round(along, 2), round(across, 2)

@@ -14,7 +14,7 @@ from analysis.explorer.pages.computed import computed
 from analysis.explorer.pictures import marker
 from analysis.explorer.site import Site
 from analysis.metrics import BOXES, shown_in
-from analysis.tables.formats import notes_of, shown_value
+from analysis.tables.formats import notes_of, printed
 from analysis.tables.model import Table, from_text
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
@@ -46,7 +46,7 @@ def humans_page(site: Site, asked: Mapping[str, str]) -> str:
             "human_collisions": human_collisions(groups),
             "caveat": content["caveat"],
             "notes": content["notes"],
-            "differences": differences(contrasts),
+            "differences": [(row.id, printed(contrasts, row)) for row in contrasts.rows],
             "difference_notes": [
                 note for note in notes_of(contrasts) if note not in content["notes"]
             ],
@@ -103,16 +103,3 @@ def against_humans(contrasts: Table) -> Table:
     return replace(
         contrasts, rows=[row for row in contrasts.rows if row.values["reference"] == HUMAN]
     )
-
-
-def differences(contrasts: Table) -> list[dict[str, Any]]:
-    """The rows of differences, as printed."""
-    columns = {column.name: column for column in contrasts.columns}
-    return [
-        {
-            "row": row.id,
-            "note": row.note,
-            **{name: shown_value(columns[name], row.values.get(name)) for name in columns},
-        }
-        for row in contrasts.rows
-    ]

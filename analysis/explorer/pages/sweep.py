@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from datetime import UTC, datetime
 
-from analysis.explorer.conditions import condition_texts, ordered
+from analysis.explorer.conditions import ordered
 from analysis.explorer.site import NothingNew, NotThere, Site
 from analysis.explorer.sweeps import Sweep, VariantCondition, duration, find_sweep, list_sweeps
 from analysis.explorer.views import prompt_text
@@ -79,7 +79,6 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
             for kind, text in KINDS.items()
         },
         "bar": bar,
-        "condition_texts": condition_texts(site.catalogue, conditions),
         "prompt_text": prompt_text,
         "duration": duration,
         "lasted": _lasted(sweep.entry.row["started_at"], sweep.entry.last_word),

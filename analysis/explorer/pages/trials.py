@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 from analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
-from analysis.explorer.conditions import condition_texts
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.site import NothingNew, NotThere, Site
@@ -40,7 +39,6 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         "trials.html",
         here="trials",
         facets=facets,
-        condition_texts=condition_texts(site.catalogue, (name for name, _ in facets["condition"])),
         chosen=wanted.chosen,
         kept={**wanted.chosen, "cell": cell},
         cell=cell,

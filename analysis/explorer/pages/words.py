@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from analysis.explorer.assets import inlined
 from analysis.explorer.display_text import visible
 from analysis.explorer.pages.trial import embedded
 from analysis.explorer.pages.trials import filter_of
@@ -23,7 +22,6 @@ HEADINGS = {
     "model": "driver",
     "variant": "prompt",
 }
-SCRIPTS = ("lists.js", "keys.js", "unpacked.js", "words.js")
 
 
 def words_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -80,12 +78,11 @@ def exported_words(site: Site, trials: Sequence[Row], pack: Callable[[object], s
         }
         for one in said
     ]
-    counts: dict[str, Counter[str]] = {name: Counter() for name in (*OWN_FACETS, *TRIAL_FACETS)}
-    for one in decided:
-        for name in OWN_FACETS:
-            counts[name].update([one[name]] if one[name] else [])
+    counts = {name: Counter(one[name] for one in decided if one[name]) for name in OWN_FACETS}
+    counts |= {name: Counter[str]() for name in TRIAL_FACETS}
+    for place, times in Counter(one["of"] for one in decided).items():
         for name in TRIAL_FACETS:
-            counts[name].update(value for value in of_trial[one["of"]][name] if value)
+            counts[name].update(dict.fromkeys(filter(None, of_trial[place][name]), times))
     return _rendered(
         site,
         found=None,
@@ -94,7 +91,6 @@ def exported_words(site: Site, trials: Sequence[Row], pack: Callable[[object], s
         kind="rationales",
         kept={},
         data=embedded(pack({"trials": of_trial, "said": decided})),
-        inlined=inlined(SCRIPTS),
     )
 
 

@@ -13,6 +13,9 @@
       const wanted = model.value ? driver === model.value : driver !== "human" || !drivers;
       group.toggleAttribute("hidden", !wanted || (variant.value && group.dataset.variant !== variant.value));
     }
+    // The other views are pages of their own, and keep the choice.
+    const chosen = new URLSearchParams([...new FormData(form)].filter(([name, value]) => name !== "by" && value));
+    for (const link of document.querySelectorAll(".groups a")) link.search = chosen;
     document.getElementById("drawn").textContent = document.querySelectorAll(".overlay [data-model]:not([hidden]) path").length;
   };
   form.addEventListener("input", show);

@@ -86,9 +86,9 @@ SELECT *,
     first_value(right_mps) OVER trial AS right_first_mps
 FROM pairs WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step);
 
--- When each vehicle's centre reaches the merge point, when its front does, and when its rear has
--- left it; NULL: never.
-CREATE OR REPLACE VIEW merge_times AS
+-- What takes the name of samples or times: trial_metrics makes its samples once, as that is most of its
+-- work.
+CREATE OR REPLACE MACRO merge_times_in(pairs) AS TABLE
 SELECT *,
     least(left_s, right_s) AS first_s,
     CASE WHEN left_s IS NOT NULL AND right_s IS NOT NULL THEN greatest(left_s, right_s) END
@@ -101,27 +101,24 @@ FROM (SELECT trial_id, spec_hash,
     min(passing_s(rear_m, left_before_m, left_m, time_before_s, time_s)) AS left_rear_s,
     min(passing_s(rear_m, right_before_m, right_m, time_before_s, time_s)) AS right_rear_s
 FROM (SELECT *, coalesce(merge_point_m, merge_point_m()) AS point_m
-    FROM vehicle_pairs LEFT JOIN geometry USING (spec_hash)) GROUP BY ALL);
+    FROM query_table(pairs) LEFT JOIN geometry USING (spec_hash)) GROUP BY ALL);
 
--- RMSE of each vehicle's speed from its initial speed, over four readings of "the interaction
--- window": from the start of control to the first vehicle's merge, to the second's, to the end,
--- and the whole trial with the tunnel where it was recorded. A window ends with the first sample
--- at which it is over. A human's speed is compared with that of the condition, which the
--- simulator gave the vehicle; a recording begins up to a step later.
-CREATE OR REPLACE VIEW speed_deviations AS
+-- When each vehicle's centre reaches the merge point, when its front does, and when its rear has
+-- left it; NULL: never.
+CREATE OR REPLACE VIEW merge_times AS FROM merge_times_in('vehicle_pairs');
+
+CREATE OR REPLACE MACRO speed_deviations_in(pairs, times) AS TABLE
 SELECT *,
-    -- the mean of both
     (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
-    -- whether both are at least 0.5 m/s
     least(rmse_left_mps, rmse_right_mps) >= 0.5 AS joint
 FROM (SELECT trial_id, spec_hash, time_window,
     sqrt(avg((left_mps - CASE source WHEN 'human'
         THEN mean_speed_mps() + relative_velocity_mps / 2 ELSE left_first_mps END) ** 2)) AS rmse_left_mps,
     sqrt(avg((right_mps - CASE source WHEN 'human'
         THEN mean_speed_mps() - relative_velocity_mps / 2 ELSE right_first_mps END) ** 2)) AS rmse_right_mps
-FROM vehicle_pairs
+FROM query_table(pairs)
 JOIN trials USING (trial_id, spec_hash)
-JOIN merge_times USING (trial_id, spec_hash)
+JOIN query_table(times) USING (trial_id, spec_hash)
 CROSS JOIN (VALUES ('first_merge'), ('both_merges'), ('end'), ('whole')) AS windows (time_window)
 WHERE status = 'finished' AND CASE time_window
     WHEN 'first_merge' THEN time_s >= 0 AND coalesce(time_before_s < first_s, true)
@@ -131,15 +128,26 @@ WHERE status = 'finished' AND CASE time_window
     ELSE true END
 GROUP BY ALL);
 
+-- RMSE of each vehicle's speed from its initial speed, over four readings of "the interaction
+-- window": from the start of control to the first vehicle's merge, to the second's, to the end,
+-- and the whole trial with the tunnel where it was recorded. A window ends with the first sample
+-- at which it is over. A human's speed is compared with that of the condition, which the
+-- simulator gave the vehicle; a recording begins up to a step later.
+CREATE OR REPLACE VIEW speed_deviations AS
+FROM speed_deviations_in('vehicle_pairs', 'merge_times');
+
 -- One row a trial. What a trial has no value for is NULL: gaps, speed deviations and joint are
 -- those of finished trials (arXiv 2604.09609, sec. II-G).
 CREATE OR REPLACE VIEW trial_metrics AS
-WITH distances AS (
+WITH pairs AS MATERIALIZED (FROM vehicle_pairs),
+-- Were these kept as well, the samples of all trials would be read for one of them.
+times AS NOT MATERIALIZED (FROM merge_times_in('pairs')),
+distances AS (
     SELECT trial_id, spec_hash,
         abs(left_before_m - right_before_m
             + (first_s - time_before_s) / (time_s - time_before_s)
             * (left_m - left_before_m - right_m + right_before_m)) AS merge_m
-    FROM vehicle_pairs JOIN merge_times USING (trial_id, spec_hash)
+    FROM pairs JOIN times USING (trial_id, spec_hash)
     WHERE time_before_s < first_s AND first_s <= time_s
 ), sampled_distances AS (
     SELECT trial_id, spec_hash,
@@ -149,20 +157,20 @@ WITH distances AS (
             FILTER (left_m + right_m >= 2 * point_m) AS mean_at_merge_m,
         max(hardest_mps2) FILTER (time_s > 0) AS max_acceleration_mps2
     FROM (SELECT *, coalesce(merge_point_m, merge_point_m()) AS point_m
-        FROM vehicle_pairs LEFT JOIN geometry USING (spec_hash)) GROUP BY ALL
+        FROM pairs LEFT JOIN geometry USING (spec_hash)) GROUP BY ALL
 ), collision_times AS (
     SELECT trial_id, spec_hash, min((abs(left_m - right_m) - length_m) / closing_mps) AS min_ttc_s
     FROM (
         SELECT *, CASE WHEN left_m > right_m THEN right_mps - left_mps
             ELSE left_mps - right_mps END AS closing_mps
-        FROM vehicle_pairs JOIN geometry USING (spec_hash)
+        FROM pairs JOIN geometry USING (spec_hash)
         WHERE greatest(left_m, right_m) >= merge_point_m
     )
     WHERE closing_mps > 0 AND abs(left_m - right_m) > length_m
     GROUP BY ALL
 ), resolutions AS (
     SELECT trial_id, spec_hash, min(time_s) AS conflict_resolution_s
-    FROM vehicle_pairs JOIN geometry USING (spec_hash)
+    FROM pairs JOIN geometry USING (spec_hash)
     WHERE time_s >= 0 AND NOT (
         on_course(contact_m, contact_m, contact_high_m, left_m, left_mps, right_m, right_mps)
         OR on_course(contact_m, contact_m, contact_high_m, right_m, right_mps, left_m, left_mps)
@@ -210,10 +218,11 @@ SELECT
     -- when the vehicles are first off a collision course; NULL after a collision
     CASE WHEN status <> 'collided' THEN conflict_resolution_s END AS conflict_resolution_s
 FROM (SELECT *, status = 'finished' AS finished FROM trials) AS trials
-LEFT JOIN merge_times USING (trial_id, spec_hash)
+LEFT JOIN times USING (trial_id, spec_hash)
 LEFT JOIN geometry USING (spec_hash)
 LEFT JOIN distances USING (trial_id, spec_hash)
 LEFT JOIN sampled_distances USING (trial_id, spec_hash)
-LEFT JOIN (FROM speed_deviations WHERE time_window = 'first_merge') USING (trial_id, spec_hash)
+LEFT JOIN (FROM speed_deviations_in('pairs', 'times') WHERE time_window = 'first_merge')
+    USING (trial_id, spec_hash)
 LEFT JOIN collision_times USING (trial_id, spec_hash)
 LEFT JOIN resolutions USING (trial_id, spec_hash);

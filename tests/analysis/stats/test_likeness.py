@@ -134,7 +134,7 @@ def driving(tmp_path, **actions) -> Study:
 def test_a_trial_has_the_mean_gain_of_the_vehicles_that_acted(tmp_path):
     study = driving(tmp_path)
     (group,) = study.models
-    profiles = study.profiles.set_index(["trial_id", "side"])
+    profiles = study.profiles_of(group).set_index(["trial_id", "side"])
     found = trial_gains(study, group).set_index("trial_id")
     assert len(found) == 11
     for trial in found.index:
@@ -147,7 +147,7 @@ def test_a_trial_has_the_mean_gain_of_the_vehicles_that_acted(tmp_path):
 def test_both_vehicles_count_where_both_acted(tmp_path):
     study = driving(tmp_path, right=(0.4, 0.0, 0.2))
     (group,) = study.models
-    both = study.profiles.groupby("trial_id")["gain"].agg(["mean", "count"])
+    both = study.profiles_of(group).groupby("trial_id")["gain"].agg(["mean", "count"])
     assert (both["count"] == 2).all()
     found = trial_gains(study, group).set_index("trial_id")["gain"]
     assert found.to_dict() == pytest.approx(both.loc[found.index, "mean"].to_dict())
@@ -159,8 +159,10 @@ def test_a_model_that_drives_against_the_resistance_is_measured_as_without(tmp_p
     slowed = load(SPEEDS, study.db)
     assert slowed["resisted"].all()
     with_it = measure_profiles(slowed.assign(resisted=False))["gain"]
-    assert (study.profiles["gain"] > with_it).mean() > 0.9
-    assert (study.profiles["gain"] > 0).all()
+    (group,) = study.models
+    found = study.profiles_of(group)["gain"]
+    assert (found > with_it).mean() > 0.9
+    assert (found > 0).all()
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ async def test_a_worker_that_is_killed_costs_its_calls_in_flight_and_nothing_els
         victim = next(w for w in workers_of(process.pid) if held_from(gate, w))
         lost = held_from(gate, victim)
         victim.kill()
-        await asyncio.sleep(0.3)
+        await process.said("is lost: its ")
         gate.open()
         code, out, err = await ended(process)
     assert code == 0, err
@@ -104,7 +104,7 @@ async def test_ctrl_c_saves_what_the_workers_have_in_flight(merge_runner, starte
         process.send_signal(signal.SIGINT)
         for worker in workers_of(process.pid):
             worker.send_signal(signal.SIGINT)  # as a terminal does
-        await asyncio.sleep(1)
+        await process.said("are saved first")
         gate.open()
         code, _, err = await ended(process)
         assert code == 130, err

@@ -1,11 +1,8 @@
 "use strict";
 // A second trial beside this one: found by its name, or offered.
 replay.comparison = (scene, { changed }) => {
-  const PAUSE_MS = 200;
   const at = (id) => document.getElementById(id);
-  const field = at("compare"), list = at("others");
-  let waiting = 0, asked = "";
-
+  const { close, field } = replay.finding(at("compare-form"));
   const say = (...words) => {
     at("ghost-key").hidden = words.length === 0;
     at("ghost-key").replaceChildren(...words);
@@ -32,43 +29,6 @@ replay.comparison = (scene, { changed }) => {
     close();
     changed(push);
   };
-  const close = () => { list.hidden = true; };
-  const entry = (one) => replay.element("li", {},
-    replay.element("button", { type: "button", "data-key": one.key }, `${one.name}: ${one.outcome}${one.note ? `, ${one.note}` : ""}`));
-  const search = async () => {
-    const text = field.value.trim();
-    asked = text;
-    const { found, more } = await explorer.search(text).catch(() => ({ found: [], more: 0 }));
-    if (asked !== text || !field.matches(":focus")) return;
-    const note = found.length === 0 ? "No trial has these words in its name, driver or outcome."
-      : more ? `${more} more: type more of a name, driver or outcome.` : "";
-    list.replaceChildren(...found.map(entry), ...(note ? [replay.element("li", { class: "quiet" }, note)] : []));
-    list.hidden = false;
-  };
-  const soon = () => {
-    clearTimeout(waiting);
-    waiting = setTimeout(search, PAUSE_MS);
-  };
-  const walk = (event, by) => {
-    const stops = [field, ...list.querySelectorAll("button")];
-    stops[Math.min(Math.max(stops.indexOf(event.target) + by, 0), stops.length - 1)].focus();
-    event.preventDefault();
-  };
-  field.addEventListener("input", soon);
-  field.addEventListener("focus", () => { field.select(); if (list.hidden) soon(); });
-  at("compare-form").addEventListener("focusout", (event) => {
-    if (!at("compare-form").contains(event.relatedTarget)) close();
-  });
-  at("compare-form").addEventListener("submit", (event) => {
-    event.preventDefault();
-    list.querySelector("button")?.click();
-  });
-  at("compare-form").addEventListener("keydown", (event) => {
-    if (event.key === "ArrowDown" && !list.hidden) walk(event, 1);
-    else if (event.key === "ArrowUp" && !list.hidden) walk(event, -1);
-    else if (event.key === "Escape") { close(); document.activeElement.blur(); event.preventDefault(); }
-    event.stopPropagation();
-  });
   at("compare-form").addEventListener("click", async (event) => {
     const button = event.target.closest("button");
     if (!button) return;
