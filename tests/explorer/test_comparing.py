@@ -16,6 +16,7 @@ from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.comparing import offered
 from analysis.explorer.site import Site
 from tests.analysis.studies import Drive, as_humans, write_study
+from tests.explorer.serving import served
 
 HOST = "127.0.0.1:8700"
 TRIAL = "emulator/baseline/N_0_0/rep01"
@@ -224,3 +225,24 @@ def test_offers_are_a_click_away(page):
     expect(page.locator("#ghost-key")).to_contain_text("human P1")
     page.go_back()
     expect(page.locator("#ghost-key")).to_contain_text("rep 2")
+
+
+def test_a_trial_on_another_track_is_said_to_be_and_no_human_is_near_it(page, db, tmp_path):
+    path = shutil.copy(db, tmp_path / "t.duckdb")
+    track = {"tunnel_exit_m": 50, "merge_point_m": 90, "end_m": 150, "start_distance_m": 25}
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(
+            "UPDATE specs SET spec = json_merge_patch(spec, ?) WHERE spec_hash IN "
+            "(SELECT spec_hash FROM trials WHERE trial_id LIKE 'o4/A1/%')",
+            [json.dumps({"track": track})],
+        )
+    with served(path) as address:
+        page.goto(f"{address}/trials/o3/A1/N_0_0/rep01?compare=o4/A1/N_0_0/rep01")
+        expect(page.locator("#ghost-key")).to_contain_text("It drove on another track")
+        page.goto(f"{address}/trials/o3/A1/N_0_0/rep01?compare=o4/baseline/N_0_0/rep02")
+        expect(page.locator("#ghost-key")).to_contain_text("dashed")
+        expect(page.locator("#ghost-key")).not_to_contain_text("another track")
+        page.goto(f"{address}/trials/o4/A1/N_0_0/rep01")
+        page.get_by_role("button", name="nearest human").click()
+        expect(page.locator("#ghost-key")).to_contain_text("none here. It would be the human trial")
+        page.goto("about:blank")
