@@ -458,7 +458,7 @@ class Catalogue:
             return self._memory.cursor()
 
     def copy(self, sql: str) -> None:
-        """Run statements of ours that copy texts from the database; raises UsageError, StoreError."""
+        """Run statements of ours that copy texts of the database; raises UsageError, StoreError."""
         try:
             with (
                 reading(self.db, self._instance) as connection,
