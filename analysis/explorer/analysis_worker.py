@@ -43,8 +43,8 @@ class Numbers:
         Where no table has the cell, the answer says so as ``absent``.
 
         ``study``, which reads it, ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``,
-        ``figure NAME``, ``humans``, or ``home FACTOR``, empty for drivers and prompts; what follows
-        the last two is ignored. Raises MergeRunnerError.
+        ``figure NAME``, ``humans``, or ``home FACTOR`` with an empty factor for drivers and
+        prompts; what follows the last two is ignored. Raises MergeRunnerError.
         """
         match list(request):
             case ["study"]:

@@ -466,7 +466,7 @@ class Catalogue:
             return self._memory.cursor()
 
     def copy(self, sql: str) -> None:
-        """Run statements of ours that copy from the database; raises UsageError and StoreError."""
+        """Run statements of ours that copy texts of the database; raises UsageError, StoreError."""
         try:
             with (
                 reading(self.db, self._instance) as connection,

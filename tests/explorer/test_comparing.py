@@ -12,6 +12,7 @@ from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
+from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.comparing import offered
 from analysis.explorer.site import Site
 from tests.analysis.studies import Drive, as_humans, write_study
@@ -80,7 +81,8 @@ def test_only_a_human_with_the_same_task_is_near(db, tmp_path, other_task):
     def nearest(which):
         with duckdb.connect(str(path)) as connection:
             connection.execute(
-                f"UPDATE specs SET spec = json_merge_patch(spec, ?) WHERE spec_hash {which} {human}",
+                "UPDATE specs SET spec = json_merge_patch(spec, ?) "
+                f"WHERE spec_hash {which} {human}",
                 [json.dumps(other_task)],
             )
         client = TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}")
@@ -123,7 +125,10 @@ def test_another_driver_has_the_same_prompt_if_it_can(client):
 def test_what_is_offered_to_all_of_a_condition_is_what_is_offered_to_each(db, client):
     site = Site(db)
     site.catalogue.refresh()
-    for (name, _), offers in offered(site, "N_0_0").items():
+    rows = site.catalogue.every(Filter(condition="N_0_0"))
+    found = offered(site, "N_0_0", [(row["trial_id"], row["spec_hash"]) for row in rows])
+    assert len(found) == len(rows)
+    for (name, _), offers in found.items():
         for kind, (other, _) in offers.items():
             assert ask(client, name, offer=kind) == other
 
