@@ -115,4 +115,3 @@ def _total(variant: str, cells: list[VariantCondition | None]) -> VariantConditi
         invalid=sum(cell.invalid for cell in there),
         state=there[0].state,
     )
-
