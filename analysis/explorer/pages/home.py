@@ -26,16 +26,6 @@ from merge_runner.study.crossing import PROMPT
 
 # More groups than these cannot be told apart in a picture.
 DRAWN = 12
-# Trials of drivers by group and condition; ``who`` tells those of stand-ins apart.
-PLAYED = """
-SELECT {key} AS key, who, condition, string_agg(DISTINCT stand_in, '; ') AS stand_in,
-    count(*) AS trials, count(*) FILTER (status <> 'failed') AS ended,
-    count(*) FILTER (status = 'failed') AS failed,
-    count(*) FILTER (status = 'collided') AS collided,
-    coalesce(sum(decisions), 0)::BIGINT AS decisions,
-    coalesce(sum(invalid), 0)::BIGINT AS invalid, coalesce(sum(cost_usd), 0) AS cost_usd
-FROM {trials} WHERE {where} GROUP BY ALL ORDER BY ALL
-"""
 COUNTS = ("trials", "ended", "failed", "collided", "decisions", "invalid", "cost_usd")
 # What is published as one class of collisions, and the two that it holds.
 SAME, SAME_ACTION = "same action", ("both insisted", "both gave way")
@@ -73,7 +63,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     if by not in ways:
         raise NotThere(f"trials are grouped by {', '.join([DRIVER_AND_PROMPT, *ways[1:]])}")
     groups = groups_of(site, by)
-    humans = site.catalogue.ask(PLAYED.format(key="who", trials="listed", where="who = 'humans'"))
+    humans = site.catalogue.counts(Filter(who="humans"), "condition")
     imported = sum(row["trials"] for row in humans)
     panels = computed(site, ("home", by, str(imported)), given, wait_s=0.0)
     verdicts = computed(site, ("tables", "indicators"), given, wait_s=0.0)
@@ -114,21 +104,13 @@ def groupings(site: Site) -> list[str]:
 
 def groups_of(site: Site, by: str) -> list[Played]:
     """Drivers and prompts, or the levels of a factor; before several their sum."""
-    drivers = "who <> 'humans'"
-    if not by:
-        key, trials = "{'model': model, 'variant': variant}", "listed"
-    elif by == PROMPT:
-        key, trials = "{'variant': variant}", "listed"
-    else:
-        key, trials = "{'level': level}", "listed JOIN levels USING (number)"
-        drivers += " AND factor = ?"
-    rows = site.catalogue.ask(
-        PLAYED.format(key=key, trials=trials, where=drivers),
-        *([by] if "factor" in drivers else []),
-    )
+    factor = by if by not in {"", PROMPT} else ""
+    names = ("level",) if factor else ("variant",) if by else ("model", "variant")
     found: dict[tuple[str, ...], Played] = {}
-    for row in rows:
-        levels = {name: value or "" for name, value in row["key"].items()}
+    for row in site.catalogue.counts(Filter(), *names, "who", "condition", factor=factor):
+        if row["who"] == "humans":
+            continue
+        levels = {name: row[name] or "" for name in names}
         state = {f"{FACTOR}{by}" if name == "level" else name: v for name, v in levels.items()}
         label = ", ".join(filter(None, levels.values()))
         new = Played(label, row["who"], {"who": row["who"], **state}, row["stand_in"] or "")
@@ -141,11 +123,9 @@ def _sums(site: Site, groups: Sequence[Played]) -> list[Played]:
     sums = []
     for who in ("drivers", "stand-ins"):
         if sum(group.who == who for group in groups) > 1:
-            rows = site.catalogue.ask(
-                PLAYED.format(key="who", trials="listed", where="who = ?"), who
-            )
-            whole = Played(f"all {who}", who, {"who": who})
-            whole.cells.update({row["condition"]: row for row in rows})
+            rows = site.catalogue.counts(Filter(who=who), "condition")
+            cells = {row["condition"]: row for row in rows}
+            whole = Played(f"all {who}", who, {"who": who}, cells=cells)
             sums.append(whole)
     return sums
 
