@@ -225,6 +225,15 @@ SORTS = {
     "invalid": "invalid",
     "cost": "cost_usd",
 }
+COUNTS = """
+count(*) AS trials, count(*) FILTER (status <> 'failed') AS ended,
+count(*) FILTER (status = 'failed') AS failed, count(*) FILTER (status = 'collided') AS collided,
+count(*) FILTER (outcome = 'left first') AS left_first,
+count(*) FILTER (outcome = 'right first') AS right_first,
+coalesce(sum(decisions), 0)::BIGINT AS decisions, coalesce(sum(invalid), 0)::BIGINT AS invalid,
+coalesce(sum(fallbacks), 0)::BIGINT AS fallbacks, coalesce(sum(cost_usd), 0) AS cost_usd,
+avg(gap_m) AS gap_m, avg(rmse_mps) AS rmse_mps, string_agg(DISTINCT stand_in, '; ') AS stand_in
+"""
 SHOWN = "* EXCLUDE (flaws, posed, tried)"
 SPEEDS = "left_mps, right_mps, left_range_mps, right_range_mps"
 EXPORTED = (
@@ -374,22 +383,30 @@ class Catalogue:
         return names if names != ["model"] else []
 
     def totals(self, wanted: Filter) -> dict[str, Row]:
-        """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``.
+        """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``."""
+        return {row["who"]: row for row in self.counts(wanted, "who")}
+
+    def counts(self, wanted: Filter, *columns: str, factor: str = "") -> list[Row]:
+        """What a filter's trials come to by columns; ``level`` is one where a factor is named.
 
         Counts over all of them, and means over those that have the value.
         """
         where, values = wanted.where()
-        rows = self.ask(
-            "SELECT who, count(*) AS trials, count(*) FILTER (status = 'collided') AS collided, "  # noqa: S608 # constants
-            "count(*) FILTER (status = 'failed') AS failed, "
-            "count(*) FILTER (status <> 'failed') AS ended, "
-            "coalesce(sum(decisions), 0) AS decisions, coalesce(sum(invalid), 0) AS invalid, "
-            "coalesce(sum(fallbacks), 0) AS fallbacks, coalesce(sum(cost_usd), 0) AS cost_usd, "
-            "avg(gap_m) AS gap_m, avg(rmse_mps) AS rmse_mps "
-            f"FROM listed WHERE {where} GROUP BY ALL ORDER BY ALL",
+        source = "listed"
+        if factor:
+            source += " JOIN (FROM levels WHERE factor = ?) USING (number)"
+            values = [factor, *values]
+        named = ", ".join(columns)
+        return self.ask(
+            f"SELECT {named}, {COUNTS} FROM {source} WHERE {where} GROUP BY {named} "  # noqa: S608 # constants
+            f"ORDER BY {named}",
             *values,
         )
-        return {row["who"]: row for row in rows}
+
+    def account_counts(self, wanted: Filter) -> list[Row]:
+        """The counts of a filter's trials that have an account, by driver, prompt and account."""
+        rows = self.counts(wanted, "who", "model", "variant", "account")
+        return [row for row in rows if row["account"] is not None]
 
     def page(self, wanted: Filter, sort: str, number: int) -> list[Row]:
         """The trials of one page, counted from 1; ``-gap`` sorts the largest gap first."""
@@ -420,15 +437,6 @@ class Catalogue:
             spec_hash,
         )
         return found[0] if found else None
-
-    def account_counts(self, wanted: Filter) -> list[Row]:
-        """How many trials of a filter have which account: who, model, variant, account, trials."""
-        where, values = wanted.where()
-        return self.ask(
-            "SELECT who, model, variant, account, count(*) AS trials FROM listed "  # noqa: S608 # constants
-            f"WHERE {where} AND account IS NOT NULL GROUP BY ALL ORDER BY ALL",
-            *values,
-        )
 
     def pairs(self, model: str, variant: str, fate: str) -> list[Row]:
         """Trials of a variant beside those of the baseline; ``fate``: outcome or joint."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections import Counter
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime
 
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
@@ -205,6 +205,14 @@ class ListedSweep:
         """When it ended, or was last heard of."""
         told: datetime | None = self.row["ended_at"]
         return self.standing.updated_at if told is None and self.standing else told
+
+    @property
+    def lasted_s(self) -> float | None:
+        """For how long it ran; the database's times are UTC without saying so."""
+        if self.last_word is None:
+            return None
+        until = self.last_word.astimezone(UTC) if self.last_word.tzinfo else self.last_word
+        return (until.replace(tzinfo=None) - self.row["started_at"]).total_seconds()
 
     @property
     def _unended(self) -> str:

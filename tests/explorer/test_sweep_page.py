@@ -97,6 +97,13 @@ def test_a_sweep_says_what_the_registry_says_of_its_model(written):
     assert "o3: retires soon." in text_of(browser(written))
 
 
+def test_runs_are_sorted_by_the_seconds_that_they_lasted(study):
+    with duckdb.connect(str(study)) as connection:
+        connection.execute("UPDATE sweeps SET ended_at = started_at + INTERVAL 2 HOURS")
+    assert 'data-value="7200.0">2.0 h<' in browser(study).get("/sweeps").text
+    assert "lasted 2.0 h" in text_of(browser(study))
+
+
 def test_the_page_has_the_numbers_of_the_database(written):
     text, facts = text_of(browser(written)), sweep_facts(written, "sweep-1")
     with duckdb.connect(str(written), read_only=True) as connection:

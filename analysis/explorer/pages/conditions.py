@@ -21,12 +21,6 @@ MOST = 500
 # Sizes in the picture, in its units.
 WIDTH, LEFT, RIGHT, PANEL, BETWEEN, TOP, FOOT = 1000, 42, 8, 170, 34, 24, 42
 CROSS = "m-5-5 10 10m0-10-10 10"
-COUNTED = """
-SELECT {columns}, count(*) AS trials, count(*) FILTER (outcome = 'left first') AS left_first,
-    count(*) FILTER (outcome = 'right first') AS right_first,
-    count(*) FILTER (outcome = 'collided') AS collided, avg(gap_m) AS gap_m
-FROM listed WHERE {where} GROUP BY ALL ORDER BY ALL
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +67,7 @@ def conditions_page(site: Site, asked: Mapping[str, str]) -> str:
     state = _news(site, asked)
     found = {
         (row["condition"], row["model"]): row
-        for row in _counted(site, "condition, model", Filter())
+        for row in site.catalogue.counts(Filter(), "condition", "model")
     }
     names = ordered({name for name, _ in found})
     return site.render(
@@ -92,7 +86,7 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     Raises NotThere, and NothingNew.
     """
     state = _news(site, asked)
-    groups = _counted(site, "model, variant", Filter(condition=name))
+    groups = site.catalogue.counts(Filter(condition=name), "model", "variant")
     if not groups:
         raise NotThere(f"no trial of the condition {name} is here")
     views = views_of(site, name)
@@ -201,11 +195,6 @@ def _news(site: Site, asked: Mapping[str, str]) -> str:
     if asked.get("seen") == state:
         raise NothingNew
     return state
-
-
-def _counted(site: Site, columns: str, wanted: Filter) -> list[Row]:
-    where, values = wanted.where()
-    return site.catalogue.ask(COUNTED.format(columns=columns, where=where), *values)
 
 
 def _rows(site: Site, wanted: Filter, *, with_humans: bool) -> list[Row]:

@@ -26,19 +26,10 @@ from merge_runner.study.crossing import PROMPT
 
 # More groups than these cannot be told apart in a picture.
 DRAWN = 12
-# Trials of drivers by group and condition; ``who`` tells those of stand-ins apart.
-PLAYED = """
-SELECT {key} AS key, who, condition, string_agg(DISTINCT stand_in, '; ') AS stand_in,
-    count(*) AS trials, count(*) FILTER (status <> 'failed') AS ended,
-    count(*) FILTER (status = 'failed') AS failed,
-    count(*) FILTER (status = 'collided') AS collided,
-    coalesce(sum(decisions), 0)::BIGINT AS decisions,
-    coalesce(sum(invalid), 0)::BIGINT AS invalid, coalesce(sum(cost_usd), 0) AS cost_usd
-FROM {trials} WHERE {where} GROUP BY ALL ORDER BY ALL
-"""
 COUNTS = ("trials", "ended", "failed", "collided", "decisions", "invalid", "cost_usd")
 # What is published as one class of collisions, and the two that it holds.
 SAME, SAME_ACTION = "same action", ("both insisted", "both gave way")
+DRIVER_AND_PROMPT = "driver and prompt"
 UNPRICED = "SELECT coalesce(sum(unpriced), 0)::BIGINT AS attempts FROM tried"
 
 
@@ -65,17 +56,14 @@ class Played:
 
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
     """The study; raises NotThere, and NothingNew where nothing is new since it was ``seen``."""
+    standing = standing_of(site.catalogue)
+    seen = news_of((standing, site.catalogue.state(), site.catalogue.held), asked.get("seen", ""))
     given = {name: value for name, value in asked.items() if name != "seen"}
     by, ways = asked.get("by", ""), groupings(site)
     if by not in ways:
-        factors = ", ".join(filter(None, ways))
-        raise NotThere(
-            f"trials are grouped by {factors or 'nothing else'}, or by driver and prompt"
-        )
-    standing = standing_of(site.catalogue)
+        raise NotThere(f"trials are grouped by {', '.join([DRIVER_AND_PROMPT, *ways[1:]])}")
     groups = groups_of(site, by)
-    humans = site.catalogue.ask(PLAYED.format(key="who", trials="listed", where="who = 'humans'"))
-    seen = news_of((standing, site.catalogue.state(), site.catalogue.held), asked.get("seen", ""))
+    humans = site.catalogue.counts(Filter(who="humans"), "condition")
     imported = sum(row["trials"] for row in humans)
     panels = computed(site, ("home", by, str(imported)), given, wait_s=0.0)
     verdicts = computed(site, ("tables", "indicators"), given, wait_s=0.0)
@@ -86,7 +74,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         standing=standing,
         seen=seen,
         by=by,
-        choices=[(way or "driver and prompt", site.at.to(HOME, by=way), way == by) for way in ways],
+        choices=[(way or DRIVER_AND_PROMPT, site.at.to(HOME, by=way), way == by) for way in ways],
         task=task_picture(site.catalogue),
         groups=groups,
         first=ranking(groups),
@@ -106,7 +94,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def groupings(site: Site) -> list[str]:
-    """By what trials are grouped: driver and prompt (empty), or a factor where any varies."""
+    """By what trials are grouped: driver and prompt (empty), or by a factor if anything varies."""
     factors = site.catalogue.factors()
     (prompts,) = site.catalogue.ask(
         "SELECT count(DISTINCT variant) AS n FROM listed WHERE who <> 'humans'"
@@ -116,21 +104,13 @@ def groupings(site: Site) -> list[str]:
 
 def groups_of(site: Site, by: str) -> list[Played]:
     """Drivers and prompts, or the levels of a factor; before several their sum."""
-    drivers = "who <> 'humans'"
-    if not by:
-        key, trials = "{'model': model, 'variant': variant}", "listed"
-    elif by == PROMPT:
-        key, trials = "{'variant': variant}", "listed"
-    else:
-        key, trials = "{'level': level}", "listed JOIN levels USING (number)"
-        drivers += " AND factor = ?"
-    rows = site.catalogue.ask(
-        PLAYED.format(key=key, trials=trials, where=drivers),
-        *([by] if "factor" in drivers else []),
-    )
+    factor = by if by not in {"", PROMPT} else ""
+    names = ("level",) if factor else ("variant",) if by else ("model", "variant")
     found: dict[tuple[str, ...], Played] = {}
-    for row in rows:
-        levels = {name: value or "" for name, value in row["key"].items()}
+    for row in site.catalogue.counts(Filter(), *names, "who", "condition", factor=factor):
+        if row["who"] == "humans":
+            continue
+        levels = {name: row[name] or "" for name in names}
         state = {f"{FACTOR}{by}" if name == "level" else name: v for name, v in levels.items()}
         label = ", ".join(filter(None, levels.values()))
         new = Played(label, row["who"], {"who": row["who"], **state}, row["stand_in"] or "")
@@ -143,11 +123,9 @@ def _sums(site: Site, groups: Sequence[Played]) -> list[Played]:
     sums = []
     for who in ("drivers", "stand-ins"):
         if sum(group.who == who for group in groups) > 1:
-            rows = site.catalogue.ask(
-                PLAYED.format(key="who", trials="listed", where="who = ?"), who
-            )
-            whole = Played(f"all {who}", who, {"who": who})
-            whole.cells.update({row["condition"]: row for row in rows})
+            rows = site.catalogue.counts(Filter(who=who), "condition")
+            cells = {row["condition"]: row for row in rows}
+            whole = Played(f"all {who}", who, {"who": who}, cells=cells)
             sums.append(whole)
     return sums
 

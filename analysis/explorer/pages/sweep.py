@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from datetime import UTC, datetime
 
 from analysis.explorer.conditions import ordered
 from analysis.explorer.site import NothingNew, NotThere, Site
@@ -22,7 +21,7 @@ def sweeps_page(site: Site, seen: str = "") -> str:
     """All sweeps; raises NothingNew where they are as they were ``seen``."""
     sweeps = list_sweeps(site.catalogue)
     return site.render(
-        "sweeps.html", here="sweeps", sweeps=sweeps, lasted=_lasted, seen=news_of(sweeps, seen)
+        "sweeps.html", here="sweeps", sweeps=sweeps, duration=duration, seen=news_of(sweeps, seen)
     )
 
 
@@ -81,7 +80,6 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
         "bar": bar,
         "prompt_text": prompt_text,
         "duration": duration,
-        "lasted": _lasted(sweep.entry.row["started_at"], sweep.entry.last_word),
     }  # fmt: skip
 
 
@@ -117,12 +115,3 @@ def _total(variant: str, cells: list[VariantCondition | None]) -> VariantConditi
         invalid=sum(cell.invalid for cell in there),
         state=there[0].state,
     )
-
-
-def _lasted(began: datetime, until: datetime | None) -> str:
-    """A time span; the database's times are UTC without saying so."""
-    if until is None:
-        return ""
-    if until.tzinfo is None:
-        until = until.replace(tzinfo=UTC)
-    return duration((until - began.replace(tzinfo=UTC)).total_seconds())
