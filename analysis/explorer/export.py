@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -86,7 +85,10 @@ def export_folder(
     key or a path of this machine. Raises UsageError.
     """
     links = StaticLinks(["trials", "words", "notes"]) if wanted else StaticLinks()
-    with _opened(db, wanted, links) as (site, rows), _Staged(folder, Leaks(db), _OURS) as staged:
+    with (
+        _opened(db, wanted, links) as (site, rows),
+        _staged(folder, Leaks(db), _OURS) as (keep, paths),
+    ):
         if not wanted:
             for request in (CELLS, *figure_requests()):
                 site.computing.ask(request, site.catalogue.state())
@@ -94,20 +96,19 @@ def export_folder(
         parts = {name: list(own) for name, own in groupby(by_condition, _condition)}
         with _bundles(site, parts, watch) as bundles:
             # While others pack, and compute.
-            staged.write_all(_noted(site, rows))
+            keep(_noted(site, rows))
             if not wanted:
-                staged.write_all(_listed_pages(site, watch))
-            staged.write_all((bundle_name(name), text) for name, text in bundles)
+                keep(_linked(_listed_pages(site, watch)))
+            keep((bundle_name(name), text) for name, text in bundles)
         behind = {"cells": {}, "sets": []} if wanted else _behind(site, rows)
         links.behind = behind["cells"]
         listing = listing_page(site, rows, behind)
-        staged.write(site.at.to("trials"), listing)
+        keep([(site.at.to("trials"), listing)])
         if wanted:
-            staged.write(f"{HOME}.html", listing)
+            keep([(f"{HOME}.html", listing)])
         else:
-            staged.write_all(_computed_pages(site, links, watch))
-        staged.finish()
-    yield from staged.paths
+            keep(_linked(_computed_pages(site, links, watch)))
+    yield from paths
 
 
 def export_page(
@@ -115,11 +116,13 @@ def export_page(
 ) -> Iterator[Path]:
     """Write one page with the wanted trials; yields its path. Raises UsageError."""
     links = StaticLinks(alone=file.name)
-    with _opened(db, wanted, links) as (site, rows), _Staged(file.parent, Leaks(db)) as staged:
-        with _bundles(site, {"": rows}, watch) as bundles:
-            staged.write_all((file.name, text) for _, text in bundles)
-        staged.finish()
-    yield from staged.paths
+    with (
+        _opened(db, wanted, links) as (site, rows),
+        _staged(file.parent, Leaks(db)) as (keep, paths),
+        _bundles(site, {"": rows}, watch) as bundles,
+    ):
+        keep((file.name, text) for _, text in bundles)
+    yield from paths
 
 
 def _condition(row: Row) -> str:
@@ -145,6 +148,12 @@ def _noted(site: Site, rows: Sequence[Row]) -> Iterator[File]:
     yield site.at.to("notes"), notes_page(site, trials)
     for name in NOTE_FILES:
         yield name, notes_file(site, name, trials)
+
+
+def _linked(files: Iterable[File]) -> Iterator[File]:
+    """Pages on which a link that only a server could follow is none."""
+    for name, text in files:
+        yield name, _LINK_TO_NOWHERE.sub(r"\1", text) if name.endswith(".html") else text
 
 
 def _listed_pages(site: Site, watch: Watch) -> Iterator[File]:
@@ -280,63 +289,32 @@ def _opened(
         site.close()
 
 
-class _Staged:
-    """Pages that are written beside their folder, and moved there when all of them are good.
+@contextmanager
+def _staged(
+    folder: Path, leaks: Leaks, replaced: re.Pattern[str] | None = None
+) -> Iterator[tuple[Callable[[Iterable[File]], None], list[Path]]]:
+    """What keeps files beside their folder, and their paths there; in the end they are moved.
 
-    Raises UsageError where a page holds a key or a path of this machine, or cannot be written.
+    Of others in the folder, those whose names are ``replaced`` go. Raises UsageError where a file
+    holds a key or a path of this machine, or cannot be written: then the folder stays as it was.
     """
+    paths: list[Path] = []
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir())
+    try:
+        with tempfile.TemporaryDirectory(prefix=".merge-runner-", dir=there) as stage:
 
-    def __init__(self, folder: Path, leaks: Leaks, replaced: re.Pattern[str] | None = None) -> None:
-        """Of others in the folder, those whose names are ``replaced`` go."""
-        self._folder = folder
-        self._leaks = leaks
-        self._replaced = replaced
-        self._names: list[str] = []
+            def keep(files: Iterable[File]) -> None:
+                for name, text in files:
+                    leaks.refuse(name, [_PACKED.sub("", text)])
+                    (Path(stage) / name).write_text(text, encoding="utf-8")
+                    paths.append(folder / name)
 
-    def __enter__(self) -> _Staged:
-        there = next(
-            path
-            for path in (self._folder.absolute(), *self._folder.absolute().parents)
-            if path.is_dir()
-        )
-        with self._writing():
-            self._stage = Path(tempfile.mkdtemp(prefix=".merge-runner-", dir=there))
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        shutil.rmtree(self._stage, ignore_errors=True)
-
-    def write(self, name: str, text: str) -> None:
-        """Keep a page for the folder."""
-        self._leaks.refuse(name, [_PACKED.sub("", text)])
-        with self._writing():
-            (self._stage / name).write_text(text, encoding="utf-8")
-        self._names.append(name)
-
-    def write_all(self, files: Iterable[File]) -> None:
-        """Keep pages as they are made; on those of a study what leads nowhere is no link."""
-        for name, text in files:
-            is_page = name.endswith(".html")
-            self.write(name, _LINK_TO_NOWHERE.sub(r"\1", text) if is_page else text)
-
-    def finish(self) -> None:
-        """Put the pages where they belong."""
-        with self._writing():
-            self._folder.mkdir(parents=True, exist_ok=True)
-            for path in self._folder.iterdir():
-                if self._replaced and self._replaced.fullmatch(path.name):
+            yield keep, paths
+            folder.mkdir(parents=True, exist_ok=True)
+            for path in folder.iterdir():
+                if replaced and replaced.fullmatch(path.name):
                     path.unlink()
-            for name in self._names:
-                (self._stage / name).replace(self._folder / name)
-
-    @property
-    def paths(self) -> list[Path]:
-        """The pages in their folder."""
-        return [self._folder / name for name in self._names]
-
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as exc:
-            raise UsageError(f"{self._folder} cannot be written: {exc}") from exc
+            for path in paths:
+                (Path(stage) / path.name).replace(path)
+    except OSError as exc:
+        raise UsageError(f"{folder} cannot be written: {exc}") from exc
