@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import os
 import pty
 import re
@@ -99,6 +100,16 @@ def folder(checkout):
 
 async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
     """Run a command at a terminal, and answer its question with yes."""
+    if not SERVES.search(command):
+        return await at_terminal(command, folder, **changes)
+    # Another process of the tests may serve at the same port.
+    with open(__file__) as own:
+        fcntl.flock(own, fcntl.LOCK_EX)
+        return await at_terminal(command, folder, **changes)
+
+
+async def at_terminal(command: str, folder: Path, **changes: str) -> tuple[int, str]:
+    """The same, where nobody else serves."""
     screen, terminal = pty.openpty()
     process = await asyncio.create_subprocess_shell(
         INSTALLED + command,
@@ -112,6 +123,7 @@ async def shell(command: str, folder: Path, **changes: str) -> tuple[int, str]:
     os.write(screen, b"y\n")
     if SERVES.search(command):  # runs until it is stopped: its first line is all there is
         out = await process.stdout.readline()
+        assert out.startswith(b"http://"), out
         os.killpg(process.pid, signal.SIGTERM)
         await process.communicate()  # until nobody writes any more: its port is free
         code = 0

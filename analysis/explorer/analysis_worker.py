@@ -36,6 +36,7 @@ class Numbers:
 
     def __init__(self, db: Path) -> None:
         self.db = db
+        self._made: dict[str, Table] = {}
 
     def answer(self, request: Sequence[str]) -> dict[str, Any]:
         """What is asked for, with ``counted``: how many trials it was made of.
@@ -90,16 +91,18 @@ class Numbers:
     def _finished(self, names: Sequence[str]) -> dict[str, Table]:
         """Tables by name; those that are kept in the database are not made again."""
         options = options_text(self.db, None)
-        kept = finished(self.db, present_state(self.db), options, names)
-        found = {name: from_text(text) for name, text in kept.items()}
-        if missing := [name for name in names if name not in found]:
+        wanted = [name for name in names if name not in self._made]
+        kept = finished(self.db, present_state(self.db), options, wanted) if wanted else {}
+        self._made |= {name: from_text(text) for name, text in kept.items()}
+        if missing := [name for name in wanted if name not in kept]:
             study = self.study
             made = dict(zip(missing, make_tables(study, missing), strict=True))
-            # If the state in which the study was read is past, they are not kept.
+            # If the state in which the study was read is past, or another program holds the
+            # database, they are not kept there.
             texts = {name: to_text(made[name]) for name in missing}
             keep_finished(self.db, study.state, options, texts)
-            found |= made
-        return found
+            self._made |= made
+        return {name: self._made[name] for name in names}
 
     def _cell(self, name: str, row_id: str, column_name: str) -> dict[str, Any]:
         from analysis.explain import sources_of, sql_command

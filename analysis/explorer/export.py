@@ -19,16 +19,25 @@ from analysis.explorer.display_text import visible
 from analysis.explorer.exported_list import listing_page
 from analysis.explorer.leaks import Leaks
 from analysis.explorer.packing import packed
-from analysis.explorer.packing_processes import AT_ONCE, Block, packed_blocks
+from analysis.explorer.packing_processes import AT_ONCE, Block, packing
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.comparing import At, offered
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.conditions import condition_page, conditions_page, views_of
 from analysis.explorer.pages.home import groupings, home_page
 from analysis.explorer.pages.humans import humans_page
-from analysis.explorer.pages.notes import notes_page
+from analysis.explorer.pages.notes import FILES as NOTE_FILES
+from analysis.explorer.pages.notes import notes_file, notes_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
-from analysis.explorer.pages.tables import FILES, table_files, table_page, tables_page
+from analysis.explorer.pages.tables import (
+    FIGURES,
+    FILES,
+    figure_requests,
+    figures,
+    table_files,
+    table_page,
+    tables_page,
+)
 from analysis.explorer.pages.trial import embedded
 from analysis.explorer.pages.words import exported_words
 from analysis.explorer.reading import Row
@@ -44,7 +53,9 @@ FEW = 12
 _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 # The names of an export's pages: those of an earlier one are deleted, and nothing else.
 _OURS = re.compile(
-    rf"(?:{'|'.join(EXPORTED)}|(?:condition|index|sweep|table|trials)-.*)\.html|table-.*\.(?:{'|'.join(FILES)})"
+    rf"(?:{'|'.join(EXPORTED)}|(?:condition|index|sweep|table|trials)-.*)\.html"
+    rf"|table-.*\.(?:{'|'.join(FILES)})|(?:{'|'.join(FIGURES)})\.svg"
+    rf"|{'|'.join(map(re.escape, NOTE_FILES))}"
 )
 # Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
@@ -56,6 +67,8 @@ CELLS = ("cells", *TABLES)
 
 Watch = Callable[[Sequence[Any], str], Iterable[Any]]
 """Shows how far a loop has come: takes its items and a name, and returns the items."""
+File = tuple[str, str]
+"""A file of an export: its name and its text."""
 
 
 def unwatched(things: Sequence[Any], _: str) -> Iterable[Any]:
@@ -75,28 +88,24 @@ def export_folder(
     links = StaticLinks(["trials", "words", "notes"]) if wanted else StaticLinks()
     with _opened(db, wanted, links) as (site, rows), _Staged(folder, Leaks(db), _OURS) as staged:
         if not wanted:
-            site.computing.ask(CELLS, site.catalogue.state())
+            for request in (CELLS, *figure_requests()):
+                site.computing.ask(request, site.catalogue.state())
         by_condition = sorted(rows, key=lambda row: row["condition"])  # stable: by name within it
         parts = {name: list(own) for name, own in groupby(by_condition, _condition)}
-        for condition, text in zip(parts, _bundles(site, parts, watch), strict=True):
-            staged.write(bundle_name(condition), text)
+        with _bundles(site, parts, watch) as bundles:
+            # While others pack, and compute.
+            staged.write_all(_noted(site, rows))
+            if not wanted:
+                staged.write_all(_listed_pages(site, watch))
+            staged.write_all((bundle_name(name), text) for name, text in bundles)
         behind = {"cells": {}, "sets": []} if wanted else _behind(site, rows)
         links.behind = behind["cells"]
         listing = listing_page(site, rows, behind)
-        pages = {
-            site.at.to("words"): exported_words(
-                site, rows, partial(packed, leaks=Leaks(db), where="words.html")
-            ),
-            site.at.to("notes"): notes_page(
-                site, {(row["trial_id"], row["spec_hash"]) for row in rows}
-            ),
-        }
-        if not wanted:
-            pages |= {name: _LINK_TO_NOWHERE.sub(r"\1", text) for name, text in _study(site, watch)}
-        pages[site.at.to("trials")] = listing
-        pages.setdefault("index.html", listing)  # of some trials
-        for name, text in pages.items():
-            staged.write(name, text)
+        staged.write(site.at.to("trials"), listing)
+        if wanted:
+            staged.write(f"{HOME}.html", listing)
+        else:
+            staged.write_all(_computed_pages(site, links, watch))
         staged.finish()
     yield from staged.paths
 
@@ -107,8 +116,8 @@ def export_page(
     """Write one page with the wanted trials; yields its path. Raises UsageError."""
     links = StaticLinks(alone=file.name)
     with _opened(db, wanted, links) as (site, rows), _Staged(file.parent, Leaks(db)) as staged:
-        for text in _bundles(site, {"": rows}, watch):
-            staged.write(file.name, text)
+        with _bundles(site, {"": rows}, watch) as bundles:
+            staged.write_all((file.name, text) for _, text in bundles)
         staged.finish()
     yield from staged.paths
 
@@ -122,45 +131,69 @@ def page_of_trials(site: Site, rows: Sequence[Row], name: str) -> str:
     """One page with trials of a served site, for a file of that name; raises UsageError."""
     alone = Site(site.db, StaticLinks(alone=name), shared={"inline": inlined})
     alone.catalogue = site.catalogue
-    (page,) = _bundles(alone, {"": rows}, unwatched)
+    with _bundles(alone, {"": rows}, unwatched) as bundles:
+        ((_, page),) = bundles
     Leaks(site.db).refuse(name, [_PACKED.sub("", page)])
     return page
 
 
-def _study(site: Site, watch: Watch) -> Iterator[tuple[str, str]]:
-    """The pages of the whole study: at a glance, its sweeps, and what is computed of it."""
+def _noted(site: Site, rows: Sequence[Row]) -> Iterator[File]:
+    """What drivers said in these trials, and what readers noted of them."""
+    pack = partial(packed, leaks=Leaks(site.db), where="words.html")
+    yield site.at.to("words"), exported_words(site, rows, pack)
+    trials = {(row["trial_id"], row["spec_hash"]) for row in rows}
+    yield site.at.to("notes"), notes_page(site, trials)
+    for name in NOTE_FILES:
+        yield name, notes_file(site, name, trials)
+
+
+def _listed_pages(site: Site, watch: Watch) -> Iterator[File]:
+    """The pages of the study for which nothing has to be computed."""
     at = site.at
-    for by in groupings(site):
-        yield at.to(HOME, by=by), home_page(site, {"by": by})
     for entry in list_sweeps(site.catalogue):
         yield at.sweep(entry.sweep_id), sweep_page(site, entry.sweep_id)
     yield at.to("sweeps"), sweeps_page(site)
+    yield at.to("glossary"), site.render("glossary.html", here="glossary")
     yield at.to("conditions"), conditions_page(site, {})
-    for row in site.catalogue.ask("SELECT DISTINCT condition FROM listed ORDER BY ALL"):
-        name = row["condition"]
+    names = site.catalogue.ask("SELECT DISTINCT condition FROM listed ORDER BY ALL")
+    for name in watch([row["condition"] for row in names], "conditions"):
         for by in views_of(site, name).values():
             yield at.condition(name, by=by), condition_page(site, name, {"by": by})
-    yield at.to("glossary"), site.render("glossary.html", here="glossary")
-    yield at.to("tables"), tables_page(site)
+
+
+def _computed_pages(site: Site, links: StaticLinks, watch: Watch) -> Iterator[File]:
+    """The study at a glance, and what else is computed of it."""
+    at = site.at
+    for by in groupings(site):
+        yield at.to(HOME, by=by), home_page(site, {"by": by})
     for name in watch(list(TABLES), "tables"):
         yield at.table(name), table_page(site, name, {})
         yield from table_files(site, name)
     yield at.to("ablations"), ablations_page(site, {})
     yield at.to("humans"), humans_page(site, {})
+    links.figures = figures(site)
+    for name, svg in links.figures.items():
+        yield at.figure(name), svg
+    yield at.to("tables"), tables_page(site)
 
 
-def _bundles(site: Site, parts: Mapping[str, Sequence[Row]], watch: Watch) -> Iterator[str]:
+@contextmanager
+def _bundles(
+    site: Site, parts: Mapping[str, Sequence[Row]], watch: Watch
+) -> Iterator[Iterator[File]]:
     """Of each condition a page with all its trials, of which it shows one."""
     blocks = [
         (name, rows[first : first + AT_ONCE])
         for name, rows in parts.items()
         for first in range(0, len(rows), AT_ONCE)
     ]
-    packing = packed_blocks(site, [rows for _, rows in blocks])
-    # Each step is a block that has been packed.
-    done = ((name, next(packing)) for name, _ in watch(blocks, "packing trials"))
-    for name, found in groupby(done, lambda one: one[0]):
-        yield _bundle_page(site, name, parts[name], [block for _, block in found])
+    with packing(site, [rows for _, rows in blocks]) as packed_blocks:
+        # Each step is a block that has been packed.
+        done = ((name, next(packed_blocks)) for name, _ in watch(blocks, "packing trials"))
+        yield (
+            (name, _bundle_page(site, name, parts[name], [block for _, block in found]))
+            for name, found in groupby(done, lambda one: one[0])
+        )
 
 
 def _bundle_page(site: Site, condition: str, rows: Sequence[Row], blocks: Sequence[Block]) -> str:
@@ -279,6 +312,12 @@ class _Staged:
         with self._writing():
             (self._stage / name).write_text(text, encoding="utf-8")
         self._names.append(name)
+
+    def write_all(self, files: Iterable[File]) -> None:
+        """Keep pages as they are made; on those of a study what leads nowhere is no link."""
+        for name, text in files:
+            is_page = name.endswith(".html")
+            self.write(name, _LINK_TO_NOWHERE.sub(r"\1", text) if is_page else text)
 
     def finish(self) -> None:
         """Put the pages where they belong."""

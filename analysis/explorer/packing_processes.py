@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from queue import SimpleQueue
 from typing import Any
@@ -28,11 +28,15 @@ LONGEST_S, MOST_BYTES = 3600.0, 2**30
 Block = dict[str, Any]
 
 
-def packed_blocks(site: Site, blocks: Sequence[Sequence[Row]]) -> Iterator[Block]:
-    """Pack each block of trials, in their order; raises UsageError."""
+@contextmanager
+def packing(site: Site, blocks: Sequence[Sequence[Row]]) -> Iterator[Iterator[Block]]:
+    """Have each block of trials packed, in their order; many are begun before one is asked for.
+
+    Raises UsageError.
+    """
     others = site.catalogue.others
     if len(blocks) < PROCESSES:
-        yield from (pack_trials(site, block, others) for block in blocks)
+        yield (pack_trials(site, block, others) for block in blocks)
         return
     requests = [{"rows": block, "others": sorted(others)} for block in blocks]
     free: SimpleQueue[Child] = SimpleQueue()
@@ -43,7 +47,7 @@ def packed_blocks(site: Site, blocks: Sequence[Sequence[Row]]) -> Iterator[Block
             child = _worker(site)
             stack.callback(child.close)  # before the threads that wait for it
             free.put(child)
-        yield from pool.map(partial(_ask, free), requests)
+        yield pool.map(partial(_ask, free), requests)
 
 
 def _worker(site: Site) -> Child:

@@ -43,14 +43,16 @@ def snippet(text: str, folded: str, terms: Sequence[str]) -> Snippet:
     pieces: list[tuple[str, bool]] = []
     at = 0
     for i, (begin, end) in enumerate(shown or [(0, 0)]):
-        start, following = (
-            max(at, begin - AROUND),
-            shown[i + 1][0] if i + 1 < len(shown) else len(text),
-        )
+        following = shown[i + 1][0] if i + 1 < len(shown) else len(text)
+        start = max(at, begin - AROUND)
         if start > at:
+            start = text.find(" ", start - 1, begin) + 1 or start  # at a word, if one begins
             pieces.append(("… " if not at else " … ", False))
         pieces += [(text[start:begin], False), (text[begin:end], True)]
-        at = min(len(text), following, end + AROUND * (1 if shown else 3))
+        at = min(following, end + AROUND * (1 if shown else 3))
+        if at < following:
+            last = text.rfind(" ", end + 1, at + 1)
+            at = at if last < 0 else last
         pieces.append((text[end:at], False))
     if at < len(text):
         pieces.append((" …", False))

@@ -85,13 +85,14 @@ class StaticLinks(Links):
     """Addresses of an exported study: files beside each other, a page of trials a condition.
 
     ``pages`` are those that there are; ``alone`` is the only file. ``behind`` gets the cells whose
-    trials the list knows.
+    trials the list knows, ``figures`` those that are drawn.
     """
 
     def __init__(self, pages: Collection[str] = EXPORTED, alone: str = "") -> None:
         self.pages = () if alone else pages
         self.alone = alone
         self.behind: Collection[str] = ()
+        self.figures: Collection[str] = ()
 
     def to(self, name: str, /, **state: object) -> str:
         """A page, or nothing where only a server has it; grouped otherwise it is another file."""
@@ -125,8 +126,8 @@ class StaticLinks(Links):
         return f"table-{name}.{suffix}"
 
     def figure(self, name: str) -> str:
-        """Nothing: a server draws it."""
-        return ""
+        """A figure as a file beside the pages, if it could be drawn."""
+        return f"{name}.svg" if name in self.figures else ""
 
     def cell(self, table: str, row: str, column: str) -> str:
         """The trials behind a cell, where there are any."""

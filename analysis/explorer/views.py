@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from bisect import bisect_left
+from collections.abc import Callable
 from typing import Any
 
 from analysis.accounts.account import Account, account
+from analysis.accounts.classes import ACTED_MPS
 from analysis.accounts.course import Course
 from analysis.explorer.details import Decision, Trial
 from analysis.explorer.display_text import visible
@@ -21,6 +23,7 @@ BISECTIONS = 14
 # What a picture shows of the plane around the track, in m.
 BEFORE_M, BEYOND_M, BESIDE_M = 3.0, 5.8, 4.5
 UNKNOWN = "no meaning is known here"
+DRAWN = {"t": "time_s", "x": "position_m", "v": "velocity_mps", "a": "acceleration_mps2"}
 
 
 def condition_text(headway: float, velocity: float) -> str:
@@ -138,9 +141,7 @@ def summary(row: Row, trial: Trial) -> list[str]:
     """What the charts of a trial show, in sentences."""
     lines = []
     for side, samples in trial.states.items():
-        speeds = [
-            v for t, v in zip(samples["time_s"], samples["velocity_mps"], strict=True) if t >= 0
-        ]
+        speeds = controlled(samples, "velocity_mps")
         if speeds:
             lines.append(
                 f"The {side} vehicle began at {speeds[0]:.1f} m/s, drove between "
@@ -165,39 +166,50 @@ def summary(row: Row, trial: Trial) -> list[str]:
 
 def _hardest(samples: Row) -> str:
     """The hardest acceleration under control: a sample's is that of the step before it."""
-    times, accelerations = samples["time_s"], samples["acceleration_mps2"]
-    controlled = [a for t, a in zip(times, accelerations, strict=True) if t > 0]
-    if not controlled:
+    accelerations = controlled(samples, "acceleration_mps2")[1:]
+    if not accelerations:
         return ""
-    return f"; its hardest acceleration was {max(controlled, key=abs):+.1f} m/s²"
+    return f"; its hardest acceleration was {max(accelerations, key=abs):+z.1f} m/s²"
+
+
+def controlled(samples: Row, name: str) -> list[float]:
+    """The samples of a vehicle from the start of control on; in the tunnels nobody controls it."""
+    return [x for t, x in zip(samples["time_s"], samples[name], strict=True) if t >= 0]
+
+
+def actions(trial: Trial) -> dict[Side, str]:
+    """How each driver first acted, and when it was at the merge point: all that humans tell."""
+    return {side: _action(samples, trial.track) for side, samples in trial.states.items()}
+
+
+def _action(samples: Row, track: Track) -> str:
+    times, speeds = controlled(samples, "time_s"), controlled(samples, "velocity_mps")
+    said = f"it kept its speed to within {ACTED_MPS:g} m/s"
+    for time_s, speed_mps in zip(times, speeds, strict=True):
+        if abs(speed_mps - speeds[0]) >= ACTED_MPS:
+            compared = "faster" if speed_mps > speeds[0] else "slower"
+            said = f"after {time_s:.1f} s it was {ACTED_MPS:g} m/s {compared} than at the start"
+            break
+    merges_s = reaches_s(samples, track.merge_point_m)
+    merged = "it never merged" if merges_s is None else f"it merged after {merges_s:.1f} s"
+    return f"{said}; {merged}"
 
 
 def account_of(row: Row, trial: Trial) -> Account | None:
     """Why a trial went as it did; None where there is nothing to explain."""
     if row["account"] is None:
         return None
-    samples = {
-        side: [i for i, t in enumerate(found["time_s"]) if t >= 0]
-        for side, found in trial.states.items()
-    }
-
-    def under_control(name: str) -> dict[Side, list[float]]:
-        return {side: [trial.states[side][name][i] for i in kept] for side, kept in samples.items()}
-
-    course = Course(
-        trial.scenario,
-        trial.track,
-        under_control("time_s")["left"],
-        under_control("position_m"),
-        under_control("velocity_mps"),
+    times, places, speeds = (
+        {side: controlled(samples, name) for side, samples in trial.states.items()}
+        for name in ("time_s", "position_m", "velocity_mps")
     )
+    course = Course(trial.scenario, trial.track, times["left"], places, speeds)
     return account(course, trial.decisions, row)
 
 
 def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, Any]:
-    """What the replay draws: samples, decisions, the track, the bounds of a collision."""
+    """What the replay draws: samples, the track, the bounds of a collision."""
     return {
-        "id": row["trial_id"],
         "spec": row["spec_hash"],
         "outcome": visible(outcome_text(row, trial.scenario)),
         "label": label(row),
@@ -205,28 +217,11 @@ def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, An
         "end": trial.end_s,
         "every": {side: trial.interval_s(side) for side in SIDES},
         "sides": {
-            side: {
-                "t": _rounded(samples["time_s"], 3),
-                "x": _rounded(samples["position_m"], 3),
-                "v": _rounded(samples["velocity_mps"], 3),
-                "a": _rounded(samples["acceleration_mps2"], 3),
-            }
+            side: {short: [round(x, 3) for x in samples[name]] for short, name in DRAWN.items()}
             for side, samples in trial.states.items()
         },
         "bounds": collision_bounds(trial),
         "marks": marks(row, trial, account),
-        "decisions": [
-            {
-                "n": d["decision"],
-                "t": round(d["time_s"], 3),
-                "side": d["side"],
-                "says": d["tactical"] or "",
-                "valid": d["valid"],
-                "fallback": d["fallback"],
-                "failure": d["failure"] or "",
-            }
-            for d in trial.decisions
-        ],
         "track": {
             "tunnel": trial.track.tunnel_exit_m,
             "merge": trial.track.merge_point_m,
@@ -262,13 +257,11 @@ def marks(row: Row, trial: Trial, account: Account | None) -> list[dict[str, Any
 def reaches_s(samples: Row, place_m: float) -> float | None:
     """When a vehicle is at a place, between two samples in proportion; None where it never is."""
     places, times = samples["position_m"], samples["time_s"]
-    for i, reached_m in enumerate(places):
-        if reached_m >= place_m:
-            if i == 0:
-                return float(times[0])
-            part = (place_m - places[i - 1]) / (reached_m - places[i - 1])
-            return float(times[i - 1] + part * (times[i] - times[i - 1]))
-    return None
+    i = bisect_left(places, place_m)  # no vehicle drives backwards
+    if i in {0, len(places)}:
+        return float(times[0]) if i == 0 else None
+    part = (place_m - places[i - 1]) / (places[i] - places[i - 1])
+    return float(times[i - 1] + part * (times[i] - times[i - 1]))
 
 
 def label(row: Row) -> str:
@@ -310,10 +303,6 @@ def _bound(scenario: ScenarioConfig, track: Track, mean_m: float) -> float | Non
         else:
             high = middle
     return round(high, 3)
-
-
-def _rounded(values: Sequence[float], digits: int) -> list[float]:
-    return [round(value, digits) for value in values]
 
 
 def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:

@@ -10,6 +10,7 @@ import pytest
 from analysis.data.study import Study
 from analysis.report.page import report_html
 from analysis.tables import make_tables
+from tests.analysis import odd_databases
 from tests.analysis.odd_databases import KINDS, made
 
 # What the report of a kind says, and what it must not say.
@@ -68,8 +69,20 @@ def test_every_kind_is_looked_at():
     assert list(SAID) == list(KINDS)
 
 
+@pytest.fixture
+def forked(prepare, emulator_url, monkeypatch):
+    """Sweeps are forked and ask the emulator of all tests: most of their time is imports."""
+
+    def sweep(db, *arguments, **changes):
+        run = prepare(db.parent, "sweep", "baseline", *arguments, "--db", db.name, **changes)
+        assert run.code == 0, run.err
+
+    monkeypatch.setattr(odd_databases, "_sweep", sweep)
+    monkeypatch.setattr(odd_databases, "_emulator", lambda: emulator_url.removesuffix("/v1"))
+
+
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
+@pytest.mark.usefixtures("few_draws", "forked")
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_report_of_an_odd_database_says_what_is_true_of_it(kind, tmp_path):
     study = Study(made(tmp_path, kind))

@@ -17,7 +17,8 @@ def unpacked(text):
 
 
 def export_with_a_table(db, folder):
-    """Export the whole study with one table, which stands for all; gives the paths."""
+    """Export the whole study with a table and a figure, which stand for all; gives the paths."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("analysis.explorer.export.TABLES", ["attempts"])
+        patch.setattr("analysis.explorer.pages.tables.FIGURES", {"ablation-matrix": "a figure"})
         return list(export_folder(db, folder, []))

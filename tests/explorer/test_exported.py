@@ -95,6 +95,19 @@ def test_no_link_of_an_export_leads_nowhere(page, exported):
         assert "" not in addresses, name
 
 
+def test_figures_stand_beside_the_list_of_tables(page, exported):
+    page.goto(f"file://{exported}/tables.html")
+    page.get_by_role("link", name="ablation-matrix").click()
+    expect(page.locator("svg")).to_be_visible()
+    assert {path.name for path in exported.glob("*.svg")} == {"ablation-matrix.svg"}
+
+
+def test_a_page_has_the_scripts_that_it_needs_alone(exported):
+    traced = {path.name for path in exported.glob("*.html") if "#drawn" in path.read_text()}
+    chosen = {path.name for path in exported.glob("*.html") if '"drawn"' in path.read_text()}
+    assert traced | chosen == {path.name for path in exported.glob("condition-*.html")}
+
+
 def test_a_page_of_its_own_leads_nowhere_else_and_is_accessible(page, study, tmp_path):
     file = tmp_path / "one two.html"
     list(export_page(study, file, ["emulator/baseline/N_0_0/*"]))
@@ -119,7 +132,7 @@ def test_an_earlier_export_in_the_folder_goes_and_nothing_else(study, tmp_path):
     list(export_folder(study, tmp_path, ["emulator/baseline/L_4_0/*"]))
     assert {path.name for path in tmp_path.iterdir()} == {
         *("index.html", "mine.html", "one.html", "trials.html", "trials-L_4_0.html"),
-        *("notes.html", "words.html"),
+        *("notes.html", "notes.csv", "agreement.csv", "words.html"),
     }
 
 

@@ -154,6 +154,16 @@ def test_paper_has_signs_of_the_size_of_the_track(page):
     assert sizes == ["5px", "2.6px"]
 
 
+def test_paper_has_no_link_that_nobody_can_follow_and_the_words_of_a_search(page):
+    page.goto(f"{TRIAL}?t=2.5")
+    expect(page.locator(".brief p").last).to_be_visible()
+    page.emulate_media(media="print")
+    expect(page.locator(".brief > p").last).to_be_hidden()
+    page.goto("/words?q=script")
+    expect(page.locator("#search")).to_be_visible()
+    expect(page.locator(".hits thead")).to_be_visible()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_trial_is_accessible_while_it_is_followed_and_compared(page, scheme):
     page.emulate_media(color_scheme=scheme)

@@ -129,7 +129,7 @@ def test_a_study_is_grouped_by_any_of_its_factors(client, own):
         "A1",
         "baseline",
     ]
-    assert "grouped by prompt" in client.get("/?by=mood").text
+    assert "grouped by driver and prompt, prompt" in client.get("/?by=mood").text
     groups = [g["id"] for g in own.computing.ask(("home", "prompt", "0"), (0, 0), wait_s=60)
               .content["groups"]]  # fmt: skip
     assert groups == ["human", "prompt=baseline", "prompt=A1"]

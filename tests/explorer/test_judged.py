@@ -21,6 +21,7 @@ from merge_runner.scenarios.merge.collision import collided
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import Drive, write_study
 from tests.explorer.serving import served
+from tests.explorer.test_listing import Texts
 
 HOST = "127.0.0.1:8700"
 # Both keep their speed and meet at the merge point.
@@ -123,6 +124,56 @@ def test_a_human_trial_is_judged_by_the_boxes(humans):
     assert "outlines of 4.5 m by 1.8 m" in text
 
 
+def test_beside_humans_who_say_nothing_stands_what_they_did(humans):
+    text = " ".join(Texts(page_of(humans)).said)
+    trial = read_trial(humans, *a_trial(humans))
+    assert "A human pair" in text
+    for samples in trial.states.values():
+        driven = [(t, v) for t, v in zip(samples["time_s"], samples["velocity_mps"], strict=True)
+                  if t >= 0]  # fmt: skip
+        changed_s = next((t for t, v in driven if abs(v - driven[0][1]) >= 0.5), None)
+        merged_s = next(
+            t for t, x in zip(samples["time_s"], samples["position_m"], strict=True) if x >= 100
+        )
+        said, *_ = re.findall(
+            "it kept its speed to within 0.5 m/s; it merged after ([0-9.]+) s"
+            if changed_s is None
+            else f"after {changed_s:.1f} s it was 0.5 m/s (?:slower|faster) than at the start; "
+            "it merged after ([0-9.]+) s",
+            text,
+        )
+        assert float(said) == pytest.approx(merged_s, abs=0.1)
+    assert "net gap when the first vehicle reaches the merge point" in text
+
+
+def test_no_sign_stands_under_a_car_and_every_car_stands_within_the_picture(page, humans):
+    box = "it => (b => [b.left, b.top, b.right, b.bottom])(it.getBoundingClientRect())"
+    name, _ = a_trial(humans)
+    with served(humans) as address:
+        for width in (1440, 900):
+            page.set_viewport_size({"width": width, "height": 900})
+            page.goto(f"{address}/trials/{name}")
+            expect(page.locator("#charts .uplot")).to_have_count(3)
+            left, top, right, bottom = page.locator("#track").evaluate(box)
+            signs = [sign.evaluate(box) for sign in page.locator("#track .sign:visible").all()]
+            assert len(signs) == 6
+            assert all(x0 >= left and y0 >= top and x1 <= right and y1 <= bottom
+                       for x0, y0, x1, y1 in signs)  # fmt: skip
+            for time_s in (None, 0):
+                if time_s is not None:
+                    page.locator("#scrub").fill(str(time_s))
+                for car in page.locator("#track .own > rect:first-child").all():
+                    x0, y0, x1, y1 = car.evaluate(box)
+                    assert x0 >= left
+                    assert y0 >= top
+                    assert x1 <= right
+                    assert y1 <= bottom
+                    assert not [
+                        s for s in signs if s[0] < x1 and x0 < s[2] and s[1] < y1 and y0 < s[3]
+                    ]
+        page.goto("about:blank")
+
+
 def test_the_hardest_acceleration_counts_from_control_on(humans):
     trial = read_trial(humans, *a_trial(humans))
     samples = trial.states["left"]
@@ -130,7 +181,7 @@ def test_the_hardest_acceleration_counts_from_control_on(humans):
     assert min(accelerations) == pytest.approx(-20, abs=0.1)
     own = [a for t, a in zip(times, accelerations, strict=True) if t > 0]
     said = re.findall(r"hardest acceleration was ([+-][\d.]+) m/s²", page_of(humans))
-    assert said[0] == f"{max(own, key=abs):+.1f}"
+    assert said[0] == f"{max(own, key=abs):+z.1f}"
     with duckdb.connect(str(humans), read_only=True) as connection:
         (metric,) = connection.execute(
             "SELECT max_acceleration_mps2 FROM trial_metrics ORDER BY trial_id"

@@ -306,7 +306,7 @@ def test_what_two_readers_agree_on_is_a_csv(db):
     noted(asking(db, "anna"), tags="y", side="left", decision="2")
     noted(asking(db, "=ben"), tags="x", side="left", decision="2")
     client = asking(db)
-    assert 'href="/agreement.csv"' in client.get("/notes").text
+    assert 'href="agreement.csv"' in client.get("/notes").text
     reply = client.get("/agreement.csv")
     assert 'filename="agreement.csv"' in reply.headers["content-disposition"]
     rows = list(csv.DictReader(io.StringIO(reply.text)))
@@ -370,6 +370,9 @@ def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(
     page.locator(".all-notes tbody a").click()
     expect(page.locator("#noted")).to_contain_text("It hesitates.")
     expect(page.locator("#note")).to_have_count(0)
+    (line,) = csv.DictReader((tmp_path / "pages" / "notes.csv").open())
+    assert (line["text"], line["trial_id"]) == ("It hesitates.", "emulator/baseline/N_0_0/rep01")
+    assert (tmp_path / "pages" / "agreement.csv").read_text().startswith("units,tag,first_reader")
     page.goto(f"file://{tmp_path}/pages/trials.html?tag=late")
     expect(page.locator("tbody tr:visible")).to_have_count(1)
     noted(client, text="sk-proj-abcdefghijklmnop0123")

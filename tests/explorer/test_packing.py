@@ -10,7 +10,7 @@ from analysis.explorer.catalogue import Filter
 from analysis.explorer.details import read_decision, read_trial, read_whole
 from analysis.explorer.export import export_folder
 from analysis.explorer.packing import SHARED, SharedTexts, pack_trials
-from analysis.explorer.packing_processes import packed_blocks
+from analysis.explorer.packing_processes import packing
 from analysis.explorer.pages.trial import panel_values
 from analysis.explorer.prompts import parts_of
 from analysis.explorer.site import Site
@@ -86,7 +86,8 @@ def test_other_processes_pack_the_same(exporting):
     site, rows = exporting
     blocks = [rows[:3], rows[3:5], rows[5:]]
     alone = [pack_trials(site, block, site.catalogue.others) for block in blocks]
-    assert list(packed_blocks(site, blocks)) == alone
+    with packing(site, blocks) as found:
+        assert list(found) == alone
 
 
 @pytest.mark.slow

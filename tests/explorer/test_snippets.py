@@ -68,6 +68,15 @@ def test_a_long_text_is_cut_around_its_matches():
     ]  # fmt: skip
 
 
+def test_what_stands_around_a_match_begins_and_ends_with_whole_words():
+    text = f"{'carefully ' * 20}brake {'carefully ' * 20}"
+    before, word, after = (piece for piece in snippet(text, text, ["brake"]).pieces if "…" not in
+                           piece[0])  # fmt: skip
+    assert word == ("brake", True)
+    assert before == ("carefully " * 7, False)
+    assert after == (" carefully" * 7, False)
+
+
 @pytest.mark.parametrize(
     ("query", "terms"),
     [

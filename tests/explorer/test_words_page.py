@@ -99,6 +99,19 @@ def test_whole_replies_are_another_search(client):
     assert found(client, **{"q": "collision", "in": "replies"}) == [("o4", "right", 1)]
 
 
+def test_long_replies_that_are_much_alike_are_searched_in_little_memory(db, tmp_path):
+    path = tmp_path / "t.duckdb"
+    path.write_bytes(db.read_bytes())
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(
+            "UPDATE calls SET reply = to_json(repeat('No, I wait. ', 250000) || attempt)"
+        )
+        ((texts,),) = connection.execute("SELECT sum(length(reply)) FROM calls").fetchall()
+    assert texts > 40 * path.stat().st_size
+    with TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}") as client:
+        assert len(found(client, **{"q": "i wait", "in": "replies"})) == PAGE
+
+
 def test_facets_choose_among_what_is_found_and_count_it(client):
     assert found(client, tactical="none", model="o3") == [("o3", "left", 1)]
     assert found(client, failure="no_array") == [("o3", "left", 3)]
@@ -186,6 +199,8 @@ def test_an_exported_study_finds_the_same_in_the_browser(page, db, tmp_path, cli
         expect(page.locator("#totals")).to_contain_text(f"{len(found(client, q=query))} decisions")
     page.locator("#search").fill("brake course")
     assert page.locator("mark").all_text_contents() == ["course", "brake"]
+    mark = "it => getComputedStyle(it, '::before').content"
+    assert page.locator(".hits .outcome").evaluate(mark) not in {"none", "normal"}
     page.get_by_label("change of mind").select_option("M to Y")
     expect(page.locator(".hits tbody tr")).to_have_count(1)
     page.reload()

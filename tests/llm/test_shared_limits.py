@@ -102,7 +102,11 @@ SENDS = """
 import sys, time
 from pathlib import Path
 from merge_runner.llm.shared_limits import SharedLimits
-shared = SharedLimits(Path(sys.argv[1]), rpm=240)
+def clock():
+    global counted_at
+    counted_at = time.monotonic()
+    return counted_at
+shared = SharedLimits(Path(sys.argv[1]), rpm=240, clock=clock)
 print("ready", flush=True)
 until = float(input())
 while time.monotonic() < until:
@@ -110,7 +114,7 @@ while time.monotonic() < until:
     if wait:
         time.sleep(min(wait, 0.01))
     else:
-        print(time.monotonic())
+        print(counted_at)
 """
 
 

@@ -28,6 +28,7 @@ DRAWN = 12
 COUNTS = ("trials", "ended", "failed", "collided", "decisions", "invalid", "cost_usd")
 # What is published as one class of collisions, and the two that it holds.
 SAME, SAME_ACTION = "same action", ("both insisted", "both gave way")
+DRIVER_AND_PROMPT = "driver and prompt"
 UNPRICED = "SELECT coalesce(sum(unpriced), 0)::BIGINT AS attempts FROM tried"
 
 
@@ -54,17 +55,14 @@ class Played:
 
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
     """The study; raises NotThere, and NothingNew where nothing is new since it was ``seen``."""
+    standing = standing_of(site.catalogue)
+    seen = news_of((standing, site.catalogue.state(), site.catalogue.held), asked.get("seen", ""))
     given = {name: value for name, value in asked.items() if name != "seen"}
     by, ways = asked.get("by", ""), groupings(site)
     if by not in ways:
-        factors = ", ".join(filter(None, ways))
-        raise NotThere(
-            f"trials are grouped by {factors or 'nothing else'}, or by driver and prompt"
-        )
-    standing = standing_of(site.catalogue)
+        raise NotThere(f"trials are grouped by {', '.join([DRIVER_AND_PROMPT, *ways[1:]])}")
     groups = groups_of(site, by)
     humans = site.catalogue.counts(Filter(who="humans"), "condition")
-    seen = news_of((standing, site.catalogue.state(), site.catalogue.held), asked.get("seen", ""))
     imported = sum(row["trials"] for row in humans)
     panels = computed(site, ("home", by, str(imported)), given, wait_s=0.0)
     verdicts = computed(site, ("tables", "indicators"), given, wait_s=0.0)
@@ -75,7 +73,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         standing=standing,
         seen=seen,
         by=by,
-        choices=[(way or "driver and prompt", site.at.to(HOME, by=way), way == by) for way in ways],
+        choices=[(way or DRIVER_AND_PROMPT, site.at.to(HOME, by=way), way == by) for way in ways],
         task=task_picture(site.catalogue),
         groups=groups,
         first=ranking(groups),
@@ -95,7 +93,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def groupings(site: Site) -> list[str]:
-    """By what trials are grouped: driver and prompt (empty), or a factor where any varies."""
+    """By what trials are grouped: driver and prompt (empty), or by a factor if anything varies."""
     factors = site.catalogue.factors()
     (prompts,) = site.catalogue.ask(
         "SELECT count(DISTINCT variant) AS n FROM listed WHERE who <> 'humans'"

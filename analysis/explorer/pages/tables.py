@@ -59,8 +59,8 @@ FILE_WAIT_S = 300.0
 
 def tables_page(site: Site) -> str:
     """The list of all tables and figures."""
-    figures = FIGURES if site.at.figure("") else {}
-    return site.render("tables.html", here="tables", about=ABOUT, figures=figures)
+    there = {name: text for name, text in FIGURES.items() if site.at.figure(name)}
+    return site.render("tables.html", here="tables", about=ABOUT, figures=there)
 
 
 def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
@@ -80,6 +80,17 @@ def table_files(site: Site, name: str) -> Iterator[tuple[str, str]]:
     (text,) = found.result.content["tables"]
     for suffix, (form, _) in FILES.items():
         yield site.at.table_file(name, suffix), render([from_text(text)], form) + "\n"
+
+
+def figure_requests() -> list[Request]:
+    """What is asked for all figures."""
+    return [("figure", name) for name in FIGURES]
+
+
+def figures(site: Site) -> dict[str, str]:
+    """All figures by name, for an export, but those that cannot be drawn."""
+    found = {name: computed(site, (kind, name), {}).result for kind, name in figure_requests()}
+    return {name: result.content["svg"] for name, result in found.items() if result is not None}
 
 
 def figure_svg(site: Site, name: str) -> str:

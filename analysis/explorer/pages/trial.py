@@ -61,6 +61,7 @@ def shown(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
         "data": embedded(replayed(site, row, trial, account)) if trial.states else None,
         "account": account,
         "lines": views.summary(row, trial),
+        "actions": {} if decided else views.actions(trial),
         "trial_decisions": decided,
         "offers": OFFERS,
         "clamped": clamped,

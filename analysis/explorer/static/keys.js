@@ -5,6 +5,8 @@
   window.isCommand = (event) => (event.ctrlKey || event.metaKey || event.altKey) && !event.getModifierState("AltGraph");
   const typing = (target) => target.matches("input:not([type=range]), select, textarea, [contenteditable]");
   const help = document.getElementById("help");
+  // Keys of a page are off while something is typed, and while a dialog is open.
+  window.isElsewhere = (event) => isCommand(event) || help.open || typing(event.target);
   const words = [...document.querySelectorAll("#page-words > div")].map((entry) => {
     const names = entry.querySelector("dt").textContent.split(", ").map((name) => name.replace(/[^\w ]/g, "\\$&"));
     return [entry, new RegExp(`(?<![\\w-])(${names.join("|")})(s|es)?(?![\\w-])`, "i")];

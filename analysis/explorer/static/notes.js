@@ -26,9 +26,8 @@
     document.activeElement.blur();
   });
   document.addEventListener("keydown", (event) => {
-    if (isCommand(event) || document.querySelector("dialog[open]") || event.target.matches("input:not([type=range]), select, textarea")) return;
     const field = { n: text, t: tags }[event.key];
-    if (!field) return;
+    if (!field || isElsewhere(event)) return;
     event.preventDefault();
     field.focus();
     field.scrollIntoView({ block: "nearest" });

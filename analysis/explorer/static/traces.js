@@ -15,7 +15,10 @@
     }
     // The other views are pages of their own, and keep the choice.
     const chosen = new URLSearchParams([...new FormData(form)].filter(([name, value]) => name !== "by" && value));
-    for (const link of document.querySelectorAll(".groups a")) link.search = chosen;
+    for (const link of document.querySelectorAll(".groups a")) {
+      const [page] = link.getAttribute("href").split("?");
+      link.setAttribute("href", chosen.size ? `${page}?${chosen}` : page);
+    }
     document.getElementById("drawn").textContent = document.querySelectorAll(".overlay [data-model]:not([hidden]) path").length;
   };
   form.addEventListener("input", show);

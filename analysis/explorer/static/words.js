@@ -32,11 +32,18 @@
     const found = spans(folded, wanted), shown = found.slice(0, MOST);
     let at = 0;
     for (const [i, [begin, end]] of (shown.length ? shown : [[0, 0]]).entries()) {
-      const start = Math.max(at, begin - AROUND);
-      if (start > at) cell.append(at ? " … " : "… ");
+      const following = shown[i + 1]?.[0] ?? text.length;
+      let start = Math.max(at, begin - AROUND);
+      if (start > at) {
+        const space = text.indexOf(" ", start - 1);
+        if (space >= 0 && space < begin) start = space + 1;
+        cell.append(at ? " … " : "… ");
+      }
       cell.append(text.slice(start, begin));
       if (end > begin) cell.append(Object.assign(document.createElement("mark"), { textContent: text.slice(begin, end) }));
-      at = Math.min(text.length, shown[i + 1]?.[0] ?? text.length, end + AROUND * (shown.length ? 1 : 3));
+      at = Math.min(following, end + AROUND * (shown.length ? 1 : 3));
+      const last = text.lastIndexOf(" ", at);
+      if (at < following && last > end) at = last;
       cell.append(text.slice(end, at));
     }
     if (at < text.length) cell.append(" …");
@@ -46,7 +53,8 @@
     const of = trials[one.of], made = document.createElement("tr");
     const head = made.appendChild(document.createElement("th"));
     head.scope = "row";
-    head.append(Object.assign(document.createElement("a"), { href: `${of.href}&${one.query}`, textContent: of.name }), ` ${of.outcome[0]}`);
+    head.append(Object.assign(document.createElement("a"), { href: `${of.href}&${one.query}`, textContent: of.name }), " ",
+      Object.assign(document.createElement("span"), { className: `outcome ${of.outcome[0].replaceAll(" ", "-")}`, textContent: of.outcome[0] }));
     made.insertCell().textContent = one.at;
     made.insertCell().textContent = [one.tactical, one.switch, one.failure].filter(Boolean).join(", ");
     const words = made.insertCell();

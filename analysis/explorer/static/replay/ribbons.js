@@ -24,7 +24,9 @@ replay.ribbons = (scene) => {
         const offset = box.left - holder.getBoundingClientRect().left;
         for (const link of holder.querySelectorAll("a.decision")) {
           link.parentElement.style.left = `${offset + scale(begins(link))}px`;
-          link.parentElement.style.width = `${Math.max(14, scale(until(link)) - scale(begins(link)) - 2)}px`;
+          const [from, usual, to] = [begins(link), begins(link) + run(link).every[link.dataset.side], until(link)].map(scale);
+          // The last one may be short: it has its letter still, but no more room than the others.
+          link.parentElement.style.width = `${Math.max(Math.min(14, usual - from - 1), to - from - 2)}px`;
         }
         holder.classList.add("placed");
       }

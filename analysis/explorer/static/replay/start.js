@@ -114,8 +114,7 @@ window.startReplay = () => {
   });
   addEventListener("popstate", recall);
   document.addEventListener("keydown", (event) => {
-    if (isCommand(event) || document.querySelector("dialog[open]")) return;
-    if (event.target.matches("input:not([type=range]), select, textarea")) return;
+    if (isElsewhere(event)) return;
     if (clock.key(event)) event.preventDefault();
     else if (event.key === "]") step(1);
     else if (event.key === "[") step(-1);
