@@ -105,8 +105,7 @@ def _trial_routes(site: Site) -> list[Route]:
         asked = request.query_params
         wanted = trials.export_filter(site, asked)
         content = site.catalogue.export(wanted, trials.sort_of(asked), form)
-        name = {"content-disposition": f'attachment; filename="trials.{form}"'}
-        return Response(content, media_type=KINDS[form], headers=name)
+        return _download(content, KINDS[form], f"trials.{form}")
 
     def raw(request: Request) -> Response:
         text = trial.raw_reply(site, request.path_params["trial"], request.query_params)
@@ -123,8 +122,7 @@ def _trial_routes(site: Site) -> list[Route]:
         rows = [trial.find(site, named, asked), comparing.named(site, asked.get("compare", ""))]
         file = f"{FILE_NAME.sub('-', named)}.html"
         page = page_of_trials(site, [row for row in rows if row is not None], file)
-        headers = {"content-disposition": f'attachment; filename="{file}"'}
-        return HTMLResponse(page, headers=headers)
+        return _download(page, "text/html", file)
 
     def fragment(request: Request) -> str:
         return trial.decision_fragment(site, request.path_params["trial"], request.query_params)
@@ -151,8 +149,7 @@ def _computed_routes(site: Site) -> list[Route]:
     def file(request: Request) -> Response:
         named = request.path_params["name"], request.path_params["suffix"]
         text, kind = tables.table_file(site, *named)
-        name = {"content-disposition": f'attachment; filename="{".".join(named)}"'}
-        return Response(text, media_type=kind, headers=name)
+        return _download(text, kind, ".".join(named))
 
     def figure(request: Request) -> Response:
         svg = tables.figure_svg(site, request.path_params["name"])
@@ -174,6 +171,12 @@ def _computed_routes(site: Site) -> list[Route]:
         Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),
         Route("/humans", page(lambda r: humans.humans_page(site, r.query_params))),
     ]
+
+
+def _download(content: str | bytes, kind: str, name: str) -> Response:
+    """A file that a browser saves under this name."""
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return Response(content, media_type=kind, headers=headers)
 
 
 def _seen(request: Request) -> str:
@@ -239,8 +242,7 @@ def _sql_routes(site: Site) -> list[Route]:
             content = sql.sql_csv(site, request.query_params)
         except sql.UNANSWERED as exc:
             return HTMLResponse(sql.sql_page(site, request.query_params, problem=str(exc)), 400)
-        name = {"content-disposition": 'attachment; filename="query.csv"'}
-        return Response(content, media_type=KINDS["csv"], headers=name)
+        return _download(content, KINDS["csv"], "query.csv")
 
     return [Route("/sql", sql_query), Route("/sql.csv", sql_download)]
 
@@ -250,8 +252,7 @@ def _words_routes(site: Site) -> list[Route]:
 
     def as_csv(request: Request) -> Response:
         file = request.url.path.removeprefix("/")
-        name = {"content-disposition": f'attachment; filename="{file}"'}
-        return Response(notes.notes_file(site, file), media_type=KINDS["csv"], headers=name)
+        return _download(notes.notes_file(site, file), KINDS["csv"], file)
 
     def write(request: Request, form: Mapping[str, str]) -> Response:
         site.refresh()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import shlex
 import threading
 from collections.abc import Iterator, MutableMapping
@@ -65,6 +66,14 @@ class NotThere(Exception):
 
 class NothingNew(Exception):
     """What was seen of a page is what it still shows."""
+
+
+def news_of(shown: object, seen: str, state: str = "all") -> str:
+    """What is shown, as a short text that differs where it does; raises NothingNew."""
+    now = f"{state}-{hashlib.sha256(repr(shown).encode()).hexdigest()[:16]}"
+    if now == seen:
+        raise NothingNew
+    return now
 
 
 @dataclass

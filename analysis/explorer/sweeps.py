@@ -5,11 +5,11 @@ from __future__ import annotations
 import shlex
 from collections import Counter
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
-from analysis.explorer.catalogue import FACTOR, Catalogue
+from analysis.explorer.catalogue import FACTOR, Catalogue, Filter
 from analysis.explorer.reading import Row
 from merge_runner.audit.expected import ArmFacts, ModelFacts
 from merge_runner.config import both_sides, pair_name
@@ -31,14 +31,6 @@ FROM sweeps LEFT JOIN (
 ) USING (sweep_id)
 ORDER BY started_at DESC, sweep_id DESC
 """
-CELLS = f"""
-SELECT model_left, model_right, coalesce(variant, '') AS variant, coalesce(levels, []) AS levels,
-    condition,
-    count(*) FILTER (status <> 'failed') AS ended, count(*) FILTER (status = 'failed') AS failed,
-    count(*) FILTER (status = 'collided') AS collided, sum(decisions)::BIGINT AS decisions,
-    sum(invalid)::BIGINT AS invalid, sum(fallbacks)::BIGINT AS fallbacks
-FROM listed {OF_SWEEP} GROUP BY ALL ORDER BY ALL
-"""  # noqa: S608 # constants
 TRIED = f"""
 SELECT requested, served, answered, outcome, sum(times)::BIGINT AS times,
     sum(unpriced)::BIGINT AS unpriced, answered AND (requested, served) IN (FROM others) AS other
@@ -59,6 +51,7 @@ REASONS = {
 
 
 # Who drives left and right, the prompt, and the levels of the other factors as texts.
+ARM = ("model_left", "model_right", "variant", "levels")
 ArmKey = tuple[str, str, str, tuple[str, ...]]
 
 
@@ -212,7 +205,8 @@ class ListedSweep:
         if self.last_word is None:
             return None
         until = self.last_word.astimezone(UTC) if self.last_word.tzinfo else self.last_word
-        return (until.replace(tzinfo=None) - self.row["started_at"]).total_seconds()
+        lasted: timedelta = until.replace(tzinfo=None) - self.row["started_at"]
+        return lasted.total_seconds()
 
     @property
     def _unended(self) -> str:
@@ -327,7 +321,7 @@ def find_sweep(catalogue: Catalogue, sweep_id: str) -> Sweep | None:
     if place is None:
         return None
     entry = entries[place]
-    stored = catalogue.ask(CELLS, sweep_id)
+    stored = catalogue.counts(Filter(sweep=sweep_id), *ARM, "condition")
     tried = catalogue.ask(TRIED, sweep_id)
     mismatches = mismatches_of(tried)
     return Sweep(
@@ -381,9 +375,9 @@ def cells_of(entry: ListedSweep, stored: list[Row]) -> dict[tuple[str, str], Var
 
 def _label(row: Row, arms: dict[ArmKey, Arm]) -> str:
     """The arm of stored trials by its label, or their prompt where only prompts vary."""
-    key = row["model_left"], row["model_right"], row["variant"], tuple(row["levels"])
-    arm = arms.get(key)
-    return arm.label if arm else str(row["variant"])
+    left, right, variant, levels = (row[name] for name in ARM)
+    arm = arms.get((left, right, variant or "", tuple(levels or ())))
+    return arm.label if arm else variant or ""
 
 
 def rates_of(

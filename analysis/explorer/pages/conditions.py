@@ -12,7 +12,7 @@ from analysis.explorer.catalogue import Filter
 from analysis.explorer.conditions import ordered
 from analysis.explorer.pictures import Axis, Scale
 from analysis.explorer.reading import Row
-from analysis.explorer.site import NothingNew, NotThere, Site
+from analysis.explorer.site import NotThere, Site, news_of
 from analysis.explorer.traces import MEASURES, read_band, read_traces
 
 HUMAN = "human"
@@ -64,7 +64,7 @@ TURNED_KIND = {"left-first": "right-first", "right-first": "left-first"}
 
 def conditions_page(site: Site, asked: Mapping[str, str]) -> str:
     """All conditions that trials were played in; raises NothingNew."""
-    state = _news(site, asked)
+    state = news_of(site.catalogue.state(), asked.get("seen", ""))
     found = {
         (row["condition"], row["model"]): row
         for row in site.catalogue.counts(Filter(), "condition", "model")
@@ -85,7 +85,7 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
 
     Raises NotThere, and NothingNew.
     """
-    state = _news(site, asked)
+    state = news_of(site.catalogue.state(), asked.get("seen", ""))
     groups = site.catalogue.counts(Filter(condition=name), "model", "variant")
     if not groups:
         raise NotThere(f"no trial of the condition {name} is here")
@@ -187,14 +187,6 @@ def picture(
         ],
         "lines": lines,
     }
-
-
-def _news(site: Site, asked: Mapping[str, str]) -> str:
-    """What is listed now, as a text; raises NothingNew where that was ``seen``."""
-    state = "-".join(map(str, site.catalogue.state()))
-    if asked.get("seen") == state:
-        raise NothingNew
-    return state
 
 
 def _rows(site: Site, wanted: Filter, *, with_humans: bool) -> list[Row]:

@@ -12,10 +12,9 @@ from analysis.explorer.catalogue import FACTOR, Filter
 from analysis.explorer.charts import Kind, drawn
 from analysis.explorer.conditions import ordered
 from analysis.explorer.pages.computed import Computed, computed
-from analysis.explorer.pages.sweep import news_of
 from analysis.explorer.pictures import marker
 from analysis.explorer.reading import Row
-from analysis.explorer.site import NotThere, Site
+from analysis.explorer.site import NotThere, Site, news_of
 from analysis.explorer.sweeps import standing_of
 from analysis.explorer.task_picture import task_picture
 from analysis.explorer.urls import HOME

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-
 from analysis.explorer.conditions import ordered
-from analysis.explorer.site import NothingNew, NotThere, Site
+from analysis.explorer.site import NothingNew, NotThere, Site, news_of
 from analysis.explorer.sweeps import Sweep, VariantCondition, duration, find_sweep, list_sweeps
 from analysis.explorer.views import prompt_text
 from merge_runner.prompts.blocks import VARIANTS
@@ -45,14 +43,6 @@ def sweep_page(site: Site, sweep_id: str, seen: str = "") -> str:
         heard=bool(seen),
         **_values(site, sweep),
     )
-
-
-def news_of(shown: object, seen: str, state: str = "all") -> str:
-    """What is shown, as a short text that differs where it does; raises NothingNew."""
-    now = f"{state}-{hashlib.sha256(repr(shown).encode()).hexdigest()[:16]}"
-    if now == seen:
-        raise NothingNew
-    return now
 
 
 def _values(site: Site, sweep: Sweep) -> dict[str, object]:

@@ -9,7 +9,7 @@ from typing import Any
 from analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.pictures import sparkline, speed_range
-from analysis.explorer.site import NothingNew, NotThere, Site
+from analysis.explorer.site import NotThere, Site, news_of
 from analysis.explorer.urls import whole
 from analysis.tables import TABLES
 from merge_runner.errors import StoreError
@@ -18,10 +18,12 @@ EXPORT_WAIT_S = 300.0
 
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
-    """One page of the trials that an address asks for."""
-    state = "-".join(map(str, site.catalogue.state()))
-    if "seen" in asked:
-        return _news(site, asked, state)
+    """One page of the trials that an address asks for; raises NothingNew as it was ``seen``."""
+    state = site.catalogue.state()
+    seen = news_of(state, asked.get("seen", ""))
+    if "seen" in asked:  # that the trials are no longer those that were seen
+        here, news = (at_of(site, asked, seen=text) for text in ("", seen))
+        return site.render("_news.html", trials=state[0], here=here, news=news)
     wanted, sort = filter_of(asked), sort_of(asked)
     cell, named = asked.get("cell", ""), None
     if cell:
@@ -50,7 +52,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         rows=rows,
         leveled=any(row["levels"] for row in rows),
         scale=speed_range(rows),
-        news=at_of(site, asked, seen=state),
+        news=at_of(site, asked, seen=seen),
         page=number,
         last_page=last,
         sparkline=sparkline,
@@ -60,19 +62,6 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
 def at_of(site: Site, asked: Mapping[str, str], **state: str) -> str:
     """The address of a list, with more of a state."""
     return site.at.to("trials", **{**asked, **state})
-
-
-def _news(site: Site, asked: Mapping[str, str], state: str) -> str:
-    """A note that the trials are no longer those that were seen; raises NothingNew."""
-    if asked["seen"] == state:
-        raise NothingNew
-    (every,) = site.catalogue.ask("SELECT count(*) AS n FROM listed")
-    return site.render(
-        "_news.html",
-        trials=every["n"],
-        here=at_of(site, asked, seen=""),
-        news=at_of(site, asked, seen=state),
-    )
 
 
 def export_filter(site: Site, asked: Mapping[str, str]) -> Filter:
