@@ -403,11 +403,6 @@ class Catalogue:
             *values,
         )
 
-    def account_counts(self, wanted: Filter) -> list[Row]:
-        """The counts of a filter's trials that have an account, by driver, prompt and account."""
-        rows = self.counts(wanted, "who", "model", "variant", "account")
-        return [row for row in rows if row["account"] is not None]
-
     def page(self, wanted: Filter, sort: str, number: int) -> list[Row]:
         """The trials of one page, counted from 1; ``-gap`` sorts the largest gap first."""
         where, values = wanted.where()

@@ -64,7 +64,8 @@ def test_a_follower_that_closes_in_is_a_near_miss_whatever_the_gap(catalogue):
 def test_accounts_are_counted_by_driver_and_variant_and_filtered(catalogue):
     counts = {
         (row["model"], row["variant"], row["account"]): row["trials"]
-        for row in catalogue.account_counts(Filter())
+        for row in catalogue.counts(Filter(), "model", "variant", "account")
+        if row["account"]
     }
     o3 = {("o3", "baseline", account): 1 for account in EXAMPLES if account}
     assert counts == {
@@ -73,7 +74,7 @@ def test_accounts_are_counted_by_driver_and_variant_and_filtered(catalogue):
         ("o4", "baseline", "both insisted"): 1,
         ("human", None, "no action"): 1,
     }
-    (alone,) = catalogue.account_counts(Filter(model="human"))
+    (alone,) = catalogue.counts(Filter(model="human"), "account")
     assert alone["account"] == "no action"
     assert ("both insisted", 2) in catalogue.facets(Filter())["account"]
 
@@ -85,7 +86,7 @@ def test_what_is_stored_later_has_its_account_too(db, tmp_path):
     catalogue.refresh()
     Store(path).write("sweep-1", [played(drive("invalid plan"))], patience_s=5)
     catalogue.refresh()
-    assert [row["account"] for row in catalogue.account_counts(Filter())] == [
+    assert [row["account"] for row in catalogue.counts(Filter(), "account")] == [
         "invalid plan",
         "no action",
     ]

@@ -22,7 +22,7 @@ from analysis.explorer.analysis_process import Computing
 from analysis.explorer.app import explorer
 from analysis.explorer.assets import STATIC, STYLES
 from analysis.explorer.child import NoAnswer
-from analysis.explorer.pages.home import account_rows, home_page
+from analysis.explorer.pages.home import Played, account_rows, home_page
 from analysis.explorer.pages.tables import FIGURES
 from analysis.explorer.site import NothingNew, Site
 from analysis.explorer.task_picture import task_picture
@@ -129,6 +129,13 @@ def test_a_study_is_grouped_by_any_of_its_factors(client, own):
         "A1",
         "baseline",
     ]
+    classes = text.split('id="accounts"')[1].split("</table>")[0]
+    assert re.findall(r'"number">([^<]+)</th>', classes)[2:] == ["A1", "baseline"]
+    links = re.findall(r'<a href="([^"]+variant=baseline[^"]*)">(\d+)</a>', classes)
+    assert links
+    assert [listed(client.get(unescape(link)).text) for link, _ in links] == [
+        int(count) for _, count in links
+    ]
     assert "grouped by driver and prompt, prompt" in client.get("/?by=mood").text
     groups = [g["id"] for g in own.computing.ask(("home", "prompt", "0"), (0, 0), wait_s=60)
               .content["groups"]]  # fmt: skip
@@ -207,21 +214,16 @@ def test_an_exported_study_begins_with_it_and_says_nothing_of_runs(db):
 
 def test_classes_of_collisions_stand_beside_the_published_ones():
     published = {"humans": {"same action": 14, "no action": 5, "other": 4}}
-    found = [
-        {"who": "drivers", "model": "o3", "variant": "baseline"}
-        | {"account": "both gave way", "trials": 3},
-        {"who": "stand-ins", "model": "o3", "variant": None}
-        | {"account": "invalid plan", "trials": 1},
-    ]
-    rows = account_rows(found, published)
-    assert list(rows["classes"]) == [
+    o3, unjudged, stand_in = (
+        Played(label, "drivers", {}, cells={account: {"trials": 1}})
+        for label, account in (("o3", "both gave way"), ("o4", None), ("o5", "invalid plan"))
+    )
+    rows = account_rows([o3, unjudged, stand_in], published)
+    assert rows["classes"] == [
         *("both insisted", "both gave way", "no action", "other", "invalid plan")
     ]
-    drivers, stand_ins = ("drivers", "o3", "baseline"), ("stand-ins", "o3", "")
-    assert rows["classes"]["both gave way"] == {drivers: 3}
-    assert rows["classes"]["invalid plan"] == {stand_ins: 1}
-    assert (rows["same"], rows["groups"]) == ({"humans": 14}, [drivers, stand_ins])
-    assert account_rows([], published) is None
+    assert (rows["same"], rows["groups"]) == ({"humans": 14}, [o3, stand_in])
+    assert account_rows([unjudged], published) is None
 
 
 def test_the_picture_of_the_task_shows_a_moment_before_the_merge(own):

@@ -34,7 +34,7 @@ UNPRICED = "SELECT coalesce(sum(unpriced), 0)::BIGINT AS attempts FROM tried"
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """What the trials of a group come to by condition; ``state`` is their filter."""
+    """What the trials of a group come to, by condition mostly; ``state`` is their filter."""
 
     label: str
     who: str
@@ -81,7 +81,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         rows=(rows := worst_first(groups)),
         beside=_sum_of([published[row["name"]] for row in rows if row["name"] in published]),
         accounts=account_rows(
-            site.catalogue.account_counts(Filter(outcome="collided")), published_accounts()
+            _grouped(site, by, Filter(outcome="collided"), "account"), published_accounts()
         ),
         unpriced=unpriced["attempts"],
         panels=panels,
@@ -103,18 +103,22 @@ def groupings(site: Site) -> list[str]:
 
 def groups_of(site: Site, by: str) -> list[Played]:
     """Drivers and prompts, or the levels of a factor; before several their sum."""
+    found = [group for group in _grouped(site, by, Filter()) if group.who != "humans"]
+    return [*_sums(site, found), *found]
+
+
+def _grouped(site: Site, by: str, wanted: Filter, cell: str = "condition") -> list[Played]:
+    """The trials of a filter in the groups ``by``, each by its conditions or another column."""
     factor = by if by not in {"", PROMPT} else ""
     names = ("level",) if factor else ("variant",) if by else ("model", "variant")
     found: dict[tuple[str, ...], Played] = {}
-    for row in site.catalogue.counts(Filter(), *names, "who", "condition", factor=factor):
-        if row["who"] == "humans":
-            continue
+    for row in site.catalogue.counts(wanted, *names, "who", cell, factor=factor):
         levels = {name: row[name] or "" for name in names}
         state = {f"{FACTOR}{by}" if name == "level" else name: v for name, v in levels.items()}
         label = ", ".join(filter(None, levels.values()))
         new = Played(label, row["who"], {"who": row["who"], **state}, row["stand_in"] or "")
-        found.setdefault((row["who"], *levels.values()), new).cells[row["condition"]] = row
-    return [*_sums(site, list(found.values())), *found.values()]
+        found.setdefault((row["who"], *levels.values()), new).cells[row[cell]] = row
+    return list(found.values())
 
 
 def _sums(site: Site, groups: Sequence[Played]) -> list[Played]:
@@ -210,24 +214,20 @@ def verdicts_of(site: Site, table: Table) -> dict[str, Any]:
 
 
 def account_rows(
-    found: Sequence[Row], published: Mapping[str, Mapping[str, int]]
+    groups: Sequence[Played], published: Mapping[str, Mapping[str, int]]
 ) -> dict[str, Any] | None:
-    """Collisions by class, of each driver and prompt and as published; None without a collision.
+    """The classes of collisions of groups, which count them, and as published; None without any.
 
-    ``classes`` have the counts by group. What is published does not tell the first two apart: they
-    are ``same``.
+    What is published does not tell the first two apart: they are ``same``.
     """
-    if not found:
+    there = [group for group in groups if any(group.cells)]
+    if not there:
         return None
-    classes: dict[str, dict[tuple[str, str, str], int]] = {name: {} for name in SAME_ACTION}
-    for name in (name for of in published.values() for name in of if name != SAME):
-        classes.setdefault(name, {})
-    groups = [(row["who"], row["model"], row["variant"] or "") for row in found]
-    for group, row in zip(groups, found, strict=True):
-        classes.setdefault(row["account"], {})[group] = row["trials"]
+    told = [name for of in published.values() for name in of if name != SAME]
+    found = [name for group in there for name in group.cells if name]
     return {
-        "groups": list(dict.fromkeys(groups)),
-        "classes": classes,
+        "groups": there,
+        "classes": list(dict.fromkeys([*SAME_ACTION, *told, *found])),
         "published": published,
         "same": {who: of[SAME] for who, of in published.items()},
     }
