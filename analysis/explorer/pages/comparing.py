@@ -31,7 +31,8 @@ WITH near AS (
     WINDOW alike AS (PARTITION BY model, variant, pair, spec_hash ORDER BY rep, trial_id)
     UNION ALL BY NAME
     SELECT one.number, '{DRIVER}' AS kind, arg_min(two.number, (two.variant IS DISTINCT FROM
-        one.variant, two.rep <> one.rep, two.model <= one.model, two.model, two.number)) AS other
+        one.variant, two.rep <> one.rep, two.model <= one.model, two.model, two.trial_id,
+        two.spec_hash)) AS other
     FROM near AS one JOIN near AS two ON two.model <> one.model AND two.source <> 'human'
     WHERE one.wanted GROUP BY one.number
 )
