@@ -197,7 +197,7 @@ def test_both_ribbons_and_both_words_stand_beside_each_other(page):
     assert own.first.bounding_box()["x"] == pytest.approx(others.first.bounding_box()["x"], abs=1)
     others.first.click()
     expect(page.locator("#decision .decision-panel h2")).to_have_count(1)
-    assert "of=other" in page.url
+    expect(page).to_have_url(re.compile("of=other"))
     page.reload()
     expect(page.locator("#other-ribbons a[aria-current]")).to_have_count(1)
     page.locator("#ghost-key a").click()
@@ -225,6 +225,24 @@ def test_offers_are_a_click_away(page):
     expect(page.locator("#ghost-key")).to_contain_text("human P1")
     page.go_back()
     expect(page.locator("#ghost-key")).to_contain_text("rep 2")
+
+
+def test_where_nobody_answers_nothing_is_said_of_what_there_is(browser, site):
+    context = browser.new_context(base_url=site)
+    page = context.new_page()
+    page.goto(f"/trials/{TRIAL}")
+    page.route("**/others/**", lambda route: route.abort())
+    page.locator("#compare").fill("rep02")
+    expect(page.locator("#lost")).to_be_visible()
+    expect(page.locator("#others")).to_be_hidden()
+    page.get_by_role("button", name="next repetition").click()
+    expect(page.locator("#lost")).to_be_visible()
+    expect(page.locator("#ghost-key")).to_be_hidden()
+    page.unroute_all()
+    page.get_by_role("button", name="next repetition").click()
+    expect(page.locator("#ghost-key")).to_contain_text("rep 2")
+    expect(page.locator("#lost")).to_be_hidden()
+    context.close()
 
 
 def test_a_trial_on_another_track_is_said_to_be_and_no_human_is_near_it(page, db, tmp_path):

@@ -35,9 +35,10 @@ replay.comparison = (scene, { changed }) => {
     // What is chosen is done with: the keys are the replay's again.
     button.blur();
     if (button.dataset.offer) {
-      const key = await explorer.offer(button.dataset.offer).catch(() => null);
+      const key = await explorer.offer(button.dataset.offer).catch(() => undefined);
+      at("lost").hidden = key !== undefined;
       if (key) lay(key, true);
-      else say(`${button.textContent}: there is none here. It would be ${button.title}.`);
+      else if (key === null) say(`${button.textContent}: there is none here. It would be ${button.title}.`);
     } else if (button.dataset.key !== undefined) lay(button.dataset.key, true);
   });
   return { lay };

@@ -10,8 +10,14 @@ replay.finding = (form) => {
   const look = async () => {
     const text = field.value.trim();
     asked = text;
-    const { found, more } = await explorer.search(text).catch(() => ({ found: [], more: 0 }));
+    const answer = await explorer.search(text).catch(() => null);
     if (asked !== text || !field.matches(":focus")) return;
+    document.getElementById("lost").hidden = answer !== null;
+    if (answer === null) {
+      close();
+      return;
+    }
+    const { found, more } = answer;
     const note = found.length === 0 ? "No trial has these words in its name, driver or outcome."
       : more ? `${more} more: type more of a name, driver or outcome.` : "";
     list.replaceChildren(...found.map(entry), ...(note ? [replay.element("li", { class: "quiet" }, note)] : []));
