@@ -60,8 +60,10 @@ def plugin(folder: Path, source: str, module: str = "dummies") -> dict[str, str]
 
 
 def environment(**changes: str) -> dict[str, str]:
-    """The environment without keys, base URLs and proxies."""
+    """The environment without keys, base URLs and proxies, and as if no make ran the tests."""
     kept = {k: v for k, v in os.environ.items() if not k.endswith(CONFIGURING)}
+    for name in ("MAKELEVEL", "MAKEFLAGS", "MFLAGS"):
+        kept.pop(name, None)
     # Compiled modules are kept, or each of the many starts would compile them anew.
     kept.pop("PYTHONDONTWRITEBYTECODE", None)
     return {**kept, **changes}

@@ -123,9 +123,9 @@ async def at_terminal(command: str, folder: Path, **changes: str) -> tuple[int, 
     os.write(screen, b"y\n")
     if SERVES.search(command):  # runs until it is stopped: its first line is all there is
         out = await process.stdout.readline()
-        assert out.startswith(b"http://"), out
         os.killpg(process.pid, signal.SIGTERM)
         await process.communicate()  # until nobody writes any more: its port is free
+        assert out.startswith(b"http://"), out
         code = 0
     else:
         out, _ = await process.communicate()
