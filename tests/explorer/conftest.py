@@ -32,6 +32,12 @@ def pytest_runtest_setup(item):
         pytest.skip("needs chromium: apt install chromium")
 
 
+@pytest.fixture(autouse=True)
+def no_study_of_another_test(monkeypatch):
+    """What an explorer starts reads the adopted study anew: one of another test may be gone."""
+    monkeypatch.setattr("merge_runner.study.parts._adopted", [])
+
+
 @pytest.fixture(scope="session")
 def study(prepare, tmp_path_factory):
     """Recorded trials, one of which collides, and a hostile, a failed and a human one."""
