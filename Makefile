@@ -14,10 +14,10 @@ export Q
 # A make that a recipe runs, as the tests do, is another one: it inherits neither words nor variables.
 unexport MODEL SWEEP ARGS RECORDING PYTHON MAKEFLAGS MFLAGS MAKEOVERRIDES
 
-.PHONY: help sweep replay report view sql test lint check bench lock
+.PHONY: help sweep replay report view sql test lint check check-all bench lock
 
 help:
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
 
 sweep: .venv/runtime $(if $(findstring --dask,$(ARGS)),.venv/dask) ## the main job: MODEL=, SWEEP=, ARGS=
 	@$(RUN) sweep $(SWEEP) $(addprefix --model ,$(MODEL)) $(ARGS)
@@ -35,7 +35,7 @@ sql: .venv/runtime ## a query over the results: Q="select ...", ARGS=
 	@$(RUN) sql "$$Q" $(ARGS)
 
 test: .venv/dev ## the quick tests, or those of ARGS=
-	@$(PYTEST) $(or $(ARGS),-m "not slow")
+	@$(PYTEST) $(or $(ARGS),-m "not slow and not long")
 
 lint: .venv/dev ## formatting, lint, types, import contract
 	@.venv/bin/ruff format --check .
@@ -43,8 +43,12 @@ lint: .venv/dev ## formatting, lint, types, import contract
 	@.venv/bin/mypy
 	@.venv/bin/lint-imports
 
-check: lint ## formatting, lint, types, import contract and all tests
-	@$(PYTEST) $(ARGS)
+check: lint ## what a change must pass: formatting, lint, types, import contract and all tests but the long ones
+	@$(PYTEST) -m "not long" $(ARGS)
+
+check-all: check ## what an hour may find: the long tests too, and the wheel on every Python that is here
+	@MERGE_RUNNER_BROWSER=required $(PYTEST) -m long $(ARGS)
+	@.ci/installed everywhere
 
 bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/reference/performance.md
 	@.venv/bin/python -m benchmarks $(ARGS)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,8 +20,16 @@ from analysis.human.commands import INTERRUPTED, human_app
 from analysis.power.commands import power
 from analysis.table_format import TableFormat
 from merge_runner.cli import app, main
-from merge_runner.cli.options import DbOption, StudyOption, levels, listed
-from merge_runner.cli.output import print_out, say
+from merge_runner.cli.options import (
+    DbOption,
+    JsonOption,
+    StudyOption,
+    TrustOption,
+    beside_study,
+    levels,
+    listed,
+)
+from merge_runner.cli.output import print_out, say, terminal_width
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB, refuse_another_kind
 
@@ -38,7 +47,9 @@ app.command()(power)
 
 ModelsOption = Annotated[
     str | None,
-    typer.Option("--models", help="Only these drivers, separated by commas; human is one."),
+    typer.Option(
+        "--models", metavar="A,B", help="Only these drivers, separated by commas; human is one."
+    ),
 ]
 WhereOption = Annotated[
     list[str] | None,
@@ -51,22 +62,48 @@ WhereOption = Annotated[
 ]
 
 
+ByOption = Annotated[
+    str | None,
+    typer.Option(
+        "--by",
+        metavar="FACTOR",
+        help="With the table factors: the others at each level of this one, and interactions.",
+    ),
+]
+
+
+def _table_names() -> list[str]:
+    from analysis.tables import TABLES
+
+    return list(TABLES)
+
+
 @app.command()
 def tables(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME ...]", help="Tables; all if none is named.")
+        list[str] | None,
+        typer.Argument(
+            metavar="NAME", autocompletion=_table_names, help="Tables; all if none is named."
+        ),
     ] = None,
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
     where: WhereOption = None,
     study_file: StudyOption = None,
+    trust: TrustOption = False,
     output: Annotated[
         TableFormat, typer.Option("--format", help="Form of the tables.")
     ] = TableFormat.TEXT,
+    columns: Annotated[
+        str | None,
+        typer.Option("--columns", metavar="A,B", help="Only these columns, by the names of CSV."),
+    ] = None,
     against: Annotated[
         str | None,
         typer.Option(
-            "--against", help="paper: published values and differences, for drivers of that name."
+            "--against",
+            metavar="paper",
+            help="Published values and differences, for drivers of that name.",
         ),
     ] = None,
     as_driver: Annotated[
@@ -78,36 +115,49 @@ def tables(
             "gemini-2.5-pro.",
         ),
     ] = None,
+    by: ByOption = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Print the paper's tables III to VII, and those that say what these cannot."""
+    """Print the paper's tables III to VII, and further ones."""
+    if by is not None and list(names or ()) != ["factors"]:
+        raise UsageError("--by FACTOR goes with the table factors: tables factors --by FACTOR")
     if as_driver is not None and against is None:
         raise UsageError("--as DRIVER goes with --against paper")
     from analysis.tables import finished_tables
-    from analysis.tables.formats import render
+    from analysis.tables.formats import render, with_columns
 
-    made = finished_tables(db, drivers(models), names or (), where=_at(where))
+    made = finished_tables(
+        db, drivers(models), names or (), where=_at(where), file=study_file, by=by
+    )
     if against is not None:
         from analysis.tables.against import against as beside
 
         made = [beside(table, against, as_driver) for table in made]
-    print_out(render(made, output))
+    if columns is not None:
+        made = with_columns(made, listed(columns) or ())
+    print_out(render(made, TableFormat.JSON if as_json else output, terminal_width()))
 
 
 @app.command()
 def explain(
-    table: Annotated[str, typer.Argument(metavar="TABLE", help="A table's name.")],
+    table: Annotated[
+        str,
+        typer.Argument(metavar="TABLE", autocompletion=_table_names, help="A table's name."),
+    ],
     cell: Annotated[str, typer.Argument(metavar="CELL", help="ROW, or ROW:COLUMN.")],
     db: DbOption = DEFAULT_DB,
     where: WhereOption = None,
     study_file: StudyOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    trust: TrustOption = False,
+    by: ByOption = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Say where a cell of a table comes from: its meaning, the query, and the trials."""
+    """Explain a cell of a table: its meaning, query and trials."""
     from analysis.explain import explain as explain_cell
     from analysis.tables import finished_tables
 
-    study = _study(db, None, where)
-    made = finished_tables(db, None, [table], study, study.where)
+    study = _study(db, None, where, study_file, by)
+    made = finished_tables(db, None, [table], study)
     found = explain_cell(study, made[0], cell)
     if as_json:
         print_out(json.dumps(asdict(found), indent=2, ensure_ascii=False))
@@ -117,46 +167,75 @@ def explain(
 
 @app.command()
 def figures(
-    out: Annotated[Path, typer.Option("--out", help="The folder to write to.")] = Path(
-        "results/figures"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="DIR", callback=beside_study, help="The folder to write to."),
+    ] = Path("results/figures"),
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
     where: WhereOption = None,
     study_file: StudyOption = None,
+    trust: TrustOption = False,
 ) -> None:
-    """Draw Figure 2, the ablation matrix and the distributions, as PDF and PNG."""
+    """Draw all figures as PDF and PNG."""
     from analysis.figures.gallery import write_figures
 
-    for path in write_figures(_study(db, models, where), out):
-        say(f"wrote {path}")
+    deque(write_figures(_study(db, models, where, study_file), out), maxlen=0)
+    print_out(f"wrote the figures into {out}")
+
+
+@app.command()
+def export(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A new folder, or that of an earlier export.")
+    ],
+    db: DbOption = DEFAULT_DB,
+) -> None:
+    """Write every table as Parquet and CSV, with all columns explained."""
+    from analysis.data.human_counts import outcomes_table
+    from merge_runner.results.export import export_tables
+
+    deque(export_tables(db, folder, [outcomes_table()]), maxlen=0)
+    print_out(f"wrote every table into {folder}: begin with {folder / 'README.md'}")
 
 
 @app.command()
 def report(
-    out: Annotated[Path, typer.Option("--out", help="The HTML file to write.")] = Path(
-        "results/report.html"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", metavar="FILE", callback=beside_study, help="The HTML file to write."
+        ),
+    ] = Path("results/report.html"),
     files: Annotated[
-        Path | None, typer.Option("--files", help="Also write all tables and figures here.")
+        Path | None,
+        typer.Option("--files", metavar="DIR", help="Also write all tables and figures here."),
     ] = None,
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
     where: WhereOption = None,
     study_file: StudyOption = None,
+    trust: TrustOption = False,
 ) -> None:
-    """Write tables, figures, provenance and conclusions as one HTML file, and all as files."""
+    """Write conclusions, tables and figures as one HTML file."""
     from analysis.report.writer import write_report
 
     refuse_another_kind(out, HTML, "page of HTML")
-    for path in write_report(db, drivers(models), out, files, _at(where)):
-        say(f"wrote {path}")
+    deque(write_report(db, drivers(models), out, files, _at(where), study_file), maxlen=0)
+    also = "" if files is None else f", and its tables and figures into {files}"
+    print_out(f"wrote {out}{also}")
 
 
-def _study(db: Path, models: str | None, where: Sequence[str] | None) -> Study:
+def _study(
+    db: Path,
+    models: str | None,
+    where: Sequence[str] | None,
+    file: str | None,
+    by: str | None = None,
+) -> Study:
     from analysis.data.study import Study
 
-    return Study(db, drivers(models), _at(where))
+    return Study(db, drivers(models), _at(where), file, by)
 
 
 def _at(where: Sequence[str] | None) -> dict[str, list[str]] | None:
@@ -183,20 +262,31 @@ def drivers(text: str | None) -> list[str] | None:
 
 @app.command()
 def view(
-    port: Annotated[int, typer.Option(help="0: any free port.", min=0, max=65535)] = 8700,
+    port: Annotated[
+        int, typer.Option(metavar="N", help="0: any free port.", min=0, max=65535)
+    ] = 8700,
     bind: Annotated[
-        str, typer.Option("--bind", help="Another address to listen at; needs the token it prints.")
+        str,
+        typer.Option(
+            "--bind",
+            metavar="ADDRESS",
+            help="Another address to listen at; needs the token it prints.",
+        ),
     ] = "127.0.0.1",
     export: Annotated[
-        Path | None, typer.Option("--export", help="Write a folder of pages instead of serving.")
+        Path | None,
+        typer.Option("--export", metavar="DIR", help="Write a folder of pages instead of serving."),
     ] = None,
     single: Annotated[
-        Path | None, typer.Option("--single", help="Write one page with the --trials.")
+        Path | None,
+        typer.Option("--single", metavar="FILE", help="Write one page with the --trials."),
     ] = None,
     trials: Annotated[
         str | None,
         typer.Option(
-            "--trials", help="Which trials to write: names separated by commas, * for anything."
+            "--trials",
+            metavar="NAMES",
+            help="Which trials to write: names separated by commas, * for anything.",
         ),
     ] = None,
     reader: Annotated[
@@ -205,8 +295,9 @@ def view(
     ] = None,
     db: DbOption = DEFAULT_DB,
     study_file: StudyOption = None,
+    trust: TrustOption = False,
 ) -> None:
-    """Serve the explorer: watch trials, read decisions, follow a sweep in a browser."""
+    """Serve the explorer: trials, decisions and sweeps in a browser."""
     if export is None and single is None:
         if trials is not None:
             raise UsageError("--trials goes with --export DIR or --single FILE.html")

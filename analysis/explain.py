@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache
 
 import duckdb
@@ -14,21 +13,25 @@ from analysis.data.study import Group, Study, of_group
 from analysis.metrics import JUDGED, METRICS
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Column, Row, Table, Value
-from merge_runner.errors import UsageError
+from merge_runner.errors import unknown_name
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.text_safety import quoted
 
-SHOWN = 10
+ACCOUNTS = "attempts"  # the table that counts repetitions of deterministic drivers, too
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The trials of one group that a cell rests on, and how to list them."""
+    """The trials of one group that a cell rests on, and how to list them.
+
+    ``numerator``: those of them that a share counts.
+    """
 
     group: str
     text: str
     query: str
     trials: tuple[str, ...]
+    numerator: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +51,12 @@ class Explanation:
         if self.note:
             lines.append(f"note: {self.note}")
         for source in self.sources:
-            lines += ["", f"{source.group}: {source.text}"]
+            marked = ", marked *" if source.numerator else ""
+            lines += ["", f"{source.group}: {source.text}{marked}"]
             if source.query:
                 lines.append(f'{self.command} "{source.query}"')
-            lines += [f"  {trial}" for trial in source.trials]
+            counted = set(source.numerator)
+            lines += [f"{'*' if trial in counted else ' '} {trial}" for trial in source.trials]
         return lines
 
 
@@ -89,6 +94,9 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
         predicate += f" AND {column.within}"
     whose = {"own": row.groups, "reference": row.references, "both": (*row.groups, *row.references)}
     groups = row.groups if column is None or not row.references else whose[column.of]
+    known = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
+    if table.name == ACCOUNTS:
+        known = tuple(group.stored for group in known)
     return tuple(
         _published(group, row, column)
         or (
@@ -96,7 +104,7 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
             if group.measured or not row.note
             else Source(group.id, f"published: {row.note}", "", ())
         )
-        for group in (*study.groups, *study.asked)
+        for group in known
         if group.id in groups
     )
 
@@ -156,15 +164,23 @@ def _source(study: Study, group: Group, predicate: str) -> Source:
     if group.spec_hash is None:
         text = f"published, not from traces: {citation('human_outcomes')}; see the table's notes"
         return Source(group.id, text, "", ())
-    found = _tables(study, group).sql(
-        f"SELECT trial_id FROM trials WHERE {predicate} ORDER BY trial_id"  # noqa: S608 # ours
+    share = next((m for m in METRICS.values() if m.rate and m.counts in predicate), None)
+    counted = share.column if share else "NULL"
+    rows = _tables(study, group).sql(
+        f"SELECT trial_id, {counted} FROM trials WHERE {predicate} ORDER BY trial_id"  # noqa: S608 # ours
     )
-    trials = tuple(trial_id for (trial_id,) in found.fetchall())
+    found = dict(rows.fetchall())
+    trials = tuple(found)
+    numerator = tuple(trial for trial, counts in found.items() if counts)
     if group.seats[1] and trials:  # the database does not know mirrored trials by their images
         predicate = f"trials.trial_id IN ({', '.join(map(quoted, trials))})"
     query = query_of(group, predicate)
     text = f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}"
-    return Source(group.id, text, query, trials)
+    if group.said:
+        text += f"; {group.said}"
+    if share:
+        text += f"; the share counts {len(numerator)} of them"
+    return Source(group.id, text, query, trials, numerator)
 
 
 @cache
@@ -191,21 +207,16 @@ def _find(table: Table, row_id: str) -> Row:
     for row in table.rows:
         if row.id == row_id:
             return row
-    ids = [row.id for row in table.rows]
-    near = get_close_matches(row_id, ids, n=3)
-    hint = f"did you mean {' or '.join(near)}?" if near else f"valid: {', '.join(ids[:SHOWN])}"
-    raise UsageError(
-        f"the table {table.name} has no row {row_id!r}; {hint} "
-        f"`merge-runner tables {table.name} --format csv` shows all rows and columns"
-    )
+    hint = f"`merge-runner tables {table.name} --format csv` shows all rows and columns"
+    raise unknown_name(f"row of {table.name}", row_id, (row.id for row in table.rows), hint)
 
 
 def _column(table: Table, row: Row, name: str) -> Column:
     for column in table.columns:
         if column.name == name:
             return column
-    valid = ", ".join(c.name for c in table.columns if row.values.get(c.name) is not None)
-    raise UsageError(f"the table {table.name} has no column {name!r}; valid: {valid}")
+    valid = (c.name for c in table.columns if row.values.get(c.name) is not None)
+    raise unknown_name(f"column of {table.name}", name, valid)
 
 
 def _predicate(table: Table, column: Column | None) -> str:

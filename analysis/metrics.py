@@ -11,6 +11,7 @@ from typing import Literal, get_args
 
 from merge_runner.errors import UsageError
 from merge_runner.registry import Registry
+from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 
 Estimator = Literal["proportion", "mean", "median"]
 # tables: Tables V and VII, the contrasts, and the sentences and pages made of these; fallbacks,
@@ -319,7 +320,13 @@ _criticality(
     "s",
     "from when the first vehicle has left the merge point to when the second reaches it",
 )
-_criticality("min_ttc_s", "min. TTC", "s", "smallest time to collision after the first merge")
+_criticality(
+    "min_ttc_s",
+    "min. TTC",
+    "s",
+    "smallest time to collision after the first merge, where the vehicles close in faster than "
+    f"{NO_CONFLICT_MPS} m/s",
+)
 _criticality(
     "max_acceleration_mps2", "max |a|", "m/s²", "largest absolute acceleration of either vehicle"
 )

@@ -8,13 +8,14 @@ import os
 import re
 import tempfile
 import tomllib
-from collections.abc import Container, Iterable, Mapping
+from base64 import b64encode
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 from pydantic import (
     AfterValidator,
@@ -26,7 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-from merge_runner.errors import UsageError
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import SHIPPED_EXPERIMENTS
 from merge_runner.planted_effect import PARAMETERS as PLANTED
 from merge_runner.records import SIDES, Side
@@ -36,9 +37,13 @@ from merge_runner.text_safety import one_line
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
 LONGEST_URL, LONGEST_HOST = 2000, 253
+# A shorter key is a dummy, and may occur in any text.
+SHORTEST_SECRET = 8
 _LABEL = re.compile(r"[a-z0-9_-]{1,63}", re.I)
 USUAL_SCENARIO = "merge"
 UNNAMED = "default"
+# What stands for the emulator where it takes the place of a provider.
+REHEARSAL = "rehearsal://localhost"
 MOST_STEPS = MOST_REPETITIONS = 100_000
 
 
@@ -53,6 +58,10 @@ def _finite(value: JsonValue) -> JsonValue:
 # Strict, or else "4" and true would be numbers.
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+# What the equations of motion can take: the square of 1e308 is no number.
+Rate = Annotated[Positive, Field(le=1e6)]
+Deviation = Annotated[NotNegative, Field(le=1e6)]
+VehicleSize = Annotated[Positive, Field(le=100)]
 Count = Annotated[int, Field(gt=0, strict=True)]
 Json = Annotated[JsonValue, AfterValidator(_finite)]
 CollisionRule = Literal["euclid2d", "rectangle", "shared_lane"]
@@ -93,8 +102,8 @@ class Perception(Frozen):
     position and speed errors of the same sizes. ``own`` and ``autocorrelation_s`` need an error.
     """
 
-    position_sd_m: NotNegative = 0.0
-    speed_sd_mps: NotNegative = 0.0
+    position_sd_m: Deviation = 0.0
+    speed_sd_mps: Deviation = 0.0
     autocorrelation_s: NotNegative = 0.0
     delay_s: NotNegative = 0.0
     dropout: Annotated[NotNegative, Field(le=1)] = 0.0
@@ -106,6 +115,11 @@ class Perception(Frozen):
     def is_perfect(self) -> bool:
         """Whether a driver is told the truth."""
         return self == PERFECT
+
+    @property
+    def is_random(self) -> bool:
+        """Whether errors or dropouts are drawn."""
+        return bool(self.position_sd_m or self.speed_sd_mps or self.dropout)
 
     @model_validator(mode="after")
     def _errors_of_a_size(self) -> Perception:
@@ -151,9 +165,9 @@ class ScenarioConfig(Frozen):
     plan_step_s: Positive | None = Field(default=None, exclude_if=lambda value: value is None)
     prompt_rate_hz: Positive = 1.0
     memory_s: Positive = 2.0
-    max_acceleration_mps2: Positive = 2.5
-    vehicle_length_m: Positive = 4.5
-    vehicle_width_m: Positive = 1.8
+    max_acceleration_mps2: Rate = 2.5
+    vehicle_length_m: VehicleSize = 4.5
+    vehicle_width_m: VehicleSize = 1.8
     timeout_s: Positive = 30.0
     collision_rule: CollisionRule = "euclid2d"
     control_start: Literal["both_exits", "own_exit"] = "both_exits"
@@ -250,10 +264,11 @@ class ModelEntry(Frozen):
     nor one of ``aliases`` is reported as a mismatch. ``parameters`` go into the request as they
     are; what is not listed is not sent, so that the provider's default applies;
     ``applied_defaults`` puts on record which, and ``rejects`` names parameters that the model
-    refuses or does not heed. ``efforts`` are the levels of ``reasoning_effort`` as parameters, for
-    a model that has no parameter of this name. ``price`` is ``free``, ``genai-prices`` (the table
+    refuses or does not heed. ``successor`` names the entry to go on with from the
+    ``shutdown`` on. ``efforts`` are the levels of ``reasoning_effort`` as parameters, for a model
+    that has no parameter of this name. ``price`` is ``free``, ``genai-prices`` (the table
     of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a minute.
-    ``typical_output_tokens`` and ``typical_latency_s`` serve the estimate of ``--dry-run`` alone. A
+    ``typical_output_tokens`` and ``typical_latency_s`` serve estimates and rehearsals alone. A
     reply longer than ``max_reply_mb`` (unpacked) is refused. ``batch`` is the batch mode: the
     ``provider``'s, ``none``, or one on the terms of another server that speaks the format.
     """
@@ -273,6 +288,7 @@ class ModelEntry(Frozen):
     rpm: Count | None = None
     tpm: Count | None = None
     shutdown: date | None = None
+    successor: str = ""
     price: Literal["free", "genai-prices"] | Price = "genai-prices"
     base_url: str | None = None
     path: str | None = None
@@ -393,8 +409,8 @@ class Endpoint:
     """Where the calls of one model go.
 
     ``identity`` enters every cache key: the provider's name at its default URL, ``emulator`` for
-    our own server, otherwise the normalised base URL. ``auth_headers`` hold the secret and are
-    neither hashed nor stored.
+    our own server, REHEARSAL where it takes the provider's place, otherwise the normalised base
+    URL. ``auth_headers`` hold the secret and are neither hashed nor stored.
     """
 
     provider: str
@@ -404,6 +420,11 @@ class Endpoint:
 
     def __repr__(self) -> str:
         return f"Endpoint({self.provider}, {self.identity})"
+
+    @property
+    def is_emulator(self) -> bool:
+        """Whether our own server answers there."""
+        return self.provider == "emulator" or self.identity == REHEARSAL
 
 
 def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.environ) -> Endpoint:
@@ -425,12 +446,35 @@ def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.e
             f"{name} needs another key: {' or '.join(key_envs)} holds a space, a line break or "
             "another character that no key has"
         )
+    base_url = endpoint_url(entry, env)
+    if key is not None and len(key) >= SHORTEST_SECRET and key.lower() in base_url.lower():
+        raise UsageError(f"the base URL of {name} holds its key: take it out, since URLs are shown")
     return Endpoint(
         provider=entry.provider,
         identity=endpoint_identity(entry, env),
-        base_url=_base_url(entry, provider, env),
+        base_url=base_url,
         auth_headers=_auth_headers(entry.auth or provider.auth, key),
     )
+
+
+def endpoint_url(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
+    """Return the base URL of a model; raises UsageError."""
+    provider = PROVIDERS.require(entry.provider)
+    variable = provider.base_url_env
+    if variable and not entry.base_url and env.get(variable):
+        return normalised_url(env[variable], variable)
+    return normalised_url(entry.base_url or provider.base_url)
+
+
+def rehearsal_endpoint(entry: ModelEntry, emulator_url: str) -> Endpoint:
+    """The emulator, in the place of an entry's provider: without a key."""
+    path = urlsplit(PROVIDERS.require(entry.provider).base_url).path
+    return Endpoint(entry.provider, REHEARSAL, emulator_url + path, {})
+
+
+def is_own_host(provider: str, identity: str) -> bool:
+    """Whether an endpoint is the provider's own, or is taken for it in a rehearsal."""
+    return identity in (provider, REHEARSAL)
 
 
 def model_id(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str | None:
@@ -444,7 +488,7 @@ def model_id(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str | No
 def endpoint_identity(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
     """What stands for the endpoint in cache keys; see Endpoint."""
     provider = PROVIDERS.require(entry.provider)
-    base_url = _base_url(entry, provider, env)
+    base_url = endpoint_url(entry, env)
     if entry.provider == "emulator":
         return "emulator"
     return entry.provider if base_url == normalised_url(provider.base_url) else base_url
@@ -499,29 +543,31 @@ def key_status(
     return "set"
 
 
-def normalised_url(url: str) -> str:
-    """A base URL in one spelling: lower-case scheme and host, no default port, no last slash."""
+def normalised_url(url: str, named: str = "base_url") -> str:
+    """A base URL in one spelling: lower-case scheme and host, no default port, no last slash.
+
+    Raises UsageError, which shows nothing of it: a key may have been pasted there. It is told apart
+    by what it is ``named``.
+    """
     url = url.strip()
-    # A URL with a user name may hold a password, which must not be shown.
-    shown = "what stands there" if "@" in url else repr(url[:60])
     if len(url) > LONGEST_URL or not (url.isascii() and url.isprintable()) or " " in url:
         raise UsageError(
-            f"{shown} is no base URL: it must be of ASCII characters without spaces, {LONGEST_URL} "
+            f"{named} is no base URL: it must be of ASCII characters without spaces, {LONGEST_URL} "
             "at most; write a name of other letters as xn--..."
         )
     try:
         parts = urlsplit(url)
         port_number = parts.port
     except ValueError as exc:
-        raise UsageError(f"{shown} is no base URL: there can be no such host or port") from exc
+        raise UsageError(f"{named} is no base URL: there can be no such host or port") from exc
     if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise UsageError(f"{shown} is no base URL: it must begin with http:// or https://")
+        raise UsageError(f"{named} is no base URL: it must begin with http:// or https://")
     if not is_host(parts.hostname) or port_number == 0:
-        raise UsageError(f"{shown} is no base URL: there can be no such host or port")
+        raise UsageError(f"{named} is no base URL: there can be no such host or port")
     if "@" in parts.netloc or parts.query or parts.fragment:
         raise UsageError(
-            f"the base URL of {parts.hostname} has a user name, a password or a part after ? or #, "
-            "which are not sent: set the provider's key variable"
+            f"{named} has a user name, a password or a part after ? or #, which are not sent: set "
+            "the provider's key variable"
         )
     host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
     default_port = 443 if parts.scheme == "https" else 80
@@ -571,6 +617,21 @@ def _check_proxy(variable: str, value: str) -> None:
         raise UsageError(f"{variable} is no URL of a proxy: set it to http://HOST:PORT or unset it")
 
 
+def proxy_secrets(env: Mapping[str, str] = os.environ) -> Iterator[str]:
+    """Yield the user info of the proxies' URLs and its password, as given, decoded and as sent."""
+    for variable, value in env.items():
+        if variable.lower() not in PROXY_VARIABLES:
+            continue
+        try:
+            info = urlsplit(value if "://" in value else f"http://{value}").netloc.rpartition("@")[
+                0
+            ]
+        except ValueError:  # it is no URL, and nothing goes there
+            continue
+        for given in {info, unquote(info)}:
+            yield from (given, given.partition(":")[2], b64encode(given.encode()).decode())
+
+
 def runtime_folder(env: Mapping[str, str] = os.environ) -> Path:
     """The folder in which a user's processes share what need not outlive the machine's next start.
 
@@ -578,6 +639,19 @@ def runtime_folder(env: Mapping[str, str] = os.environ) -> Path:
     """
     named = Path(env.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
     return named if named.is_dir() else Path(tempfile.gettempdir())
+
+
+def state_folder(env: Mapping[str, str] = os.environ) -> Path:
+    """Return the folder of what the program remembers for a user.
+
+    It lies in XDG_STATE_HOME, or else in HOME, and is never relative, or else a working folder
+    could bring its own. Raises UsageError.
+    """
+    for named, below in (("XDG_STATE_HOME", ""), ("HOME", ".local/state")):
+        folder = Path(env.get(named, ""))
+        if folder.is_absolute():
+            return folder / below / "merge-runner"
+    raise UsageError("HOME names no folder: set it, or XDG_STATE_HOME")
 
 
 def running_emulator_url(env: Mapping[str, str] = os.environ) -> str | None:
@@ -624,9 +698,10 @@ def experiments() -> list[Path]:
     return [here if here.is_dir() else SHIPPED_EXPERIMENTS]
 
 
-def _base_url(entry: ModelEntry, provider: Provider, env: Mapping[str, str]) -> str:
-    from_env = env.get(provider.base_url_env, "") if provider.base_url_env else ""
-    return normalised_url(entry.base_url or from_env or provider.base_url)
+def url_origin(url: str) -> str:
+    """Return the scheme, host and port of a URL in one spelling; raises UsageError."""
+    parts = urlsplit(normalised_url(url))
+    return f"{parts.scheme}://{parts.netloc}"
 
 
 def _auth_headers(scheme: str, key: str | None) -> dict[str, str]:
@@ -643,7 +718,7 @@ def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
             owner = model
             for part in error["loc"][:-1]:
                 owner = getattr(owner, "nested", {}).get(part, owner)
-            lines.append(f"unknown key {place!r}; valid: {', '.join(owner.model_fields)}")
+            lines.append(str(unknown_name("key", place, owner.model_fields)))
         else:
             text = error["msg"].removeprefix("Value error, ")
             lines.append(f"{place}: {text}" if place else text)

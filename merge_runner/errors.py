@@ -10,6 +10,7 @@ MergeRunnerError
 │   ├── WaitingForBatches  --detach, and all that is left waits for batches     exit 3
 │   ├── ProviderDown       nobody listens, or nothing is answered any more      exit 1
 │   ├── ModelSwapped       --strict-model, and another model answers            exit 1
+│   ├── NoValidDecision    a model answers nothing that can be driven           exit 1
 │   ├── ClusterFailed      the cluster that plays cannot go on                  exit 1
 │   └── CacheFailed        replies cannot be kept or read                       exit 1
 ├── TrialSuspended         --max-cost cannot pay for the trial to go on         exit 3
@@ -20,10 +21,14 @@ MergeRunnerError
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from merge_runner.records import Attempt, ChatRequest
+
+
+MOST_NAMES = 40
 
 
 class MergeRunnerError(Exception):
@@ -36,6 +41,21 @@ class UsageError(MergeRunnerError):
     """Wrong usage or configuration; the message says what is valid and what to type next."""
 
     exit_code = 2
+
+
+def unknown_name(kind: str, name: str, names: Iterable[str], hint: str = "") -> UsageError:
+    """Return the error for a name that is none of ``names``; it suggests the nearest of them."""
+    from difflib import get_close_matches
+
+    valid = list(names)
+    # The name of a key has its table before it.
+    near = get_close_matches(name, valid) or get_close_matches(name.rpartition(".")[2], valid)
+    more = f" and {len(valid) - MOST_NAMES} more" if len(valid) > MOST_NAMES else ""
+    return UsageError(
+        f"unknown {kind} {name!r}; valid: {', '.join(valid[:MOST_NAMES]) or 'none'}{more}"
+        + (f" ({hint})" if hint else "")
+        + (f". Did you mean {' or '.join(near)}?" if near else "")
+    )
 
 
 class CallFailed(MergeRunnerError):
@@ -91,6 +111,10 @@ class ProviderDown(SweepStopped):
 
 class ModelSwapped(SweepStopped):
     """Another model answers than was asked for, and the user wants none of it."""
+
+
+class NoValidDecision(SweepStopped):
+    """The first decisions of a model are all invalid, and the user has not said to go on."""
 
 
 class ClusterFailed(SweepStopped):

@@ -21,7 +21,7 @@ from merge_runner.drivers.base import Driver
 from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import MergeRunnerError, UsageError
-from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 from merge_runner.registry import Registry
 from merge_runner.run import summary
 from merge_runner.run.estimate import Estimate
@@ -50,6 +50,7 @@ class RunOptions(TypedDict, total=False):
     tpm: int | None
     max_cost_usd: float | None
     strict_model: bool
+    keep_going: bool
     batch: bool
     round_deadline_s: float
     detach: bool
@@ -84,9 +85,9 @@ class StudyOutcome:
 
         A factor is of numbers where all its levels are numbers, of truth values likewise.
         """
-        from merge_runner.results.frames import with_factors
+        from merge_runner.results.frames import load_trials
 
-        return with_factors(self._rows("trials"), self._rows("trial_factors"))
+        return load_trials(self.db, self.sweep_id)
 
     def decisions(self) -> pd.DataFrame:
         """One row a decision."""
@@ -117,8 +118,10 @@ class Study:
 
     ``models``, ``repetitions``, ``conditions`` and ``prompts`` take the place of what the file
     says; ``only`` names a level, or a list of levels, by factor; ``mirror`` plays two different
-    drivers both ways round. ``arun``, ``aseat_first``, ``areplay`` and ``adry_run`` are awaited, as
-    in a notebook; ``run``, ``seat_first``, ``replay`` and ``dry_run`` are for scripts.
+    drivers both ways round; ``db`` and ``cache`` lie beside the file; ``trust`` agrees to the code
+    of the study, and to where its models.toml sends keys. ``arun``, ``aseat_first``, ``areplay``
+    and ``adry_run`` are awaited, as in a notebook; ``run``, ``seat_first``, ``replay`` and
+    ``dry_run`` are for scripts.
 
     All of them raise UsageError for what cannot be run as it is asked for. What goes wrong on the
     way is in the outcome, beside the trials that ended: the same call goes on from there.
@@ -128,8 +131,8 @@ class Study:
         self,
         file: Path | str,
         *,
-        db: Path | str = DEFAULT_DB,
-        cache: Path | str = DEFAULT_CACHE,
+        db: Path | str | None = None,
+        cache: Path | str | None = None,
         models: Sequence[str] | str = (),
         only: Mapping[str, JsonValue] | None = None,
         mirror: bool = False,
@@ -137,9 +140,11 @@ class Study:
         conditions: Sequence[str] | None = None,
         prompts: Sequence[str] | None = None,
         sample_set: int = 0,
+        trust: bool = False,
     ) -> None:
         self.file = str(file)
-        self.db, self.cache = Path(db), Path(cache)
+        home = home_of(self.file)
+        self.db, self.cache = Path(db or home / DEFAULT_DB), Path(cache or home / DEFAULT_CACHE)
         self._wanted: dict[str, Any] = {
             "models": models,
             "repetitions": repetitions,
@@ -148,6 +153,7 @@ class Study:
             "sample_set": sample_set,
             "only": {name: _texts(levels) for name, levels in (only or {}).items()},
             "mirror": mirror,
+            "trust": trust,
         }
 
     def register(self, registry: Registry[T], name: str, thing: T) -> T:
@@ -165,9 +171,11 @@ class Study:
         meaning: str,
         parameters: Mapping[str, Parameter] | None = None,
         rate_hz: float | None = None,
+        *,
+        chance: bool = False,
     ) -> None:
         """Add a driver; see ``Program``. Where its source is edited, it is another driver."""
-        program = Program(driver, meaning, parameters or {}, rate_hz)
+        program = Program(driver, meaning, parameters or {}, rate_hz, chance=chance)
         self.register(PROGRAMS, name, program)
 
     def plan(self) -> Plan:

@@ -15,6 +15,18 @@ DEFAULT_DB = Path("results/merge.duckdb")
 DEFAULT_CACHE = Path("cache/responses")
 
 
+def home_of(study: str) -> Path:
+    """Return the folder of a study's results: that of its file, or of its ``experiments``.
+
+    A study of ``experiments`` that goes by its name has its results in the working directory.
+    """
+    if not study.endswith(".toml"):
+        return Path()
+    folder = Path(study).absolute().parent
+    home = folder.parent if folder.name == "experiments" else folder
+    return home.relative_to(Path.cwd()) if home.is_relative_to(Path.cwd()) else home
+
+
 def refuse_another_kind(file: Path, begins: bytes, kind: str) -> None:
     """Raise UsageError where a file exists and does not begin like those of this kind."""
     if not file.is_file():

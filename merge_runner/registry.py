@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from merge_runner.errors import UsageError
+from merge_runner.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -55,10 +55,9 @@ def changes() -> int:
 
 
 def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
-    """The thing of this name; raises UsageError, which lists those that there are."""
+    """The thing of this name; raises UsageError."""
     if name not in things:
-        valid = ", ".join(things) + (f" ({hint})" if hint else "")
-        raise UsageError(f"unknown {kind} {name!r}; valid: {valid}")
+        raise unknown_name(kind, name, things, hint)
     return things[name]
 
 

@@ -18,6 +18,8 @@ from tests.zygote import Zygote
 RUNTIME = tempfile.TemporaryDirectory()
 # Limits of a key that another test used must hold up none.
 os.environ["XDG_RUNTIME_DIR"] = RUNTIME.name
+# No agreement is kept: no test must pass because another one agreed.
+os.environ["XDG_STATE_HOME"] = os.devnull
 
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)

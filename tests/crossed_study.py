@@ -63,7 +63,7 @@ def play(folder: Path, prepare: Callable[..., Run]) -> Mine:
     (folder / "mine.py").write_text(PLUGIN)
     models = [MODEL.format(name=name, price=price) for name, price in (("cheap", 1), ("dear", 9))]
     (folder / "models.toml").write_text("".join(models))
-    ran = prepare(folder, "sweep", "mine.toml", "--yes", "--db", "t.duckdb", *FAST)
+    ran = prepare(folder, "sweep", "mine.toml", "--yes", "--trust", "--db", "t.duckdb", *FAST)
     assert ran.code == 0, ran.err
 
     def run(*arguments: object, db: str = "t.duckdb") -> Run:

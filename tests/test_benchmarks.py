@@ -15,6 +15,8 @@ from benchmarks.recorder import multiply
 from benchmarks.soak import soak
 from merge_runner.llm.cache import ResponseCache
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def bench(tmp_path):
@@ -89,7 +91,6 @@ def test_a_long_case_is_run_only_where_it_is_named():
     assert next(case for case in CASES if case.name == "replay").chosen("re*", "")
 
 
-@pytest.mark.slow
 def test_a_soak_is_killed_and_counts_what_its_server_saw(bench, monkeypatch):
     monkeypatch.setattr("benchmarks.soak.FAULT_RATE", 0.1)
     figures = soak(2, lives_s=0.5)(bench)

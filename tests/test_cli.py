@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import json
+import os
+import pty
+import struct
+import subprocess
+import termios
+from contextlib import suppress
 from importlib.metadata import entry_points
 
 import pytest
 import typer.main
+from typer.testing import CliRunner
 
 import merge_runner as package
 from analysis.commands import app
 from merge_runner.cli.app import alone
+from tests.harness import PROGRAM, environment
 
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
@@ -51,6 +60,102 @@ def test_a_command_has_its_options_where_those_of_the_others_are_left_out():
         assert not any(p.name != "help" for each in others for p in each.params)
 
 
+def every_command(command, path=()):
+    yield path, command
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from every_command(inner, (*path, name))
+
+
+@pytest.mark.parametrize("columns", [80, 100])
+def test_every_help_has_a_short_form_and_cuts_no_line(columns):
+    for path, _ in every_command(typer.main.get_command(app)):
+        run = CliRunner().invoke(app, [*path, "-h"], env={"COLUMNS": str(columns)})
+        assert run.exit_code == 0, path
+        for line in run.output.splitlines()[1:]:
+            assert len(line) <= columns, (path, line)
+            assert not line.endswith("..."), (path, line)
+
+
+def test_every_command_that_prints_a_result_prints_it_as_json():
+    silent = {"init", "export", "forget", "emulate", "figures", "report", "view"}
+    silent |= {"recording export", "recording import", "recording verify"}
+    silent |= {"human import", "human import-first-actions"}
+    for path, command in every_command(typer.main.get_command(app)):
+        if hasattr(command, "commands") or " ".join(path) in silent:
+            continue
+        assert any("--json" in parameter.opts for parameter in command.params), path
+
+
+async def test_the_json_of_tables_sql_digest_and_models_can_be_read(merge_runner):
+    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--reps", 1)).code == 0
+    for arguments in (["tables", "gap"], ["sql", "from trials"], ["digest"], ["models"]):
+        assert json.loads((await merge_runner(*arguments, "--json")).out), arguments
+
+
+@pytest.mark.slow
+async def test_a_table_fits_the_terminal_and_is_whole_elsewhere(merge_runner, tmp_path):
+    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--reps", 1)).code == 0
+    whole = (await merge_runner("tables", "indicators")).out.splitlines()
+    assert max(map(len, whole)) > 80
+    ours, its = pty.openpty()
+    fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    program = [PROGRAM, "tables", "indicators"]
+    env = {name: value for name, value in environment().items() if name != "COLUMNS"}
+    with open(ours, "rb", buffering=0) as terminal:
+        process = subprocess.Popen(program, cwd=tmp_path, env=env, stdout=its)
+        os.close(its)
+        text = b""
+        with suppress(OSError):  # its other end is closed
+            while part := terminal.read(4096):
+                text += part
+    assert process.wait() == 0
+    lines = text.decode().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert any("--columns" in line for line in lines)
+
+
+async def test_a_quiet_sweep_shows_no_progress(merge_runner):
+    arguments = ("sweep", "baseline", "--model", "constant", "--reps", 1)
+    quiet = await merge_runner(*arguments, "--quiet")
+    assert (quiet.code, quiet.err) == (0, "")
+    assert "audited: 11 trials" in quiet.out
+
+
+@pytest.mark.parametrize(
+    ("typed", "completed"),
+    [
+        ("sw", "sweep"),
+        ("sweep base", "baseline"),
+        ("sweep baseline --model human-o", "human-odds"),
+        ("sweep baseline --ord", "--order-seed"),
+        ("tables indi", "indicators"),
+    ],
+)
+async def test_the_shell_completes_commands_options_and_names(merge_runner, typed, completed):
+    words = f"merge-runner {typed}"
+    asks = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
+    run = await merge_runner(_MERGE_RUNNER_COMPLETE="complete_bash", **asks)
+    assert run.out.split() == [completed]
+
+
+async def test_a_mistyped_name_is_answered_with_the_nearest(merge_runner):
+    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--reps", 1)).code == 0
+    for arguments, near in (
+        (["sweep", "basline"], "baseline"),
+        (["sweep", "baseline", "--model", "emulater"], "emulator"),
+        (["sweep", "baseline", "--conditions", "N_0_1"], "N_0_0"),
+        (["sweep", "baseline", "--variants", "basline"], "baseline"),
+        (["tables", "who-frst"], "who-first"),
+        (["tables", "gap", "--models", "constnt"], "constant"),
+        (["explain", "gap", "constant/baseline/intercept:nn"], "n"),
+        (["explain", "gap", "constant/baseline/intercep"], "constant/baseline/intercept"),
+        (["forget", "constant/baseline/N_0_0/rep7"], "constant/baseline/N_0_0/rep"),
+    ):
+        run = await merge_runner(*arguments)
+        assert run.code == 2
+        assert f". Did you mean {near}" in run.err
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -60,7 +165,7 @@ def test_a_command_has_its_options_where_those_of_the_others_are_left_out():
         (["sweep", "baseline", "--reps", "0"], "--reps is a whole number from 1"),
         (["sweep", "nope"], "valid: ablations, baseline"),
         (["sweep", "none.toml"], "none.toml does not exist"),
-        (["sweep", "baseline", "--model", "gpt9"], "valid: emulator, o3"),
+        (["sweep", "baseline", "--model", "gpt9"], "valid: emulator, random, o3"),
         (["sweep", "baseline", "--model", "o3+gpt9"], "unknown model 'gpt9'"),
         (["sweep", "baseline", "--conditions", "X"], "valid: R_-4_-8"),
         (["sweep", "baseline", "--variants", "A1"], "With --reps N"),
@@ -118,3 +223,21 @@ async def test_models_lists_keys_prices_and_shutdown_dates(merge_runner):
     gemini = next(line for line in out.splitlines() if line.startswith("gemini-2.5-pro ")).split()
     assert gemini[3] == "missing"
     assert "k" not in out.replace("OPENAI_API_KEY", "").split()
+
+
+@pytest.mark.parametrize(
+    "command", [["models"], ["sweep", "baseline", "--model", "a", "--dry-run"]]
+)
+async def test_models_and_dry_runs_say_that_a_model_has_closed_and_what_comes_after_it(
+    merge_runner, tmp_path, command
+):
+    given = 'provider = "openai"\nformat = "openai-chat"\nid = "m"\nmax_output_tokens = 100\n'
+    (tmp_path / "models.toml").write_text(
+        f'[a]\n{given}shutdown = 2020-01-31\nsuccessor = "b"\n[b]\n{given}shutdown = 9999-01-31\n'
+    )
+    lines = (await merge_runner(*command)).err.splitlines()
+    (closed,) = [line for line in lines if line.startswith("WARNING: a ")]
+    assert "a closed on 2020-01-31" in closed
+    assert closed.endswith("its successor is b")
+    far = any(line.startswith("note: b closes in") for line in lines)
+    assert far == (command == ["models"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import json
 import os
 import pty
 import re
@@ -141,7 +142,7 @@ def forked(zygote, tmp_path_factory):
     return {**zygote.on_path(tmp_path_factory.mktemp("bin"), PATH), "RUN": "merge-runner"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @NEEDS_MAKE
 async def test_every_command_of_the_docs_does_what_it_says(folder, forked):
     """What stands on the pages twice is run once, where the later pages need nothing of it."""
@@ -161,12 +162,57 @@ async def test_every_command_of_the_docs_does_what_it_says(folder, forked):
     assert len(done) >= 14
 
 
+RECORD = DOCS / "how-to/record-before-shutdown.md"
+
+
+@pytest.mark.slow
+async def test_the_page_on_recording_has_the_prices_that_a_dry_run_prints(merge_runner):
+    rows = [line for line in RECORD.read_text().splitlines() if ", baseline |" in line]
+    rows += [line for line in RECORD.read_text().splitlines() if ", ablations |" in line]
+    assert len(rows) == 4
+    for row in rows:
+        what, *figures = (cell.strip() for cell in row.strip("|").split("|"))
+        model, sweep = what.split(", ")
+        run = await merge_runner("sweep", sweep, "--model", model, "--batch", "--dry-run", "--json")
+        told = json.loads(run.out)
+        costs = [f"{usd:.2f}" for usd in (told["cost_usd"], told["batch"]["cost_usd"])]
+        counts = [told[name] for name in ("calls", "input_tokens", "output_tokens")]
+        assert figures == [*map(str, counts), costs[0], str(told["minutes"]), costs[1]]
+
+
+@pytest.mark.long
+@NEEDS_MAKE
+@pytest.mark.parametrize(
+    ("model", "base_url", "version"),
+    [("o3", "OPENAI_BASE_URL", "/v1"), ("gemini-2.5-pro", "GOOGLE_GEMINI_BASE_URL", "")],
+)
+async def test_the_page_on_recording_leads_to_a_file_that_replays(
+    folder, forked, model, base_url, version
+):
+    registry = folder / "experiments/models.toml"
+    registry.write_text(re.sub("typical_latency_s = .*", "", registry.read_text()))
+    blocks = re.findall(r"^   ```sh\n(.*?)^   ```", RECORD.read_text(), re.MULTILINE | re.DOTALL)
+    told = [line for block in blocks for line in lines_of(block)]
+    said = []
+    async with watched() as server:
+        account = {"OPENAI_API_KEY": "k", "GEMINI_API_KEY": "k", base_url: server.url + version}
+        for command in (line.replace("o3", model) for line in told):
+            env = {} if "--rehearse" in command else account
+            code, out = await shell(command, folder, **env, **forked)
+            assert code == 0, f"{command}\n{out}"
+            said.append(out)
+    assert f"{model} at localhost: a scripted stand-in answered, not {model}" in said[0]
+    first, second = (out.split()[-3] for out in said[-2:])
+    assert first == second
+    assert (folder / f"{model}.parquet").is_file()
+
+
 def unspaced(text: str) -> str:
     """A text whose columns may be padded to other widths."""
     return "\n".join(" ".join(line.split()) for line in text.splitlines())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @NEEDS_MAKE
 async def test_the_tutorial_shows_what_its_commands_say(checkout):
     said = ""
@@ -188,9 +234,9 @@ async def test_the_tutorial_shows_what_its_commands_say(checkout):
 @pytest.mark.parametrize(
     ("words", "ending"),
     [
-        (["test"], '.venv/bin/pytest -m "not slow"\n'),
+        (["test"], '.venv/bin/pytest -m "not slow and not long"\n'),
         (["test", "ARGS=-k name"], ".venv/bin/pytest -k name\n"),
-        (["check"], ".venv/bin/pytest \n"),
+        (["check"], '.venv/bin/pytest -m "not long" \n'),
     ],
 )
 def test_make_test_runs_the_quick_tests_or_those_that_are_named_and_make_check_all(words, ending):
@@ -211,8 +257,9 @@ def test_every_command_and_every_make_target_is_in_the_docs():
 
 def test_the_reference_of_commands_has_every_command_and_every_option_and_no_other():
     text = (DOCS / "reference/commands.md").read_text()
-    options = {"--debug", "--help", "--version"}
-    for name, command in typer.main.get_command(app).commands.items():
+    whole = typer.main.get_command(app)
+    options = {"--help", *(option for p in whole.params for option in p.opts)}
+    for name, command in whole.commands.items():
         for part, inner in getattr(command, "commands", {"": command}).items():
             words = f"{name} {part}".strip()
             assert re.search(rf"^\| `{words}[` ]", text, re.MULTILINE), words

@@ -1,3 +1,5 @@
+from datetime import date
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,7 +16,7 @@ from merge_runner.config import (
 )
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.models import read_models
+from merge_runner.llm.models import read_models, shutdown_notes
 from merge_runner.study.file import read_study
 from tests.harness import PROJECT
 
@@ -108,6 +110,17 @@ def test_a_base_url_has_one_spelling(url, normal):
 def test_what_is_no_base_url_is_refused(url):
     with pytest.raises(UsageError):
         normalised_url(url)
+
+
+@pytest.mark.parametrize("at", ["{}", "{}/v1", "http://{}:port", "https://h/{} ", "https://h/v1/{}",
+                                "https://{}/v1", "https://u:{}@h", "https://h?k={}"])  # fmt: skip
+def test_a_key_that_was_pasted_into_a_base_url_is_refused_and_not_shown(at):
+    key = "sk-Proj-0123456789"
+    env = {"OPENAI_API_KEY": key, "OPENAI_BASE_URL": at.format(key)}
+    with pytest.raises(UsageError) as refused:
+        resolve_endpoint("x", entry(), env)
+    assert key.lower()[3:] not in str(refused.value).lower()
+    assert "base URL" in str(refused.value) or "OPENAI_BASE_URL" in str(refused.value)
 
 
 labels = st.text("abcXYZ09-", min_size=1, max_size=8)
@@ -238,6 +251,31 @@ def test_the_models_of_the_paper_are_those_it_names():
     assert gemini.shutdown.isoformat() == "2026-12-01"
     assert gemini.parameters["temperature"] == 1.0
     assert "temperature" not in models["o3"].parameters
+
+
+def test_every_model_that_closes_has_a_successor_in_the_registry():
+    models = read_models(REGISTRY)
+    successors = {name: model.successor for name, model in models.items() if model.shutdown}
+    assert successors == {"o3": "gpt-5.6-sol", "gemini-2.5-pro": "gemini-3.8-flash"}
+    assert {*successors.values()} <= models.keys()
+
+
+@pytest.mark.parametrize(
+    ("today", "note"),
+    [
+        ("2026-11-10", "note: m closes in 31 days, on 2026-12-11; its successor is n"),
+        ("2026-11-11", "WARNING: m closes in 30 days, on 2026-12-11: record it now (docs/"),
+        ("2026-12-10", "WARNING: m closes in 1 day, on 2026-12-11: record it now (docs/"),
+        ("2026-12-11", "WARNING: m closed on 2026-12-11: only a recording answers for it"),
+        ("2027-01-01", "WARNING: m closed on 2026-12-11: only a recording answers for it"),
+    ],
+)
+def test_a_warning_comes_thirty_days_before_a_model_closes_and_from_then_on(today, note):
+    closing = {"m": entry(shutdown="2026-12-11", successor="n"), "other": entry()}
+    (said,) = shutdown_notes(closing, date.fromisoformat(today))
+    assert said.startswith(note)
+    assert said.endswith("; its successor is n")
+    assert not [*shutdown_notes({"other": entry()}, date.fromisoformat(today))]
 
 
 VALID = """

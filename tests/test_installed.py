@@ -53,7 +53,7 @@ def test_python_m_merge_runner_has_every_command_and_the_version(tmp_path):
         assert run(tmp_path, *program, "--version").out == f"merge-runner {__version__}\n"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_command_imports_from_the_folder_it_is_called_in(hostile, tmp_path):
     assert run(hostile, PROGRAM, "tables", "--db", tmp_path / "none").code == 2
     small = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")

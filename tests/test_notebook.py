@@ -89,7 +89,7 @@ async def test_a_factor_of_numbers_and_other_levels_is_of_texts(folder):
     assert set(outcome.trials()["temperature"]) == {"default", "1"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_an_outcome_holds_the_trials_of_its_own_sweep(folder):
     first = await Study("study.toml", only={"temperature": 0.2, "memory_s": 2.0}).arun()
     second = await Study("baseline", models="constant", repetitions=1).arun()

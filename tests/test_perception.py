@@ -161,7 +161,7 @@ def test_without_autocorrelation_each_instant_has_an_error_of_its_own():
     assert fmean(a * b for a, b in pairwise(values)) == pytest.approx(0, abs=0.04)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @given(seeds, st.sampled_from([0.0, 0.3, 2.0, 1e6]), st.randoms(use_true_random=False))
 def test_the_errors_do_not_depend_on_the_steps_and_the_order_in_which_they_are_asked(
     seed, tau_s, chance: Random

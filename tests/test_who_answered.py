@@ -47,7 +47,7 @@ def marks(db):
         ).fetchall()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("model", POINTED)
 async def test_the_emulator_behind_a_models_name_is_stored_as_what_it_is(
     merge_runner, emulator_url, tmp_path, model
@@ -122,7 +122,7 @@ def estimated(merge_runner):
     return estimate
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
     merge_runner, emulator_url, estimated
 ):
@@ -139,7 +139,7 @@ async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
     assert 0.9 * before[0] < there < before[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_answers_at_another_effort_or_place_do_not_change_it_either(
     merge_runner, estimated, tmp_path
 ):
@@ -195,7 +195,7 @@ urls = st.builds(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @given(st.none() | st.sampled_from(["openai", "emulator", "emulator#faults-1-{}"]) | urls)
 def test_the_program_and_the_database_name_a_driver_alike(endpoint):
     with in_memory({}) as connection:

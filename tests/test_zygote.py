@@ -19,6 +19,8 @@ from tests.forked_program import DIGITS
 from tests.harness import environment, watched
 from tests.zygote import Zygote, wait_until_nobody_holds
 
+pytestmark = pytest.mark.long
+
 SWEEP = ("sweep", "baseline", "--reps", 1, "--conditions", "R_-4_8", "--json")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -105,6 +105,17 @@ def has(connection: duckdb.DuckDBPyConnection, table: str) -> bool:
         [table],
     )
     return found.fetchone() is not None
+
+
+def options_text(
+    db: Path,
+    models: Sequence[str] | None = None,
+    where: Mapping[str, Sequence[str]] | None = None,
+    file: str | None = None,
+    by: str | None = None,
+) -> str:
+    """What a table depends on besides the results; the path, since its notes name the database."""
+    return json.dumps([str(db), models, where, file, by])
 
 
 def present_state(db: Path) -> str:

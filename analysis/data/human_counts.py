@@ -7,7 +7,11 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from merge_runner.results.data_dictionary import SchemaColumn, SchemaTable
+
 DATA = Path(__file__).parent
+OUTCOMES = "human_outcomes.csv"
+WORDS = ("smallest", "first quartile of the", "median", "third quartile of the", "largest")
 
 
 class HumanCounts(NamedTuple):
@@ -39,6 +43,24 @@ def published_accounts() -> dict[str, dict[str, int]]:
     for row in _rows("collision_accounts"):
         found.setdefault(row["drivers"], {})[row["account"]] = int(row["collisions"])
     return found
+
+
+def outcomes_table() -> tuple[SchemaTable, Path]:
+    """The published outcomes as a table of an export, and their file."""
+    (source,) = (row["citation"] for row in _rows("sources") if row["file"] == OUTCOMES)
+    quartiles = zip(("min", "q1", "median", "q3", "max"), WORDS, strict=True)
+    columns = [
+        SchemaColumn("condition", "VARCHAR", "of the experiment"),
+        SchemaColumn("left_first", "BIGINT", "trials in which the left vehicle merged first"),
+        SchemaColumn("right_first", "BIGINT", "trials in which the right vehicle merged first"),
+        SchemaColumn("collided", "BIGINT", "trials in which boxes overlapped"),
+        *(
+            SchemaColumn(f"crt_{name}_s", "DOUBLE", f"{word} conflict resolution time")
+            for name, word in quartiles
+        ),
+    ]
+    table = SchemaTable("human_outcomes", is_view=False, comment=source, columns=columns)
+    return table, DATA / OUTCOMES
 
 
 def _rows(name: str) -> list[dict[str, str]]:

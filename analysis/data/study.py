@@ -15,7 +15,7 @@ from typing import Any
 import pandas as pd
 
 from analysis.data.collision_rules import judged
-from analysis.data.derived_cache import present_state
+from analysis.data.derived_cache import options_text, present_state
 from analysis.data.first_actions import FIRST_ACTIONS, HUMAN_FIRST_ACTIONS
 from analysis.data.imported_humans import RECORDINGS, Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
@@ -29,21 +29,25 @@ from analysis.data.load import (
     TRACES,
     WORDS,
     Calls,
+    check_statuses,
     load_calls,
     load_each,
     load_specs,
 )
 from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
+from analysis.data.studies import Order, Studies, read_studies, study_name
 from merge_runner.drivers.human_replay import unresponsive
-from merge_runner.drivers.registry import language_models, stand_in
-from merge_runner.errors import UsageError
+from merge_runner.drivers.registry import has_chance, language_models, stand_in
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.content_hashes import canonical_json, spec_hash
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.records import SIDES, Side
 from merge_runner.registry import require
 from merge_runner.results.levels import LEVELS
+from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF
+from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF, listed_levels
+from merge_runner.study.file import BASELINE, StudySource, read_study
 from merge_runner.text_safety import quoted
 
 HUMAN = "human"
@@ -52,7 +56,6 @@ COLUMNS_OF_GROUPS = [
     "driver", "image", "task", "usual", "mark", "apart", "shared", "trace", "left_scripted",
     "right_scripted",
 ]  # fmt: skip
-BASELINE = "baseline"
 MEAN_SPEED = "mean_speed_mps"
 # Factors that every study has, and levels that others are compared with.
 FIRST = (MODEL, PROMPT)
@@ -82,9 +85,10 @@ class Group:
     name the driver, ``models`` are the names that were asked for, the ego's first, an equal one
     once, ``seats`` are how many of the trials have the ego on the left and on the right, ``posing``
     is what is said of a scripted stand-in, which answered for the models ``posed``, and ``caution``
-    what is said of a human who is replayed. Of a driver
-    without chance, whose repetitions are the same trial again, only the first are ``trials``, and
-    ``repeated`` counts the others; ``equal`` counts such trials of a driver that samples.
+    what is said of a human who is replayed: such trials are not judged. The ``trials`` of a
+    deterministic driver are distinct, and ``whole`` is the group with their repetitions; ``equal``
+    counts the trials of a language model that went as an earlier one.
+    ``unjudged`` says why nothing is concluded from them, and is empty where something is.
     ``narrowed`` is what tells the trials in SQL from others of their spec and variant, empty where
     there are none.
     ``published_outcomes`` stand in the place of the trials' outcomes where these are a part of the
@@ -104,8 +108,9 @@ class Group:
     posing: str = ""
     posed: frozenset[str] = frozenset()
     caution: str = ""
-    repeated: int = 0
+    whole: Group | None = None
     equal: int = 0
+    unjudged: str = ""
     narrowed: str = ""
     published_outcomes: pd.DataFrame | None = None
     levels: Mapping[str, str] = field(default_factory=dict)
@@ -121,9 +126,24 @@ class Group:
         return _label(f"{model} of {self.driver}", "; ".join(said))
 
     @property
+    def said(self) -> str:
+        """What is said of a scripted stand-in and of a human who is replayed."""
+        return "; ".join(filter(None, (self.posing, self.caution)))
+
+    @property
     def scripted(self) -> bool:
         """Whether a scripted stand-in answered."""
         return bool(self.posing)
+
+    @property
+    def repeated(self) -> int:
+        """How many trials of a deterministic driver are left out as repetitions."""
+        return len(self.stored.trials) - len(self.trials)
+
+    @property
+    def stored(self) -> Group:
+        """The group with all its trials, as accounts of calls and money count them."""
+        return self.whole or self
 
     @property
     def is_mixed(self) -> bool:
@@ -185,7 +205,8 @@ class Group:
 class Study:
     """The groups of a database, humans first, and what is computed from their traces once.
 
-    ``state`` is that of the results before they were read: rows may be stored meanwhile.
+    ``played`` are those of drivers, and ``models`` the ones of them that something is concluded
+    from. ``state`` is that of the results before they were read: rows may be stored meanwhile.
     """
 
     def __init__(
@@ -193,15 +214,24 @@ class Study:
         db: Path | str = DEFAULT_DB,
         models: Sequence[str] | None = None,
         where: Mapping[str, Sequence[str]] | None = None,
+        file: str | None = None,
+        by: str | None = None,
     ) -> None:
         """Read the trials; ``models`` keeps these drivers alone, ``where`` these levels of factors.
 
-        Raises UsageError.
+        ``file`` keeps the trials of this study, and ``by`` is the factor at whose levels the table
+        ``factors`` shows the others. Raises UsageError.
         """
         self.db = Path(db)
         self.chosen = models
         self.where = where
+        self.by = by
+        self.options = options_text(self.db, models, where, file, by)
         self.state = present_state(self.db)
+        check_statuses(self.db)
+        self.studies = read_studies(self.db)
+        self.source = None if file is None else read_study(file)
+        self.file, self.order = _chosen(self.db, self.studies, self.source)
         self.specs = specs = load_specs(self.db)
         trials = trials_with_metrics(self.db).merge(
             self._read(TRACES), on=["trial_id", "spec_hash"], how="left"
@@ -210,40 +240,71 @@ class Study:
         recorded = trials["source"] == HUMAN
         self.imported = _imported(trials[recorded], specs) if recorded.any() else None
         self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
-        every = _model_groups(trials[~recorded], specs)
-        levels = self._read(LEVELS)
-        every = [replace(group, levels=_levels(levels, group)) for group in every]
-        asked = self._read(ASKED)
+        found = load_each({"levels": LEVELS, "asked": ASKED, "decisions": ASKED_DECISIONS}, self.db)
+        driven = trials[~recorded]
+        every = _model_groups(
+            driven[self.is_of_file(driven)], specs, found["decisions"], part=bool(self.file)
+        )
+        every = [replace(group, levels=_levels(found["levels"], group)) for group in every]
+        asked = found["asked"][self.is_of_file(found["asked"])]
         drivers = [*(group.driver for group in every), *asked["driver"].unique()]
         valid = list(dict.fromkeys([HUMAN, *drivers]))
         wanted = valid if models is None else list(models)
-        unknown = [name for name in wanted if name not in valid]
-        if unknown or not wanted:
-            named = f"no driver {unknown[0]!r}" if unknown else "nothing that --models names"
-            raise UsageError(f"{db} holds {named}; valid: {', '.join(valid)}")
+        for name in wanted or [""]:
+            if name not in valid:
+                raise unknown_name("driver", name, valid, f"in {db}")
         self.empty = not every
-        self.models = _at(
+        self.played = _at(
             where or {},
             [group for group in every if group.driver in wanted],
             asked[asked["driver"].isin(wanted)],
             self.db,
+            self.order,
         )
+        self.models = [group for group in self.played if not group.unjudged]
         self.groups = [self.human, *self.models] if HUMAN in wanted else self.models
 
-    @cached_property
+    @property
     def asked(self) -> list[Group]:
         """The drivers that were only asked what they do first, each marked so by its name."""
+        return [group for group in self._asked if not group.unjudged]
+
+    @property
+    def unjudged(self) -> list[Group]:
+        """The groups of drivers that nothing is concluded from."""
+        return [group for group in self.played if group.unjudged]
+
+    @property
+    def unjudged_asked(self) -> list[Group]:
+        """The same of drivers that were only asked."""
+        return [group for group in self._asked if group.unjudged]
+
+    @cached_property
+    def _asked(self) -> list[Group]:
         trials = self._read(ASKED_TRIALS).merge(
             self._read(TRACES), on=["trial_id", "spec_hash"], how="left"
         )
+        trials = trials[self.is_of_file(trials)]
         if self.chosen is not None:
             trials = trials[trials["driver"].isin(self.chosen)]
-        levels = self._read(LEVELS)
-        groups = _model_groups(trials.assign(driver=trials["driver"] + ONLY_ASKED), self.specs)
+        levels, decisions = self._read(LEVELS), self._read(ASKED_DECISIONS)
+        trials = trials.assign(driver=trials["driver"] + ONLY_ASKED)
+        groups = _model_groups(trials, self.specs, decisions, part=bool(self.file))
         return _kept(
             self.where or {},
             [replace(group, levels=_levels(levels, group)) for group in groups],
         )
+
+    def is_of_file(self, trials: pd.DataFrame) -> pd.Series:
+        """Whether each of these trials was played for the study that was chosen, if any was."""
+        if not self.file:
+            return pd.Series(True, index=trials.index)
+        return self.studies.holds(self.file, trials)
+
+    @property
+    def reference(self) -> str:
+        """The prompt that others are compared with."""
+        return next(iter(levels_of(self.played, self.order).get(PROMPT, ())), BASELINE)
 
     @property
     def calibrated(self) -> bool:
@@ -259,9 +320,10 @@ class Study:
 
     @cached_property
     def conditions(self) -> dict[str, tuple[float, float]]:
-        """Name to projected headway in m and relative velocity in m/s: the humans', then others.
+        """Name to projected headway in m and relative velocity in m/s, of those that were played.
 
-        The others are read from the stored trials: what registered them may not be installed here.
+        Those of the humans come first; where no model played, all of these. The others are read
+        from the stored trials: what registered them may not be installed here.
         """
         played = {
             row.condition: (row.projected_headway_m, row.relative_velocity_mps)
@@ -272,6 +334,7 @@ class Study:
         humans = {
             name: (condition.projected_headway_m, condition.relative_velocity_mps)
             for name, condition in HUMAN_CONDITIONS.items()
+            if name in played or not played
         }
         return humans | dict(sorted(own.items(), key=lambda one: (one[1], one[0])))
 
@@ -279,6 +342,11 @@ class Study:
     def baselines(self) -> list[Group]:
         """The humans and every driver with the baseline prompt."""
         return [group for group in self.groups if group.setting in {"", BASELINE}]
+
+    @property
+    def compared(self) -> list[Group]:
+        """The drivers' baselines that are set against the humans."""
+        return [group for group in self.models if group.setting == BASELINE and not group.caution]
 
     @property
     def measured(self) -> list[Group]:
@@ -337,6 +405,10 @@ class Study:
 
 def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.DataFrame:
     """The rows of a per-trial frame that belong to these trials of a group."""
+    return _of_trials(frame, trials)
+
+
+def _of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
     keys = trials[["trial_id", "spec_hash"]]
     # To join all rows takes longer than to leave out those of other groups first.
     near = frame["spec_hash"].isin(keys["spec_hash"].unique())
@@ -381,31 +453,66 @@ def _levels(levels: pd.DataFrame, group: Group) -> dict[str, str]:
     return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
 
 
-def levels_of(groups: Iterable[Group]) -> dict[str, list[str]]:
-    """The levels of each factor that these groups have, as a reader expects them.
+def levels_of(groups: Iterable[Group], order: Order) -> dict[str, list[str]]:
+    """The levels of each factor that these groups have, those in ``order`` first.
 
-    Usual ones first, then numbers by size, then the rest by name.
+    Then come usual ones, then numbers by size, then the rest by name.
     """
     found: dict[str, set[str]] = {}
     for group in groups:
         for factor, level in group.levels.items():
             found.setdefault(factor, set()).add(level)
-    return {factor: sorted(levels, key=_place) for factor, levels in found.items()}
+    return {
+        factor: sorted(levels, key=lambda level: _place(level, order.get(factor, ())))
+        for factor, levels in found.items()
+    }
 
 
-def _place(level: str) -> tuple[bool, float, str]:
+def _place(level: str, listed: Sequence[str]) -> tuple[int, bool, float, str]:
+    place = listed.index(level) if level in listed else len(listed)
     number = float(level) if NUMBER.fullmatch(level) else inf
-    return level not in USUAL, number, level
+    return place, level not in USUAL, number, level
+
+
+@cache
+def in_one_study(study: Study, *groups: Group) -> bool:
+    """Whether one study was played with all trials of these groups of drivers."""
+    held = (study.studies.of_all(group.trials) for group in groups)
+    return len(study.studies.orders) < 2 or bool(frozenset.intersection(*held))
+
+
+def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str, Order]:
+    """The name of the study that was chosen, empty without one, and the order of its levels.
+
+    Where several studies are pooled none of them says the order. Raises UsageError where the
+    database has no trial of the study.
+    """
+    if source is None:
+        return "", next(iter(studies.orders.values())) if len(studies.orders) == 1 else {}
+    order = listed_levels(source.file, source.file.models)
+    study = study_name(source.name, order)
+    if study not in studies.orders:
+        held = ", ".join(studies.orders) or "none"
+        raise UsageError(f"{db} holds no trial of the study {study}; it holds those of: {held}")
+    recorded = studies.orders[study]
+    return study, {
+        factor: list(dict.fromkeys([*order.get(factor, ()), *recorded.get(factor, ())]))
+        for factor in {**order, **recorded}
+    }
 
 
 def _at(
-    where: Mapping[str, Sequence[str]], groups: list[Group], asked: pd.DataFrame, db: Path
+    where: Mapping[str, Sequence[str]],
+    groups: list[Group],
+    asked: pd.DataFrame,
+    db: Path,
+    order: Order,
 ) -> list[Group]:
     """The groups at these levels.
 
     Raises UsageError where nothing was driven there or ``asked``, or there is no such level.
     """
-    there = levels_of(groups)
+    there = levels_of(groups, order)
     for factor, found in asked.groupby("factor")["value"]:
         there[factor] = list(dict.fromkeys([*there.get(factor, ()), *found]))
     for factor, levels in where.items():
@@ -490,8 +597,16 @@ def _usual(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> pd.S
     return usual.mask(mixed, trials["image"])
 
 
-def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> list[Group]:
-    """Groups by driver and variant, scripted stand-ins last.
+def _model_groups(
+    trials: pd.DataFrame,
+    specs: Mapping[str, Mapping[str, Any]],
+    decisions: pd.DataFrame,
+    *,
+    part: bool,
+) -> list[Group]:
+    """Groups by driver and variant, scripted stand-ins last, of all trials or of a ``part``.
+
+    ``decisions`` are ASKED_DECISIONS.
 
     Where a driver was run under several settings of the task, all but the most frequent carry a
     mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
@@ -509,9 +624,10 @@ def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) 
     keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "usual")
     keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
     # Two names of one model have equal specs, as under two prices.
-    keyed["shared"] = keyed.groupby(["spec_hash", "variant"])["driver"].transform("nunique") > 1
+    shared = keyed.groupby(["spec_hash", "variant"])["driver"].transform("nunique") > 1
+    keyed["shared"] = shared | part
     keys = ["driver", "mark", "apart", "scripted", "variant", "usual"]
-    groups = [_model_group(rows, specs) for _, rows in keyed.groupby(keys)]
+    groups = [_model_group(rows, specs, decisions) for _, rows in keyed.groupby(keys)]
     return sorted(
         groups,
         key=lambda group: (
@@ -523,7 +639,9 @@ def _model_groups(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) 
     )
 
 
-def _model_group(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> Group:
+def _model_group(
+    rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]], decisions: pd.DataFrame
+) -> Group:
     """The group of these trials, which have equal keys."""
     first = rows.iloc[0]
     scripted = bool(first["scripted"])
@@ -535,16 +653,14 @@ def _model_group(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> 
     said = "; ".join(filter(None, (posing, caution)))
     seats = rows["ego"].value_counts()
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
-    distinct = _distinct(rows)
     narrowed = [f"scripted = {str(scripted).lower()}"] if first["apart"] else []
-    if len(distinct) < len(rows) or rows["shared"].any():
-        names = ", ".join(quoted(trial_id) for trial_id in distinct["trial_id"])
-        narrowed.append(f"trials.trial_id IN ({names})")
-    return Group(
+    by_name = [_among(rows)] if rows["shared"].any() else []
+    again = _again(rows)
+    group = Group(
         driver,
         first["variant"],
         min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
-        distinct.drop(columns=COLUMNS_OF_GROUPS),
+        rows.drop(columns=COLUMNS_OF_GROUPS),
         label=_label(driver, said),
         models=tuple(dict.fromkeys(models.values())),
         name=first["driver"],
@@ -553,29 +669,38 @@ def _model_group(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> 
         posing=posing,
         posed=frozenset(models[side] for side in sides),
         caution=caution,
-        repeated=len(rows) - len(distinct),
-        equal=len(_again(distinct)),
-        narrowed=" AND ".join(narrowed),
+        equal=len(again) if first["source"] != "driver" else 0,
+        unjudged=_unjudged(decisions, rows),
+        narrowed=" AND ".join(narrowed + by_name),
     )
+    if again.empty or not _is_deterministic(rows, specs):
+        return group
+    trials = group.trials.drop(index=again)
+    return replace(
+        group, trials=trials, whole=group, narrowed=" AND ".join([*narrowed, _among(trials)])
+    )
+
+
+def _among(rows: pd.DataFrame) -> str:
+    return f"trials.trial_id IN ({', '.join(map(quoted, rows['trial_id']))})"
+
+
+def _unjudged(decisions: pd.DataFrame, rows: pd.DataFrame) -> str:
+    """Why nothing is concluded from these trials, for each of their models; empty: something is."""
+    counts = _of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
+    reasons = (not_judged(one.Index, one.invalid, one.asked) for one in counts.itertuples())
+    return "; ".join(filter(None, reasons))
 
 
 def _label(driver: str, said: str) -> str:
     return f"{driver} ({said})" if said else driver
 
 
-def _distinct(rows: pd.DataFrame) -> pd.DataFrame:
-    """The trials without the repetitions of a driver that has no chance in it.
-
-    That is a program, and a model that in every condition went the same way each time. Of a driver
-    that samples, two equal trials are two samples.
-    """
-    again = _again(rows)
-    ways = rows.groupby("condition")["trace"].agg(["count", "nunique"])
-    repeated = ways[ways["count"] > 1]
-    # In a single condition it may be chance.
-    no_chance = len(repeated) > 1 and bool((repeated["nunique"] == 1).all())
-    programs = bool((rows["source"] == "driver").all())
-    return rows.drop(index=again) if no_chance or programs else rows
+def _is_deterministic(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Whether a pair declares that it has no chance, and its repetitions do not contradict it."""
+    ways = rows.groupby(["condition", "ego"])["trace"].nunique()
+    declared = not any(has_chance(specs.get(name, {})) for name in rows["spec_hash"].unique())
+    return declared and bool((ways <= 1).all())
 
 
 def _again(rows: pd.DataFrame) -> pd.Index:

@@ -14,7 +14,6 @@ from typing import Any
 from analysis.explorer.catalogue import State, stamp_of
 from analysis.explorer.child import Child, Ended, NoAnswer
 from merge_runner.errors import MergeRunnerError
-from merge_runner.study.parts import adopted
 
 Request = tuple[str, ...]
 REMEMBERED = 100
@@ -44,9 +43,9 @@ class Waiting:
 
 def worker(db: Path) -> Child:
     """The process that computes, with the same study's plug-ins as this one; raises NoAnswer."""
-    study = adopted()
-    own = [str(study.path)] if study and study.is_own else []
-    return Child("analysis.explorer.analysis_worker", str(db), *own)
+    child = Child("analysis.explorer.analysis_worker", str(db))
+    child.give_study()
+    return child
 
 
 class Computing:

@@ -12,12 +12,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.data.derived_cache import finished, keep_finished, present_state
-from analysis.explorer.child import serve
+from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
+from analysis.explorer.child import adopt_given, serve
 from analysis.metrics import GAP, LEFT_FIRST, Metric, shown_in
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
-from analysis.tables.model import Table, from_text, options_text, to_text
+from analysis.tables.model import Table, from_text, to_text
 from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
@@ -76,7 +76,7 @@ class Numbers:
 
     def _counted(self) -> dict[str, Any]:
         if "study" in self.__dict__:
-            groups = [group for group in self.study.groups if group.measured]
+            groups = [*self.study.measured, *self.study.unjudged]
             return {"counted": sum(len(group.trials) for group in groups)}
         with read_database(self.db) as connection:
             (row,) = connection.execute(
@@ -90,7 +90,7 @@ class Numbers:
 
     def _finished(self, names: Sequence[str]) -> dict[str, Table]:
         """Tables by name; those that are kept in the database are not made again."""
-        options = options_text(self.db, None)
+        options = options_text(self.db)
         wanted = [name for name in names if name not in self._made]
         kept = finished(self.db, present_state(self.db), options, wanted) if wanted else {}
         self._made |= {name: from_text(text) for name, text in kept.items()}
@@ -168,9 +168,9 @@ class Numbers:
     def _specs(self) -> dict[str, dict[str, str]]:
         """Of each group that has traces the spec of each trial."""
         return {
-            group.id: dict(zip(group.trials["trial_id"], group.trials["spec_hash"], strict=True))
-            for group in self.study.groups
-            if group.measured
+            group.id: dict(zip(trials["trial_id"], trials["spec_hash"], strict=True))
+            for group in (*self.study.measured, *self.study.unjudged)
+            for trials in [group.stored.trials]
         }
 
 
@@ -306,10 +306,6 @@ def _published_gaps() -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    for study in sys.argv[2:]:
-        from merge_runner.study.file import read_study
-        from merge_runner.study.parts import adopt
-
-        adopt(read_study(study))
+    adopt_given()
     numbers = Numbers(Path(sys.argv[1]))
     serve(lambda request: (numbers.answer(request), b""))

@@ -56,8 +56,8 @@ CREATE TABLE listed (
     status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
     error VARCHAR, scripted BOOLEAN, stand_in VARCHAR, caution VARCHAR,
     time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
-    joint BOOLEAN, min_ttc_s DOUBLE, account VARCHAR, decisions BIGINT, invalid BIGINT,
-    fallbacks BIGINT, attempts BIGINT, cost_usd DOUBLE,
+    joint BOOLEAN, min_ttc_s DOUBLE, account VARCHAR, decisions BIGINT, asked BIGINT,
+    invalid BIGINT, fallbacks BIGINT, attempts BIGINT, cost_usd DOUBLE,
     left_mps FLOAT[], right_mps FLOAT[], left_range_mps FLOAT[],
     right_range_mps FLOAT[], flaws VARCHAR[], posed VARCHAR[],
     tried STRUCT(requested VARCHAR, served VARCHAR, answered BOOLEAN, outcome VARCHAR,
@@ -71,8 +71,8 @@ CREATE TABLE noted (trial_id VARCHAR, spec_hash VARCHAR, tag VARCHAR);
 CREATE VIEW tagged AS SELECT number, tag FROM noted JOIN listed USING (trial_id, spec_hash);
 CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
-CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, invalid BIGINT,
-    fallbacks BIGINT, flaws VARCHAR[]);
+CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, asked BIGINT,
+    invalid BIGINT, fallbacks BIGINT, flaws VARCHAR[]);
 CREATE TABLE driven (trial_id VARCHAR, spec_hash VARCHAR, made STRUCT(side VARCHAR,
     time_s DOUBLE, fallback BOOLEAN)[]);
 CREATE TABLE called AS SELECT trial_id, spec_hash, attempts, cost_usd, posed, tried FROM listed;
@@ -117,7 +117,8 @@ INSERT INTO memory.trial_factors FROM trial_factors SEMI JOIN memory.trials
 INSERT INTO memory.states BY NAME
     FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
 INSERT INTO memory.decided
-    SELECT trial_id, spec_hash, count(*), count(*) FILTER (NOT valid), count(*) FILTER (fallback),
+    SELECT trial_id, spec_hash, count(*), count(call_key), count(*) FILTER (NOT valid),
+        count(*) FILTER (fallback),
         list(failure) FILTER (failure IS NOT NULL)
     FROM decisions SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
 INSERT INTO memory.driven
@@ -155,7 +156,7 @@ SELECT trials.trial_id, trials.spec_hash, source,
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'
         ELSE 'all valid' END AS validity,
     time_to_merge_s, gap_m, rmse_mps, joint, min_ttc_s, {OTHER_ACCOUNTS} AS account,
-    coalesce(decisions, 0) AS decisions,
+    coalesce(decisions, 0) AS decisions, coalesce(asked, 0) AS asked,
     coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
     coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps, left_range_mps,
     right_range_mps, flaws, posed, tried, levels
@@ -230,14 +231,16 @@ count(*) AS trials, count(*) FILTER (status <> 'failed') AS ended,
 count(*) FILTER (status = 'failed') AS failed, count(*) FILTER (status = 'collided') AS collided,
 count(*) FILTER (outcome = 'left first') AS left_first,
 count(*) FILTER (outcome = 'right first') AS right_first,
-coalesce(sum(decisions), 0)::BIGINT AS decisions, coalesce(sum(invalid), 0)::BIGINT AS invalid,
+coalesce(sum(decisions), 0)::BIGINT AS decisions, coalesce(sum(asked), 0)::BIGINT AS asked,
+coalesce(sum(invalid), 0)::BIGINT AS invalid,
 coalesce(sum(fallbacks), 0)::BIGINT AS fallbacks, coalesce(sum(cost_usd), 0) AS cost_usd,
 avg(gap_m) AS gap_m, avg(rmse_mps) AS rmse_mps, string_agg(DISTINCT stand_in, '; ') AS stand_in
 """
 SHOWN = "* EXCLUDE (flaws, posed, tried)"
 SPEEDS = "left_mps, right_mps, left_range_mps, right_range_mps"
 EXPORTED = (
-    f"* EXCLUDE (who, flaws, posed, tried, levels, number, model_left, model_right, {SPEEDS})"
+    "* EXCLUDE (who, flaws, posed, tried, levels, number, asked, model_left, model_right, "
+    f"{SPEEDS})"
 )
 
 

@@ -12,8 +12,10 @@ import queue
 import subprocess
 import sys
 import threading
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from merge_runner.errors import MergeRunnerError
@@ -63,6 +65,16 @@ class Child:
             )
         except OSError as exc:
             raise NoAnswer(f"no process can be started: {exc.strerror}") from exc
+
+    def give_study(self) -> None:
+        """Send the study that is registered here, whatever stands in its files by now."""
+        from merge_runner.study.parts import adopted  # the process of queries has no use for it
+
+        study = adopted()
+        sent = (study.text, str(study.path), study.plugins) if study and study.is_own else None
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError):  # whoever asks it is told that it ended
+            self.process.stdin.write(json.dumps(sent).encode() + b"\n")
 
     @property
     def alive(self) -> bool:
@@ -119,6 +131,17 @@ class Child:
             if pipe is not None:
                 with suppress(BrokenPipeError):  # of a request that it did not read
                     pipe.close()
+
+
+def adopt_given() -> None:
+    """In the child: register the study that ``give_study`` sends."""
+    from merge_runner.study.file import StudyFile, StudySource
+    from merge_runner.study.parts import adopt
+
+    if sent := json.loads(sys.stdin.readline()):
+        text, path, plugins = sent
+        file = StudyFile.model_validate(tomllib.loads(text))
+        adopt(StudySource(Path(path).stem, file, text, Path(path), plugins))
 
 
 def serve(answer: Callable[[Any], Answer]) -> None:

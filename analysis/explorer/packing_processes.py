@@ -16,7 +16,6 @@ from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
 from analysis.explorer.urls import StaticLinks
 from merge_runner.errors import UsageError
-from merge_runner.study.parts import adopted
 
 # A process reads so many trials at once, in some 50 MB, and the queries for them take as long as
 # for a tenth of them.
@@ -53,12 +52,12 @@ def packing(site: Site, blocks: Sequence[Sequence[Row]]) -> Iterator[Iterator[Bl
 def _worker(site: Site) -> Child:
     assert isinstance(site.at, StaticLinks)
     links = {"pages": list(site.at.pages), "alone": site.at.alone}
-    study = adopted()
-    own = [str(study.path)] if study and study.is_own else []
     try:
-        return Child("analysis.explorer.packing_worker", str(site.db), json.dumps(links), *own)
+        child = Child("analysis.explorer.packing_worker", str(site.db), json.dumps(links))
     except NoAnswer as exc:
         raise UsageError(str(exc)) from exc
+    child.give_study()
+    return child
 
 
 def _ask(free: SimpleQueue[Child], request: object) -> Block:

@@ -7,12 +7,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from analysis.explorer.child import Answer, serve
+from analysis.explorer.child import Answer, adopt_given, serve
 from analysis.explorer.packing import pack_trials
 from analysis.explorer.site import Site
 from analysis.explorer.urls import StaticLinks
-from merge_runner.study.file import read_study
-from merge_runner.study.parts import adopt
 
 
 def answer(site: Site, request: dict[str, Any]) -> Answer:
@@ -22,8 +20,7 @@ def answer(site: Site, request: dict[str, Any]) -> Answer:
 
 
 if __name__ == "__main__":
-    file, links, *studies = sys.argv[1:]
-    for study in studies:
-        adopt(read_study(study))
+    file, links = sys.argv[1:]
+    adopt_given()
     of_files = Site(Path(file), StaticLinks(**json.loads(links)))
     serve(lambda request: answer(of_files, request))

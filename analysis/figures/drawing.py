@@ -28,8 +28,7 @@ def named(group: Group) -> str:
     """A group's name in figures: ``o3/A2``, with a stand-in or a replayed human marked as such."""
     if not group.setting:
         return group.label
-    said = "; ".join(filter(None, (group.posing, group.caution)))
-    return f"{group.id} ({said})" if said else group.id
+    return f"{group.id} ({group.said})" if group.said else group.id
 
 
 def wrapped(text: str, width_in: float) -> str:

@@ -39,6 +39,7 @@ from analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     Point,
     deviations,
+    drawn_groups,
     farthest_headway_m,
     gaps,
     left_first,
@@ -73,18 +74,19 @@ SETTINGS: Any = {
 
 def figure_2(study: Study) -> Figure:
     """Velocities of the left vehicle (A, B), who was first (C), gap (D), speed deviation (E)."""
-    groups = study.baselines
+    groups = drawn_groups(study, study.baselines)
     figure = Figure(figsize=(PAGE_IN, 8.2), layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=(2, 3))
     traces, curves = parts
-    _traces(traces.subplots(2, max(len(groups), 1), sharex=True, sharey=True, squeeze=False), study)
+    frames = traces.subplots(2, max(len(groups), 1), sharex=True, sharey=True, squeeze=False)
+    _traces(frames, study, groups)
     velocities = velocities_mps(study)
-    axes = curves.subplots(3, len(velocities), sharex=True, sharey="row")
+    axes = curves.subplots(3, len(velocities), sharex=True, sharey="row", squeeze=False)
     _curves(axes[0], groups, left_first, velocities, "C", "P(left merges first)")
     _curves(axes[1], groups, gaps, velocities, "D", "gap at merge (m)")
     _curves(axes[2], groups, deviations, velocities, "E", "RMSE of speed (m/s)")
     axes[0, 0].set_ylim(-0.05, 1.05)
-    unmeasured = study.human in groups and not study.human.measured
+    unmeasured = not all(group.measured for group in groups)
     for column, velocity in enumerate(velocities):
         axes[0, column].set_title(f"Δv = {velocity_text(velocity)}")
         axes[2, column].set_xlabel("projected headway (m)")
@@ -266,19 +268,19 @@ def _figure(study: Study, name: str) -> Figure:
     return figure
 
 
-def _traces(axes: NDArray[np.object_], study: Study) -> None:
-    for column, group in enumerate(study.baselines):
+def _traces(axes: NDArray[np.object_], study: Study, groups: list[Group]) -> None:
+    for column, group in enumerate(groups):
         for row, (first, panel) in enumerate((("left", "A"), ("right", "B"))):
             axis: Axes = axes[row, column]
             found = left_traces(study, group, first)
-            colour = _style(study.baselines, group).colour
+            colour = _style(groups, group).colour
             draw_traces(axis, found, colour, len(found))
             if not group.measured:
                 say(axis, MISSING)
             elif not found:
                 say(axis, f"{first} never merged first")
             if row == 0:
-                axis.set_title(wrapped(group.label, 0.85 * PAGE_IN / len(study.baselines)))
+                axis.set_title(wrapped(group.label, 0.85 * PAGE_IN / len(groups)))
             if found:
                 axis.text(0.98, 0.04, f"n = {len(found)}", transform=axis.transAxes, ha="right")
             if column == 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,9 +27,16 @@ class Point:
     estimate: Estimate
 
 
+def drawn_groups(study: Study, groups: Iterable[Group]) -> list[Group]:
+    """The groups in the conditions that are drawn: humans drove others, too."""
+    return [
+        group.part(lambda trials: trials["condition"].isin(study.conditions)) for group in groups
+    ]
+
+
 def velocities_mps(study: Study) -> list[float]:
     """The relative velocities that have panels."""
-    return sorted({*HUMAN_VELOCITIES_MPS, *(velocity for _, velocity in study.conditions.values())})
+    return sorted({velocity for _, velocity in study.conditions.values()})
 
 
 def farthest_headway_m(study: Study) -> float:

@@ -28,6 +28,7 @@ from analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     Point,
     deviations,
+    drawn_groups,
     farthest_headway_m,
     gaps,
     left_first,
@@ -70,7 +71,7 @@ PANELS = (left_first, gaps, deviations)
 
 def figure_2_variants(study: Study) -> Figure:
     """Left speeds (A, B), who was first (C), gap (D) and speed deviation (E) of every group."""
-    groups = study.groups
+    groups = drawn_groups(study, study.groups)
     styles = _styles(study)
     names = [_name(group) for group in groups]
     figure, axes = _panels(len(groups), max(ROW_IN, LINE_IN * line_count(names) + 0.06))
@@ -84,7 +85,7 @@ def figure_2_variants(study: Study) -> Figure:
         for axis, points in zip(row[2:], PANELS, strict=True):
             _points(axis, group, points, styles)
         if not group.measured:
-            _published(row[3])
+            _published(row[3], styles)
     _scales(axes, groups, study)
     _headings(axes)
     _legend(figure, study, styles)
@@ -96,7 +97,7 @@ def _styles(study: Study) -> Styles:
     humans = dict(zip(HUMAN_VELOCITIES_MPS, STYLES, strict=True))
     others = [velocity for velocity in velocities_mps(study) if velocity not in humans]
     own = {velocity: turned(i, OTHER_COLOURS, OTHER_SHAPES) for i, velocity in enumerate(others)}
-    return dict(sorted({**humans, **own}.items()))
+    return {velocity: (humans | own)[velocity] for velocity in velocities_mps(study)}
 
 
 def _panels(rows: int, row_in: float) -> tuple[Figure, NDArray[np.object_]]:
@@ -161,10 +162,10 @@ def _points(
         say(axis, MISSING)
 
 
-def _published(axis: Axes) -> None:
+def _published(axis: Axes, styles: Styles) -> None:
     """The humans' gaps as the paper's regression has them."""
-    for velocity, style in zip(HUMAN_VELOCITIES_MPS, STYLES, strict=True):
-        axis.plot(*published_gap_line(velocity), color=style.colour, ls="--", lw=0.8)
+    for velocity in {*styles} & {*HUMAN_VELOCITIES_MPS}:
+        axis.plot(*published_gap_line(velocity), color=styles[velocity].colour, ls="--", lw=0.8)
 
 
 def _scales(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from merge_runner.cli.options import DbOption
+from merge_runner.cli.options import DbOption, JsonOption
 from merge_runner.cli.output import print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
@@ -40,7 +41,10 @@ def human_import(
     ],
     db: DbOption = DEFAULT_DB,
 ) -> None:
-    """Add the recorded human trials to the database; those that are there stay as they are."""
+    """Add the recorded human trials to the database.
+
+    Those that are there stay as they are.
+    """
     from rich.console import Console
     from rich.progress import track
 
@@ -93,7 +97,7 @@ def human_import_first_actions(
     ] = False,
     db: DbOption = DEFAULT_DB,
 ) -> None:
-    """Add the first actions of the humans: what the table first-action compares drivers with."""
+    """Add the humans' first actions."""
     from analysis.human.archive import Unreadable
     from analysis.human.first_actions import read_first_actions, rows_of
     from merge_runner.results.store import Store
@@ -115,8 +119,8 @@ def human_import_first_actions(
 
 
 @human_app.command("status")
-def human_status(db: DbOption = DEFAULT_DB) -> None:
-    """Count the human trials per pair and condition, beside the published counts."""
+def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
+    """Count the human trials, beside the published counts."""
     from analysis.data.imported_humans import (
         COUNTS,
         OUTCOMES,
@@ -130,6 +134,9 @@ def human_status(db: DbOption = DEFAULT_DB) -> None:
 
     trials = human_trials(db) if db.exists() else None
     actions = first_actions(db) if db.exists() else 0
+    if as_json:
+        print_out(json.dumps(_counts(trials, actions), ensure_ascii=False))
+        return
     if actions:
         print_out(f"first actions of {actions} trials are imported")
     if trials is None or trials.empty:
@@ -146,6 +153,17 @@ def human_status(db: DbOption = DEFAULT_DB) -> None:
     print_out("")
     for line in imported(trials).findings():
         print_out(line)
+
+
+def _counts(trials: pd.DataFrame | None, first_actions: int) -> dict[str, object]:
+    from analysis.data.imported_humans import by_condition, by_pair, imported
+
+    counts: dict[str, object] = {"first_actions": first_actions}
+    if trials is not None and not trials.empty:
+        for name, frame in (("pairs", by_pair(trials)), ("conditions", by_condition(trials))):
+            counts[name] = frame.to_dict("index")
+        counts["notes"] = list(imported(trials).findings())
+    return counts
 
 
 def _nothing_in(path: Path, files: list[File]) -> str:

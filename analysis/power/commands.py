@@ -17,11 +17,12 @@ from merge_runner.cli.options import (
     ModelOption,
     OnlyOption,
     RepsOption,
+    TrustOption,
     VariantsOption,
     levels,
     listed,
 )
-from merge_runner.cli.output import print_out, say
+from merge_runner.cli.output import print_out, say, terminal_width
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 
 
@@ -34,13 +35,18 @@ def power(
     reps: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
-    sims: Annotated[int, typer.Option(help="Simulated studies of each size.", min=20)] = 200,
-    seed: Annotated[int, typer.Option(help="Another number draws other studies.", min=0)] = 0,
+    sims: Annotated[
+        int, typer.Option(metavar="N", help="Simulated studies of each size.", min=20)
+    ] = 200,
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Another number draws other studies.", min=0)
+    ] = 0,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
+    trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what a study could find and what that costs, before it is played; sends nothing."""
+    """Say what a study could find and what it costs; send nothing."""
     from analysis.power.shown import table
     from analysis.power.study import power as chances
     from analysis.table_format import TableFormat
@@ -55,10 +61,11 @@ def power(
         listed(conditions),
         listed(variants),
         only=levels(only or (), "--only"),
+        trust=trust,
     )
     expected = of_all(plan, Options(db=Path(db), cache=Path(cache)), say=say)
     found = chances(plan, expected, simulations=sims, seed=seed)
     if as_json:
         print_out(json.dumps(asdict(found), ensure_ascii=False))
     else:
-        print_out(render([table(found)], TableFormat.TEXT))
+        print_out(render([table(found)], TableFormat.TEXT, terminal_width()))

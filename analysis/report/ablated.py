@@ -7,17 +7,15 @@ from dataclasses import dataclass
 from math import comb, prod
 from typing import Any
 
-from scipy import stats
-
-from analysis.data.study import BASELINE, Group, Study
+from analysis.data.study import Group, Study
 from analysis.metrics import Metric, compared
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import POWER
-from analysis.stats.measures import counts
 from analysis.stats.variants import variants
 from analysis.tables import finished_tables
 from analysis.tables.model import Row
 from analysis.tables.notes import listed
+from merge_runner.study.file import BASELINE
 
 # How a sentence names each coefficient of the regressions, and its unit.
 SLOPES = {
@@ -73,25 +71,30 @@ def ablation_sentences(study: Study) -> list[str]:
     if not shown:
         return []
     # The sentences quote the tables' values, so that text and tables cannot disagree.
-    tables = finished_tables(study.db, study.chosen, SOURCES, study)
+    tables = finished_tables(study.db, None, SOURCES, study)
     rows = {row.id: row for table in tables for row in table.rows}
     return [
         text
         for label in dict.fromkeys(group.label for group in shown)
         for mine in [[group for group in shown if group.label == label]]
-        for text in _of_driver(label, mine, found[mine[0]], rows)
+        for text in _of_driver(label, mine, study.reference, found[mine[0]], rows)
     ]
 
 
 def _of_driver(
-    label: str, groups: list[Group], baseline: Group | None, rows: dict[str, Row]
+    label: str,
+    groups: list[Group],
+    reference: str,
+    baseline: Group | None,
+    rows: dict[str, Row],
 ) -> Iterator[str]:
     names = ", ".join(group.setting for group in groups)
     if all((group.trials["source"] == "driver").all() for group in groups):
         yield f"{label} is a program and reads no prompt: {names} can change nothing."
         return
     if baseline is None:
-        yield f"{label}: it has no baseline of its own, so what {names} changes cannot be said."
+        lacking = "baseline" if reference == BASELINE else f"prompt {reference}"
+        yield f"{label}: it has no {lacking} to compare with: what {names} changes cannot be said."
         return
     changes = [change for group in groups for change in _changes(group, baseline, rows)]
     for group in groups:
@@ -99,14 +102,14 @@ def _of_driver(
     # A test that could not have reached 5 % says nothing when it does not, unlike one
     # that could have found a difference and did not.
     possible = [one for one in changes if one.possible and one.p_holm >= ALPHA]
-    yield from _not_shown(label, possible)
+    yield from _not_shown(label, baseline, possible)
     yield from _too_few(label, [one for one in changes if not one.possible])
-    yield from _not_compared(label, groups, changes)
+    yield from _not_compared(label, baseline, groups, changes)
 
 
 def _changes(group: Group, baseline: Group, rows: dict[str, Row]) -> Iterator[Change]:
     for metric in compared():
-        row = rows.get(f"{group.id}/{BASELINE}/{metric.name}")
+        row = rows.get(f"{group.id}/{baseline.setting}/{metric.name}")
         if row is not None:
             # Before Holm's correction, which only makes p larger: a lenient bound.
             possible = smallest_p(group, baseline, metric) < ALPHA
@@ -135,12 +138,9 @@ def _change(group: Group, what: str, row: Row, interval: str, *, possible: bool)
 def smallest_p(group: Group, baseline: Group, metric: Metric) -> float:
     """The smallest p that a test of so many trials can give, whatever their outcomes.
 
-    For a rate, Fisher's p of rates 1 and 0. For a mean, the permutation test's p where only one of
-    all ways to shuffle within the conditions is the most extreme, or two that mirror each other.
+    Only one of all ways to shuffle within the conditions is the most extreme, or two that mirror
+    each other; of a rate it is 1 in one group and 0 in the other.
     """
-    if metric.rate:
-        n, m = (counts(one, metric)[1] for one in (group, baseline))
-        return float(stats.fisher_exact([[n, 0], [0, m]]).pvalue)
     first, second = (
         one.trials.dropna(subset=[metric.column])["condition"].value_counts()
         for one in (group, baseline)
@@ -157,12 +157,17 @@ def _differs(label: str, group: Group, baseline: Group, changes: list[Change]) -
     found = [one.text for one in changes if one.setting == group.setting and one.p_holm < ALPHA]
     if found:
         yield (
-            f"{label}, {group.setting} ({len(group.ended)} trials) differs from the baseline "
+            f"{label}, {group.setting} ({len(group.ended)} trials) differs from {_named(baseline)} "
             f"({len(baseline.ended)}), also after Holm's correction, in {listed(found)}."
         )
 
 
-def _not_shown(label: str, changes: list[Change]) -> Iterator[str]:
+def _named(baseline: Group) -> str:
+    setting = baseline.setting
+    return f"the {BASELINE}" if setting == BASELINE else f"the prompt {setting}"
+
+
+def _not_shown(label: str, baseline: Group, changes: list[Change]) -> Iterator[str]:
     if not changes:
         return
     sizes = [
@@ -173,7 +178,8 @@ def _not_shown(label: str, changes: list[Change]) -> Iterator[str]:
         ]
         if found
     ]
-    yield f"{label}: no difference from the baseline is shown, after Holm's correction, in " + (
+    shown = f"{label}: no difference from {_named(baseline)} is shown, after Holm's correction, in "
+    yield shown + (
         f"{_which(changes)}."
         if not sizes
         else f"{_which(changes)}. That does not show that there is none: the smallest difference "
@@ -190,7 +196,9 @@ def _too_few(label: str, changes: list[Change]) -> Iterator[str]:
         )
 
 
-def _not_compared(label: str, groups: list[Group], changes: list[Change]) -> Iterator[str]:
+def _not_compared(
+    label: str, baseline: Group, groups: list[Group], changes: list[Change]
+) -> Iterator[str]:
     there = {(one.setting, one.what) for one in changes}
     lacking = [
         (group.setting, what)
@@ -200,7 +208,7 @@ def _not_compared(label: str, groups: list[Group], changes: list[Change]) -> Ite
     ]
     if lacking:
         yield (
-            f"{label}: not compared with the baseline, for want of finished trials or of a fit: "
+            f"{label}: not compared with {_named(baseline)}: "
             f"{_grouped(lacking)}. The notes of the tables {', '.join(SOURCES)} say why."
         )
 

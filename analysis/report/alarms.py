@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from analysis.data.provenance import Mismatch, Provenance, tally
 from analysis.data.study import Group, Study
-from merge_runner.drivers.registry import EMULATOR
+from analysis.tables.notes import equal_note
+from merge_runner.drivers.registry import MOCKS
 
 # The share of a group's decisions above which an alarm is raised: a convention.
 MANY_FALLBACKS = 0.05
@@ -32,6 +33,12 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
             "model.",
         ),
         (
+            "Too few valid decisions",
+            [f"{g.id}: {g.unjudged}" for g in (*study.unjudged, *study.unjudged_asked)],
+            "What was driven is mostly not what the model decided: no value, test or conclusion "
+            "rests on these trials.",
+        ),
+        (
             "Repetitions are the same trial",
             [
                 f"{group.repeated} of {len(group.trials) + group.repeated} trials of {group.id} "
@@ -39,19 +46,14 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
                 for group in study.models
                 if group.repeated
             ],
-            "A driver without chance goes the same way each time: equal trials count once, in "
-            "every n, interval and test.",
+            "They are of programs that declare no chance: equal trials count once, in every n, "
+            "interval and test.",
         ),
         (
             "Some trials are equal",
-            [
-                f"{group.equal} of {len(group.trials)} trials of {group.id} are as an earlier one "
-                "to the last state"
-                for group in study.models
-                if group.equal
-            ],
-            "Others of their repetitions differ, so that each counts; where they came from a cache "
-            "on the way, they are no samples.",
+            [f"{group.id}: {equal_note(group)}" for group in study.models if group.equal],
+            "Where a cache on the way answered, or the temperature is 0, they are no samples, and "
+            "intervals and tests claim too much.",
         ),
         (
             "The human trials are another data set",
@@ -68,7 +70,7 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
         ),
         (
             "Trials failed",
-            [_failures(group) for group in study.models if len(group.trials) > len(group.ended)],
+            [_failures(group) for group in study.played if len(group.trials) > len(group.ended)],
             "They are in no measure; the same sweep again plays them anew.",
         ),
         (
@@ -106,8 +108,8 @@ def mismatch(one: Mismatch) -> str:
 
 
 def posing(study: Study) -> list[Group]:
-    """Groups where a stand-in answered under a model's name; the emulator's own name is honest."""
-    return [group for group in study.models if group.scripted and EMULATOR not in group.models]
+    """Groups where a stand-in answered under a model's name; a mock model's own name is honest."""
+    return [group for group in study.played if group.scripted and MOCKS.isdisjoint(group.models)]
 
 
 def _failures(group: Group) -> str:
@@ -129,7 +131,7 @@ def _fallbacks(study: Study) -> Iterator[str]:
 
 
 def _unknown(study: Study) -> Iterator[str]:
-    for group in study.models:
+    for group in study.played:
         if unknown := tally(study, group).unknown:
             yield f"{unknown} of {tally(study, group).attempts} of {group.id}"
 
@@ -137,6 +139,6 @@ def _unknown(study: Study) -> Iterator[str]:
 def _mixed(study: Study) -> Iterator[str]:
     """Names under which several settings were played; each with the marks that tell them apart."""
     marked: dict[str, dict[str, None]] = {}
-    for group in study.models:
+    for group in study.played:
         marked.setdefault(group.name, {})[group.name + group.mark] = None
     yield from (", ".join(names) for names in marked.values() if len(names) > 1)

@@ -24,9 +24,10 @@ from analysis.stats.measures import (
     no_human_value,
 )
 from analysis.stats.mixed import MIN_PAIRS
-from analysis.tables.notes import one_sided_note
+from analysis.tables.notes import one_sided_note, replayed_notes
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner.study.file import BASELINE
 
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",
@@ -36,8 +37,9 @@ NAMES = {
     "I5": "accelerations are held and jump as the humans' do",
 }
 # That a driver lacks an indicator is strong evidence against it where at least the first share of
-# human data sets of the study's size show this indicator, weak where fewer than the second do.
-STRONG, WEAK = 0.95, 0.8
+# human data sets of the study's size show this indicator, weak where fewer than the second do, and
+# none where fewer than the third do.
+STRONG, WEAK, NONE = 0.95, 0.8, 0.05
 
 
 def shown(study: Study) -> list[str]:
@@ -54,6 +56,8 @@ def not_shown(study: Study, origin: Provenance) -> list[str]:
         for group in study.baselines
         if group.scripted
     ]
+    texts += [f"{note}." for note in replayed_notes(study)]
+    texts += [f"{group.id}: {group.unjudged}." for group in study.unjudged]
     texts += [f"Another model answered: {mismatch(one)}" for one in origin.mismatches]
     if not _concluded(study):
         texts.append("There is no baseline trial of a driver to judge: nothing can be concluded.")
@@ -64,6 +68,8 @@ def not_shown(study: Study, origin: Provenance) -> list[str]:
 
 def nothing(study: Study) -> str:
     """Why nothing can be concluded; for use where ``shown`` is empty."""
+    if any(group.setting == BASELINE for group in study.unjudged):
+        return "Nothing: of the drivers with the baseline prompt too many decisions are invalid."
     if study.chosen is not None:
         return "Nothing: no driver that was played with the baseline prompt is chosen."
     if study.empty:
@@ -72,12 +78,14 @@ def nothing(study: Study) -> str:
         )
     if any(group.setting and group.scripted for group in study.baselines):
         return "Nothing: with the baseline prompt only scripted stand-ins drove."
+    if replayed_notes(study):
+        return "Nothing: with the baseline prompt only replayed humans were played."
     return "Nothing yet: no driver was played with the baseline prompt."
 
 
 def _concluded(study: Study) -> list[Group]:
-    """The baselines that conclusions are drawn about: no humans, no stand-ins."""
-    return [group for group in study.baselines if group.setting and not group.scripted]
+    """The baselines that conclusions are drawn about: no humans, also replayed, no stand-ins."""
+    return [group for group in study.compared if not group.scripted]
 
 
 def _shown(study: Study, group: Group) -> list[str]:
@@ -165,6 +173,8 @@ def _size(group: Group) -> str:
 
 
 def _strength(share: float) -> str:
+    if share < NONE:
+        return "no"
     return "strong" if share >= STRONG else "weak" if share < WEAK else "some"
 
 

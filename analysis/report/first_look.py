@@ -16,7 +16,10 @@ def first_look(study: Study, group: Group) -> Iterator[str]:
         yield from _slope(study, seat, known)
         shown = [one.said for one in faults(acts(study, seat), known) if one.shown]
         if shown:
-            yield f"In its first action {seat.name} differs from the humans: {listed(shown)}."
+            yield (
+                f"In its first action {seat.name} differs from the humans, after Holm's "
+                f"correction: {listed(shown)}."
+            )
 
 
 def _slope(study: Study, seat: Seat, known: Humans) -> Iterator[str]:

@@ -17,6 +17,7 @@ from analysis.explain import Source, sources_of, sql_command
 from analysis.figures.gallery import FIGURES
 from analysis.report.alarms import alarms, posing
 from analysis.report.conclusions import not_shown, nothing, shown
+from analysis.report.design import design
 from analysis.stats.factors import levels_by_factor
 from analysis.tables.against import PAPER, against, in_paper
 from analysis.tables.formats import table_view
@@ -60,8 +61,12 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         lstrip_blocks=True,
     )
     origin = provenance(study.db)
+    views = {
+        table.name: table_view(table, links.to) for table in tables if table.name not in left_out
+    }
     return environment.get_template("report.html").render(
         study=study,
+        design=design(study),
         alarms=alarms(study, origin),
         shown=shown(study),
         not_shown=not_shown(study, origin),
@@ -72,7 +77,8 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
             for name, data in figures.items()
             if name not in left_out
         ],
-        tables=[table_view(table, links.to) for table in tables if table.name not in left_out],
+        factors=views.pop("factors", None),
+        tables=list(views.values()),
         beside=[table_view(against(table, PAPER), links.to) for table in tables if in_paper(table)],
         sources=[(number, sources) for sources, number in links.found.items()],
         listed=LISTED,

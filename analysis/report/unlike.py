@@ -12,6 +12,7 @@ from analysis.stats.intervals import POWER, Difference
 from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions
 from analysis.tables.notes import listed
 
+OUTCOMES = {WHO_FIRST: "who merges first", GAP: "the gap"}
 # The intercept's interaction, in words: with every term at 0, nobody is ahead or faster.
 LEVELS = {
     WHO_FIRST: ("who merges first where nobody is ahead or faster", "logits"),
@@ -23,8 +24,12 @@ def unlike(study: Study, group: Group) -> Iterator[str]:
     """What a joint model of a driver and the humans shows about their difference."""
     found = interactions(study.human, group)
     tested = [(one, one.found) for one in found if one.found is not None]
-    for problem in dict.fromkeys(one.problem for one in found if one.problem):
-        yield f"{group.driver}: a difference from the humans cannot be tested: {problem}."
+    for outcome, problem in dict.fromkeys((one.outcome, one.problem) for one in found):
+        if problem:
+            yield (
+                f"{group.driver}: a difference from the humans in {OUTCOMES[outcome]} cannot be "
+                f"estimated: {problem}."
+            )
     for remark in dict.fromkeys(one.remark for one, _ in tested if NARROW in one.remark):
         yield f"{group.driver} beside the humans: {remark}."
     # Over both outcomes at once, since the sentence makes one claim about the driver; the table
@@ -39,8 +44,8 @@ def unlike(study: Study, group: Group) -> Iterator[str]:
     others = [pair for pair in tested if pair not in shown]
     if others:
         yield (
-            f"{group.driver}: no difference from the humans is shown in "
-            f"{listed([_name(one)[0] for one, _ in others])}. That does not show that there is "
+            f"{group.driver}: no difference from the humans is shown, after Holm's correction, "
+            f"in {listed([_name(one)[0] for one, _ in others])}. That does not show that there is "
             f"none: the smallest that one such test, not yet corrected, finds with a chance of "
             f"{100 * POWER:.0f} % is {listed([_smallest(*pair) for pair in others])}."
         )

@@ -13,7 +13,7 @@ from analysis.report.page import report_html
 from analysis.table_format import TableFormat
 from analysis.tables import finished_tables
 from analysis.tables.formats import render
-from analysis.tables.model import Table, options_text
+from analysis.tables.model import Table
 from merge_runner.errors import UsageError
 
 
@@ -23,17 +23,18 @@ def write_report(
     out: Path,
     files: Path | None,
     where: Mapping[str, Sequence[str]] | None = None,
+    file: str | None = None,
 ) -> Iterator[Path]:
     """Write the report, and every table and figure into the folder ``files``; yields the paths.
 
-    ``models`` and ``where`` restrict the report as they do a study. Raises UsageError.
+    ``models``, ``where`` and ``file`` restrict the report as they do a study. Raises UsageError.
     """
-    study = Study(db, models, where)
-    tables = finished_tables(db, models, study=study, where=where)
+    study = Study(db, models, where, file)
+    tables = finished_tables(db, None, study=study)
     if files is not None:
         yield from write_figures(study, files)
         yield from write_tables(tables, files)
-    text = report_html(study, tables, finished_figures(study, options_text(db, models, where)))
+    text = report_html(study, tables, finished_figures(study))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
@@ -52,15 +53,15 @@ def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
             yield path
 
 
-def finished_figures(study: Study, options: str) -> dict[str, str]:
+def finished_figures(study: Study) -> dict[str, str]:
     """Every figure by name as SVG in Base64: read from the database where stored, else drawn."""
     files = {f"{name}.svg": name for name in FIGURES}  # a table may have the name alone
-    found = finished(study.db, study.state, options, list(files))
+    found = finished(study.db, study.state, study.options, list(files))
     drawn = {
         file: base64.b64encode(rendered(study, name, "svg")).decode()
         for file, name in files.items()
         if file not in found
     }
     if drawn:
-        keep_finished(study.db, study.state, options, drawn)
+        keep_finished(study.db, study.state, study.options, drawn)
     return {name: (found | drawn)[file] for file, name in files.items()}

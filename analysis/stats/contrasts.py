@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from math import ceil
 
@@ -10,22 +11,95 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
-from analysis.stats.intervals import LEVEL, POWER, Difference, detectable, interval
+from analysis.stats.intervals import (
+    LEVEL,
+    POWER,
+    Difference,
+    detectable,
+    difference,
+    interval,
+    newcombe,
+    two_sided_p,
+)
 
 SEED = 260409609
 PERMUTATIONS = 9999
 DRAWN_AT_ONCE = 2**15  # they stay in the processor
 
 
-def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Difference:
-    """Two rates, (successes, n) each: Fisher's exact test, Newcombe's score interval (1998)."""
-    from statsmodels.stats.proportion import confint_proportions_2indep
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """Two rates by condition: successes and trials of the first, and of the second.
 
-    (a, n), (b, m) = first, second
-    low, high = confint_proportions_2indep(a, n, b, m, method="newcomb", alpha=1 - LEVEL)
-    p = stats.fisher_exact([[a, n - a], [b, m - b]]).pvalue
-    found = detectable_rate(n, m, b / m)
-    return Difference(a / n - b / m, float(low), float(high), float(p), found)
+    Conditions weigh n m / (n + m), as by Mantel and Haenszel and in least squares.
+    """
+
+    a: NDArray[np.int_]
+    n: NDArray[np.int_]
+    b: NDArray[np.int_]
+    m: NDArray[np.int_]
+
+    @property
+    def rates(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Both rates with these weights, each with the trials that it is as good as."""
+        weights = self.n * self.m / (self.n + self.m)
+        weights = weights / weights.sum()
+        first, second = (
+            (float(weights @ (k / size)), 1 / float(weights**2 @ (1 / size)))
+            for k, size in ((self.a, self.n), (self.b, self.m))
+        )
+        return first, second
+
+    @property
+    def p(self) -> float:
+        """Of Fisher's exact test within conditions, two-sided by probability."""
+        chances, least = np.ones(1), 0
+        for a, n, b, m in zip(self.a, self.n, self.b, self.m, strict=True):
+            there = np.arange(max(0, a + b - m), min(n, a + b) + 1)
+            chances = np.convolve(chances, stats.hypergeom.pmf(there, n + m, a + b, n))
+            least += there[0]
+        # As likely but for rounding is as likely.
+        likely = chances <= chances[self.a.sum() - least] * (1 + 1e-7)
+        return min(1.0, float(chances[likely].sum() / chances.sum()))
+
+
+def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cells | None:
+    """Return the rates of two groups in the conditions that both have; None where there is none."""
+    one, other = (
+        each.dropna(subset=[measure]).astype({measure: bool}).groupby("condition")[measure]
+        for each in (first, second)
+    )
+    both = pd.concat([one.sum(), one.size(), other.sum(), other.size()], axis=1, join="inner")
+    return Cells(*both.to_numpy(int).T) if len(both) else None
+
+
+def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Difference:
+    """Two rates, (successes, n) each: Fisher's exact test, Newcombe's score interval."""
+    return contrast_cells(Cells(*np.array([[*first, *second]]).T))
+
+
+def contrast_cells(both: Cells) -> Difference:
+    """Two rates within conditions: Fisher's exact test, Newcombe's interval of weighted rates."""
+    (one, _), (other, _) = both.rates
+    found = detectable_rate(int(both.n.sum()), int(both.m.sum()), other)
+    return Difference(one - other, *newcombe(both.rates), both.p, found)
+
+
+def interaction_of_rates(one: Cells, other: Cells) -> Difference:
+    """Return how far two differences of rates differ; p is the level at which 0 is excluded."""
+    rates = (*one.rates, *reversed(other.rates))
+    value = sum(rate if place % 2 == 0 else -rate for place, (rate, _) in enumerate(rates))
+
+    def excludes_zero_by(z: float) -> float:
+        low, high = newcombe(rates, z)
+        return low if value > 0 else -high
+
+    largest = 40.0  # of this quantile p is 0 to 300 digits
+    z = 0.0
+    if value:
+        ends = excludes_zero_by(largest)
+        z = largest if ends > 0 else float(optimize.brentq(excludes_zero_by, 0.0, largest))
+    return Difference(value, *newcombe(rates), two_sided_p(z), None)
 
 
 def detectable_rate(n: int, m: int, rate: float) -> float | None:
@@ -65,6 +139,55 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class Within:
+    """The measures of two groups, less the mean of their condition, in the order of conditions.
+
+    ``chosen`` are those of the first group, ``sizes`` those of the conditions, and ``group`` is
+    ``chosen`` less its mean in the condition.
+    """
+
+    value: NDArray[np.float64]
+    group: NDArray[np.float64]
+    chosen: NDArray[np.bool_]
+    sizes: NDArray[np.int_]
+
+    @property
+    def weight(self) -> float:
+        """What of the groups is left within conditions; 0 where no condition has both."""
+        weight = float((self.group**2).sum())
+        return weight if weight > 1e-12 else 0.0
+
+    @property
+    def difference(self) -> float:
+        """The first mean minus the second, by least squares with a level for each condition."""
+        # Of what is left of both within conditions, the slope is that of the whole model (Frisch
+        # and Waugh 1933; Lovell 1963).
+        return float((self.group * self.value).sum()) / self.weight
+
+    @property
+    def error(self) -> tuple[float, int] | None:
+        """Its standard error with the degrees of freedom; None without any."""
+        freedom = len(self.value) - len(self.sizes) - 1
+        if freedom <= 0:
+            return None
+        variance = float(((self.value - self.difference * self.group) ** 2).sum()) / freedom
+        return float(np.sqrt(variance / self.weight)), freedom
+
+
+def within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Within:
+    """Return the measures of two groups within conditions."""
+    both = pd.concat([first.assign(_first=1.0), second.assign(_first=0.0)]).dropna(subset=[measure])
+    both = both.sort_values("condition", kind="stable")
+    by_condition = both.groupby("condition")
+    return Within(
+        (both[measure].astype(float) - by_condition[measure].transform("mean")).to_numpy(float),
+        (both["_first"] - by_condition["_first"].transform("mean")).to_numpy(float),
+        both["_first"].to_numpy(float) == 1,
+        by_condition.size().to_numpy(),
+    )
+
+
 def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Difference | None:
     """Two means, compared within conditions: permutation test, least-squares interval.
 
@@ -72,48 +195,36 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> D
     conditions, as when one group collides more in some, makes none. The test shuffles the groups
     within each condition, seeded. None where the groups share no condition.
     """
-    both = pd.concat([first.assign(_first=1.0), second.assign(_first=0.0)]).dropna(subset=[measure])
-    both = both.sort_values("condition", kind="stable")
-    by_condition = both.groupby("condition")
-    value = (both[measure].astype(float) - by_condition[measure].transform("mean")).to_numpy(float)
-    group = (both["_first"] - by_condition["_first"].transform("mean")).to_numpy(float)
-    # Of what is left of both within conditions, the slope is that of the whole model (Frisch and
-    # Waugh 1933; Lovell 1963).
-    weight = float((group**2).sum())
-    if weight < 1e-12:  # no condition has trials of both groups
+    both = within(first, second, measure)
+    if not both.weight:
         return None
-    difference = float((group * value).sum()) / weight
-    freedom = len(both) - by_condition.ngroups - 1
     low = high = found = None
-    if freedom > 0:
-        variance = float(((value - difference * group) ** 2).sum()) / freedom
-        se = float(np.sqrt(variance / weight))
-        low, high = interval(difference, se, freedom)
-        found = detectable(se, freedom)
-    chosen = both["_first"].to_numpy(float) == 1
-    sizes = by_condition.size().to_numpy()
-    p = _permutation_p(value, chosen, sizes, weight, difference)
-    return Difference(difference, low, high, p, found)
+    if both.error:
+        low, high = interval(both.difference, *both.error)
+        found = detectable(*both.error)
+    return Difference(both.difference, low, high, _permutation_p(both), found)
 
 
-def _permutation_p(
-    value: NDArray[np.float64],
-    chosen: NDArray[np.bool_],
-    sizes: NDArray[np.int_],
-    weight: float,
-    observed: float,
-) -> float:
+def interaction_of_means(one: Within, other: Within) -> Difference | None:
+    """Return how far two differences of means differ, by Welch's test; None without errors."""
+    if not (one.weight and other.weight and one.error and other.error):
+        return None
+    return difference(one.difference - other.difference, one.error, other.error)
+
+
+def _permutation_p(both: Within) -> float:
     """Share of shuffles within conditions, the observed one included, with as large a difference.
 
-    ``value`` is centred within each condition; conditions lie one after another, in ``sizes``.
+    Conditions lie one after another, in ``sizes``.
     """
-    starts = np.cumsum(sizes) - sizes
-    counts = np.add.reduceat(chosen.astype(int), starts)
-    shuffles = _shuffles(tuple(zip(sizes.tolist(), counts.tolist(), strict=True)))
-    values = np.split(value, starts[1:])
+    starts = np.cumsum(both.sizes) - both.sizes
+    counts = np.add.reduceat(both.chosen.astype(int), starts)
+    shuffles = _shuffles(tuple(zip(both.sizes.tolist(), counts.tolist(), strict=True)))
+    values = np.split(both.value, starts[1:])
     parts = [shuffled_sums(*each) for each in zip(shuffles, values, strict=True)]
     # As large but for rounding is as large.
-    extreme = int((np.abs(np.sum(parts, axis=0) / weight) >= abs(observed) - 1e-12).sum())
+    found = np.abs(np.sum(parts, axis=0) / both.weight)
+    extreme = int((found >= abs(both.difference) - 1e-12).sum())
     # The trials as they are count as a shuffle, so that p is never 0 (Phipson and Smyth 2010).
     return (extreme + 1) / (PERMUTATIONS + 1)
 

@@ -5,14 +5,22 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache
+from math import isnan
 
 import pandas as pd
 
-from analysis.data.study import Group, Study, levels_of
+from analysis.data.study import Group, Study, in_one_study, levels_of
 from analysis.metrics import Metric
-from analysis.stats.contrasts import contrast_means, contrast_rates
+from analysis.stats.contrasts import (
+    contrast_cells,
+    contrast_means,
+    interaction_of_means,
+    interaction_of_rates,
+    shared_cells,
+    within,
+)
 from analysis.stats.intervals import Difference
-from analysis.stats.measures import counts, trials_of
+from analysis.stats.measures import trials_of
 
 Cell = tuple[str, ...]
 
@@ -23,6 +31,7 @@ class Level:
 
     The trials have a column ``cell``: their condition and the levels of all other factors.
     ``posing`` is what is said of scripted stand-ins; the ``mark`` tells their level from others'.
+    ``at`` is the level of another factor that all of its trials have, if it is shown by that one.
     """
 
     factor: str
@@ -31,11 +40,12 @@ class Level:
     pooled: Group
     posing: str = ""
     mark: str = ""
+    at: str = ""
 
     @property
     def id(self) -> str:
-        """``temperature=0.2``."""
-        return f"{self.factor}={self.name}{self.mark}"
+        """``temperature=0.2``, or ``opponent=idm/temperature=0.2``."""
+        return f"{self.at}/" * bool(self.at) + f"{self.factor}={self.name}{self.mark}"
 
     @property
     def cells(self) -> Counter[Cell]:
@@ -44,48 +54,89 @@ class Level:
 
 
 @cache
-def levels_by_factor(study: Study) -> list[list[Level]]:
-    """The levels of each factor in which the trials of drivers differ.
+def levels_by_factor(study: Study, by: str = "", at: str = "") -> list[list[Level]]:
+    """The levels of each factor in which the trials of drivers differ, the reference first.
 
-    Trials of scripted stand-ins are never pooled with others.
+    Trials of scripted stand-ins are never pooled with others. Where there are several levels of the
+    factor ``by``, the trials are those ``at`` one of them.
     """
-    kinds = [[g for g in study.models if g.scripted == scripted] for scripted in (False, True)]
-    apart = all(kinds)
+    chosen = [group for group in study.models if not by or group.levels.get(by) == at]
+    kinds = [[g for g in chosen if g.scripted == scripted] for scripted in (False, True)]
+    apart = any(g.scripted for g in study.models) and not all(g.scripted for g in study.models)
     return [
-        [_level(groups, factor, name, apart=apart) for name in levels]
+        [_level(groups, factor, name, by, apart=apart) for name in levels]
         for groups in kinds
-        for factor, levels in levels_of(groups).items()
+        for factor, levels in levels_of(groups, study.order).items()
         if len(levels) > 1
     ]
 
 
-def _level(every: list[Group], factor: str, name: str, *, apart: bool) -> Level:
+def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) -> Level:
     groups = [group for group in every if group.levels.get(factor) == name]
     parts = []
     for group in groups:
-        others = tuple(f"{n}={level}" for n, level in group.levels.items() if n != factor)
+        others = [f"{n}={level}" for n, level in group.levels.items() if n not in (factor, by)]
+        others += [group.mark.strip()] * bool(group.mark)  # another setting of the task
         cells = [(condition, *others) for condition in group.trials["condition"]]
         parts.append(group.trials.assign(cell=pd.Series(cells, group.trials.index, dtype=object)))
     pooled = replace(groups[0], trials=pd.concat(parts, ignore_index=True))
     said = {group.posing for group in groups}
     posing = said.pop() if len(said) == 1 else "scripted stand-ins"
     mark = " [scripted]" if apart and posing else ""
-    return Level(factor, name, tuple(group.id for group in groups), pooled, posing, mark)
+    at = f"{by}={groups[0].levels[by]}" if by else ""
+    return Level(factor, name, tuple(group.id for group in groups), pooled, posing, mark, at)
 
 
-def difference(level: Level, first: Level, metric: Metric) -> Difference | None:
-    """A level minus the first one: rates over all trials, means within cells.
+def difference(study: Study, level: Level, first: Level, metric: Metric) -> Difference | None:
+    """A level minus the first one, within the cells that both have.
 
-    None for medians, which have no test here, and where nothing can be compared.
+    None where these are of several studies, or share no cell; and for medians, which have no test.
     """
-    if metric.rate:
-        rates = counts(level.pooled, metric), counts(first.pooled, metric)
-        return contrast_rates(*rates) if all(n for _, n in rates) else None
-    if metric.estimator == "median":
+    if metric.estimator == "median" or not in_one_study(study, level.pooled, first.pooled):
         return None
-    trials = (trials_of(each.pooled, metric) for each in (level, first))
-    one, other = (each.assign(condition=each["cell"]) for each in trials)
+    one, other = _by_cell(metric, level, first)
+    if metric.rate:
+        both = shared_cells(one, other, metric.column)
+        return contrast_cells(both) if both else None
     return contrast_means(one, other, metric.column)
+
+
+def difference_of_medians(study: Study, level: Level, first: Level, metric: Metric) -> float | None:
+    """A level's median minus that of the first one, in the cells that both have."""
+    if not in_one_study(study, level.pooled, first.pooled):
+        return None
+    one, other = (each[metric.column].median() for each in _in_shared_cells(metric, level, first))
+    return None if isnan(one) or isnan(other) else float(one - other)
+
+
+def interaction(
+    study: Study, pair: tuple[Level, Level], others: tuple[Level, Level], metric: Metric
+) -> Difference | None:
+    """How far the difference of a ``pair`` of levels differs from that of two ``others``.
+
+    It is taken in the cells that all four have; None as in ``difference``.
+    """
+    every = (*pair, *others)
+    if metric.estimator == "median" or not in_one_study(study, *(each.pooled for each in every)):
+        return None
+    a, b, c, d = _in_shared_cells(metric, *every)
+    if metric.rate:
+        one, other = (shared_cells(*each, metric.column) for each in ((a, b), (c, d)))
+        return interaction_of_rates(one, other) if one and other else None
+    return interaction_of_means(within(a, b, metric.column), within(c, d, metric.column))
+
+
+def _by_cell(metric: Metric, *levels: Level) -> list[pd.DataFrame]:
+    """The trials of each level that have a measure, with their cell as condition."""
+    frames = (trials_of(level.pooled, metric).dropna(subset=[metric.column]) for level in levels)
+    return [frame.assign(condition=frame["cell"]) for frame in frames]
+
+
+def _in_shared_cells(metric: Metric, *levels: Level) -> list[pd.DataFrame]:
+    """The same in the cells that all levels have."""
+    frames = _by_cell(metric, *levels)
+    shared = set.intersection(*(set(frame["condition"]) for frame in frames))
+    return [frame[frame["condition"].isin(shared)] for frame in frames]
 
 
 def balance(levels: list[Level]) -> str:

@@ -32,6 +32,7 @@ from analysis.stats.contrasts import SEED, corrected
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import Difference, difference
 from analysis.stats.mixed import MIN_PAIRS
+from merge_runner.drivers.registry import has_chance
 from merge_runner.records import SIDES
 
 # Accelerations in m/s² at which distributions are compared; none is beyond with the human vehicle.
@@ -162,13 +163,17 @@ def acts(study: Study, seat: Seat) -> Acts:
 
 
 def repeats_itself(study: Study, seat: Seat) -> bool:
-    """Whether one of a mixed pair does the same first in all repetitions of each situation.
+    """Whether one of a mixed pair declares no chance, and repeats its first action.
 
-    They are the same action again, as of a driver without chance. The trials of equal drivers
-    without chance are equal, and are left out of their group.
+    The trials of two drivers without chance are equal, and are left out of their group.
     """
     rows = _rows(study, seat)
     own = rows[rows["side"] == seat.side]
+    trials = seat.group.ended
+    sat = np.where(trials["ego"] == seat.side, *SIDES)
+    known = set(zip(trials["spec_hash"], sat, strict=True))
+    if any(has_chance(study.specs.get(name, {}), [side]) for name, side in known):
+        return False
     ways = own.groupby("condition")["first_mps2"].agg(["size", np.ptp])
     return len(ways) < len(own) and bool((ways["ptp"] < SAME_MPS2).all())
 

@@ -11,7 +11,7 @@ from functools import cache
 from analysis.data.reference_data import published
 from analysis.data.study import Group, Study
 from analysis.stats.ceiling import Ceiling, Population, ceiling, imported_humans, published_humans
-from analysis.stats.indicators import PAPER, ROBUST, Verdict, verdicts
+from analysis.stats.indicators import INDICATORS, PAPER, ROBUST, Verdict, verdicts
 from analysis.stats.likeness import likeness
 from analysis.stats.regressions import Regression, gap_ols, who_first_firth, who_first_logit
 
@@ -105,6 +105,8 @@ def score(study: Study, group: Group) -> Score:
             paper[name] = Verdict(bool(row[name.lower()]), PUBLISHED)
         paper["I5"] = Verdict(bool(row["i5"]), BY_EYE)
         robust["I5"] = Verdict(None, BY_EYE)
+    elif group.caution:
+        paper = robust = dict.fromkeys(INDICATORS, Verdict(None, group.caution))
     elif group is study.human:
         paper["I5"] = robust["I5"] = Verdict(None, REFERENCE)
     else:

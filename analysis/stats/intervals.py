@@ -51,11 +51,31 @@ def proportion(successes: int, n: int) -> Estimate:
     """
     if n == 0:
         return Estimate(None, None, None, 0)
-    z, p = Z, successes / n
+    return Estimate(successes / n, *wilson(successes / n, n), n)
+
+
+def wilson(p: float, n: float, z: float = Z) -> tuple[float, float]:
+    """Return the score interval of a proportion of ``n`` trials at a quantile ``z``."""
     middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z / (1 + z**2 / n) * sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     # The exact bounds at 0 and n are 0 and 1; rounding must not leave the estimate outside.
-    return Estimate(p, min(p, max(0.0, middle - half)), max(p, min(1.0, middle + half)), n)
+    return min(p, max(0.0, middle - half)), max(p, min(1.0, middle + half))
+
+
+def newcombe(rates: Sequence[tuple[float, float]], z: float = Z) -> tuple[float, float]:
+    """Return the interval of a difference of rates, (rate, trials) each (Newcombe 1998).
+
+    The first is added, the second subtracted, and so on in turn.
+    """
+    value, below, above = 0.0, 0.0, 0.0
+    for place, (rate, n) in enumerate(rates):
+        low, high = rate - wilson(rate, n, z)[0], wilson(rate, n, z)[1] - rate
+        if place % 2:
+            value, low, high = value - rate, high, low
+        else:
+            value += rate
+        below, above = hypot(below, low), hypot(above, high)
+    return value - below, value + above
 
 
 def mean(values: Sequence[float] | NDArray[np.float64]) -> Estimate:

@@ -2,8 +2,9 @@
 
 Who merged first is left ~ (h + dv) x source (logit), the gap is ~ (|h| + |dv| + h*dv) x source
 (least squares); source is 1 for the driver and 0 for the humans. Since it stands in every term, the
-likelihood, and Firth's penalty, fall apart into one factor of the humans and one of the driver: an
-interaction is the driver's coefficient minus the humans' (see ``regressions.differences``).
+likelihood falls apart into one factor of the humans and one of the driver: an interaction is the
+driver's coefficient minus the humans' (see ``regressions.differences``). Where one of the two is
+separated, it has no finite estimate, and there is none.
 
 The driver's trials are independent: Fisher's information in the logit, HC3 errors for the gap. The
 humans' come from pairs who differ: a jackknife over the pairs (CV3 of MacKinnon, Nielsen and Webb
@@ -12,8 +13,8 @@ humans' come from pairs who differ: a jackknife over the pairs (CV3 of MacKinnon
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from math import sqrt
 
@@ -24,7 +25,6 @@ from analysis.data.study import Group
 from analysis.stats.group_scores import fits
 from analysis.stats.intervals import Difference
 from analysis.stats.mixed import MIN_PAIRS
-from analysis.stats.penalised import FIRTH, firth_differences
 from analysis.stats.regressions import (
     GAP_TERMS,
     WHO_FIRST_TERMS,
@@ -64,11 +64,9 @@ class Interaction:
 @cache
 def interactions(human: Group, group: Group) -> tuple[Interaction, ...]:
     """How a driver differs from the humans: in who merged first, then in the gap, by term."""
-    mine, theirs = fits(group).hc3, _human_gap(human)
-    found = differences(mine, theirs, "least squares")
     return (
-        *_of_who_first(human, group),
-        *_by_term(GAP, mine, theirs, found, theirs.remark),
+        *_by_term(WHO_FIRST, fits(group).logit, _human_who_first(human), "ML"),
+        *_by_term(GAP, fits(group).hc3, _human_gap(human), "least squares"),
     )
 
 
@@ -98,28 +96,9 @@ def by_pairs(
     return Regression(whole.n, terms, freedom=freedom, remark=remark)
 
 
-def _of_who_first(human: Group, group: Group) -> list[Interaction]:
-    """By maximum likelihood, or by Firth's where one of the two has no finite estimate."""
-    mine, theirs = fits(group).logit, _human_who_first(human)
-    if mine.terms and theirs.terms:
-        found = differences(mine, theirs, "ML")
-        return _by_term(WHO_FIRST, mine, theirs, found, theirs.remark)
-    remark = theirs.remark if theirs.terms and NARROW in theirs.remark else f"Firth's fit: {NARROW}"
-    mine, theirs = fits(group).firth, fits(human).firth
-    found = firth_differences(group, human)
-    if any(one.by != FIRTH for one in found.values()):
-        mine = replace(mine, problem="Firth's penalised joint fit does not converge")
-    return _by_term(WHO_FIRST, mine, theirs, found, remark)
-
-
-def _by_term(
-    outcome: str,
-    driver: Regression,
-    human: Regression,
-    found: Mapping[str, Difference],
-    remark: str,
-) -> list[Interaction]:
+def _by_term(outcome: str, driver: Regression, human: Regression, by: str) -> list[Interaction]:
     """An interaction with the source for each term, or why there is none."""
+    found = differences(driver, human, by)
     problem = driver.problem or (f"humans: {human.problem}" if human.problem else "")
     steady = "neither the driver nor the humans vary: there is nothing to test"
     return [
@@ -133,7 +112,7 @@ def _by_term(
             driver.terms[term].b,
             human.terms[term].b,
             found[term],
-            remark=remark,
+            remark=human.remark,
         )
         for term in (WHO_FIRST_TERMS if outcome == WHO_FIRST else GAP_TERMS)
     ]

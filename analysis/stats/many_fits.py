@@ -133,7 +133,7 @@ def firth_differences(draws: Draws, others: Draws, term: str) -> Fits:
     """By term how the coefficients of two groups differ, first minus second.
 
     Of one model of both in which every term may differ between them, with a penalised
-    likelihood-ratio test of one term's difference, as ``penalised.firth_differences`` has it.
+    likelihood-ratio test of one term's difference.
     """
     own, rest = draws.logit_design, others.logit_design
     design = np.block([[rest, 0 * rest], [own, own]])

@@ -1,4 +1,4 @@
-"""Who merges first by Firth's penalised likelihood: profile intervals, and how two groups differ.
+"""Who merges first by Firth's penalised likelihood: profile intervals.
 
 Likelihood-ratio tests and profile intervals hold where the data are separated, and Wald's do not
 (Heinze and Schemper 2002). All trials are taken as independent.
@@ -7,7 +7,6 @@ Likelihood-ratio tests and profile intervals hold where the data are separated, 
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -16,19 +15,16 @@ from scipy.linalg import LinAlgError
 
 from analysis.data.study import Group
 from analysis.stats.group_scores import fits
-from analysis.stats.intervals import LEVEL, Difference
+from analysis.stats.intervals import LEVEL
 from analysis.stats.regressions import (
     MAX_ITERATIONS,
     WHO_FIRST_TERMS,
     Array,
-    differences,
     who_first_data,
 )
 
 if TYPE_CHECKING:
     from firthmodels import FirthLogisticRegression
-
-FIRTH, WALD = "Firth", "Firth, Wald"
 
 
 @cache
@@ -42,33 +38,6 @@ def firth_intervals(group: Group) -> dict[str, tuple[float, float]]:
         term: _profile(fit, index) for term, index in zip(WHO_FIRST_TERMS, (2, 0, 1), strict=True)
     }
     return {term: bounds for term, bounds in found.items() if bounds is not None}
-
-
-@cache
-def firth_differences(group: Group, other: Group) -> dict[str, Difference]:
-    """By term: the group's coefficient minus the other's; empty where one of the fits is missing.
-
-    Test and interval are of the penalised likelihood of one model of both groups, in which every
-    term may differ between them; what is detectable is Wald's. Where that does not converge all is
-    Wald's, which is too wide under separation, and ``by`` says so.
-    """
-    found = differences(fits(group).firth, fits(other).firth, WALD)
-    if not found:
-        return {}
-    (own, left), (rest, other_left) = who_first_data(group.outcomes), who_first_data(other.outcomes)
-    design = np.block([[rest, 0 * rest], [own, own]])
-    fit = _fitted(design, np.concatenate([other_left, left]))
-    if not fit.converged_:
-        return found
-    first = design.shape[1] - len(WHO_FIRST_TERMS) - 1  # the common intercept is not a column
-    return {term: _tested(fit, first + i, found[term]) for i, term in enumerate(WHO_FIRST_TERMS)}
-
-
-def _tested(fit: FirthLogisticRegression, index: int, wald: Difference) -> Difference:
-    bounds, p = _profile(fit, index), float(fit.lrt(features=index).lrt_pvalues_[index])
-    if bounds is None or not np.isfinite(p):
-        return wald
-    return replace(wald, low=bounds[0], high=bounds[1], p=p, by=FIRTH)
 
 
 def _fitted(design: Array, left: Array) -> FirthLogisticRegression:

@@ -28,8 +28,9 @@ GAP_TERMS = (
     "headway_x_velocity",
 )
 BY_SIDE = ("the left vehicle", "the right vehicle")
-# firthmodels' default of 25 is too few under separation.
+# The defaults of firthmodels, 25 and 1e-4, are too few and too coarse under separation.
 MAX_ITERATIONS = 1000
+TOLERANCE = 1e-6
 # Gaps of a program can be equal but for the rounding of a step: that is no effect.
 STEADY_GAP_M = 0.01
 
@@ -161,7 +162,9 @@ def who_first_firth(trials: pd.DataFrame) -> Regression:
     problem = _unidentified(design, left, vehicles(trials))
     if problem:
         return Regression(len(left), {}, problem)
-    fit = FirthLogisticRegression(max_iter=MAX_ITERATIONS).fit(design[:, 1:], left)
+    fit = FirthLogisticRegression(max_iter=MAX_ITERATIONS, gtol=TOLERANCE, xtol=TOLERANCE).fit(
+        design[:, 1:], left
+    )
     if not fit.converged_:
         return Regression(len(left), {}, "Firth's penalised fit does not converge")
     fit.lrt()

@@ -1,15 +1,14 @@
-"""Coefficients of a prompt variant against those of its driver's baseline."""
+"""Coefficients of a prompt variant against those of its driver's reference prompt."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-from analysis.data.study import BASELINE, Group, Study
+from analysis.data.study import Group, Study, in_one_study
 from analysis.stats.contrasts import corrected
 from analysis.stats.group_scores import fits
 from analysis.stats.intervals import Difference
-from analysis.stats.penalised import firth_differences
 from analysis.stats.regressions import differences
 
 Differences = Callable[[Group, Group], Mapping[str, Difference]]
@@ -25,18 +24,18 @@ class Corrected:
 
 
 def variants(study: Study) -> Iterator[tuple[Group, Group | None]]:
-    """Every variant with its driver's baseline, None where that was not played."""
-    baselines = {group.driver: group for group in study.models if group.setting == BASELINE}
+    """Every prompt with its driver's reference, None where that was not played."""
+    references = {group.driver: group for group in study.models if group.setting == study.reference}
     for group in study.models:
-        if group.setting != BASELINE:
-            yield group, baselines.get(group.driver)
+        if group.setting != study.reference:
+            yield group, references.get(group.driver)
 
 
 def corrected_differences(study: Study, compare: Differences) -> dict[tuple[str, str], Corrected]:
     """By group and term what there is; a family is one term of one driver over its variants."""
     families: dict[tuple[str, str], dict[str, Difference]] = {}
     for group, baseline in variants(study):
-        if baseline is not None:
+        if baseline is not None and in_one_study(study, group, baseline):
             for term, found in compare(group, baseline).items():
                 families.setdefault((group.driver, term), {})[group.id] = found
     return {
@@ -54,11 +53,5 @@ def gap_differences(group: Group, baseline: Group) -> dict[str, Difference]:
 
 
 def who_first_differences(group: Group, baseline: Group) -> dict[str, Difference]:
-    """By term of the logit; of Firth's fits where one of the two is not finite.
-
-    Empty where these do not exist either.
-    """
-    one, other = fits(group).logit, fits(baseline).logit
-    if one.problem or other.problem:
-        return firth_differences(group, baseline)
-    return differences(one, other, "logit")
+    """By term of the logit; empty where one of the two has no finite estimate."""
+    return differences(fits(group).logit, fits(baseline).logit, "logit")

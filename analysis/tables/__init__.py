@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analysis.data.derived_cache import finished, keep_finished, present_state
-from analysis.tables.formats import value_rows
-from analysis.tables.model import Table, from_text, options_text, to_text
-from merge_runner.errors import UsageError
+from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
+from analysis.tables.formats import value_names, value_rows
+from analysis.tables.model import Row, Table, Value, from_text, to_text
+from merge_runner.errors import unknown_name
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from analysis.data.study import Study
+    from analysis.data.study import Group, Study
 
 # Maps each table to its module. A module is imported only when its table is computed, so that a
 # table stored in the database can be shown without waiting for pandas.
@@ -45,11 +46,32 @@ TABLES = {
 }
 
 
+# Tables of drivers that were only asked, and those that also have these.
+OF_ASKED, OF_BOTH = ("first-look-surface",), ("first-action", "first-action-faults")
+
+
 def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
     """Compute the named tables, or all of them; raises UsageError for an unknown name."""
     from analysis.tables.against import placed
+    from analysis.tables.notes import footnoted
 
-    return [placed(_maker(name)(study), study.groups) for name in _valid(names)]
+    made = [_with_unjudged(_maker(name)(study), study) for name in _valid(names)]
+    return [placed(footnoted(table, study), study) for table in made]
+
+
+def _with_unjudged(table: Table, study: Study) -> Table:
+    """The table with a row, of a note alone, for each group that it leaves out as not judged."""
+    groups = study.unjudged if table.name not in OF_ASKED else []
+    groups = groups + (study.unjudged_asked if table.name in (*OF_ASKED, *OF_BOTH) else [])
+    rows = [Row(group.id, (group.id,), _named(table, group), group.unjudged) for group in groups]
+    shown = {name for row in table.rows for name in row.groups}
+    return replace(table, rows=[*table.rows, *(row for row in rows if row.id not in shown)])
+
+
+def _named(table: Table, group: Group) -> dict[str, Value]:
+    if any(column.name == "driver" for column in table.columns):
+        return {"driver": group.label, "setting": group.setting}
+    return {table.columns[0].name: group.id}
 
 
 def finished_tables(
@@ -58,14 +80,16 @@ def finished_tables(
     names: Sequence[str] = (),
     study: Study | None = None,
     where: Mapping[str, Sequence[str]] | None = None,
+    file: str | None = None,
+    by: str | None = None,
 ) -> list[Table]:
     """The named tables of a database, or all: read from it where stored, else computed.
 
-    ``models`` and ``where`` restrict the tables as they do a study; ``study`` is theirs, if the
-    caller already has it. Raises UsageError for an unknown name.
+    ``study`` stands in the place of the options of one, if the caller already has it. Raises
+    UsageError for an unknown name.
     """
     wanted = _valid(names)
-    options = options_text(db, models, where)
+    options = study.options if study else options_text(db, models, where, file, by)
     state = study.state if study else present_state(db)
     kept = finished(db, state, options, wanted)
     found = {name: from_text(text) for name, text in kept.items()}
@@ -74,7 +98,7 @@ def finished_tables(
     if missing:
         from analysis.data.study import Study
 
-        study = study or Study(db, models, where)
+        study = study or Study(db, models, where, file, by)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
         # The state is the one before the study was read: trials stored since then outdate it.
         keep_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})
@@ -93,13 +117,22 @@ def table(study: Study | Path | str, name: str) -> pd.DataFrame:
 
     read = study if isinstance(study, Study) else Study(study)
     (made,) = make_tables(read, [name])
-    return pd.DataFrame(value_rows(made)).set_index("row")
+    frame = pd.DataFrame(value_rows(made)).set_index("row")
+    numbers = (
+        name
+        for column in made.columns
+        if column.kind in {"count", "number", "percent", "p", "interval"}
+        for name in value_names(column)
+    )
+    # Where all are missing pandas cannot tell; a published p may be the text <0.001.
+    missing = [name for name in numbers if frame[name].isna().all()]
+    return frame.astype(dict.fromkeys(missing, "float64"))
 
 
 def _valid(names: Sequence[str]) -> Sequence[str]:
     for name in names:
         if name not in TABLES:
-            raise UsageError(f"there is no table {name!r}; valid: {', '.join(TABLES)}")
+            raise unknown_name("table", name, TABLES)
     return names or tuple(TABLES)
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import pandas as pd
 
 from analysis.data.reference_data import citation, published
-from analysis.data.study import HUMAN, Group
+from analysis.data.study import HUMAN, Group, Study
 from analysis.metrics import shown_in
 from analysis.stats.indicators import INDICATORS
 from analysis.tables.model import Column, Row, Table, Value
-from merge_runner.drivers.registry import EMULATOR
+from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
 
 PAPER = "paper"
@@ -41,14 +40,14 @@ COLUMNS = {
 INDICATOR_ROWS = {**{f"I{i}": f"i{i}" for i in range(1, 6)}, "score": "score"}
 
 
-def placed(table: Table, groups: Iterable[Group]) -> Table:
+def placed(table: Table, study: Study) -> Table:
     """The table, each of whose rows now names the paper's driver to compare it with.
 
     That is the driver of exactly the same name, provided that no stand-in answered for it.
     """
     if not in_paper(table):
         return table
-    known = {group.id: group for group in groups}
+    known = {group.id: group for group in (*study.groups, *study.unjudged)}
     return replace(table, rows=[_placed(row, known[row.groups[0]]) for row in table.rows])
 
 
@@ -57,9 +56,10 @@ def _placed(row: Row, group: Group) -> Row:
     # same driver: it only draws other samples.
     (asked, *others) = group.models
     sample_set = "" if group.name == asked else f"/set{group.trials['sample_set'].iloc[0]}"
-    own = not others and group.name == asked + sample_set and not group.scripted
-    # The emulator under its own name misleads nobody.
-    posing = group.scripted and group.models != (EMULATOR,)
+    apart = group.scripted or group.unjudged
+    own = not others and group.name == asked + sample_set and not apart
+    # A mock model under its own name misleads nobody.
+    posing = group.scripted and not MOCKS.issuperset(group.models)
     return replace(
         row,
         beside=asked if own and asked in DRIVERS else "",

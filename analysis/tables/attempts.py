@@ -19,7 +19,7 @@ FALLBACK = (
 
 def attempts(study: Study) -> Table:
     """A row per driver and variant: trials, calls, attempts, and what went wrong with them."""
-    found = {group.id: tally(study, group) for group in study.models}
+    found = {group.id: tally(study, group.stored) for group in study.played}
     # Only the reasons that occur get a column; those of ANSWERS have theirs even at zero.
     reasons = dict.fromkeys(
         reason for one in found.values() for reason in sorted(one.failures) if reason not in ANSWERS
@@ -28,7 +28,7 @@ def attempts(study: Study) -> Table:
         "attempts",
         "What became of the calls",
         _columns(study, tuple(reasons)),
-        [_row(group, found[group.id], tuple(reasons)) for group in study.models],
+        [_row(group, found[group.id], tuple(reasons)) for group in study.played],
         (
             "a call is asked at one decision, in one or more attempts; retried: another attempt "
             "followed, of all attempts; lost: the call ended without an answer, and its trial "
@@ -36,7 +36,7 @@ def attempts(study: Study) -> Table:
             "fallback: an older plan was driven, or none, of all decisions",
             "unknown: attempts that were under way when a run was killed, whose reply nobody saw; "
             "other model: answers of another model than the one asked for, by no declared alias",
-            *sample_notes(study, study.models),
+            *sample_notes(study, study.played),
         ),
     )
 

@@ -9,6 +9,7 @@ from analysis.stats.measures import values
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import measured_notes, sample_notes
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 from merge_runner.text_safety import quoted
 
 # Quartiles, since the human times are published as these; named as the columns of that file.
@@ -64,8 +65,9 @@ def criticality(study: Study) -> Table:
         columns,
         [_criticality(group) for group in study.measured],
         (
-            "medians and quartiles of the finished trials that have the measure: one that never "
-            "closes in after the merge has no time to collision",
+            "medians and quartiles of the finished trials that have the measure; vehicles that "
+            f"after the merge never close in faster than {NO_CONFLICT_MPS} m/s are in no conflict "
+            "and have no time to collision",
             *measured_notes(study),
         ),
     )

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from analysis.data.study import BASELINE, Group, Study
+from analysis.data.study import Group, Study, in_one_study
 from analysis.metrics import RULES_NOTE, Metric, compared
-from analysis.stats.contrasts import contrast_means, contrast_rates, corrected
+from analysis.stats.contrasts import (
+    contrast_cells,
+    contrast_means,
+    contrast_rates,
+    corrected,
+    shared_cells,
+)
 from analysis.stats.intervals import Difference
 from analysis.stats.measures import (
     counts,
@@ -18,14 +24,18 @@ from analysis.stats.measures import (
     values,
 )
 from analysis.tables.model import Column, Row, Table
-from analysis.tables.notes import listed, sample_notes
+from analysis.tables.notes import listed, replayed_notes, sample_notes
+from merge_runner.study.file import BASELINE
 
 # The columns that rest on human outcomes, in rows whose metric does.
 COLUMNS = ("difference", "ci", "p", "p_holm", "p_bh", "n", "n_reference")
 
 
 def contrasts(study: Study) -> Table:
-    """Every variant against its driver's baseline, and every baseline against the humans."""
+    """Every prompt against its driver's reference, and every baseline against the humans.
+
+    Without a baseline it is the reference that is set against the humans.
+    """
     rows: list[Row] = []
     for driver in dict.fromkeys(group.driver for group in study.models):
         # A family is one question asked of several variants. Correcting over all metrics at once
@@ -35,7 +45,7 @@ def contrasts(study: Study) -> Table:
     rows += _against_humans(study)
     return Table(
         "contrasts",
-        "Differences from the baseline prompt, and of the baseline from humans",
+        "Differences between prompts, and from humans",
         (
             Column("driver", "driver"),
             Column("setting", "setting"),
@@ -59,15 +69,18 @@ def contrasts(study: Study) -> Table:
         ),
         rows,
         (
-            "rates: Fisher's exact test; means: their difference within conditions, tested by "
-            "permutation, seeded; a family is one measure of one driver over its variants, or over "
-            "all drivers against humans",
+            "prompts are compared within the conditions that both have: rates by the weights of "
+            "Mantel and Haenszel, with Newcombe's interval and Fisher's exact test within "
+            "conditions; means by least squares, with a seeded permutation test. Against humans "
+            "rates are compared over all trials. A family is one measure of one driver over its "
+            "prompts, or over all drivers against humans",
             "detectable: the smallest difference that is found at p < .05, before correction, with "
             "a power of .8; rates: by the exact power of Fisher's test, the reference's true rate "
             "being the observed one, in the direction in which less is enough; means: (t.975 + "
             "t.8) times the standard error of the linear model",
             RULES_NOTE,
             *_recordings_note(study),
+            *replayed_notes(study),
             *shared_notes(study),
             *sample_notes(study, study.groups),
             *([] if rows else ["there is no pair of groups to compare"]),
@@ -76,20 +89,29 @@ def contrasts(study: Study) -> Table:
 
 
 def _family(study: Study, driver: str, metric: Metric) -> list[Row]:
-    """One measure of a driver's variants against its baseline."""
+    """One measure of a driver's variants against its reference prompt."""
     groups = [group for group in study.models if group.driver == driver]
-    baseline = next((group for group in groups if group.setting == BASELINE), None)
-    if baseline is None:
+    reference = next((group for group in groups if group.setting == study.reference), None)
+    if reference is None:
         return []
-    pairs = [(group, baseline) for group in groups if group.setting != BASELINE]
-    return _corrected(pairs, metric, "baseline")
+    pairs = [
+        (group, reference)
+        for group in groups
+        if group is not reference and in_one_study(study, group, reference)
+    ]
+    return _corrected(pairs, metric, study.reference)
 
 
 def _against_humans(study: Study) -> Iterator[Row]:
-    """Every driver's baseline against the humans, for metrics whose human value can be tested."""
+    """Every driver against the humans, for metrics whose human value can be tested."""
     if study.human not in study.groups:
         return
-    pairs = [(group, study.human) for group in study.models if group.setting == BASELINE]
+    prompt = BASELINE if study.compared else study.reference
+    pairs = [
+        (group, study.human)
+        for group in study.models
+        if group.setting == prompt and not group.caution
+    ]
     for metric in compared():
         if known(study.human, metric) or _published_rate(metric) is not None:
             yield from _corrected(pairs, metric, "human")
@@ -149,10 +171,14 @@ def _note(group: Group, other: Group, metric: Metric) -> str:
 
 
 def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
-    if metric.rate:
-        first, second = counts(group, metric), _rate(other, metric)
-        return contrast_rates(first, second) if first[1] and second[1] else None
-    return contrast_means(trials_of(group, metric), trials_of(other, metric), metric.column)
+    frames = trials_of(group, metric), trials_of(other, metric)
+    if not metric.rate:
+        return contrast_means(*frames, metric.column)
+    if other.setting:
+        both = shared_cells(*frames, metric.column)
+        return contrast_cells(both) if both else None
+    first, second = counts(group, metric), _rate(other, metric)
+    return contrast_rates(first, second) if first[1] and second[1] else None
 
 
 def _rate(group: Group, metric: Metric) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from analysis.stats.intervals import Difference
 from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions, pairs_known
 from analysis.stats.mixed import MIN_PAIRS
 from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import sample_notes
+from analysis.tables.notes import replayed_notes, sample_notes
 from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
 
 OUTCOMES = {WHO_FIRST: "left first (logit)", GAP: "gap (m)"}
@@ -25,9 +25,8 @@ OF_HUMANS = ("n_human", "b_human", "difference", "ci", "p", "freedom", "detectab
 
 def differences(study: Study) -> Table:
     """Every driver's baseline against the humans: a row per outcome and term."""
-    drivers = [group for group in study.baselines if group is not study.human]
-    compared = drivers if study.human in study.groups else []
     human = study.human
+    compared = study.compared if human in study.groups else []
     rows = [_row(human, group, one) for group in compared for one in interactions(human, group)]
     return Table(
         "differences",
@@ -82,12 +81,12 @@ def differences(study: Study) -> Table:
             "relative velocity + headway : relative velocity) x source, source being 1 for the "
             "driver and 0 for humans; Source is the difference where the other terms are 0",
             "errors of the driver: Fisher's information (left first), HC3 (gap); of the humans: "
-            "jackknife over their pairs where these are known; t with Satterthwaite's df. Firth, "
-            "where maximum likelihood has no finite estimate: penalised likelihood ratios, and "
-            "Fisher's information for what is detectable",
+            "jackknife over their pairs where these are known; t with Satterthwaite's df. Where "
+            "maximum likelihood has no finite estimate, no difference can be estimated",
             "detectable: what a two-sided test at 5 % finds in four of five such studies, from "
             f"the standard error of this one; where {NARROW}, it is too small as well",
             "p is not corrected for the number of terms and drivers",
+            *replayed_notes(study),
             *sample_notes(study, [study.human, *compared] if rows else [], pooled=False),
             *([] if rows else ["there is no driver and no human to compare"]),
         ),

@@ -3,22 +3,60 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
 
-from analysis.data.study import Study
+from analysis.data.study import Study, levels_of
 from analysis.metrics import METRICS, RULES_NOTE, Metric, intervals_of
-from analysis.stats.factors import Level, balance, difference, levels_by_factor
+from analysis.stats.contrasts import corrected
+from analysis.stats.factors import (
+    Level,
+    balance,
+    difference,
+    difference_of_medians,
+    interaction,
+    levels_by_factor,
+)
+from analysis.stats.intervals import Difference
 from analysis.stats.measures import estimate, undecided
-from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.model import Column, Kind, Row, Table, Value
 from analysis.tables.notes import sample_notes
+from merge_runner.registry import require
+
+DIFFERENCES = (
+    "differences are from the reference, the level that stands first, in the cells that both have "
+    "(a cell is a condition with one level of each other factor): of rates by the weights of "
+    "Mantel and Haenszel, with Newcombe's interval and Fisher's exact test within cells; of means "
+    "by least squares, with a seeded permutation test within cells; of medians without a test"
+)
+INTERACTIONS = (
+    "an interaction (×) is the difference at that level minus the one at the first level of {by}, "
+    "in the cells that all four have: of rates by Newcombe's intervals, p being the level at which "
+    "they exclude 0; of means by Welch's t test"
+)
+
+NO_INTERACTION = "no interaction without cells that all four have, or without spread within cells"
 
 
 def factors(study: Study) -> Table:
-    """A row per factor, measure and level: the level's value, and how far it is from the first."""
-    found = levels_by_factor(study)
+    """A row per factor, measure and level: the level's value, and how far it is from the first.
+
+    Where the study is shown by a factor, each of its levels has rows of its own, and interactions.
+    """
+    by = study.by or ""
+    shown = [""]
+    if by:
+        shown = require(levels_of(study.models, study.order), "factor", by)
+    found = [levels for at in shown for levels in levels_by_factor(study, by, at)]
+    rows = [row for levels in found for row in _rows(study, levels)]
+    rows += _interactions(study, found) if by else []
+    tested = [row for row in rows if row.values.get("p") is not None]
+    judged = "judged " if study.unjudged else ""
     return Table(
         "factors",
-        "Each factor's levels, pooled over all other factors",
+        "Each factor's levels, pooled over all other factors" + (f", by {by}" if by else ""),
         (
+            *([Column("at", by)] if by else []),
             Column("factor", "factor"),
             Column("drivers", "drivers", optional=True),
             Column("measure", "measure"),
@@ -34,62 +72,56 @@ def factors(study: Study) -> Table:
             Column("n", "n", "count", 0, "of these, trials that count for the measure"),
             Column("value", "value", "number", 2, "the measure", optional=True),
             Column("ci", "95 % CI", "interval", 2, "of the measure", optional=True),
-            Column(
-                "difference",
-                "difference",
-                "number",
-                2,
-                "from the factor's first level",
-                optional=True,
-                of="both",
-            ),
-            Column(
-                "difference_ci",
-                "95 % CI",
-                "interval",
-                2,
-                "of the difference",
-                optional=True,
-                of="both",
-            ),
-            Column(
-                "p", "p", "p", 3, "Fisher's exact or permutation test", optional=True, of="both"
-            ),
+            _compared("difference", "difference", "number", "from the factor's reference"),
+            _compared("difference_ci", "95 % CI", "interval", "of the difference"),
+            _compared("p", "p", "p", "exact or permutation test"),
+            _compared("p_holm", "Holm", "p", "corrected by Holm"),
         ),
-        [row for levels in found for row in _rows(levels)],
+        list(_corrected(rows, tested)),
         (
-            *([] if found else ["the trials of drivers differ in no factor"]),
-            f"intervals: {intervals_of(METRICS.values())}. Differences of rates: of the pooled "
-            "rates, Newcombe's interval and Fisher's test; of means: within cells (a condition "
-            "with one level of each other factor), least squares and a seeded permutation test; "
-            "of medians: without a test. p is not corrected",
-            *(f"{levels[0].factor}{levels[0].mark}: {balance(levels)}" for levels in found),
+            *([] if found else [f"the trials of {judged}drivers differ in no factor"]),
+            f"intervals: {intervals_of(METRICS.values())}. {DIFFERENCES}",
+            *([INTERACTIONS.format(by=by)] if by else []),
+            *([f"Holm: corrected for all {len(tested)} p of the table"] if tested else []),
+            *(f"{_named(levels[0])}: {balance(levels)}" for levels in found),
             RULES_NOTE,
             *sample_notes(study, study.models),
         ),
     )
 
 
-def _rows(levels: list[Level]) -> Iterator[Row]:
+def _compared(name: str, heading: str, kind: Kind, meaning: str) -> Column:
+    digits = 3 if kind == "p" else 2
+    return Column(name, heading, kind, digits, meaning, optional=True, of="both")
+
+
+def _named(level: Level) -> str:
+    return f"{level.factor}{level.mark}" + (f" at {level.at}" if level.at else "")
+
+
+def _corrected(rows: list[Row], tested: list[Row]) -> Iterator[Row]:
+    """The rows with their p corrected for the number of all that are ``tested``."""
+    p = {row.id: float(str(row.values["p"])) for row in tested}
+    holm = dict(zip(p, corrected([*p.values()])[0], strict=True)) if p else {}
+    for row in rows:
+        extra = {"p_holm": float(holm[row.id])} if row.id in holm else {}
+        yield replace(row, values={**row.values, **extra})
+
+
+def _rows(study: Study, levels: list[Level]) -> Iterator[Row]:
     for metric in METRICS.values():
         for level in levels:
-            yield _row(level, levels[0], metric)
+            yield _row(study, level, levels[0], metric)
 
 
-def _row(level: Level, first: Level, metric: Metric) -> Row:
+def _row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
     found = estimate(level.pooled, metric)
-    cells: dict[str, Value] = {
-        "factor": level.factor,
-        "drivers": level.posing or None,
-        "measure": metric.heading,
-        "level": level.name,
-        "trials": len(level.pooled.ended),
-        "n": found.n,
-        "value": found.value,
-        "ci": found.bounds(),
-    }
+    cells = _cells(level, metric) | {"n": found.n, "value": found.value, "ci": found.bounds()}
     if level is not first:
-        cells |= _compared(level, first, metric)
+        if metric.estimator == "median":
+            cells |= {"difference": difference_of_medians(study, level, first, metric)}
+        else:
+            cells |= _difference(difference(study, level, first, metric), metric)
     nothing = "" if found.n else f"{metric.heading}: no trial with this measure"
     return Row(
         f"{level.id}/{metric.name}",
@@ -101,11 +133,20 @@ def _row(level: Level, first: Level, metric: Metric) -> Row:
     )
 
 
-def _compared(level: Level, first: Level, metric: Metric) -> dict[str, Value]:
-    if metric.estimator == "median":
-        one, other = (estimate(each.pooled, metric).value for each in (level, first))
-        return {} if one is None or other is None else {"difference": one - other}
-    found, unit = difference(level, first, metric), 100 if metric.rate else 1
+def _cells(level: Level, metric: Metric) -> dict[str, Value]:
+    """What every row of a level says."""
+    return {
+        "at": level.at.partition("=")[2],
+        "factor": level.factor,
+        "drivers": "mock" if level.posing else None,
+        "measure": metric.heading,
+        "level": level.name,
+        "trials": len(level.pooled.ended),
+    }
+
+
+def _difference(found: Difference | None, metric: Metric) -> dict[str, Value]:
+    unit = 100 if metric.rate else 1
     if found is None:
         return {}
     return {
@@ -113,3 +154,39 @@ def _compared(level: Level, first: Level, metric: Metric) -> dict[str, Value]:
         "difference_ci": found.bounds(unit),
         "p": found.p,
     }
+
+
+def _interactions(study: Study, found: list[list[Level]]) -> Iterator[Row]:
+    """A row for each level of a factor at each level of the other one, but for their references."""
+    known: dict[tuple[str, str], list[list[Level]]] = {}
+    for levels in found:
+        known.setdefault((levels[0].factor, levels[0].mark), []).append(levels)
+    tested = [metric for metric in METRICS.values() if metric.estimator != "median"]
+    for (base, *more), metric in product(known.values(), tested):
+        twins = {level.name: level for level in base[1:]}
+        for first, *levels in more:
+            for level in levels:
+                if level.name in twins and first.name == base[0].name:
+                    others = twins[level.name], base[0]
+                    yield _interaction(study, (level, first), others, metric)
+
+
+def _interaction(
+    study: Study, pair: tuple[Level, Level], others: tuple[Level, Level], metric: Metric
+) -> Row:
+    (level, first), (twin, base) = pair, others
+    by, _, at = level.at.partition("=")
+    cells = _cells(level, metric) | {
+        "at": f"{at} - {base.at.partition('=')[2]}",
+        "factor": f"{level.factor} × {by}",
+        "n": estimate(level.pooled, metric).n,
+    }
+    found = interaction(study, pair, others, metric)
+    return Row(
+        f"{level.id}/interaction/{metric.name}",
+        level.groups,
+        cells | _difference(found, metric),
+        "" if found else f"{metric.heading}: {NO_INTERACTION}",
+        metric.counts,
+        references=tuple(dict.fromkeys((*first.groups, *twin.groups, *base.groups))),
+    )

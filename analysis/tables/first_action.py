@@ -173,8 +173,8 @@ def _left_out_notes(study: Study) -> Iterator[str]:
         for seat in seats(group):
             if repeats_itself(study, seat):
                 yield (
-                    f"{seat.name}: it does the same first in all repetitions of a situation, as a "
-                    "driver without chance: each situation counts once"
+                    f"{seat.name}: it declares no chance, and does the same first in all "
+                    "repetitions of a situation: each situation counts once"
                 )
 
 

@@ -85,7 +85,7 @@ def _remarks(found: Sequence[FirstLooks]) -> Iterator[str]:
                 if remark and fit.n:
                     yield f"{looks.id}: {what}: {remark}"
         if not looks.sampled:
-            yield f"{looks.id}: no chance shows in its answers: each counts once, with no interval"
+            yield f"{looks.id}: it declares no chance: each answer counts once, with no interval"
 
 
 def _rate(found: Exchange) -> Estimate | None:

@@ -9,22 +9,27 @@ from __future__ import annotations
 
 import io
 import json
+import textwrap
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import accumulate, takewhile
 
 from analysis.table_format import TableFormat
 from analysis.tables.model import Column, Row, Table, Value
+from merge_runner.errors import unknown_name
 from merge_runner.prompts.blocks import title_of
 from merge_runner.text_safety import csv_writer, in_spreadsheet
 
 MISSING = "–"
+BETWEEN = "   "
 
 
-def render(tables: Sequence[Table], form: TableFormat) -> str:
-    """All tables as one text that ends without a line break."""
+def render(tables: Sequence[Table], form: TableFormat, width: int | None = None) -> str:
+    """All tables as one text that ends without a line break; ``width`` is that of a terminal."""
     if form is TableFormat.JSON:
         return json.dumps({"tables": [as_json(t) for t in tables]}, indent=2, ensure_ascii=False)
     write: Callable[[Table], str] = {
-        TableFormat.TEXT: as_text,
+        TableFormat.TEXT: lambda table: as_text(table, width),
         TableFormat.CSV: as_csv,
         TableFormat.MD: as_markdown,
         TableFormat.LATEX: as_latex,
@@ -38,33 +43,78 @@ def render(tables: Sequence[Table], form: TableFormat) -> str:
     )
 
 
-def as_text(table: Table) -> str:
-    """A table for the terminal, never cut: lines are as long as they need to be."""
+def with_columns(tables: Sequence[Table], names: Sequence[str]) -> list[Table]:
+    """The tables with these columns, after those that name a row; raises UsageError."""
+    known = dict.fromkeys(column.name for table in tables for column in table.columns)
+    for name in names:
+        if name not in known:
+            raise unknown_name("column", name, known)
+    return [
+        replace(
+            table,
+            columns=[
+                column
+                for place, column in enumerate(table.columns)
+                if column.name in names or place < _naming(table.columns)
+            ],
+        )
+        for table in tables
+    ]
+
+
+def _naming(columns: Sequence[Column]) -> int:
+    """How many columns at the left name a row."""
+    return sum(1 for _ in takewhile(lambda column: column.kind == "text", columns))
+
+
+def as_text(table: Table, width: int | None = None) -> str:
+    """A table for a terminal; without its ``width`` lines are as long as they need to be.
+
+    Columns that do not fit are left out from the right, and named.
+    """
     # Characters differ in width on a terminal, so len() would misalign the columns.
     from rich.cells import cell_len
 
-    columns = []
-    for column in shown_columns(table):
+    shown = shown_columns(table)
+    columns: list[list[str]] = []
+    for column in shown:
         cells = [_text(column, row.values.get(column.name)) for row in table.rows]
-        width = max(cell_len(cell) for cell in (column.heading, *cells))
-        blanks = [" " * (width - cell_len(cell)) for cell in (column.heading, *cells)]
+        widest = max(cell_len(cell) for cell in (column.heading, *cells))
+        blanks = [" " * (widest - cell_len(cell)) for cell in (column.heading, *cells)]
         columns.append(
             [
                 cell + blank if column.kind == "text" else blank + cell
                 for cell, blank in zip((column.heading, *cells), blanks, strict=True)
             ]
         )
-    lines = ["   ".join(cells) for cells in zip(*columns, strict=True)]
+    notes = notes_of(table)
+    if width is not None:
+        ends = accumulate(cell_len(cells[0]) + len(BETWEEN) for cells in columns)
+        fitting = max(sum(end - len(BETWEEN) <= width for end in ends), 1)
+        if left_out := [column.name for column in shown[fitting:]]:
+            notes.insert(
+                0,
+                f"wider than the terminal, so without {', '.join(left_out)}: --columns NAME,NAME "
+                "chooses, --format csv has all",
+            )
+        columns = columns[:fitting]
+    lines = [BETWEEN.join(cells) for cells in zip(*columns, strict=True)]
     lines[1:1] = ["─" * max(map(cell_len, lines))] if lines else []
-    notes = (f"  {note}" for note in notes_of(table))
-    return "\n".join([table.heading, *(line.rstrip() for line in lines), *notes])
+    texts = (_wrapped(f"  {note}", width) for note in notes)
+    return "\n".join([_wrapped(table.heading, width), *(line.rstrip() for line in lines), *texts])
+
+
+def _wrapped(text: str, width: int | None) -> str:
+    if width is None:
+        return text
+    return textwrap.fill(text, width, subsequent_indent="    ", break_on_hyphens=False)
 
 
 def as_csv(table: Table) -> str:
     """A table's values at full precision; an interval takes two columns."""
     out = io.StringIO()
     writer = csv_writer(out)
-    names = [name for column in table.columns for name in _names(column)]
+    names = [name for column in table.columns for name in value_names(column)]
     writer.writerow(["row", *names, "note"])
     for row in value_rows(table):
         writer.writerow(_exact(value) for value in row.values())
@@ -94,7 +144,7 @@ def value_rows(table: Table) -> list[dict[str, Value]]:
             **{
                 name: cell
                 for column in table.columns
-                for name, cell in zip(_names(column), _plain(column, row), strict=True)
+                for name, cell in zip(value_names(column), _plain(column, row), strict=True)
             },
             "note": row.note,
         }
@@ -200,7 +250,8 @@ def _exact(cell: Value) -> object:
     return repr(float(cell)) if isinstance(cell, float) else in_spreadsheet(cell)
 
 
-def _names(column: Column) -> tuple[str, ...]:
+def value_names(column: Column) -> tuple[str, ...]:
+    """The names of the values of a column: those of an interval are two."""
     if column.kind == "interval":
         return f"{column.name}_low", f"{column.name}_high"
     return (column.name,)

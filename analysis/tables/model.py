@@ -9,7 +9,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from math import isnan
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -138,10 +137,3 @@ def from_text(text: str) -> Table:
             row[name] = tuple(row[name])
     rows = [Row(**row) for row in content["rows"]]
     return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})
-
-
-def options_text(
-    db: Path, models: Sequence[str] | None, where: Mapping[str, Sequence[str]] | None = None
-) -> str:
-    """What a table depends on besides the results; the path, since its notes name the database."""
-    return json.dumps([str(db), models, where])

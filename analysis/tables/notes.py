@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
+
+import pandas as pd
 
 from analysis.data.intermittency import STEADY_MPS
 from analysis.data.reference_data import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
 from analysis.data.study import Group, Study
 from analysis.stats import ceiling
 from analysis.stats.likeness import MARGIN_SD
+from analysis.tables.model import Table
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 
@@ -38,10 +42,26 @@ def sample_notes(
         notes.append(
             f"{study.db} holds no trial of a model; `merge-runner sweep baseline` plays some"
         )
+    notes += _pooled_notes(study, [group for group in shown if group.setting])
     if study.human in study.groups:
         notes += [*_human_notes(study, pooled), *_own_notes(study, shown)]
     notes += [f"{group.id}: {repeated_note(group)}" for group in shown if group.repeated]
+    notes += [f"{group.id}: {equal_note(group)}" for group in shown if group.equal]
     return [*notes, *(f"{group.id}: {pair_note(group)}" for group in shown if group.is_mixed)]
+
+
+def _pooled_notes(study: Study, groups: list[Group]) -> Iterator[str]:
+    """Which studies the trials are of, where these are several."""
+    if study.file or len(study.studies.orders) < 2 or not groups:
+        return
+    trials = pd.concat([group.trials for group in groups])
+    sizes = {name: int(study.studies.holds(name, trials).sum()) for name in study.studies.orders}
+    named = [f"{name} ({n} trials)" for name, n in sizes.items() if n]
+    if len(named) > 1:
+        yield (
+            f"trials of several studies: {listed(named)}. No p is given for a difference across "
+            "studies; `--study FILE` keeps the trials of one"
+        )
 
 
 def measured_notes(study: Study) -> list[str]:
@@ -66,12 +86,44 @@ def _own_notes(study: Study, groups: list[Group]) -> list[str]:
     return [f"{', '.join(ids)}: {note}" for note, ids in whose.items()]
 
 
+def replayed_notes(study: Study) -> list[str]:
+    """Which baselines are not judged, since a human is replayed in them."""
+    return [
+        f"{group.id}: {group.caution}: it is not judged, nor compared with the humans"
+        for group in study.baselines
+        if group.caution
+    ]
+
+
+def footnoted(table: Table, study: Study) -> Table:
+    """The table with ``*`` for what is said of a stand-in or a replayed human, told in a note."""
+    groups = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
+    said = {text for group in groups for text in (group.posing, group.said)}
+    whose: dict[str, dict[str, None]] = {}
+    rows = []
+    for row in table.rows:
+        driver, _, text = str(row.values.get("driver")).removesuffix(")").rpartition(" (")
+        if text in said:
+            whose.setdefault(text, {})[driver] = None
+            row = replace(row, values={**row.values, "driver": f"{driver}*"})  # noqa: PLW2901
+        rows.append(row)
+    notes = (f"* {', '.join(drivers)}: {text}" for text, drivers in whose.items())
+    return replace(table, rows=rows, notes=(*table.notes, *notes))
+
+
 def repeated_note(group: Group) -> str:
     """Says that a deterministic driver repeats its trials."""
-    every = len(group.trials) + group.repeated
     return (
-        f"{group.repeated} of {every} trials repeat an earlier one to the last state, as of a "
-        "driver without chance: they are left out, and n counts the others"
+        f"{group.repeated} of {len(group.stored.trials)} trials repeat an earlier one to the last "
+        "state, of programs that declare no chance: they are left out, and n counts the others"
+    )
+
+
+def equal_note(group: Group) -> str:
+    """Says that trials of a language model are equal."""
+    return (
+        f"{group.equal} of {len(group.trials)} trials are as an earlier one to the last state; "
+        "each counts"
     )
 
 

@@ -1,11 +1,11 @@
-"""Tables III and IV for every prompt variant, with its differences from the baseline."""
+"""Tables III and IV for every prompt variant, with its differences from the reference prompt."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from analysis.data.study import Group, Study
+from analysis.data.study import Group, Study, in_one_study
 from analysis.stats.group_scores import Fits, fits
 from analysis.stats.intervals import POWER
 from analysis.stats.penalised import firth_intervals
@@ -24,14 +24,14 @@ from analysis.tables.notes import sample_notes
 from analysis.tables.regressions import WITH_GAP, WITH_MERGER, gap_row, key_columns, who_first_row
 
 FAMILY_NOTE = (
-    "difference: variant minus its driver's baseline; Holm, BH: corrected over the variants of a "
+    "difference: from the {} prompt of the same driver; Holm, BH: corrected over the variants of a "
     "driver, one term a family; detectable: the smallest difference that one such test, not yet "
     f"corrected, shows in {100 * POWER:.0f} % of studies of this size"
 )
 
 
 def who_first_variants(study: Study) -> Table:
-    """Table III with a row per group and term, and the differences from the baseline."""
+    """Table III with a row per group and term, and the differences from the reference prompt."""
     return Table(
         "who-first-variants",
         "Logistic regression of which driver merged first (1: left), for every prompt variant",
@@ -40,15 +40,12 @@ def who_first_variants(study: Study) -> Table:
             *_fit_columns("", "", "", "p", "Wald", WITH_MERGER),
             *_fit_columns("firth_", "Firth ", "", "LR p", "penalised likelihood", WITH_MERGER),
             *_difference_columns(WITH_MERGER),
-            Column("by", "fits", meaning="the fits that are compared", optional=True),
         ),
-        _rows(study, WHO_FIRST_TERMS, _who_first_row, who_first_differences, lambda fit: fit.firth),
+        _rows(study, WHO_FIRST_TERMS, _who_first_row, who_first_differences, lambda fit: fit.logit),
         (
-            FAMILY_NOTE,
-            "differences are tested by Wald's test; where one of the two fits has no finite "
-            "estimate, of Firth's fits by penalised likelihood ratio, with a profile interval and "
-            "an approximate detectable one (fits: Firth; Firth, Wald where the profile does not "
-            "converge)",
+            FAMILY_NOTE.format(study.reference),
+            "differences are tested by Wald's test; there is none where one of the two fits has no "
+            "finite estimate",
             *shared_notes(study),
             *sample_notes(study, study.groups),
         ),
@@ -56,7 +53,7 @@ def who_first_variants(study: Study) -> Table:
 
 
 def gap_variants(study: Study) -> Table:
-    """Table IV with a row per group and term, and the differences from the baseline."""
+    """Table IV with a row per group and term, and the differences from the reference prompt."""
     return Table(
         "gap-variants",
         "Linear regression of the gap at the merge point (m), for every prompt variant",
@@ -68,7 +65,7 @@ def gap_variants(study: Study) -> Table:
         ),
         _rows(study, GAP_TERMS, gap_row, gap_differences, lambda fit: fit.hc3),
         (
-            FAMILY_NOTE,
+            FAMILY_NOTE.format(study.reference),
             "differences are tested by Welch's t test with HC3 errors",
             *shared_notes(study),
             *sample_notes(study, study.groups),
@@ -98,7 +95,13 @@ def _difference_columns(counts: str) -> tuple[Column, ...]:
         return Column(name, heading, kind, digits, meaning, counts, optional=True, of="both")
 
     return (
-        column("difference", "difference", "number", 2, "of the coefficient from the baseline's"),
+        column(
+            "difference",
+            "difference",
+            "number",
+            2,
+            "of the coefficients",
+        ),
         column("difference_ci", "95 % CI", "interval", 2, "of the difference"),
         column("difference_p", "p", "p", 3, "of the difference, two-sided"),
         column("p_holm", "Holm", "p", 3, "corrected by Holm"),
@@ -131,7 +134,7 @@ def _rows(
             if one is not None:
                 plain = _with_difference(plain, baselines[group], one)
             elif group in baselines:
-                why = _why_none(group, baselines[group], compared)
+                why = _why_none(study, group, baselines[group], compared)
                 plain = replace(plain, note="; ".join(filter(None, (plain.note, why))))
             rows.append(plain)
     return rows
@@ -151,17 +154,20 @@ def _with_difference(row: Row, baseline: Group | None, one: Corrected) -> Row:
             "p_holm": one.holm,
             "p_bh": one.bh,
             "detectable": found.detectable,
-            "by": found.by,
         },
     )
 
 
-def _why_none(group: Group, baseline: Group | None, compared: Callable[[Fits], Regression]) -> str:
-    """Why a variant has no difference from its baseline, unless its own note already says so."""
-    # The note of its own regression names this problem.
-    if compared(fits(group)).problem:
-        return ""
+def _why_none(
+    study: Study, group: Group, baseline: Group | None, compared: Callable[[Fits], Regression]
+) -> str:
+    """Why a variant has no difference from its reference, unless its own note already says so."""
     if baseline is None:
-        return "no difference: its driver has no baseline"
-    problem = compared(fits(baseline)).problem or "neither fit leaves an error"
-    return f"no difference from {baseline.id}: {problem}"
+        return f"no difference: its driver has no {study.reference} prompt to compare with"
+    if not in_one_study(study, group, baseline):
+        return f"no difference from {baseline.id}: no study was played with all trials of both"
+    problem = compared(fits(baseline)).problem
+    # The note of its own regression names its own problem.
+    if not problem and compared(fits(group)).problem:
+        return ""
+    return f"no difference from {baseline.id}: {problem or 'neither fit leaves an error'}"

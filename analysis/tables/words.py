@@ -24,6 +24,7 @@ def words(study: Study) -> Table:
     """A row per driver and variant that said M or Y, and for each of a mixed pair that did."""
     every = [(seat, words_of(study, seat)) for group in study.models for seat in seats(group)]
     spoken = [(seat, found) for seat, found in every if found is not None]
+    judged = "judged " if study.unjudged else ""
     return Table(
         "words",
         "Words and deeds: what follows M (merge first) and Y (yield)",
@@ -36,7 +37,7 @@ def words(study: Study) -> Table:
             "the first word: Firth's logit of M on own projected headway (m) and own relative "
             "velocity (m/s), with penalised likelihood ratios; both drivers of a trial count, "
             "since neither knows the other's first word. It follows what has p < .05",
-            *([] if spoken else ["no driver said a tactical word"]),
+            *([] if spoken else [f"no {judged}driver said a tactical word"]),
             *sample_notes(
                 study, dict.fromkeys(seat.group for seat, _ in spoken), pooled=False, whole=False
             ),

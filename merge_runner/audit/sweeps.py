@@ -25,11 +25,12 @@ from merge_runner.audit.replies import (
 )
 from merge_runner.audit.slots import check_slots
 from merge_runner.audit.traces import GAPS, check_traces, reach_m
-from merge_runner.errors import StoreError, UsageError
+from merge_runner.errors import StoreError, UsageError, unknown_name
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.records import SIDES
 from merge_runner.results.database import append, by_name, read_database, room_for_texts
 from merge_runner.results.human_trials import read_human_trials
+from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.served_model import other_models
 from merge_runner.study.parts import adopt_declared, adopt_humans, adopted
 from merge_runner.text_safety import first_line
@@ -88,6 +89,14 @@ UNION ALL SELECT 'sweep_trials', trial_id, count(*) FROM sweep_trials
 ANTI JOIN sweeps USING (sweep_id) GROUP BY ALL
 ORDER BY ALL
 """
+# Of each driver, prompt and model that was asked how many decisions are invalid.
+DECIDED = f"""
+SELECT driver || '/' || variant, model, sum(invalid)::BIGINT, sum(asked)::BIGINT
+FROM ({ASKED_DECISIONS}) JOIN (SELECT trial_id, spec_hash, variant FROM trials)
+    USING (trial_id, spec_hash)
+JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
+GROUP BY driver, variant, model, spec_hash ORDER BY ALL
+"""  # noqa: S608 # constants
 LOOSE_TEXTS = {
     "trials": "no sweep has this trial",
     "sweep_trials": "it is a trial of a sweep that is not stored",
@@ -106,9 +115,7 @@ def audit_sweep(
     with _reading(path) as connection:
         known = _sweeps(connection)
         if sweep_id not in known:
-            raise UsageError(
-                f"{path} holds no sweep {sweep_id}; valid: {', '.join(known) or 'none'}"
-            )
+            raise unknown_name("sweep", sweep_id, known, f"in {path}")
         specs = _prepare(connection)
         config, ended = known[sweep_id]
         claims = ended if finished is None else finished
@@ -167,6 +174,7 @@ def _audit(
     audit.notes += _checked_elsewhere(connection, sweep_id)
     audit.notes += meaningless_ids(connection)
     audit.notes += _alike_notes(connection)
+    audit.notes += _not_judged(connection)
     if derive and config is not None:
         if any("data" in spec.driver(side) for spec in specs.values() for side in SIDES):
             adopt_humans(read_human_trials(connection))
@@ -325,6 +333,13 @@ def _alike_notes(connection: duckdb.DuckDBPyConnection) -> Iterable[str]:
             f"all {repeated} answers to prompts that were asked before are word for word as "
             "before: are they samples?"
         )
+
+
+def _not_judged(connection: duckdb.DuckDBPyConnection) -> Iterable[str]:
+    """Notes on drivers and prompts from whose trials nothing is concluded."""
+    for group, model, invalid, asked in connection.execute(DECIDED).fetchall():
+        if why := not_judged(model, invalid, asked):
+            yield f"{group}: {why}"
 
 
 def _counts(connection: duckdb.DuckDBPyConnection, sql: str) -> dict[str, int]:

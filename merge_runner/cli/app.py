@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import os
 import sys
 from collections.abc import Callable
 from copy import copy
@@ -16,7 +17,7 @@ from merge_runner.cli.ledger import ledger
 from merge_runner.cli.models import models
 from merge_runner.cli.output import print_out, say
 from merge_runner.cli.recording import recording_app
-from merge_runner.cli.results import audit, digest, export, forget, sql
+from merge_runner.cli.results import audit, digest, forget, sql
 from merge_runner.cli.seat import seat_app
 from merge_runner.cli.stand_in import emulate
 from merge_runner.cli.sweep import init, replay, sweep
@@ -24,6 +25,7 @@ from merge_runner.errors import MergeRunnerError, UsageError
 
 # A full disk, a limit of file sizes, and a device that fails.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
+COMPLETION = "_MERGE_RUNNER_COMPLETE"  # set by the shell's script that typer installs
 
 
 def _print_version(wanted: bool) -> None:
@@ -50,12 +52,12 @@ app = typer.Typer(
     name="merge-runner",
     help="Finds out whether a language model drives like a human.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 app.callback()(common)
-for _command in (init, sweep, replay, sql, export, digest, audit, ledger, forget, models, emulate):
+for _command in (init, sweep, replay, sql, digest, audit, ledger, forget, models, emulate):
     app.command()(_command)
 app.add_typer(recording_app, name="recording")
 app.add_typer(seat_app, name="seat")
@@ -93,9 +95,10 @@ def main() -> None:
     gc.set_threshold(20_000, 10, 100)
     debug = "--debug" in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != "--debug"]
+    completing = COMPLETION in os.environ  # a shell asks, whose words are not in argv
     words = (argument for argument in sys.argv[1:] if not argument.startswith("-"))
     try:
-        alone(next(words, None))()
+        (app if completing else alone(next(words, None)))(prog_name="merge-runner")
     except MergeRunnerError as exc:
         if debug:
             raise

@@ -25,7 +25,7 @@ def ledger(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before releasing.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what each sweep has spent, and what is set aside and why; or release that."""
+    """Show what each sweep has spent, and what is set aside."""
     from merge_runner.run import spending
 
     if release is None:

@@ -9,11 +9,49 @@ from typing import Annotated, Any
 import typer
 
 from merge_runner.errors import UsageError
+from merge_runner.paths import home_of
 
-DbOption = Annotated[Path, typer.Option("--db", help="The results database.")]
+
+def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> Path:
+    """Put a default beside the study's file, from wherever it is started."""
+    source = ctx.get_parameter_source(str(param.name))
+    study = next(filter(None, map(ctx.params.get, ("name", "study", "study_file"))), "")
+    return home_of(study) / path if source is not None and source.name == "DEFAULT" else path
 
 
-CacheOption = Annotated[Path, typer.Option("--cache", help="The folder of recorded replies.")]
+DbOption = Annotated[
+    Path,
+    typer.Option(
+        "--db",
+        metavar="FILE",
+        callback=beside_study,
+        help="The results database; that of a study's file lies beside it.",
+    ),
+]
+
+
+CacheOption = Annotated[
+    Path,
+    typer.Option(
+        "--cache",
+        metavar="DIR",
+        callback=beside_study,
+        help="The folder of recorded replies; that of a study's file lies beside it.",
+    ),
+]
+
+
+def _drivers() -> list[str]:
+    from merge_runner.drivers.registry import PROGRAMS
+    from merge_runner.llm.models import load_models
+
+    return [*load_models(), *PROGRAMS]
+
+
+def _studies() -> list[str]:
+    from merge_runner.study.file import study_files
+
+    return sorted(study_files())
 
 
 ModelOption = Annotated[
@@ -21,6 +59,7 @@ ModelOption = Annotated[
     typer.Option(
         "--model",
         metavar="NAME",
+        autocompletion=_drivers,
         help="A model of the registry, a program, or LEFT+RIGHT; may be given more than once. "
         "Else those of the study's file, or the emulator.",
     ),
@@ -45,39 +84,49 @@ MirrorOption = Annotated[
     ),
 ]
 RepsOption = Annotated[
-    int | None, typer.Option("--reps", help="Repetitions per condition, for every variant.")
+    int | None,
+    typer.Option("--reps", metavar="N", help="Repetitions per condition, for every variant."),
 ]
 
 
 ConditionsOption = Annotated[
-    str | None, typer.Option("--conditions", help="Conditions, separated by commas.")
+    str | None,
+    typer.Option("--conditions", metavar="A,B", help="Conditions, separated by commas."),
 ]
 
 
 VariantsOption = Annotated[
-    str | None, typer.Option("--variants", help="Prompt variants, separated by commas.")
+    str | None,
+    typer.Option("--variants", metavar="A,B", help="Prompt variants, separated by commas."),
 ]
 
 
 SampleSetOption = Annotated[
-    int, typer.Option("--sample-set", help="Another number draws a fresh set of samples.")
+    int,
+    typer.Option("--sample-set", metavar="N", help="Another number draws a fresh set of samples."),
 ]
 
 
 InFlightOption = Annotated[
-    int, typer.Option("--in-flight", help="Trials at once, over all workers.", min=1)
+    int, typer.Option("--in-flight", metavar="N", help="Trials at once, over all workers.", min=1)
 ]
 
 
-RpmOption = Annotated[int | None, typer.Option("--rpm", help="Requests a minute.", min=1)]
+RpmOption = Annotated[
+    int | None, typer.Option("--rpm", metavar="N", help="Requests a minute.", min=1)
+]
 
 
-TpmOption = Annotated[int | None, typer.Option("--tpm", help="Tokens a minute.", min=1)]
+TpmOption = Annotated[
+    int | None, typer.Option("--tpm", metavar="N", help="Tokens a minute.", min=1)
+]
 
 
 MaxCostOption = Annotated[
     float | None,
-    typer.Option("--max-cost", help="Never spend more USD on this, over all its runs.", min=0),
+    typer.Option(
+        "--max-cost", metavar="USD", help="Never spend more on this, over all its runs.", min=0
+    ),
 ]
 
 
@@ -114,6 +163,12 @@ StrictModelOption = Annotated[
 ]
 
 
+KeepGoingOption = Annotated[
+    bool,
+    typer.Option("--keep-going", help="Go on with a model that gives no valid decision."),
+]
+
+
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only estimate.")]
 
 
@@ -123,20 +178,35 @@ YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask before spendi
 ReplayOption = Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")]
 
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+QuietOption = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
 
 
 NameArgument = Annotated[
-    str, typer.Argument(metavar="NAME", help="experiments/NAME.toml, or a path.")
+    str,
+    typer.Argument(
+        metavar="NAME", autocompletion=_studies, help="experiments/NAME.toml, or a path."
+    ),
 ]
 
 
-def _adopt(file: str | None) -> str | None:
-    if file is not None:
-        from merge_runner.study.file import read_study
-        from merge_runner.study.parts import adopt
+TrustOption = Annotated[
+    bool,
+    typer.Option(
+        "--trust",
+        is_eager=True,  # before --study is looked at
+        help="Run the study's code and send keys where its models.toml says, unasked.",
+    ),
+]
 
-        adopt(read_study(file))
+
+def _adopt(context: typer.Context, file: str | None) -> str | None:
+    if file is not None:
+        from merge_runner.study.parts import load_study
+
+        load_study(file, trust=context.params["trust"])
     return file
 
 
@@ -146,8 +216,8 @@ StudyOption = Annotated[
         "--study",
         metavar="FILE",
         callback=_adopt,
-        help="The study of the trials: its plug-ins run, and its prompts, conditions, drivers and "
-        "metrics are known.",
+        help="A study's file: tables, figures and reports are of its trials alone, its plug-ins "
+        "run, and its prompts, conditions, drivers and metrics are known.",
     ),
 ]
 
@@ -163,7 +233,9 @@ ImportedFile = Annotated[
 RecordingOption = Annotated[
     list[Path] | None,
     typer.Option(
-        "--recording", help="Also replay from this file, without importing it; may be repeated."
+        "--recording",
+        metavar="FILE",
+        help="Also replay from this file, without importing it; may be repeated.",
     ),
 ]
 

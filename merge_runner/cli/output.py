@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 
 import typer
@@ -13,6 +14,11 @@ from merge_runner.text_safety import printable
 def print_out(text: str) -> None:
     """Print a result."""
     print(printable(text), flush=True)  # noqa: T201 # the command line's output
+
+
+def terminal_width() -> int | None:
+    """How many columns the result may take; None where it goes into a file or a pipe."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def say(text: str) -> None:

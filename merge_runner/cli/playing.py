@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,11 +39,15 @@ def play(
     """
     import asyncio
 
+    from merge_runner.llm.models import shutdown_notes
     from merge_runner.run.unsent import unsent
 
     for note in plan.notes():
         say(note)
     if not options.replay:
+        asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
+        for note in shutdown_notes(asked, datetime.now(UTC).date()):
+            say(note)
         options = plan.within_budget(options)
     else:
         from merge_runner.run.recorded_plan import replayed
@@ -89,9 +94,8 @@ def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
     from merge_runner.config import resolve_endpoint
 
     for name, entry in plan.entries.items():
-        resolve_endpoint(name, entry)
-        if entry.shutdown:
-            say(f"note: {name} ({entry.id}) is announced to shut down on {entry.shutdown}")
+        if not plan.is_rehearsal:
+            resolve_endpoint(name, entry)
     if all(entry.price == "free" for entry in plan.entries.values()):
         return None
     expected = asyncio.run(prepared.estimate())

@@ -31,7 +31,9 @@ def recording_export(
     sweeps: Annotated[
         list[str] | None,
         typer.Option(
-            "--sweep", help="A sweep_id, which may be repeated; the newest sweep if none is given."
+            "--sweep",
+            metavar="ID",
+            help="A sweep_id, which may be repeated; the newest sweep if none is given.",
         ),
     ] = None,
     sign: Annotated[
@@ -59,7 +61,7 @@ def recording_export(
 
 @recording_app.command("import")
 def recording_import(file: ImportedFile, cache: CacheOption = DEFAULT_CACHE) -> None:
-    """Verify a recording, or the cache folder of somebody else, and add it to the cache."""
+    """Verify a recording or a cache folder, and add it to the cache."""
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.cache_import import import_folder
     from merge_runner.results.recording import import_recording
@@ -74,7 +76,9 @@ def recording_verify(
     file: RecordingFile,
     signers: Annotated[
         Path | None,
-        typer.Option(help="Whose signature it must have: allowed signers, or a minisign key."),
+        typer.Option(
+            metavar="FILE", help="Whose signature it must have: allowed signers, or a minisign key."
+        ),
     ] = None,
 ) -> None:
     """Check that a file is as it was exported, and by whom."""
@@ -90,7 +94,10 @@ def recording_verify(
 
 
 @recording_app.command("info")
-def recording_info(file: RecordingFile) -> None:
+def recording_info(
+    file: RecordingFile,
+    as_json: Annotated[bool, typer.Option("--json", help="The same.", show_default=False)] = True,
+) -> None:
     """Verify a recording and print what it holds, as JSON."""
     from dataclasses import asdict
 

@@ -17,6 +17,7 @@ from merge_runner.cli.options import (
     DbOption,
     JsonOption,
     StudyOption,
+    TrustOption,
 )
 from merge_runner.cli.output import agree, print_out, say
 from merge_runner.errors import UsageError
@@ -35,6 +36,7 @@ def sql(
     query: Annotated[str, typer.Argument(metavar="QUERY", help="One SQL query.")],
     db: DbOption = DEFAULT_DB,
     output: Annotated[Format, typer.Option("--format", help="Form of the result.")] = Format.TEXT,
+    as_json: JsonOption = False,
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
     from merge_runner.results.query_output import write_csv, write_json, write_table
@@ -44,48 +46,45 @@ def sql(
     # A slow reader of a pipe would otherwise keep every sweep from writing meanwhile.
     with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as spooled:
         with answers(db, query) as (names, rows):
-            writers[output](names, rows, spooled)
+            writers[Format.JSON if as_json else output](names, rows, spooled)
         spooled.seek(0)
         shutil.copyfileobj(spooled, sys.stdout)
 
 
-def export(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A new folder, or that of an earlier export.")
-    ],
-    db: DbOption = DEFAULT_DB,
-) -> None:
-    """Write every table and view as Parquet and CSV, with a dictionary of all columns."""
-    from merge_runner.results.export import export_tables
-
-    for path in export_tables(db, folder):
-        say(f"wrote {path}")
-
-
-def digest(db: DbOption = DEFAULT_DB) -> None:
+def digest(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
     """Print one line: a hash of all results, equal for equal results."""
     from merge_runner.results.store import results_digest
 
     value, trials = results_digest(db)
-    print_out(f"{value}  {trials} trials")
+    if as_json:
+        print_out(json.dumps({"digest": value, "trials": trials}))
+    else:
+        print_out(f"{value}  {trials} trials")
 
 
 def audit(
     db: DbOption = DEFAULT_DB,
     sweep_id: Annotated[
-        str | None, typer.Option("--sweep", help="A sweep_id; everything if not given.")
+        str | None,
+        typer.Option("--sweep", metavar="ID", help="A sweep_id; everything if not given."),
     ] = None,
     recording: Annotated[
-        Path | None, typer.Option("--recording", help="Check this recording instead of a database.")
+        Path | None,
+        typer.Option(
+            "--recording", metavar="FILE", help="Check this recording instead of a database."
+        ),
     ] = None,
     cache: Annotated[
         Path | None,
-        typer.Option("--cache", help="Also compare every attempt with this cache folder."),
+        typer.Option(
+            "--cache", metavar="DIR", help="Also compare every attempt with this cache folder."
+        ),
     ] = None,
     study: StudyOption = None,
+    trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that each sample is there, once, and that all else follows from the replies."""
+    """Check that each trial is there and follows from its replies."""
     from merge_runner.audit import (
         NOT_DERIVED,
         audit_cache,
@@ -120,7 +119,7 @@ def audit(
 def forget(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME ...]", help="Sweeps or trials; * stands for anything."),
+        typer.Argument(metavar="NAME", help="Sweeps or trials; * stands for anything."),
     ] = None,
     sweeps: Annotated[
         list[str] | None, typer.Option("--sweep", metavar="ID", help="A sweep_id.")
@@ -131,7 +130,10 @@ def forget(
     db: DbOption = DEFAULT_DB,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before removing.")] = False,
 ) -> None:
-    """Remove sweeps and trials from the database; their replies stay in the cache."""
+    """Remove sweeps and trials from the database.
+
+    Their replies stay in the cache.
+    """
     from merge_runner.results import forgetting
 
     # A trial's id has a slash, a sweep's has none.

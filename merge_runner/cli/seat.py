@@ -15,10 +15,12 @@ from merge_runner.cli.options import (
     DryRunOption,
     InFlightOption,
     JsonOption,
+    KeepGoingOption,
     MaxCostOption,
     MirrorOption,
     ModelOption,
     OnlyOption,
+    QuietOption,
     RecordingOption,
     ReplayOption,
     RoundDeadlineOption,
@@ -26,6 +28,7 @@ from merge_runner.cli.options import (
     SampleSetOption,
     StrictModelOption,
     TpmOption,
+    TrustOption,
     VariantsOption,
     YesOption,
     batch_options,
@@ -37,7 +40,7 @@ from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 
 seat_app = typer.Typer(
-    help="Situations asked by themselves, without the trial that follows.", no_args_is_help=True
+    help="First decisions, without the trial that follows.", no_args_is_help=True
 )
 
 
@@ -59,7 +62,9 @@ def first(
     mirror: MirrorOption = False,
     samples: Annotated[
         int | None,
-        typer.Option("--samples", help="How often each is asked; else the study's repetitions."),
+        typer.Option(
+            "--samples", metavar="N", help="How often each is asked; else the study's repetitions."
+        ),
     ] = None,
     grid: Annotated[
         str | None,
@@ -84,13 +89,16 @@ def first(
     round_deadline: RoundDeadlineOption = None,
     detach: DetachOption = False,
     strict_model: StrictModelOption = False,
+    keep_going: KeepGoingOption = False,
     dry_run: DryRunOption = False,
     yes: YesOption = False,
+    trust: TrustOption = False,
     replay: ReplayOption = False,
     recording: RecordingOption = None,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Ask what drivers do first: both sides of each condition, without the rest of the trial."""
+    """Ask both sides of each condition what they do first."""
     from merge_runner.run.plan import Options, make_plan
     from merge_runner.run.seat import first_situations, grid_conditions
 
@@ -107,6 +115,8 @@ def first(
         replay=replay,
         recordings=recording or (),
         strict_model=strict_model,
+        keep_going=keep_going,
+        quiet=quiet,
         **batch_options(batch=batch, round_deadline=round_deadline, detach=detach),
     )
     plan = make_plan(
@@ -119,6 +129,7 @@ def first(
         only=levels(only or (), "--only"),
         db=db,
         mirror=mirror,
+        trust=trust,
     )
     whole = any(part is not None for part in (samples, grid, conditions, variants))
     plan = first_situations(plan)

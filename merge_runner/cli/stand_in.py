@@ -15,16 +15,23 @@ if TYPE_CHECKING:
 
 
 def emulate(
-    port: Annotated[int, typer.Option(help="0: any free port.", min=0, max=65535)] = 8765,
-    fault_rate: Annotated[float, typer.Option(help="Share of attempts with a fault.")] = 0.0,
-    faults: Annotated[Path | None, typer.Option(help="A TOML file of faults.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the faults.")] = 0,
+    port: Annotated[
+        int, typer.Option(metavar="N", help="0: any free port.", min=0, max=65535)
+    ] = 8765,
+    fault_rate: Annotated[
+        float, typer.Option(metavar="P", help="Share of attempts with a fault.")
+    ] = 0.0,
+    faults: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A TOML file of faults.")
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the faults.")] = 0,
     batch_delay: Annotated[
-        float | None, typer.Option(help="Seconds until a batch has its results.", min=0)
+        float | None,
+        typer.Option(metavar="S", help="Seconds until a batch has its results.", min=0),
     ] = None,
     until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
-    """Run the local stand-in for a language model on 127.0.0.1; prints its base URL."""
+    """Serve the emulator on 127.0.0.1, and print its base URL."""
     import asyncio
 
     from merge_runner.emulator.server import run

@@ -18,11 +18,13 @@ from merge_runner.cli.options import (
     DryRunOption,
     InFlightOption,
     JsonOption,
+    KeepGoingOption,
     MaxCostOption,
     MirrorOption,
     ModelOption,
     NameArgument,
     OnlyOption,
+    QuietOption,
     RecordingOption,
     ReplayOption,
     RepsOption,
@@ -31,6 +33,7 @@ from merge_runner.cli.options import (
     SampleSetOption,
     StrictModelOption,
     TpmOption,
+    TrustOption,
     VariantsOption,
     YesOption,
     batch_options,
@@ -41,13 +44,13 @@ from merge_runner.cli.output import print_out, say
 from merge_runner.cli.playing import check_money_and_replay, play
 from merge_runner.cli.stand_in import emulator_options, faults_of
 from merge_runner.errors import UsageError
-from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 
 
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
 ) -> None:
-    """Write a folder with a study that runs as it is, to be changed into your own."""
+    """Write a folder with a study that runs, to change into your own."""
     from merge_runner.study.folder import write_folder
 
     for path in write_folder(folder):
@@ -65,7 +68,7 @@ def sweep(
     variants: VariantsOption = None,
     sample_set: SampleSetOption = 0,
     order_seed: Annotated[
-        int, typer.Option("--order-seed", help="Another number draws another order.")
+        int, typer.Option("--order-seed", metavar="N", help="Another number draws another order.")
     ] = 0,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
@@ -92,15 +95,28 @@ def sweep(
     round_deadline: RoundDeadlineOption = None,
     detach: DetachOption = False,
     strict_model: StrictModelOption = False,
+    keep_going: KeepGoingOption = False,
     dry_run: DryRunOption = False,
+    rehearse: Annotated[
+        bool,
+        typer.Option(
+            "--rehearse",
+            help="The emulator answers in the model's place, ten times as fast: no key, no cost.",
+        ),
+    ] = False,
     yes: YesOption = False,
+    trust: TrustOption = False,
     replay: ReplayOption = False,
     recording: RecordingOption = None,
     fault_rate: Annotated[
-        float, typer.Option(help="Emulator only: share of attempts with a transient fault.")
+        float,
+        typer.Option(metavar="P", help="Emulator only: share of attempts with a transient fault."),
     ] = 0.0,
-    faults: Annotated[Path | None, typer.Option(help="Emulator only: a file of faults.")] = None,
-    seed: Annotated[int, typer.Option(help="Emulator only: seed of the faults.")] = 0,
+    faults: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Emulator only: a file of faults.")
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Emulator only: seed of the faults.")] = 0,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
@@ -122,6 +138,8 @@ def sweep(
         emulator_options=emulator_options(fault_rate, faults, seed),
         faults_identity=faults_of(fault_rate, faults, seed).identity,
         strict_model=strict_model,
+        keep_going=keep_going,
+        quiet=quiet,
         dask=dask,
         until=None if until is None else deadline(until, datetime.now(UTC)),
         **batch_options(batch=batch, round_deadline=round_deadline, detach=detach),
@@ -137,7 +155,12 @@ def sweep(
         only=levels(only or (), "--only"),
         mirror=mirror,
         db=db,
+        trust=trust,
     )
+    if rehearse:
+        from merge_runner.run.rehearsal import rehearsed
+
+        plan, options = rehearsed(plan, options, home_of(name))
     if dask is not None and plan.replays_humans:
         raise UsageError("human-replay is played in this process: leave --dask out")
     whole = any(part is not None for part in (reps, conditions, variants))
@@ -156,7 +179,9 @@ def replay(
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
     in_flight: InFlightOption = 200,
+    trust: TrustOption = False,
     recording: RecordingOption = None,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Play a sweep from recorded replies alone: no key, no network."""
@@ -172,7 +197,9 @@ def replay(
         db=db,
         cache=cache,
         in_flight=in_flight,
+        trust=trust,
         replay=True,
         recording=recording,
+        quiet=quiet,
         as_json=as_json,
     )

@@ -106,5 +106,6 @@ PROGRAMS.register(
         20.0,
         settable=True,
         check=_check,
+        chance=True,
     ),
 )

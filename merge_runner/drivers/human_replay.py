@@ -12,7 +12,7 @@ from typing import Any
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.program_seat import ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, Program
-from merge_runner.errors import UsageError
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.records import SIDES, Decision, Observation, Side
 from merge_runner.scenarios.merge.vehicle import net_acceleration
 
@@ -94,8 +94,7 @@ def require_trials(
         raise UsageError(f"{HUMAN_REPLAY} takes no clock: what a human did stays as it was")
     pairs = sorted({trial.pair for trial in trials.trials})
     if pair not in (EVERY_PAIR, *pairs):
-        valid = ", ".join((EVERY_PAIR, *pairs))
-        raise UsageError(f"{HUMAN_REPLAY} knows no pair {pair!r}; valid: {valid}")
+        raise unknown_name(f"pair of {HUMAN_REPLAY}", pair, (EVERY_PAIR, *pairs))
     if (config.step_s, config.control_start) != (SAMPLE_S, "both_exits"):
         raise UsageError(
             f"{HUMAN_REPLAY} needs a world of step_s = {SAMPLE_S} and control_start = "

@@ -103,5 +103,6 @@ PROGRAMS.register(
         settable=True,
         sets=SETS,
         check=_check,
+        chance=True,
     ),
 )

@@ -14,6 +14,12 @@ from merge_runner.records import ChatReply, Decision, Observation, Side, Slot, T
 
 Ask = Callable[[str, Slot, TrialSpec], Awaitable[ChatReply]]
 """Asks the model with a prompt, for a slot of a trial; raises CallFailed."""
+Decided = Callable[[Decision], None]
+"""Gets each decision before it is driven; raises SweepStopped."""
+
+
+def _ignore(_: Decision) -> None:
+    pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,10 +27,12 @@ class LanguageModel:
     """Makes drivers that ask one model."""
 
     ask: Ask
+    decided: Decided = _ignore
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> LlmDriver:
         """See MakeDriver."""
-        return LlmDriver(self.ask, spec, take_seat(scenario, spec, side, model_pace(scenario)))
+        seat = take_seat(scenario, spec, side, model_pace(scenario))
+        return LlmDriver(self.ask, spec, seat, self.decided)
 
 
 @dataclass(slots=True)
@@ -34,6 +42,7 @@ class LlmDriver:
     ask: Ask
     spec: TrialSpec
     seat: Seat
+    decided: Decided = _ignore
     _plan: tuple[float, ...] | None = None
     _executed: int = 0
 
@@ -57,7 +66,7 @@ class LlmDriver:
             self._plan, self._executed = parsed.plan, 0
         elif scenario.fallback == "restart":
             self._executed = 0
-        return Decision(
+        decision = Decision(
             plan=parsed.plan,
             applied=self._take(),
             tactical=parsed.tactical,
@@ -67,6 +76,8 @@ class LlmDriver:
             prompt=prompt,
             reply=reply,
         )
+        self.decided(decision)
+        return decision
 
     def _remaining(self) -> tuple[float, ...] | None:
         return None if self._plan is None else self._plan[self._executed :]

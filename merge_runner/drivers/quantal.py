@@ -123,5 +123,6 @@ PROGRAMS.register(
         settable=True,
         check=_check,
         check_clock=_check_clock,
+        chance=True,
     ),
 )

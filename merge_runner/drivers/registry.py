@@ -21,7 +21,9 @@ from merge_runner.records import SIDES, Side, TrialSpec, other_side
 from merge_runner.registry import Registry, require
 from merge_runner.source import source_digest
 
-EMULATOR = "emulator"  # the model that a scripted stand-in of ours answers for
+EMULATOR = "emulator"
+MOCKS = frozenset({EMULATOR, "random"})
+"""The models of our own, under whose names no other is expected to answer."""
 SET = "set"  # the parameter that names a set of others
 RESERVED = ("program", "clock")  # what a study says of a driver beside its parameters
 
@@ -44,8 +46,9 @@ class Program:
     program reads its parameters from its seat, so that a study can set them. ``sets`` are named
     sets of further parameters, of which the parameter ``set`` chooses one. ``check`` raises
     UsageError for parameters that cannot be, ``check_clock`` for a clock in s (the time between two
-    decisions) that cannot be beside them. ``data`` is what else it drives by. ``based_on``
-    names the program that a study has given other parameters or another clock.
+    decisions) that cannot be beside them. ``data`` is what else it drives by. ``chance`` declares
+    that it draws by the seed of its seat: the analysis counts equal trials of drivers that do not
+    once. ``based_on`` names the program that a study has given other parameters or another clock.
     """
 
     driver: Callable[[ProgramSeat], Driver]
@@ -57,6 +60,7 @@ class Program:
     check: Callable[[Mapping[str, Parameter]], None] | None = None
     check_clock: Callable[[Mapping[str, Parameter], float], None] | None = None
     data: Data | None = None
+    chance: bool = False
     based_on: str = ""
 
     def __post_init__(self) -> None:
@@ -169,6 +173,8 @@ class Program:
             "program": name,
             "parameters": self.values,
             "source": self.source,
+            # Left out where there is none, so that specs from before it keep their hashes.
+            **({"chance": True} if self.chance else {}),
             **({} if self.rate_hz is None else {"rate_hz": self.rate_hz}),
             **({} if self.data is None else {"data": self.data.digest}),
             **({"based_on": self.based_on} if self.based_on else {}),
@@ -203,12 +209,24 @@ def language_models(names: Mapping[Side, str], spec: Mapping[str, Any]) -> dict[
     return {side: name for side, name in names.items() if "program" not in (spec.get(side) or {})}
 
 
+def has_chance(spec: Mapping[str, Any], sides: Collection[Side] = SIDES) -> bool:
+    """Return whether drivers of a spec, or what they perceive, are drawn by chance.
+
+    A language model samples; a program declares it.
+    """
+    scenario = ScenarioConfig.model_validate(spec.get("scenario", {}))
+    drivers = [spec.get(side) or {} for side in sides]
+    return any("program" not in driver or driver.get("chance") for driver in drivers) or any(
+        scenario.perception(side).is_random for side in sides
+    )
+
+
 def stand_in(models: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:
     """What is said of trials of these language models in which a stand-in answered on these sides.
 
     A side that a program drives has no model.
     """
-    named = {side: name for side, name in models.items() if name != EMULATOR}
+    named = {side: name for side, name in models.items() if name not in MOCKS}
     posing = "+".join(dict.fromkeys(name for side, name in named.items() if side in sides))
     real = [side for side in named if side not in sides]
     where = f" on the {'left' if real == ['right'] else 'right'}" if real else ""

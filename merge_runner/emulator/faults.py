@@ -83,7 +83,8 @@ class FaultPlan(BaseModel):
     """How often each fault occurs; ``rates`` are probabilities per attempt.
 
     ``latency_s`` delays every answer. ``delay_s`` is how long a rate limit asks to wait. A hang is
-    silent for ``hang_s``, longer than a client's patience, and then closes. ``batch`` says what
+    silent for ``hang_s``, longer than a client's patience, and then closes. An answer has about
+    ``output_tokens`` with its reasoning; a few hundred where it is not given. ``batch`` says what
     becomes of batches.
     """
 
@@ -94,6 +95,7 @@ class FaultPlan(BaseModel):
     latency_s: Seconds = 0.0
     delay_s: Seconds = 0.05
     hang_s: Seconds = 30.0
+    output_tokens: Annotated[int, Field(gt=0)] | None = None
     batch: BatchPlan = BatchPlan()
 
     @model_validator(mode="after")

@@ -19,7 +19,8 @@ Envelope = tuple[dict[str, Any], dict[str, str]]
 class Said:
     """An answer of the model to a prompt; ``reply`` becomes part of its id.
 
-    Its token counts are about a quarter of the bytes.
+    Its token counts are about a quarter of the bytes, and as many for the reasoning as bring its
+    output to about ``typical_output``, or a few hundred.
     """
 
     reply: str
@@ -27,6 +28,7 @@ class Said:
     prompt: str
     text: str
     refused: bool
+    typical_output: int | None = None
 
     @property
     def tokens_in(self) -> int:
@@ -41,7 +43,10 @@ class Said:
     @property
     def reasoning(self) -> int:
         """Output tokens of the reasoning, which no reply shows."""
-        return 200 + draw_index(600, "reasoning", self.prompt)
+        if self.typical_output is None:
+            return 200 + draw_index(600, "reasoning", self.prompt)
+        drawn = self.typical_output // 2 + draw_index(self.typical_output, "reasoning", self.prompt)
+        return max(0, drawn - self.visible)
 
     @property
     def output(self) -> int:

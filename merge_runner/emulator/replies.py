@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.config import validated
-from merge_runner.emulator.driver import answer
+from merge_runner.emulator import driver, random_driver
 from merge_runner.emulator.faults import Fault, FaultPlan
 from merge_runner.emulator.formats import Said, ServedFormat
 from merge_runner.errors import UsageError
@@ -96,12 +96,13 @@ class Replies:
     def answer(self, question: Question, attempt: int, fault: Fault | None) -> dict[str, Any]:
         """The body of an answer, with the field that says that no model made it."""
         asked, slot = question.asked, question.slot
-        text = TEXTS[fault] if fault in TEXTS else answer(question.prompt, slot, question.effect)
+        text = TEXTS[fault] if fault in TEXTS else _text(question)
         # Only the same attempt at the same request gets the same id: the audit takes one that
         # comes back for an answer that was given twice.
         which = f"{asked.path} {asked.where} {attempt}".encode()
         reply_id = hashlib.sha256(asked.raw + which).hexdigest()[:24]
-        said = Said(reply_id, question.model, question.prompt, text, fault == "refused")
+        refused, typical = fault == "refused", self.faults.output_tokens
+        said = Said(reply_id, question.model, question.prompt, text, refused, typical)
         body_sha256 = asked.body_sha256
         told = {"body_sha256": body_sha256, "slot": slot and slot.as_dict()}
         self._answered[body_sha256, asked.slot, asked.custom_id] += 1
@@ -113,6 +114,12 @@ class Replies:
             {"body_sha256": body, "slot": slot, "custom_id": custom_id, "answered": count}
             for (body, slot, custom_id), count in self._answered.items()
         ]
+
+
+def _text(question: Question) -> str:
+    if question.model == random_driver.MODEL:
+        return random_driver.answer(question.prompt, question.slot)
+    return driver.answer(question.prompt, question.slot, question.effect)
 
 
 def marked(body: dict[str, Any]) -> dict[str, Any]:

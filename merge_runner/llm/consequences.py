@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from merge_runner.config import ModelEntry, driver_name
+from merge_runner.config import ModelEntry, driver_name, is_own_host
 from merge_runner.errors import EndpointRefused, MergeRunnerError, ProviderDown, QuotaExhausted
 from merge_runner.llm.call import Call
 from merge_runner.llm.first_call import (
@@ -41,7 +41,7 @@ class Consequences:
     @property
     def own_host(self) -> str | None:
         """The provider whose own host is asked; None: another server in its format."""
-        return self.entry.provider if self.endpoint == self.entry.provider else None
+        return self.entry.provider if is_own_host(self.entry.provider, self.endpoint) else None
 
     def error(
         self, call: Call, outcome: AttemptOutcome, raw: RawReply | None

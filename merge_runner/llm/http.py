@@ -14,7 +14,7 @@ import aiohttp
 import httpx
 from httpx_aiohttp import AiohttpTransport, HttpxAiohttpClient
 
-from merge_runner.config import LOOPBACK, Endpoint
+from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, proxy_secrets
 from merge_runner.errors import UsageError
 from merge_runner.llm.bodies import ENCODING, read_body, read_lines
 from merge_runner.llm.connections import Connections, Trust
@@ -24,8 +24,6 @@ from merge_runner.llm.masking import Mask
 from merge_runner.llm.transport import ErrorReply, TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
-# A shorter one is a dummy, and may occur in any text.
-SHORTEST_SECRET = 8
 NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
@@ -85,11 +83,9 @@ class HttpTransport:
     ) -> None:
         self._endpoint = endpoint
         self._most_bytes = most_bytes
-        self._mask = Mask(
-            secret
-            for value in endpoint.auth_headers.values()
-            if len(secret := value.removeprefix("Bearer ")) >= SHORTEST_SECRET
-        )
+        keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
+        secrets = {*keys, *proxy_secrets()}
+        self._mask = Mask(secret for secret in secrets if len(secret) >= SHORTEST_SECRET)
         self._trust = Trust()
         # Each id is a UUID, as some servers demand (llama-cpp-python): a random part, this
         # transport's own, and the number of the request.
@@ -106,7 +102,7 @@ class HttpTransport:
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Post the hashed bytes; raises TransportFailure."""
         headers = request.headers
-        if self._endpoint.provider == "emulator":
+        if self._endpoint.is_emulator:
             slot = canonical_json(request.slot.as_dict())
             headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
         body = request.body.encode()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import duckdb
 
-from merge_runner.errors import StoreError, UsageError
+from merge_runner.errors import StoreError, UsageError, unknown_name
 from merge_runner.results.comparison import PLACES
 from merge_runner.results.database import PATIENCE_S, open_database, read_database
 from merge_runner.results.progress_file import running
@@ -120,12 +120,10 @@ def _require_each(
         )
         if not found.fetchone():
             names = connection.execute(
-                f"SELECT DISTINCT {column} FROM {table} ORDER BY ALL LIMIT 10"  # noqa: S608 # our tables
+                f"SELECT DISTINCT {column} FROM {table} ORDER BY ALL"  # noqa: S608 # our tables
             ).fetchall()
-            raise UsageError(
-                f"{db} holds no {table} named {pattern}; it has, among others: "
-                f"{', '.join(name for (name,) in names) or 'none'}. * stands for anything"
-            )
+            hint = f"in {db}; * stands for anything"
+            raise unknown_name(table.rstrip("s"), pattern, (name for (name,) in names), hint)
 
 
 def _mark(

@@ -1,4 +1,9 @@
-"""The levels of the trials of drivers, as a query."""
+"""What was designed, as queries: descriptions of studies, and levels of the trials of drivers."""
+
+DESCRIPTIONS = """
+SELECT config->>'$.description' AS description FROM sweeps
+WHERE description <> '' GROUP BY ALL ORDER BY min(started_at)
+"""
 
 # One row a trial and factor: those of its study, and the model and the prompt that it had. Who
 # meets an opponent is the model; of a pair without one both are, the ego first.

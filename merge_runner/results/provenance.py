@@ -19,12 +19,13 @@ def versions() -> dict[str, str]:
 def git_state() -> tuple[str, bool | None]:
     """The commit of the program's own checkout, and whether there are uncommitted changes.
 
+    Files that git does not track, such as a study of the user's, are no change of the program.
     Without a checkout: the installed version and None.
     """
     commit = _commit()
     if commit is None:
         return f"merge-runner {version('merge-runner')}", None
-    return commit, bool(_git("status", "--porcelain"))
+    return commit, bool(_git("status", "--porcelain", "--untracked-files=no"))
 
 
 def program() -> str:

@@ -28,7 +28,7 @@ from pydantic import TypeAdapter, ValidationError
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import KEY_VERSION, call_key, canonical_json
-from merge_runner.llm.verify import DAMAGED, check_attempts, check_body
+from merge_runner.llm.verify import DAMAGED, check_attempts, check_body, check_slot
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
 from merge_runner.results.database import Settings, append, in_memory
@@ -401,6 +401,7 @@ def _entry(row: dict[str, Any]) -> CachedCall:
     slot = Slot(
         row["condition"], row["repetition"], row["side"], row["decision"], row["sample_set"]
     )
+    check_slot(slot)
     headers = HEADERS.validate_json(row["headers"], strict=True)
     key = call_key(
         endpoint=row["endpoint"],

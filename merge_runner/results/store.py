@@ -17,7 +17,7 @@ from typing import Any
 
 import duckdb
 
-from merge_runner.errors import StoreError, UsageError
+from merge_runner.errors import StoreError, UsageError, unknown_name
 from merge_runner.records import TrialRecord
 from merge_runner.results.comparison import FACTORS, PLACES, TrialKey, rows_of_trials, stored_rows
 from merge_runner.results.database import (
@@ -133,6 +133,22 @@ class Store:
         with self._writing() as connection:
             _refuse_other_conditions(connection, list(keys))
             return {key for key, ended in _ended(connection, list(keys)).items() if ended}
+
+    def decisions_by_spec(self, spec_hashes: Collection[str]) -> list[tuple[Any, ...]]:
+        """Of the trials that did not fail, by spec and side, how many decisions are (in)valid.
+
+        (spec_hash, side, valid ones, invalid ones, failure and rationale of an invalid one)
+        """
+        sql = """
+            SELECT spec_hash, side, count(*) FILTER (valid), count(*) FILTER (NOT valid),
+                arg_min(failure, (trial_id, decision)) FILTER (NOT valid),
+                arg_min(rationale, (trial_id, decision)) FILTER (NOT valid)
+            FROM decisions SEMI JOIN (FROM trials WHERE status <> 'failed')
+                USING (trial_id, spec_hash)
+            WHERE list_contains(?, spec_hash) GROUP BY ALL
+        """
+        with self._writing() as connection:
+            return connection.execute(sql, [list(spec_hashes)]).fetchall()
 
     def write(
         self, sweep_id: str, records: Sequence[TrialRecord], *, patience_s: float
@@ -330,8 +346,7 @@ def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str
         sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(SWEEPS))}
         wanted = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
         if unknown := [sweep_id for sweep_id in wanted if sweep_id not in sweeps]:
-            names = ", ".join(sorted(sweeps)) or "none"
-            raise UsageError(f"{path} holds no sweep {unknown[0]}; valid: {names}")
+            raise unknown_name("sweep", unknown[0], sorted(sweeps), f"in {path}")
         keys = connection.execute(
             "SELECT DISTINCT call_key FROM decisions SEMI JOIN "
             "(SELECT trial_id, spec_hash FROM sweep_trials SEMI JOIN (SELECT unnest(?) AS sweep_id)"

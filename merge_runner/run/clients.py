@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 
 from merge_runner.config import (
+    REHEARSAL,
+    Endpoint,
     ModelEntry,
     base_urls,
     check_network,
+    rehearsal_endpoint,
     resolve_endpoint,
     running_emulator_url,
     with_base_urls,
@@ -29,11 +32,12 @@ from merge_runner.llm.ledger import NO_CAPS, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import is_known
-from merge_runner.llm.shared_limits import SharedLimits, limits_file
+from merge_runner.llm.shared_limits import WINDOW_S, SharedLimits, limits_file
 from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan, most_prompts
+from merge_runner.run.rehearsal import SPEED, write_behaviour
 
 # For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
@@ -110,10 +114,12 @@ def open_services(
         model = plan.registered[name]
         if model not in by_model:
             rpm, tpm = options.rates(entry)
-            shared = _shared_limits(name, entry, rpm, tpm, stack)
-            by_model[model] = Limiter(
-                rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]], shared=shared
-            )
+            pause = pauses[plan.endpoints[name]]
+            if plan.is_rehearsal:
+                by_model[model] = Limiter(rpm=rpm, tpm=tpm, pause=pause, window_s=WINDOW_S / SPEED)
+            else:
+                shared = _shared_limits(name, entry, rpm, tpm, stack)
+                by_model[model] = Limiter(rpm=rpm, tpm=tpm, pause=pause, shared=shared)
         limiters[name] = by_model[model]
     costs = trial_costs(plan, measured, batch=options.batch)
     budget = Budget(ledger, options.caps, costs)
@@ -134,17 +140,20 @@ def _shared_limits(
     return shared
 
 
-async def start_endpoints(
-    entries: Mapping[str, ModelEntry], emulator_options: Sequence[str], stack: AsyncExitStack
-) -> dict[str, str]:
-    """The variables of base URLs that lead to the entries' endpoints.
+async def start_endpoints(plan: Plan, options: Options, stack: AsyncExitStack) -> dict[str, str]:
+    """The variables of base URLs that lead to the endpoints of a plan's models.
 
-    Starts the emulator where an entry needs it; closing ``stack`` stops it.
+    Starts the emulator where one needs it; closing ``stack`` stops it.
     """
-    urls = base_urls(entries)
-    emulated = any(entry.provider == "emulator" for entry in entries.values())
-    if emulated and running_emulator_url() is None:
-        url = await stack.enter_async_context(emulator_process(emulator_options))
+    urls = base_urls(plan.entries)
+    emulated = any(entry.provider == "emulator" for entry in plan.entries.values())
+    if plan.is_rehearsal:
+        behaviour = options.db.with_name("faults.toml")
+        write_behaviour(plan, behaviour)
+        process = emulator_process(["--faults", str(behaviour)])
+        urls[REHEARSAL] = await stack.enter_async_context(process)
+    elif emulated and running_emulator_url() is None:
+        url = await stack.enter_async_context(emulator_process(options.emulator_options))
         urls |= {"EMULATOR_BASE_URL": f"{url}/v1"}
     return urls
 
@@ -172,7 +181,7 @@ def live_clients(
     for name, entry in plan.entries.items():
         model = plan.registered[name]
         if model not in transports:
-            endpoint = resolve_endpoint(name, entry, with_base_urls(endpoint_plan.urls))
+            endpoint = _endpoint(plan, name, endpoint_plan.urls)
             check_network(endpoint.base_url)
             transports[model] = HttpTransport(
                 endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 1e6)
@@ -198,6 +207,12 @@ def live_clients(
             batches=_batches(model, entry, cache, budget, rounds),
         )
     return clients
+
+
+def _endpoint(plan: Plan, name: str, urls: Mapping[str, str]) -> Endpoint:
+    if plan.is_rehearsal:
+        return rehearsal_endpoint(plan.entries[name], urls[REHEARSAL])
+    return resolve_endpoint(name, plan.entries[name], with_base_urls(urls))
 
 
 def _batches(
@@ -234,7 +249,11 @@ def open_rounds(
         return None
     most = max((most_prompts(arm) for arm in plan.arms), default=1)
     ways = BatchWays(options.batch, options.round_deadline_s, options.detach, most)
-    free = {plan.registered[n] for n, entry in plan.entries.items() if entry.price == "free"}
+    free = {
+        plan.registered[name]
+        for name, entry in plan.entries.items()
+        if plan.is_rehearsal or entry.price == "free"
+    }
     return Rounds(journal, {}, ways, free=free, say=say)
 
 
@@ -255,7 +274,8 @@ def check_batches(plan: Plan, options: Options) -> None:
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         require_batch(plan.registered[name], entry, registry)
-        if options.detach and entry.provider == "emulator" and running_emulator_url() is None:
+        started = entry.provider == "emulator" and running_emulator_url() is None
+        if options.detach and (started or plan.is_rehearsal):
             raise UsageError(
                 "an emulator that a sweep starts ends with it: for --detach start `merge-runner "
                 "emulate` and name it in EMULATOR_BASE_URL"

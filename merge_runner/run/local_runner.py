@@ -18,6 +18,7 @@ from merge_runner.llm.call import Wait
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
 from merge_runner.records import SIDES, Cell, ChatReply, Slot, TrialRecord, TrialSpec
+from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.plan import Plan
 from merge_runner.run.scheduler import Gate, run_bounded
 from merge_runner.study.crossing import Arm
@@ -90,6 +91,7 @@ class LocalRunner:
     plan: Plan
     clients: Mapping[str, LlmClient]
     in_flight: int
+    first: FirstDecisions = field(default_factory=FirstDecisions)
     gate: Gate = field(default_factory=Gate)
     playing: Counter[Cell] = field(default_factory=Counter)
     asking: Counter[int] = field(default_factory=Counter)
@@ -104,7 +106,10 @@ class LocalRunner:
     @cached_property
     def drivers(self) -> Mapping[str, MakeDriver]:
         """Makers of drivers by name: of a program, or of a model that one of the clients asks."""
-        models = {name: LanguageModel(partial(self._ask, name)) for name in self.clients}
+        models = {
+            name: LanguageModel(partial(self._ask, name), partial(self.first.count, name))
+            for name in self.clients
+        }
         return {**PROGRAMS, **models}
 
     @cached_property
@@ -166,6 +171,12 @@ class LocalRunner:
     ) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
         await room()  # before any call: what is answered must also be stored
         arm = self.arms[spec.arm]
+        async with self.first.turn(self.clients.keys() & arm.asked.values()):
+            return await self._played(spec, arm)
+
+    async def _played(
+        self, spec: TrialSpec, arm: Arm
+    ) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
         drivers = {
             side: self.drivers[arm.asked[side]].make(arm.scenario, spec, side) for side in SIDES
         }

@@ -12,6 +12,7 @@ from typing import Literal
 
 from merge_runner.config import (
     MOST_REPETITIONS,
+    REHEARSAL,
     ModelEntry,
     ScenarioConfig,
     both_sides,
@@ -20,7 +21,7 @@ from merge_runner.config import (
 )
 from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials, require_trials
 from merge_runner.drivers.pace import model_pace
-from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
+from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.rounds import USUAL_DEADLINE_S
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
@@ -38,8 +39,11 @@ from merge_runner.study.crossing import (
     PROMPT,
     SET_BY,
     Arm,
+    chosen_models,
     cross,
-    level_text,
+    driver_names,
+    file_prompts,
+    listed_levels,
 )
 from merge_runner.study.file import (
     EVERY_CONDITION,
@@ -47,9 +51,8 @@ from merge_runner.study.file import (
     BudgetTerms,
     StudyFile,
     StudySource,
-    read_study,
 )
-from merge_runner.study.parts import adopt, adopt_humans
+from merge_runner.study.parts import adopt_humans, load_study
 from merge_runner.text_safety import in_a_name
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
@@ -64,9 +67,10 @@ class Options:
     ``rpm`` and ``tpm`` override the registry's. ``split_usd`` caps what single models cost.
     ``dask`` names the cluster that plays the trials; if None, this process plays them.
     ``faults_identity`` keeps the answers of an emulator that was told to misbehave apart from those
-    of the usual one. A ``dry_run`` sends nothing. From ``until`` on no trial begins. In a ``batch``
-    run all trials ask together, at a lower price; a batch is cancelled after ``round_deadline_s``,
-    and a run that is to ``detach`` waits for none.
+    of the usual one. A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that
+    is to ``keep_going`` asks a model on that gives no valid decision. From ``until`` on no trial
+    begins. In a ``batch`` run all trials ask together, at a lower price; a batch is
+    cancelled after ``round_deadline_s``, and a run that is to ``detach`` waits for none.
     """
 
     db: Path
@@ -81,6 +85,8 @@ class Options:
     emulator_options: Sequence[str] = ()
     faults_identity: str = ""
     strict_model: bool = False
+    keep_going: bool = False
+    quiet: bool = False
     dask: str | None = None
     dry_run: bool = False
     until: datetime | None = None
@@ -159,6 +165,12 @@ class Plan:
         return {arm.variant: arm.repetitions for arm in self.arms}
 
     @property
+    def levels(self) -> dict[str, list[str]]:
+        """The levels of each factor of its file, a factor's reference first."""
+        models = (arm.model_level for arm in self.arms)
+        return listed_levels(self.study.file, models, self.repetitions)
+
+    @property
     def trials(self) -> int:
         """The number of trials."""
         return sum(arm.repetitions for arm in self.arms) * len(self.conditions)
@@ -178,6 +190,11 @@ class Plan:
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
         return any(map(_is_scripted, self.arms))
+
+    @property
+    def is_rehearsal(self) -> bool:
+        """Whether the emulator takes the place of the providers."""
+        return REHEARSAL in self.endpoints.values()
 
     @property
     def replays_humans(self) -> bool:
@@ -200,14 +217,17 @@ class Plan:
         budget = self.study.file.budget
         total_usd = budget.total_usd if options.max_cost_usd is None else options.max_cost_usd
         paid = {self.registered[n] for n, entry in self.entries.items() if entry.price != "free"}
-        file = self.study.file
-        named = [*file.models, *map(level_text, file.factors.get(OPPONENT, ()))]
-        sides = {name for pair in named for name in both_sides(pair).values()}
-        Caps(budget.total_usd, budget.split).check(paid, sides | {*self.registered.values()})
+        named = driver_names(self.study.file, self.study.file.models)
+        Caps(budget.total_usd, budget.split).check(paid, named | {*self.registered.values()})
         return replace(options, max_cost_usd=total_usd, split_usd=budget.split)
 
     def notes(self) -> Iterator[str]:
         """What a user may have meant otherwise."""
+        if self.is_rehearsal:
+            yield (
+                f"REHEARSAL: the emulator answers as {self.driver}, ten times as fast as the "
+                "model; nothing is sent to the provider, and nobody charges"
+            )
         prompts = self.study.file.prompts
         used = {*self.repetitions, *(prompt.based_on for prompt in prompts.values())}
         if unused := [name for name in prompts if name not in used]:
@@ -324,6 +344,8 @@ class Plan:
             "sample_set": self.sample_set,
             "order_seed": self.order_seed,
             "prompt_blocks": prompt_blocks,
+            "levels": self.levels,
+            **({"description": file.description} if file.description else {}),
             **({"seat": self.seat} if self.seat else {}),
         }
         if self.mirror:
@@ -406,23 +428,27 @@ def make_plan(
     only: Mapping[str, Sequence[str]] | None = None,
     db: Path | None = None,
     mirror: bool = False,
+    trust: bool = False,
 ) -> Plan:
     """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
-    Registers what the study adds (``study.parts.adopt``), and the human trials of ``db`` where
-    they are to be replayed. Raises UsageError.
+    Registers what the study adds (``study.parts.load_study``, which ``trust`` is for), and the
+    human trials of ``db`` where they are to be replayed. Raises UsageError.
     """
-    study = read_study(sweep)
+    asked = (models,) if isinstance(models, str) else tuple(models)
+    study = load_study(sweep, asked, trust=trust)
     registry = load_models(study.path.parent)
-    adopt(study)
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
-    asked = (models,) if isinstance(models, str) else tuple(models)
-    drivers = tuple(dict.fromkeys(asked or study.file.models or (EMULATOR,)))
+    drivers = chosen_models(study.file, asked)
     if db is not None and _replays_humans(study.file, drivers):
         adopt_humans(human_trials(db))
     wanted = _repetitions(study, variants, repetitions)
-    arms = cross(study.file, drivers, wanted, registry, only or {}, mirror=mirror)
+    names = _conditions(study.file, conditions)
+    arms = cross(
+        study.file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
+    )
+    _check_conditions(names, arms)
     entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
     return Plan(
         name=study.name,
@@ -431,7 +457,7 @@ def make_plan(
         arms=tuple(arms),
         entries=entries,
         endpoints={name: endpoint_identity(entry) for name, entry in entries.items()},
-        conditions=_conditions(study.file, conditions, arms),
+        conditions=names,
         sample_set=sample_set,
         order_seed=order_seed,
         mirror=mirror,
@@ -440,9 +466,8 @@ def make_plan(
 
 def _replays_humans(file: StudyFile, drivers: Sequence[str]) -> bool:
     """Whether a driver of a study may replay imported human trials."""
-    pairs = [*drivers, *map(level_text, file.factors.get(OPPONENT, ()))]
-    sides = {name for pair in pairs for name in both_sides(pair).values()}
-    return HUMAN_REPLAY in {*sides, *(driver.program for driver in file.drivers.values())}
+    names = driver_names(file, drivers)
+    return HUMAN_REPLAY in {*names, *(driver.program for driver in file.drivers.values())}
 
 
 def _replaying(arm: Arm) -> list[Program]:
@@ -451,10 +476,8 @@ def _replaying(arm: Arm) -> list[Program]:
     return [program for program in programs if isinstance(program.data, HumanTrials)]
 
 
-def _conditions(
-    file: StudyFile, chosen: Sequence[str] | None, arms: Sequence[Arm]
-) -> tuple[str, ...]:
-    scenario = SCENARIOS[file.scenario.name]
+def _conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
+    scenario = SCENARIOS.require(file.scenario.name)
     listed = None if file.conditions is None else [each.name for each in file.conditions]
     wanted = next(c for c in (chosen, listed, scenario.conditions) if c is not None)
     conditions = tuple(
@@ -466,12 +489,16 @@ def _conditions(
     )
     if not conditions:
         raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
+    return conditions
+
+
+def _check_conditions(conditions: Sequence[str], arms: Sequence[Arm]) -> None:
+    """Raise UsageError for a condition that an arm cannot be played in."""
     for name in conditions:
         for arm in arms:
-            new_world(arm.scenario, name)  # raises where the condition cannot be played
+            new_world(arm.scenario, name)
             for program in _replaying(arm):
                 require_trials(program, arm.scenario, name, arm.repetitions)
-    return conditions
 
 
 def _repetitions(
@@ -482,8 +509,7 @@ def _repetitions(
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
     given = dict(study.file.repetitions)
     for_all = given.pop(EVERY_PROMPT, None)
-    levels = [level_text(level) for level in study.file.factors.get(PROMPT, ())]
-    listed = levels or [*given] or ["baseline"] * (for_all is not None)
+    listed = file_prompts(study.file)
     for variant in (*given, *listed, *(variants or ())):
         blocks_of(variant)
     for name in given:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import sys
 import time
@@ -258,9 +259,14 @@ async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncItera
 
 
 @asynccontextmanager
-async def display_progress(progress: Progress) -> AsyncIterator[None]:
-    """Show the progress on stderr or in a notebook while the body runs, and at its end."""
+async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[None]:
+    """Show the progress on stderr or in a notebook while the body runs, and at its end.
+
+    ``quiet``: only the clients' messages.
+    """
     show = _show_live if sys.stderr.isatty() else _show_in_cell if in_cell() else _show_plain
+    if quiet:
+        show = _show_notes
     stop = asyncio.Event()
     display = asyncio.create_task(show(progress, stop))
     pulse = asyncio.create_task(_feel_pulse(progress))
@@ -269,7 +275,11 @@ async def display_progress(progress: Progress) -> AsyncIterator[None]:
     finally:
         pulse.cancel()
         stop.set()
-        await display
+        try:
+            await display
+        except OSError as exc:
+            if exc.errno != errno.EIO:  # that of a terminal that is closed
+                raise
 
 
 async def _publish(progress: Progress, file: ProgressFile) -> None:
@@ -328,6 +338,14 @@ async def _show_plain(progress: Progress, stop: asyncio.Event) -> None:
         _say(_line(progress))
     for line in (*_notes(progress), _line(progress)):
         _say(line)
+
+
+async def _show_notes(progress: Progress, stop: asyncio.Event) -> None:
+    stopped = False
+    while not stopped:
+        stopped = await _stopped(stop, PLAIN_EVERY_S)
+        for note in _notes(progress):
+            _say(note)
 
 
 def _table(progress: Progress) -> Table:

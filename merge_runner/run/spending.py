@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from merge_runner.errors import UsageError
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import IN_FLIGHT, UNRECORDED, Ledger, Reason, Release, Spending, scopes
 
@@ -65,9 +65,7 @@ def account(folder: Path, sweep: str) -> Account:
     """The ledger of one sweep; raises UsageError for one that is not there."""
     found = {each.sweep: each for each in accounts(folder)}
     if sweep not in found:
-        raise UsageError(
-            f"{folder} has no ledger of a sweep {sweep!r}; valid: {', '.join(found) or 'none'}"
-        )
+        raise unknown_name("sweep", sweep, found, f"with a ledger in {folder}")
     return found[sweep]
 
 

@@ -329,4 +329,5 @@ def _statuses(facts: SweepFacts) -> dict[str, int]:
 def _row(name: str, values: Iterable[object], width: int = 10) -> str:
     # The widths do not depend on the counts, so that two runs can be compared side by side; rich
     # would fit them to the content.
-    return f"{name:<{max(width, 10)}}" + "".join(f"{value:>12}" for value in values)
+    first, *others = values
+    return f"{name:<{max(width, 10)}}{first:>9}" + "".join(f"{value:>12}" for value in others)

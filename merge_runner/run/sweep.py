@@ -46,6 +46,7 @@ from merge_runner.run.clients import (
     start_endpoints,
 )
 from merge_runner.run.estimate import Estimate, Todo, estimate
+from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
@@ -227,7 +228,7 @@ class Sweep:
             self._progress.unstored = lambda: flusher.problem
             began = time.perf_counter()
             try:
-                async with display_progress(self._progress):
+                async with display_progress(self._progress, quiet=self._options.quiet):
                     await self._play(runner, flusher, outcome)
             finally:
                 outcome.playing_s = time.perf_counter() - began
@@ -259,7 +260,7 @@ class Sweep:
     async def estimate(self) -> Estimate:
         """What a live run takes: plays from recorded replies alone, and counts what is missing."""
         plan = self._plan
-        trials: Counter[str] = Counter()
+        trials = Counter(spec.arm for spec in self._todo if not self._arms[spec.arm].entries)
         calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in self._arms.items()}
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
@@ -272,8 +273,9 @@ class Sweep:
                     answered = sum(row.side == side for row in record.decisions)
                     calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
 
+        asking = [spec for spec in self._todo if self._arms[spec.arm].entries]
         clients = sealed_clients(plan, self._cache)
-        await LocalRunner(plan, clients, in_flight=1).play(self._todo, ended)
+        await LocalRunner(plan, clients, in_flight=1).play(asking, ended)
         return self._estimated({label: Todo(trials[label], calls[label]) for label in self._arms})
 
     def estimate_of_all(self) -> Estimate:
@@ -350,7 +352,7 @@ class Sweep:
             in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
             return LocalRunner(plan, clients, in_flight)
         services = open_services(plan, options, self._cache, self._ledger, self._measured(), stack)
-        urls = await start_endpoints(plan.entries, options.emulator_options, stack)
+        urls = await start_endpoints(plan, options, stack)
         known = frozenset(
             name
             for name, entry in plan.entries.items()
@@ -374,7 +376,8 @@ class Sweep:
                 self._progress.batches = rounds.standing
             # A trial that waits for a round takes up nobody's time.
             in_flight = len(self._todo) if options.batch else options.in_flight
-            return LocalRunner(plan, clients, in_flight)
+            first = self._first_decisions(one_by_one=rounds is None)
+            return LocalRunner(plan, clients, in_flight, first)
         from merge_runner.run.cluster.connect import connected
 
         client = await stack.enter_async_context(connected(options.dask))
@@ -386,6 +389,8 @@ class Sweep:
 
     async def _play(self, runner: TrialRunner, flusher: Flusher, outcome: Outcome) -> None:
         """Run the trials until all have ended, or the sweep is stopped or interrupted."""
+        # No worker of a cluster has all of them.
+        first = None if isinstance(runner, LocalRunner) else self._first_decisions()
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             if isinstance(record, TrialSuspended):
@@ -396,17 +401,19 @@ class Sweep:
             self._misses += _misses(spec, record)
             flusher.add(record)
             self._watch_for_outage(record, runner)
+            if first is not None:
+                self._count(record, first)
 
         # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
         work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
         drain = asyncio.create_task(_drained(runner, work))
 
         def interrupted() -> None:
+            work.cancel()  # before anything is written: the terminal may be closed
             self._say(
                 f"Stopping: {runner.in_flight_calls} calls in flight are saved first; "
                 "Ctrl-C again drops them."
             )
-            work.cancel()
 
         beside = [asyncio.create_task(self._stop_in_time(runner, interrupted))]
         if self._rounds is not None and isinstance(runner, LocalRunner):
@@ -515,6 +522,25 @@ class Sweep:
                     f"in between ({record.error}): the rest is not tried. When the service answers "
                     "again, run the same command to go on"
                 )
+
+    def _count(self, record: TrialRecord, first: FirstDecisions) -> None:
+        asked = self._arms[record.spec.arm].asked
+        for row in record.decisions:
+            if asked[row.side] in self._plan.entries:
+                first.count(asked[row.side], row.decision)
+
+    def _first_decisions(self, *, one_by_one: bool = False) -> FirstDecisions:
+        """The first decisions of the models, with those that are stored already."""
+        if self._options.keep_going:
+            return FirstDecisions()
+        first = FirstDecisions(MOST_INVALID, one_by_one=one_by_one)
+        arms = {spec.spec_hash: self._arms[spec.arm] for spec in self._stored_specs}
+        stored = self._store.decisions_by_spec(arms) if arms else []
+        for spec, side, valid, invalid, failure, rationale in stored:
+            model = arms[spec].asked[side]
+            if model in self._plan.entries:
+                first.add_stored(model, valid, invalid, failure, rationale)
+        return first
 
     @property
     def _is_silent(self) -> bool:

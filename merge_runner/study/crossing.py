@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from operator import itemgetter
 
 from pydantic import JsonValue
 
 from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, ego_side, validated
 from merge_runner.drivers.pace import pace_of
-from merge_runner.drivers.registry import PROGRAMS, Program
-from merge_runner.errors import UsageError
+from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.formats.parameters import known_parameters, with_parameter
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES, Side, other_side
 from merge_runner.registry import require
 from merge_runner.scenarios.registry import SCENARIOS
-from merge_runner.study.file import StudyFile
+from merge_runner.study.file import BASELINE, EVERY_PROMPT, StudyFile
 from merge_runner.study.world_step import with_world_step
 
 MODEL, PROMPT, OPPONENT, SELF, DEFAULT = "model", "prompt", "opponent", "self", "default"
@@ -27,6 +29,7 @@ PERCEPTION, PERFECT_ONE = "perception", "perfect"
 _PERCEPTIONS = tuple(f"{PERCEPTION}_{side}" for side in SIDES)
 SET_BY = {PERCEPTION: _PERCEPTIONS, **{name: (name,) for name in _PERCEPTIONS}}
 """The factors of perception, with the switches of the scenario that each sets."""
+MOST_TRIALS = 1_000_000
 Levels = Mapping[str, JsonValue]
 
 
@@ -86,12 +89,14 @@ def cross(
     registry: Mapping[str, ModelEntry],
     only: Mapping[str, Sequence[str]],
     *,
+    conditions: int,
     mirror: bool = False,
 ) -> list[Arm]:
     """The arms of a study, model by model; raises UsageError for a crossing that cannot be.
 
     ``repetitions`` are those of each prompt, ``only`` the levels, as texts, that are wanted. With
-    ``mirror``, or where the file says so, two different drivers are played both ways round.
+    ``mirror``, or where the file says so, two different drivers are played both ways round. Each
+    arm is played in so many ``conditions``.
     """
     factors = {name: levels for name, levels in file.factors.items() if name != PROMPT}
     if PROMPT in file.factors or len(repetitions) > 1:
@@ -99,15 +104,14 @@ def cross(
     axes = {MODEL: tuple(models), **factors}
     _check_names(file, registry)
     _check_axes(file, axes, only)
+    axes = {name: _reference_first(file, name, levels) for name, levels in axes.items()}
     varying = [name for name, levels in axes.items() if len(levels) > 1]
+    axes = {name: _wanted(levels, only.get(name)) for name, levels in axes.items()}
+    _check_size(axes, file.skip, repetitions, conditions)
     arms = []
-    for chosen in product(*axes.values()):
-        levels = dict(zip(axes, chosen, strict=True))
-        prompt = levels.get(PROMPT, next(iter(repetitions)))
-        if _is_left_out({PROMPT: prompt, **levels}, file.skip, only):
-            continue
+    for prompt, levels in _crossings(axes, file.skip, repetitions):
         try:
-            arm = _arm(file, levels, str(prompt), repetitions, registry, varying)
+            arm = _arm(file, levels, prompt, repetitions, registry, varying)
         except UsageError as exc:
             if not file.factors:
                 raise
@@ -121,6 +125,87 @@ def cross(
             f"there are no two different drivers to mirror: name them, as --model {models[0]}+OTHER"
         )
     return list(_once(arms, mirrored=mirror or file.mirror))
+
+
+def listed_levels(
+    file: StudyFile, models: Iterable[str], prompts: Iterable[str] = ()
+) -> dict[str, list[str]]:
+    """The levels of each factor as texts, in the order of the file, but its reference first.
+
+    The ``models`` are those that are played, and so are the ``prompts`` beside the file's.
+    """
+    axes = {MODEL: [*models], **file.factors, PROMPT: [*file_prompts(file), *prompts]}
+    return {
+        name: list(dict.fromkeys(map(level_text, _reference_first(file, name, levels))))
+        for name, levels in axes.items()
+    }
+
+
+def file_prompts(file: StudyFile) -> list[str]:
+    """The prompts that a file plays by itself."""
+    levels = [level_text(level) for level in file.factors.get(PROMPT, ())]
+    named = [name for name in file.repetitions if name != EVERY_PROMPT]
+    return levels or named or [BASELINE] * (EVERY_PROMPT in file.repetitions)
+
+
+def _reference_first(
+    file: StudyFile, factor: str, levels: Iterable[JsonValue]
+) -> tuple[JsonValue, ...]:
+    if factor not in file.reference:
+        return tuple(levels)
+    reference = level_text(file.reference[factor])
+    return tuple(sorted(levels, key=lambda level: level_text(level) != reference))
+
+
+def _wanted(levels: Sequence[JsonValue], only: Sequence[str] | None) -> tuple[JsonValue, ...]:
+    return tuple(level for level in levels if only is None or level_text(level) in only)
+
+
+def _crossings(
+    axes: Mapping[str, Sequence[JsonValue]], skip: Sequence[Levels], repetitions: Mapping[str, int]
+) -> Iterator[tuple[str, Levels]]:
+    """Each crossing that is to be played: its prompt and its levels."""
+    for chosen in product(*axes.values()):
+        levels = dict(zip(axes, chosen, strict=True))
+        prompt = str(levels.get(PROMPT, next(iter(repetitions))))
+        if not _is_left_out({PROMPT: prompt, **levels}, skip):
+            yield prompt, levels
+
+
+def _check_size(
+    axes: Mapping[str, Sequence[JsonValue]],
+    skip: Sequence[Levels],
+    repetitions: Mapping[str, int],
+    conditions: int,
+) -> None:
+    """Raise UsageError where these are more trials than can be played."""
+    prompts = [str(prompt) for prompt in axes.get(PROMPT, [*repetitions][:1])]
+    others = [(len(levels), name) for name, levels in axes.items() if name != PROMPT]
+    of_a_prompt = math.prod(n for n, _ in others)
+    trials = conditions * of_a_prompt * sum(repetitions[prompt] for prompt in prompts)
+    if skip and of_a_prompt * len(prompts) <= MOST_TRIALS:  # few enough to go through
+        trials = conditions * sum(repetitions[p] for p, _ in _crossings(axes, skip, repetitions))
+    if trials <= MOST_TRIALS:
+        return
+    sizes = [(n, f"levels of {name}") for n, name in [*others, (len(prompts), PROMPT)]]
+    sizes += [(conditions, "conditions"), (max(repetitions.values()), "repetitions")]
+    sizes.sort(key=itemgetter(0), reverse=True)
+    raise UsageError(
+        f"{' x '.join(f'{n:,} {what}' for n, what in sizes if n > 1)} make {trials:,} trials, and "
+        f"at most {MOST_TRIALS:,} can be played: leave out {sizes[0][1]}, in the file or by "
+        "--only, --conditions or --reps"
+    )
+
+
+def chosen_models(file: StudyFile, models: Sequence[str]) -> tuple[str, ...]:
+    """Return who drives: the ``models`` asked for, else the study's own, else the emulator."""
+    return tuple(dict.fromkeys(models or file.models or (EMULATOR,)))
+
+
+def driver_names(file: StudyFile, models: Iterable[str]) -> set[str]:
+    """Return the names of all drivers that meet where these models drive in a study."""
+    pairs = [*models, *map(level_text, file.factors.get(OPPONENT, ()))]
+    return {name for pair in pairs for name in both_sides(pair).values()}
 
 
 def _hint(error: UsageError, levels: Levels) -> str:
@@ -256,11 +341,9 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     known = known_parameters(registry.values())
     for name in filter(_is_parameter, file.factors):
         if name not in known:
-            raise UsageError(
-                f"unknown factor {name!r}; valid: {PROMPT}, {OPPONENT}, {PERCEPTION}, a parameter "
-                f"({', '.join(sorted(known))}) or a switch of the scenario "
-                f"({', '.join(ScenarioConfig.model_fields)})"
-            )
+            switches = ScenarioConfig.model_fields
+            valid = (PROMPT, OPPONENT, PERCEPTION, *sorted(known), *switches)
+            raise unknown_name("factor", name, valid)
 
 
 def _entry(
@@ -290,10 +373,7 @@ def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
     made = _switched(file.scenario, {name: levels[name] for name in levels if name in fields})
     rules = SCENARIOS.require(made.name).collision_rules
     if made.collision_rule not in rules:
-        raise UsageError(
-            f"the scenario {made.name} has no collision_rule {made.collision_rule!r}; valid: "
-            + ", ".join(rules)
-        )
+        raise unknown_name(f"collision_rule of {made.name}", made.collision_rule, rules)
     return made
 
 
@@ -326,9 +406,17 @@ def _check_axes(
 ) -> None:
     """Raise UsageError for levels that are not there, or there twice, and for names of none."""
     for name, levels in axes.items():
-        texts = [level_text(level) for level in levels]
-        if not texts or len({*texts}) < len(texts):
-            raise UsageError(f"the factor {name} needs levels, each of them once")
+        if not levels:
+            raise UsageError(f"the factor {name} needs levels")
+        known: dict[str, JsonValue] = {}
+        for level in levels:
+            value = int(level) if isinstance(level, float) and level.is_integer() else level
+            if (text := level_text(value)) in known:
+                raise UsageError(
+                    f"the factor {name} needs each of its levels once: {level_text(known[text])} "
+                    f"and {level_text(level)} are the same"
+                )
+            known[text] = level
     for name, wanted in only.items():
         for text in wanted:
             _check_level(axes, name, text)
@@ -337,6 +425,8 @@ def _check_axes(
     for row in file.skip:
         for name, text in _pairs(row):
             _check_level(whole, name, text)
+    for name, level in file.reference.items():
+        _check_level(whole, name, level_text(level))
 
 
 def _check_level(axes: Mapping[str, Sequence[JsonValue]], name: str, text: str) -> None:
@@ -350,11 +440,11 @@ def _pairs(row: Levels) -> Iterator[tuple[str, str]]:
             yield name, level_text(level)
 
 
-def _is_left_out(levels: Levels, skip: Iterable[Levels], only: Mapping[str, Sequence[str]]) -> bool:
+def _is_left_out(levels: Levels, skip: Iterable[Levels]) -> bool:
     texts = {name: level_text(level) for name, level in levels.items()}
 
     def fits(row: Levels) -> bool:
         named = list(_pairs(row))
         return all((name, texts[name]) in named for name in row)
 
-    return any(map(fits, skip)) or any(texts[name] not in wanted for name, wanted in only.items())
+    return any(map(fits, skip))

@@ -17,14 +17,16 @@ from merge_runner.config import (
     NotNegative,
     Perception,
     Positive,
+    Rate,
     ScenarioConfig,
     experiments,
     read_toml,
     validated,
 )
-from merge_runner.errors import UsageError
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
 
+BASELINE = "baseline"
 EVERY_PROMPT = "every prompt"
 """Stands for a single number of repetitions in ``StudyFile.repetitions``."""
 EVERY_CONDITION = "all"
@@ -85,7 +87,7 @@ class StudyPrompt(Frozen):
 
     nested: ClassVar[Mapping[str, type[BaseModel]]] = {"replace": RoadTexts, "add": AddedText}
 
-    based_on: str = "baseline"
+    based_on: str = BASELINE
     remove: tuple[str, ...] = ()
     replace: dict[str, Annotated[RoadTexts, BeforeValidator(_texts)]] = Field(default_factory=dict)
     add: tuple[AddedText, ...] = ()
@@ -99,7 +101,7 @@ class StudyCondition(Frozen):
     name: str
     projected_headway_m: Annotated[float, Field(allow_inf_nan=False)] | None = None
     relative_velocity_mps: Annotated[float, Field(allow_inf_nan=False)] | None = None
-    mean_speed_mps: Positive = MEAN_SPEED_MPS
+    mean_speed_mps: Rate = MEAN_SPEED_MPS
 
     @property
     def is_own(self) -> bool:
@@ -150,7 +152,8 @@ class StudyFile(Frozen):
     """One study. ``repetitions`` are per condition, for each prompt or for all of them.
 
     ``factors`` are crossed with each other, with the ``models`` and with the conditions; ``skip``
-    leaves crossings out: each row names levels, or lists of them. With ``mirror`` two different
+    leaves crossings out: each row names levels, or lists of them. Tables compare the levels of a
+    factor with its first one, or with that which ``reference`` names. With ``mirror`` two different
     drivers are played both ways round. ``perception`` holds by name what the levels of the factors
     perception, perception_left and perception_right stand for.
     """
@@ -174,6 +177,7 @@ class StudyFile(Frozen):
     scenario: ScenarioConfig = ScenarioConfig()
     factors: dict[str, tuple[Json, ...]] = Field(default_factory=dict)
     skip: tuple[dict[str, Json], ...] = ()
+    reference: dict[str, Json] = Field(default_factory=dict)
     mirror: bool = False
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)
@@ -217,8 +221,7 @@ def read_study(name: str) -> StudySource:
     if path.suffix != ".toml":
         files = study_files()
         if name not in files:
-            known = ", ".join(sorted(files))
-            raise UsageError(f"there is no sweep {name!r}; valid: {known}, or a path")
+            raise unknown_name("sweep", name, sorted(files), "or a path")
         path = files[name]
     file = validated(StudyFile, read_toml(path), str(path))
     return StudySource(
@@ -232,6 +235,8 @@ def read_study(name: str) -> StudySource:
 
 def _source(study: Path, file: str) -> str:
     path = study.parent / file
+    if not path.resolve().is_relative_to(study.parent.resolve()):
+        raise UsageError(f"{study}: the plug-in {file} lies outside of the study's folder: move it")
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as exc:

@@ -8,7 +8,8 @@ from pathlib import Path
 from merge_runner.errors import UsageError
 
 TEMPLATE = Path(__file__).with_name("template")
-FILES = ("study.toml", "models.toml", "plugin.py", "README.md", "CITATION.cff", "Makefile")
+PLUGIN = "plugin.py"
+FILES = ("study.toml", "models.toml", PLUGIN, "README.md", "CITATION.cff", "Makefile")
 IGNORED = "gitignore"  # with a dot it would hold for the template itself
 
 

@@ -6,7 +6,7 @@ import re
 import sys
 import threading
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.abc import InspectLoader
 from importlib.util import module_from_spec, spec_from_loader
@@ -36,6 +36,7 @@ from merge_runner.registry import (
     unregister,
 )
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.study.crossing import chosen_models, driver_names
 from merge_runner.study.file import (
     AddedText,
     StudyCondition,
@@ -43,7 +44,9 @@ from merge_runner.study.file import (
     StudyFile,
     StudyPrompt,
     StudySource,
+    read_study,
 )
+from merge_runner.study.trust import require_agreement
 
 LAST = "the end"
 PACKAGE = "study_plugins"
@@ -52,10 +55,26 @@ _lock = threading.RLock()
 _adopted: list[tuple[StudySource, int]] = []
 
 
+def load_study(
+    name: str, models: Sequence[str] | None = None, *, trust: bool = False
+) -> StudySource:
+    """Read a study and register what it adds, once the user agrees to its code.
+
+    ``models`` are those that are to be asked, in place of the file's own; None: nobody is asked.
+    The user also agrees to where their keys go. ``trust`` agrees. Raises UsageError.
+    """
+    study = read_study(name)
+    file = study.file
+    asked = () if models is None else driver_names(file, chosen_models(file, models))
+    require_agreement(study, asked, trust=trust)
+    adopt(study)
+    return study
+
+
 def adopt(study: StudySource) -> None:
     """Register what a study adds, in place of what the study before it added.
 
-    Raises UsageError.
+    Its plug-ins run: the user has agreed to them (``load_study``). Raises UsageError.
     """
     load_plugins()  # first: a study may build on what is installed
     with _lock:  # a Dask worker may play for several threads at once

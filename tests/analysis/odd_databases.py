@@ -7,12 +7,14 @@ they say.
 from __future__ import annotations
 
 import os
+import random
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from analysis.data.reference_data import PAIRS, published
 from analysis.explorer.export import export_folder
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
@@ -22,10 +24,23 @@ from merge_runner.results.database import open_database
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.recordings import drive, write_folder
-from tests.analysis.studies import Said, write_study, yielding
+from tests.analysis.studies import Drive, Said, as_humans, write_study, yielding
 
+RECORDINGS = Path(__file__).parents[2] / "cache/recordings"
+# A study of its own drivers and factors, of a model that another sweep drives too.
+STUDY = """
+models = ["emulator"]
+repetitions = 3
+conditions = ["N_0_0", "L_0_-8", "R_0_8", "L_4_8"]
+[factors]
+prompt = ["baseline", "hurry"]
+opponent = ["self", "projected-order"]
+[prompts.hurry]
+add = [{ after = "C3.human", text = "You are late, and in a hurry." }]
+"""
 OWN = {"endpoint": "openai", "body": {"model": "o3", "messages": [], "reasoning_effort": "medium"}}
 IMPORTED = 129
+BASELINE = ("sweep", "baseline")
 UNLIMITED = ("--rpm", "100000", "--tpm", "1000000000")
 
 
@@ -37,7 +52,7 @@ def two_trials(db: Path) -> None:
 def stand_in_behind_o3(db: Path) -> None:
     """The emulator at OPENAI_BASE_URL, asked for o3."""
     url = {"OPENAI_BASE_URL": f"{_emulator()}/v1", "OPENAI_API_KEY": "no-key"}
-    _sweep(db, "--model", "o3", "--reps", "2", "--yes", *UNLIMITED, **url)
+    _run(db, *BASELINE, "--model", "o3", "--reps", "2", "--yes", *UNLIMITED, **url)
 
 
 def another_endpoint(db: Path) -> None:
@@ -75,7 +90,7 @@ def temperature(db: Path) -> None:
 def programs(db: Path) -> None:
     """Drivers that are programs, each with repetitions, and one against the emulator."""
     for model in ("projected-order", "constant", "emulator+constant"):
-        _sweep(db, "--model", model, "--reps", "2")
+        _run(db, *BASELINE, "--model", model, "--reps", "2")
 
 
 def only_failed(db: Path) -> None:
@@ -100,6 +115,60 @@ def word_for_word(db: Path) -> None:
     write_study(db, drives, asked=OWN)
 
 
+def two_studies(db: Path) -> None:
+    """A sweep of the paper and a study with factors, of one model, in one database."""
+    _run(db, *BASELINE, "--reps", "3")
+    db.with_name("study.toml").write_text(STUDY)
+    _run(db, "sweep", "study.toml")
+
+
+def mirrored_chance(db: Path) -> None:
+    """A pair in which one draws by chance and the other does not, both ways round."""
+    _run(db, *BASELINE, "--model", "human-odds+constant", "--mirror", "--reps", "10")
+
+
+def no_valid_reply(db: Path) -> None:
+    """A language model of whose replies none was valid."""
+    replayed(db, "smollm2-free")
+
+
+def separated(db: Path) -> None:
+    """A driver that goes first wherever it is ahead, so that the logit has no finite estimate."""
+    write_study(db, yielding("o3", reps=4), asked=OWN)
+
+
+def all_tied(db: Path) -> None:
+    """Every other trial of each condition collides."""
+    drives = [
+        drive if drive.rep % 2 else replace(drive, left=(), right=())
+        for drive in yielding("o3", reps=4)
+    ]
+    write_study(db, drives, asked=OWN)
+
+
+def complete_import(db: Path) -> None:
+    """A driver beside all 990 human trials: published outcomes, and pairs who differ."""
+    chance = random.Random(4)
+    pairs = [(pair, chance.gauss(0, 1), chance.gauss(0, 0.1)) for pair in PAIRS.values()]
+    drives = yielding("o3", reps=5)
+    for row in published("human_outcomes").itertuples():
+        trials = [
+            (bold + chance.gauss(0, 1), 0.4 + close + chance.gauss(0, 0.1), pair, rep)
+            for pair, bold, close in pairs
+            for rep in range(1, 11)
+        ]
+        # Bold pairs go first on the left.
+        for place, (_, strength, pair, rep) in enumerate(sorted(trials, reverse=True)):
+            strong = min(max(strength, 0.25), 1.0)
+            faster, slower = (strong,) * 3, (-strong,) * 3
+            ways = {True: (faster, slower), False: (slower, faster)}
+            crash = place >= row.left_first + row.right_first
+            left, right = ((), ()) if crash else ways[place < row.left_first]
+            drives.append(Drive("human", pair, row.condition, rep, left, right))
+    write_study(db, drives, asked=OWN)
+    as_humans(db)
+
+
 KINDS: dict[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -107,12 +176,18 @@ KINDS: dict[str, Callable[[Path], None]] = {
         stand_in_behind_o3,
         another_endpoint,
         partial_import,
+        complete_import,
         other_vehicle_length,
         temperature,
         programs,
         only_failed,
         killed,
         word_for_word,
+        two_studies,
+        mirrored_chance,
+        no_valid_reply,
+        separated,
+        all_tied,
     )
 }
 
@@ -123,6 +198,12 @@ def made(folder: Path, kind: str) -> Path:
     db.parent.mkdir(parents=True)
     KINDS[kind](db)
     return db
+
+
+def replayed(db: Path, model: str) -> None:
+    """Replay the shipped recording of a model."""
+    recording = str(RECORDINGS / f"{model}-baseline.parquet")
+    _run(db, "replay", "baseline", "--model", model, "--recording", recording)
 
 
 def _emulator() -> str:
@@ -137,10 +218,9 @@ def _emulator() -> str:
     return process.stdout.readline().strip()
 
 
-def _sweep(db: Path, *arguments: str, **environment: str) -> None:
-    program = (sys.executable, "-m", "merge_runner", "sweep", "baseline")
+def _run(db: Path, *arguments: str, **environment: str) -> None:
     subprocess.run(
-        [*program, *arguments, "--db", db.name, "--cache", "cache"],
+        [sys.executable, "-m", "merge_runner", *arguments, "--db", db.name, "--cache", "cache"],
         cwd=db.parent,
         env={**os.environ, **environment},
         check=True,
@@ -149,15 +229,15 @@ def _sweep(db: Path, *arguments: str, **environment: str) -> None:
 
 
 def main() -> None:
-    """Make all of them in the folder that is named, and say what they are."""
-    folder = Path(sys.argv[1])
-    for kind, make in KINDS.items():
-        db = made(folder, kind)
+    """Make the kinds that are named after the folder, else all, and say what they are."""
+    folder, *kinds = sys.argv[1:]
+    for kind in kinds or KINDS:
+        db = made(Path(folder), kind)
         for _ in write_report(db, None, db.with_name("report.html"), db.with_name("files")):
             pass
         for _ in export_folder(db, db.with_name("pages"), []):
             pass
-        sys.stdout.write(f"{db.parent}: {make.__doc__}\n")
+        sys.stdout.write(f"{db.parent}: {KINDS[kind].__doc__}\n")
 
 
 if __name__ == "__main__":

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import duckdb
 import pytest
+from statsmodels.stats.multitest import multipletests
 
 from analysis.commands import drivers
 from analysis.data.study import Study
@@ -13,6 +15,7 @@ from analysis.explain import explain
 from analysis.stats.factors import levels_by_factor
 from analysis.tables import make_tables
 from merge_runner.errors import UsageError
+from tests.analysis.studies import changed, write_study, yielding
 from tests.crossed_study import PLUGIN
 
 CHEAP_COLD = "cheap+sleepy [temperature=0.2]"
@@ -23,9 +26,13 @@ def study(played):
     return Study(played.db)
 
 
-def value(table, row_id, column):
+def found(table, row_id):
     (row,) = [row for row in table.rows if row.id == row_id]
-    return row.values[column]
+    return row.values
+
+
+def value(table, row_id, column):
+    return found(table, row_id)[column]
 
 
 @pytest.mark.slow
@@ -36,7 +43,9 @@ def test_the_summary_of_a_sweep_counts_by_model_and_by_each_factor(played):
     assert by_factor["temperature"] == [["1.0", "18"], ["0.2", "18"]]
     assert by_factor["opponent"] == [["self", "24"], ["sleepy", "12"]]
     (played.folder / "again.duckdb").write_bytes(played.db.read_bytes())
-    again = played.run("sweep", "mine.toml", "--yes", "--json", db="again.duckdb").summary
+    again = played.run(
+        "sweep", "mine.toml", "--yes", "--trust", "--json", db="again.duckdb"
+    ).summary
     trials = {(one["factor"], one["level"]): one["trials"] for one in again["outcomes_by_level"]}
     assert trials["temperature", "0.2"] == 18
     assert trials["model", "dear"] == 12
@@ -77,7 +86,7 @@ def test_where_keeps_the_trials_of_these_levels_and_names_the_valid_ones(played)
     assert kept.groups[0].id == "human"
     with pytest.raises(UsageError, match="unknown factor 'mood'; valid: model, prompt, opponent, "):
         Study(played.db, where={"mood": ["good"]})
-    with pytest.raises(UsageError, match=r"unknown level of temperature '0.3'; valid: 0.2, 1.0"):
+    with pytest.raises(UsageError, match=r"unknown level of temperature '0.3'; valid: 1.0, 0.2"):
         Study(played.db, where={"temperature": ["0.3"]})
     with pytest.raises(UsageError, match="no trial with model=dear and opponent=sleepy"):
         Study(played.db, where={"model": ["dear"], "opponent": ["sleepy"]})
@@ -114,7 +123,87 @@ def test_a_levels_row_pools_its_trials_and_is_compared_with_the_first_level(stud
     assert low < rates["sleepy"] - rates["self"] < high
     assert value(table, "opponent=self/collided_percent", "trials") == 24
     levels = [row.values["level"] for row in table.rows if row.id.endswith("/gap_m")]
-    assert levels == ["cheap", "dear", "self", "sleepy", "0.2", "1.0"]
+    assert levels == ["cheap", "dear", "self", "sleepy", "1.0", "0.2"]
+
+
+def test_a_level_is_compared_with_the_first_that_the_study_lists_or_with_its_reference(
+    study, played, tmp_path
+):
+    text = (played.folder / "mine.toml").read_text()
+    (tmp_path / "mine.py").write_text(PLUGIN)
+    file = tmp_path / "mine.toml"
+    file.write_text('reference = { temperature = 0.2, model = "dear" }\n' + text)
+    (listed,), (chosen,) = (
+        make_tables(known, ["factors"]) for known in (study, Study(played.db, file=str(file)))
+    )
+    for first, row in ((listed, "temperature=0.2/gap_m"), (chosen, "temperature=1.0/gap_m")):
+        assert "difference" in {n for n, v in found(first, row).items() if v is not None}
+    assert value(listed, "temperature=0.2/gap_m", "difference") == pytest.approx(
+        -value(chosen, "temperature=1.0/gap_m", "difference")
+    )
+    assert found(chosen, "temperature=0.2/gap_m").get("difference") is None
+    levels = [row.values["level"] for row in chosen.rows if row.id.endswith("/gap_m")]
+    assert levels == ["dear", "cheap", "self", "sleepy", "0.2", "1.0"]
+
+
+def test_p_values_are_corrected_for_their_number(study):
+    (table,) = make_tables(study, ["factors"])
+    p = {row.id: row.values["p"] for row in table.rows if row.values.get("p") is not None}
+    holm = multipletests(list(p.values()), method="holm")[1]
+    shown = [row.values["p_holm"] for row in table.rows if row.id in p]
+    assert shown == pytest.approx(holm)
+    assert f"Holm: corrected for all {len(p)} p of the table" in table.notes
+
+
+@pytest.mark.slow
+def test_factors_are_shown_at_each_level_of_another_one_with_interactions(played):
+    made = played.run("tables", "factors", "--by", "opponent", "--json")
+    (table,) = json.loads(made.out)["tables"]
+    rows = {row["row"]: row for row in table["rows"]}
+    at_self, at_sleepy = (rows[f"opponent={n}/temperature=0.2/gap_m"] for n in ("self", "sleepy"))
+    assert (at_self["trials"], at_sleepy["trials"]) == (12, 6)
+    between = rows["opponent=sleepy/temperature=0.2/interaction/gap_m"]
+    assert (between["at"], between["factor"]) == ("sleepy - self", "temperature × opponent")
+    cell = "opponent=sleepy/temperature=0.2/interaction/gap_m:difference"
+    told = json.loads(played.run("explain", "factors", cell, "--by", "opponent", "--json").out)
+    assert len(told["sources"]) == 6, "four of the models against themselves, two against sleepy"
+    wrong = played.run("tables", "factors", "--by", "mood")
+    assert "unknown factor 'mood'; valid: model, prompt, opponent, temperature" in wrong.err
+
+
+@pytest.fixture
+def moody(tmp_path):
+    """o3 with two prompts in two moods; in the second mood the second prompt brakes harder."""
+    drives = []
+    for drive in [*yielding("o3", reps=8), *yielding("o3", "A1", 8)]:
+        hard = drive.variant == "A1" and drive.rep % 2 == 0
+        right = tuple(x * (0.5 + 0.25 * hard) for x in drive.right)
+        drives.append(replace(drive, right=right))
+    db = write_study(tmp_path / "t.duckdb", drives)
+    return changed(
+        db,
+        "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'mood', "
+        "if(rep % 2 = 0, 'late', 'early') FROM trials",
+    )
+
+
+def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(moody):
+    study = Study(moody.db, by="mood")
+    (table,) = make_tables(study, ["factors"])
+    name = "mood=late/prompt=A1"
+    parts = [
+        value(table, f"mood={mood}/prompt=A1/gap_m", "difference") for mood in ("late", "early")
+    ]
+    found = value(table, f"{name}/interaction/gap_m", "difference")
+    assert found == pytest.approx(parts[0] - parts[1])
+    assert abs(found) > 0.1
+    low, high = value(table, f"{name}/interaction/gap_m", "difference_ci")
+    assert low < found < high
+    assert (value(table, f"{name}/interaction/gap_m", "p") < 0.05) == (low > 0 or high < 0)
+    # By the other factor it is the same.
+    (turned,) = make_tables(Study(moody.db, by="prompt"), ["factors"])
+    same = value(turned, "prompt=A1/mood=late/interaction/gap_m", "difference")
+    assert same == pytest.approx(found)
 
 
 def test_the_notes_say_which_cells_a_level_lacks(study):
@@ -168,11 +257,11 @@ def test_stand_ins_are_never_pooled_with_models(played, tmp_path):
 def test_a_metric_of_the_studys_plug_in_is_shown_only_where_the_study_is_named(played):
     plain = played.run("tables", "factors")
     assert "duration" not in plain.out
-    named = played.run("tables", "factors", "--study", "mine.toml")
+    named = played.run("tables", "factors", "--study", "mine.toml", "--trust")
     assert "duration (s)" in named.out, named.err
     edited = PLUGIN.replace('label="duration"', 'label="whole time"')
     (played.folder / "mine.py").write_text(edited)
-    again = played.run("tables", "factors", "--study", "mine.toml")
+    again = played.run("tables", "factors", "--study", "mine.toml", "--trust")
     (played.folder / "mine.py").write_text(PLUGIN)
     assert "whole time (s)" in again.out, "what was kept before the edit is not shown"
 
@@ -185,5 +274,5 @@ def test_an_audit_derives_a_studys_prompts_and_conditions_without_its_file_but_r
     assert alone["ok"]
     assert alone["audits"][0]["counts"]["derived anew"] == 36
     assert "'sleepy', which is no driver here" in " ".join(alone["audits"][0]["notes"])
-    named = json.loads(played.run("audit", "--json", "--study", "mine.toml").out)
+    named = json.loads(played.run("audit", "--json", "--study", "mine.toml", "--trust").out)
     assert not any("not derived" in note for note in named["audits"][0]["notes"])

@@ -25,7 +25,7 @@ SAID = {
     "stand_in_behind_o3": (
         [
             "A scripted stand-in answered",
-            "(scripted stand-in, not o3)",
+            ": scripted stand-in, not o3",
             "Nothing: with the baseline prompt only scripted stand-ins drove.",
         ],
         ["o3 collided", "o3 leaves", "o3 shows", ">o3</td>"],
@@ -42,6 +42,10 @@ SAID = {
         ],
         ["The human recordings are not imported"],
     ),
+    "complete_import": (
+        ["humans 12.93 m in 962 imported trials of the same 11 conditions"],
+        ["The human recordings are not imported", "which pair drove is not published"],
+    ),
     "other_vehicle_length": (["o3: its task is not the default one: vehicle_length_m = 8.0."], []),
     "temperature": (["temperature = 0.2"], ["no temperature", "default sampling temperature"]),
     "programs": (
@@ -49,7 +53,7 @@ SAID = {
             "11 of 22 trials of projected-order/baseline repeat an earlier one",
             "projected-order collided, by boxes that overlap, in 0.0 % of 11 trials",
             "projected-order is a program",
-            "emulator+constant (scripted stand-in, no language model)",
+            "* emulator+constant: scripted stand-in, no language model",
         ],
         ["temperature", "A scripted stand-in answered"],
     ),
@@ -59,9 +63,44 @@ SAID = {
         ["evidence against the driver"],
     ),
     "word_for_word": (
-        ["22 of 33 trials of o3/baseline repeat an earlier one", "0.0 % of 11 trials"],
-        ["% of 33 trials"],
+        [
+            "o3/baseline: 22 of 33 trials are as an earlier one to the last state; each counts",
+            "0.0 % of 33 trials",
+        ],
+        ["% of 11 trials", "repeat an earlier one", "no chance"],
     ),
+    "two_studies": (
+        [
+            "Nothing: with the baseline prompt only scripted stand-ins drove.",
+            "trials of several studies: ",
+            "No p is given for a difference across studies",
+        ],
+        [],
+    ),
+    "mirrored_chance": (
+        [
+            "constant merged first in all 104 trials: nothing to explain",
+            "collided, by boxes that overlap, in 53.0 % of 219 trials",
+        ],
+        ["repeat an earlier one"],
+    ),
+    "no_valid_reply": (
+        [
+            "Too few valid decisions",
+            "smollm2-free/baseline: not judged: 92 of the 92 decisions of smollm2-free are invalid "
+            "(100.0 %, more than 20 %)",
+            "Nothing: of the drivers with the baseline prompt too many decisions are invalid.",
+        ],
+        ["smollm2-free collided", "Many fallbacks", "p < 0.001"],
+    ),
+    "separated": (
+        [
+            "I1, I2 cannot be judged by the paper's test: separation",
+            "o3: a difference from the humans in who merges first cannot be estimated: separation",
+        ],
+        ["effect of headway on who merges first"],
+    ),
+    "all_tied": (["on average of 22 trials"], []),
 }
 
 
@@ -73,11 +112,11 @@ def test_every_kind_is_looked_at():
 def forked(prepare, emulator_url, monkeypatch):
     """Sweeps are forked and ask the emulator of all tests: most of their time is imports."""
 
-    def sweep(db, *arguments, **changes):
-        run = prepare(db.parent, "sweep", "baseline", *arguments, "--db", db.name, **changes)
-        assert run.code == 0, run.err
+    def run(db, *arguments, **changes):
+        done = prepare(db.parent, *arguments, "--db", db.name, **changes)
+        assert done.code == 0, done.err
 
-    monkeypatch.setattr(odd_databases, "_sweep", sweep)
+    monkeypatch.setattr(odd_databases, "_run", run)
     monkeypatch.setattr(odd_databases, "_emulator", lambda: emulator_url.removesuffix("/v1"))
 
 

@@ -83,6 +83,12 @@ async def test_two_replayed_sides_of_a_trial_are_the_trial(db, plan_of, resistan
     assert (trial.status, trial.merged_first) == ("finished", "left")
 
 
+async def test_a_replayed_human_declares_no_chance_and_is_the_same_with_any_seed(plan_of):
+    one, other = [await played(plan_of(HUMAN_REPLAY, sample_set=n)) for n in (0, 1)]
+    assert one.states == other.states
+    assert not PROGRAMS[HUMAN_REPLAY].chance
+
+
 @pytest.mark.parametrize("side", SIDES)
 async def test_a_replayed_human_keeps_its_trace_beside_a_free_driver(db, plan_of, side):
     pair = f"{HUMAN_REPLAY}+idm" if side == "left" else f"idm+{HUMAN_REPLAY}"
@@ -144,7 +150,10 @@ async def test_a_study_names_the_pair(db, plan_of):
     assert (await played(plan)).merged_first == "right"
     assert json.loads(plan.spec(plan.arms[0], "L_4_0"))["left"]["based_on"] == HUMAN_REPLAY
     for text_, said in (
-        (text.replace("pair2", "pair7"), "knows no pair 'pair7'; valid: all, pair1, pair2"),
+        (
+            text.replace("pair2", "pair7"),
+            "unknown pair of human-replay 'pair7'; valid: all, pair1, pair2",
+        ),
         (text + "clock = 1.0\n", "takes no clock"),
         (text + "[factors]\nstep_s = [0.025]\n", "needs a world of step_s = 0.05"),
     ):
@@ -189,8 +198,9 @@ async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
     (first, *_) = audit_database(db)
     assert not first.findings
     assert not [note for note in first.notes if "derived" in note]
-    tables = await merge_runner("tables", "ablation-quantitative", "--format", "csv")
-    assert "(the human on the left is replayed and does not react)" in tables.out
+    tables = await merge_runner("tables", "ablation-quantitative")
+    cautioned = "human-replay+idm: the human on the left is replayed and does not react"
+    assert cautioned in " ".join(tables.out.split())
     explored = TestClient(explorer(Site(db), {"127.0.0.1:1"}), base_url="http://127.0.0.1:1")
     said = "the human on the left is replayed and does not react"
     assert explored.get("/trials").text.count(said) == 1, "of five trials one"

@@ -79,6 +79,20 @@ async def test_a_mirrored_pair_gives_the_mirrored_trial(left, right, condition):
             assert row.position_m == pytest.approx(mirrored.position_m, abs=1e-9)
 
 
+@pytest.mark.parametrize("name", sorted({*PROGRAMS} - {"human-replay"}))
+async def test_a_program_declares_chance_exactly_where_another_seed_is_another_trial(name):
+    differs = False
+    for condition in HUMAN_CONDITIONS:
+        one, other = [
+            await play(both(PROGRAMS[name]), condition, seeds=dict(zip(SIDES, seeds, strict=True)))
+            for seeds in ((1, 2), (2, 1))
+        ]
+        differs = one.states != other.states
+        if differs:
+            break
+    assert differs == PROGRAMS[name].chance
+
+
 def seen(own_mps=10.0, other_mps=10.0, distance_m=50.0, other_ahead_m=0.0):
     road = "merge" if distance_m > 0 else "straight"
     to_merge = distance_m if distance_m > 0 else None

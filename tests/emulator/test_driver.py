@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import re
 from dataclasses import replace
 
 import pytest
@@ -10,7 +9,7 @@ import pytest
 from merge_runner.chance import draw, draw_between, draw_index
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
-from merge_runner.emulator.driver import answer, read_prompt
+from merge_runner.emulator.driver import NEEDED, Seen, answer, read_prompt
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.prompts.blocks import VARIANTS, Variant
 from merge_runner.prompts.parse import parse_reply
@@ -301,7 +300,8 @@ def test_a_table_is_read_as_the_list_is(monkeypatch):
     VARIANTS.register("tabled", tabled)
     for condition in CONDITIONS:
         listed, table = (first_prompt(condition, "left", name) for name in ("baseline", "tabled"))
-        assert read_prompt(table) == read_prompt(listed) is not None
+        assert read_prompt(table) == read_prompt(listed)
+        assert isinstance(read_prompt(table), Seen)
     assert read_prompt(straight_prompt("tabled")) == read_prompt(straight_prompt())
 
 
@@ -331,13 +331,16 @@ def test_without_a_slot_an_answer_depends_on_the_prompt_alone():
 
 @pytest.mark.parametrize("slot", [None, Slot("N_0_0", 1, "left", 0, 0)])
 @pytest.mark.parametrize("prompt", ["", "What is the capital of France?", "Your speed: x m/s"])
-def test_a_prompt_about_something_else_gets_a_polite_text(prompt, slot):
+def test_a_prompt_about_something_else_gets_what_it_lacks_and_who_answers_it(prompt, slot):
     text = answer(prompt, slot)
-    assert text.startswith("I am a scripted stand-in for a language model and can only answer")
+    assert all(f"`{words}`" in text for words in NEEDED)
+    assert text.endswith("The model `random` answers any prompt.")
     assert parse_reply(text, SCENARIO.plan_actions).plan is None
 
 
-@pytest.mark.parametrize("line", ["Your speed", "Speed of the other car", "Relative distance"])
-def test_a_prompt_with_a_number_missing_is_no_driving_prompt(line):
-    prompt = re.sub(f"- {line}.*", "", FIRST_PROMPTS["N_0_0", "left"])
-    assert "can only answer driving prompts" in answer(prompt, None)
+@pytest.mark.parametrize("words", NEEDED)
+def test_a_prompt_without_a_number_that_the_driver_needs_is_told_which(words):
+    prompt = "\n".join(each.replace("N", "7") for each in NEEDED if each != words)
+    assert f"does not say `{words}`, with" in answer(prompt, None)
+    whole = answer("\n".join(each.replace("N", "7") for each in NEEDED), None)
+    assert len(parse_reply(whole, 7).plan) == 7

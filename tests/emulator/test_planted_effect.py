@@ -117,7 +117,7 @@ def test_the_registry_lets_every_planted_parameter_through_to_the_emulator_alone
     assert PROVIDERS["emulator"].parameters == PARAMETERS
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_study_finds_what_it_planted_and_replays_it(merge_runner, tmp_path):
     (tmp_path / "planted.toml").write_text(STUDY)
     run = await merge_runner("sweep", "planted.toml", "--json")

@@ -8,7 +8,7 @@ from merge_runner.emulator.faults import TRANSIENT, FaultPlan
 from merge_runner.results.store import results_digest
 from tests.harness import watched
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 # What each fault is to the client.
 OUTCOMES = {

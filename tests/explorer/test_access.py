@@ -50,6 +50,7 @@ def findings(page):
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("address", PAGES)
 def test_a_page_fits_its_window_and_axe_finds_nothing_serious(page, address):
     page.goto(address)
@@ -58,6 +59,7 @@ def test_a_page_fits_its_window_and_axe_finds_nothing_serious(page, address):
     assert findings(page) == []
 
 
+@pytest.mark.long
 def test_exported_pages_fit_and_axe_finds_nothing_serious(page, exported):
     for path in sorted(exported.glob("*.html")):
         page.goto(f"file://{path}")

@@ -173,6 +173,7 @@ def test_a_page_of_a_trial_with_a_secret_is_refused_with_the_reason(db, tmp_path
     assert "content-disposition" not in reply.headers
 
 
+@pytest.mark.long
 def test_a_page_of_a_trial_holds_the_one_it_is_compared_with(page, tmp_path):
     page.goto(f"/trials/{TRIAL}?t=2.5&compare=emulator/baseline/L_4_0/rep01")
     expect(page.locator("#ghost-key")).to_contain_text("L_4_0")
@@ -204,6 +205,7 @@ def test_both_ribbons_and_both_words_stand_beside_each_other(page):
     expect(page.locator("h1")).to_have_text(other)
 
 
+@pytest.mark.long
 def test_the_other_is_found_by_keyboard_alone(page):
     page.goto(f"/trials/{TRIAL}")
     page.keyboard.press("c")
@@ -217,6 +219,7 @@ def test_the_other_is_found_by_keyboard_alone(page):
     expect(page.locator("#play")).to_have_text("Pause")
 
 
+@pytest.mark.long
 def test_offers_are_a_click_away(page):
     page.goto(f"/trials/{TRIAL}")
     page.get_by_role("button", name="next repetition").click()
@@ -227,6 +230,7 @@ def test_offers_are_a_click_away(page):
     expect(page.locator("#ghost-key")).to_contain_text("rep 2")
 
 
+@pytest.mark.long
 def test_where_nobody_answers_nothing_is_said_of_what_there_is(browser, site):
     context = browser.new_context(base_url=site)
     page = context.new_page()
@@ -245,6 +249,7 @@ def test_where_nobody_answers_nothing_is_said_of_what_there_is(browser, site):
     context.close()
 
 
+@pytest.mark.long
 def test_a_trial_on_another_track_is_said_to_be_and_no_human_is_near_it(page, db, tmp_path):
     path = shutil.copy(db, tmp_path / "t.duckdb")
     track = {"tunnel_exit_m": 50, "merge_point_m": 90, "end_m": 150, "start_distance_m": 25}

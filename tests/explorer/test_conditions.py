@@ -264,6 +264,7 @@ def test_a_click_on_a_trace_opens_its_trial_and_a_choice_changes_the_picture(bro
     context.close()
 
 
+@pytest.mark.long
 def test_an_export_has_the_same_picture_and_chooses_without_a_server(page, db, tmp_path):
     export_with_a_table(db, tmp_path / "pages")
     page.context.set_offline(True)

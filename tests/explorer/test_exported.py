@@ -26,6 +26,7 @@ def exported(study, tmp_path_factory):
     return made.rename(made.with_name("moved"))
 
 
+@pytest.mark.long
 def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     page.context.set_offline(True)
     page.goto(f"file://{exported}/index.html")
@@ -95,6 +96,7 @@ def test_no_link_of_an_export_leads_nowhere(page, exported):
         assert "" not in addresses, name
 
 
+@pytest.mark.long
 def test_figures_stand_beside_the_list_of_tables(page, exported):
     page.goto(f"file://{exported}/tables.html")
     page.get_by_role("link", name="ablation-matrix").click()
@@ -155,6 +157,7 @@ def test_what_a_model_wrote_is_text_there_too(page, exported):
     assert "owned" not in page.title()
 
 
+@pytest.mark.long
 def test_a_page_of_few_trials_lists_them(page, study, tmp_path):
     file = tmp_path / "one.html"
     assert list(export_page(study, file, ["emulator/baseline/N_0_0/*"])) == [file]
@@ -168,6 +171,7 @@ def test_a_page_of_few_trials_lists_them(page, study, tmp_path):
     expect(page.locator("#choose")).to_have_count(0)
 
 
+@pytest.mark.long
 def test_one_of_many_trials_of_a_page_is_found_by_words(page, study, tmp_path, monkeypatch):
     monkeypatch.setattr("analysis.explorer.export.FEW", 3)
     file = tmp_path / "many.html"
@@ -228,6 +232,7 @@ def test_names_that_fit_no_trial_are_told(study, tmp_path):
         list(export_page(study, tmp_path / "one.html", ["o5/*"]))
 
 
+@pytest.mark.long
 def test_the_list_shows_a_page_at_a_time_of_all_that_are_found(page, study, tmp_path, monkeypatch):
     monkeypatch.setattr("analysis.explorer.exported_list.PAGE", 2)
     monkeypatch.setattr("analysis.explorer.exported_list.PACKED_ROWS", 3)
@@ -252,6 +257,7 @@ def test_the_list_shows_a_page_at_a_time_of_all_that_are_found(page, study, tmp_
     expect(page.locator("h1")).to_contain_text("rep02")
 
 
+@pytest.mark.long
 def test_charts_are_tables_too_as_soon_as_they_are_opened(page, study, tmp_path):
     file = tmp_path / "one.html"
     list(export_page(study, file, ["emulator/baseline/N_0_0/*"]))

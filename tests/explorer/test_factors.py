@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -79,6 +80,7 @@ from merge_runner.study.file import read_study
 from merge_runner.study.parts import adopt
 
 adopt(read_study(sys.argv[2]))
+Path(sys.argv[2]).with_name("mine.py").write_text("raise RuntimeError('nobody agreed to this')")
 child = worker(Path(sys.argv[1]))
 said, _ = child.ask(["tables", "factors"], seconds=60, most_bytes=2**24)
 child.close()
@@ -87,9 +89,11 @@ print(said["tables"][0])
 
 
 @pytest.mark.slow
-def test_what_the_pages_compute_knows_the_study_that_the_explorer_was_given(played):
+def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(played, tmp_path):
+    for name in ("mine.toml", "mine.py"):
+        shutil.copy(played.folder / name, tmp_path)
     told = subprocess.run(
-        [sys.executable, "-c", ASK, played.db, played.folder / "mine.toml"],
+        [sys.executable, "-c", ASK, played.db, tmp_path / "mine.toml"],
         capture_output=True,
         text=True,
         check=True,
@@ -97,6 +101,7 @@ def test_what_the_pages_compute_knows_the_study_that_the_explorer_was_given(play
     assert "opponent=sleepy/duration_s" in told.stdout
 
 
+@pytest.mark.long
 def test_an_exported_list_filters_by_factor(played, tmp_path, browser):
     list(export_folder(played.db, tmp_path / "out", ["cheap*"]))
     page = browser.new_page()
@@ -107,7 +112,7 @@ def test_an_exported_list_filters_by_factor(played, tmp_path, browser):
     page.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_exported_study_answers_by_any_factor(played, tmp_path, monkeypatch):
     monkeypatch.setattr("analysis.explorer.export.TABLES", ["attempts"])
     pages = {path.name: path.read_text() for path in export_folder(played.db, tmp_path / "o", [])}

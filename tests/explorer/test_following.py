@@ -77,6 +77,7 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_se
     assert sweep.wait() == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("address", ["/trials", "/trials/emulator/baseline/N_0_0/rep01"])
 def test_a_page_says_when_nobody_answers_it_any_more(browser, study, address):
     context = browser.new_context()

@@ -39,6 +39,7 @@ def test_the_panel_shows_what_both_say_now(page):
     expect(headings(page)).to_have_text(["right decision 2 at 2.0 s"])
 
 
+@pytest.mark.long
 def test_it_follows_while_the_trial_plays_and_asks_for_each_decision_once(page):
     asked = []
     page.on("request", lambda r: asked.append(r.url) if "/decisions/" in r.url else None)
@@ -54,6 +55,7 @@ def test_it_follows_while_the_trial_plays_and_asks_for_each_decision_once(page):
     assert 4 < len(asked) == len(set(asked)) <= page.locator("a.decision").count()
 
 
+@pytest.mark.long
 def test_a_decision_that_is_chosen_stays_until_escape(page):
     page.goto(f"{TRIAL}?t=0.5")
     page.locator("a.decision").nth(1).click()
@@ -70,6 +72,7 @@ def test_a_decision_that_is_chosen_stays_until_escape(page):
     expect(page.get_by_role("heading", name="What it was told")).to_be_visible()
 
 
+@pytest.mark.long
 def test_who_scrolls_to_read_is_not_disturbed(page):
     page.set_viewport_size({"width": 1500, "height": 420})
     page.goto(f"{TRIAL}?t=1.5")
@@ -83,6 +86,7 @@ def test_who_scrolls_to_read_is_not_disturbed(page):
     expect(headings(page).first).to_contain_text("decision 3")
 
 
+@pytest.mark.long
 def test_what_was_said_and_planned_stands_before_the_prompt(page):
     page.goto(f"{TRIAL}?side=left&decision=1")
     found = page.locator("#decision h3").all_inner_texts()
@@ -102,6 +106,7 @@ def test_an_invalid_reply_stands_open_and_the_plan_that_went_on_is_named(page):
     expect(panel.locator("details", has_text="The whole reply")).to_have_attribute("open", "")
 
 
+@pytest.mark.long
 def test_buttons_go_through_the_decisions(page):
     page.goto(TRIAL)
     page.locator("#next-decision").click()
@@ -111,6 +116,7 @@ def test_buttons_go_through_the_decisions(page):
     expect(headings(page)).to_have_text(["left decision 0 at 0.0 s"])
 
 
+@pytest.mark.long
 def test_a_decision_that_is_tapped_on_a_phone_is_seen_and_leads_back(phone):
     phone.goto(TRIAL)
     phone.locator("a.decision").nth(2).click()
@@ -121,6 +127,7 @@ def test_a_decision_that_is_tapped_on_a_phone_is_seen_and_leads_back(phone):
     assert phone.evaluate("document.documentElement.scrollWidth") == 420
 
 
+@pytest.mark.long
 def test_the_moments_stand_on_every_chart_and_the_slider(page):
     page.goto(COLLIDED)
     for place in ("#chart-v", "#chart-a", "#chart-h", "#ticks"):
@@ -133,6 +140,7 @@ def test_the_moments_stand_on_every_chart_and_the_slider(page):
     assert float(re.search(r"left \S+ m/s at (\S+) m", told)[1]) == pytest.approx(100, abs=0.1)
 
 
+@pytest.mark.long
 def test_the_legend_tells_the_time_of_the_slider(page):
     page.goto(TRIAL)
     page.locator("#scrub").fill("2.47")
@@ -142,6 +150,7 @@ def test_the_legend_tells_the_time_of_the_slider(page):
     assert f"left {float(said[1]):.1f} m/s" in page.locator("#now").inner_text()
 
 
+@pytest.mark.long
 def test_paper_has_signs_of_the_size_of_the_track(page):
     page.set_viewport_size({"width": 700, "height": 900})
     page.goto(TRIAL)
@@ -154,6 +163,7 @@ def test_paper_has_signs_of_the_size_of_the_track(page):
     assert sizes == ["5px", "2.6px"]
 
 
+@pytest.mark.long
 def test_paper_has_no_link_that_nobody_can_follow_and_the_words_of_a_search(page):
     page.goto(f"{TRIAL}?t=2.5")
     expect(page.locator(".brief p").last).to_be_visible()
@@ -164,6 +174,7 @@ def test_paper_has_no_link_that_nobody_can_follow_and_the_words_of_a_search(page
     expect(page.locator(".hits thead")).to_be_visible()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_trial_is_accessible_while_it_is_followed_and_compared(page, scheme):
     page.emulate_media(color_scheme=scheme)

@@ -212,6 +212,35 @@ def test_an_exported_study_begins_with_it_and_says_nothing_of_runs(db):
     site.computing.close()
 
 
+def test_a_driver_that_is_not_judged_ranks_no_condition(tmp_path):
+    prose = dict.fromkeys(range(99), Said(failure="no_array"))
+    bad = [replace(drive, said=prose, left=(), right=()) for drive in yielding("bad", reps=1)]
+    pages = []
+    for drives in (bad, [*bad, *yielding("o3", reps=1)]):
+        site = Site(db := write_study(tmp_path / f"{len(drives)}.duckdb", drives))
+        site.computing = Computing(db, Never)
+        site.catalogue.refresh()
+        pages.append(client_of(site).get("/").text)
+        site.computing.close()
+    alone, beside = pages
+    reason = (
+        "not judged: 46 of the 92 decisions of bad, baseline are invalid (50.0 %, more than 20 %)"
+    )
+    assert f"<p>{reason}.</p>" in alone
+    assert 'id="collisions"' not in alone
+    assert "No trial of o3, baseline collided." in beside
+    assert f'title="{reason}">not judged</span>' in beside
+
+
+def test_the_study_begins_with_its_description(tmp_path):
+    config = {"description": "Who is <first>?"}
+    db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)[:1], config=config)
+    site = Site(db)
+    site.computing = Computing(db, Never)
+    assert "<h1>Who is &lt;first&gt;?</h1>" in client_of(site).get("/").text
+    site.computing.close()
+
+
 def test_classes_of_collisions_stand_beside_the_published_ones():
     published = {"humans": {"same action": 14, "no action": 5, "other": 4}}
     o3, unjudged, stand_in = (
@@ -355,6 +384,7 @@ def test_captions_of_all_tables_have_one_rule():
     assert rules == ["styles/base.css"]
 
 
+@pytest.mark.long
 def test_ablations_are_whole_at_1024_pixels_and_numbers_look_like_links(browser, db):
     with served(db) as address:
         page = browser.new_page(viewport={"width": 1024, "height": 800})
@@ -370,6 +400,7 @@ def test_ablations_are_whole_at_1024_pixels_and_numbers_look_like_links(browser,
         page.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("address", ["/", "/humans"])
 def test_nothing_is_cut_off_at_1024_pixels(page, address):
     page.set_viewport_size({"width": 1024, "height": 800})

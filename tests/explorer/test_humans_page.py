@@ -70,7 +70,7 @@ def notes_of(db):
     return sample_notes(study, study.baselines)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_has_the_notes_of_its_rows_and_is_made_anew_after_an_import(ask, db, tmp_path):
     before = ask()
     assert "The recordings of the humans are not imported" in before

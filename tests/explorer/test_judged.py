@@ -91,6 +91,7 @@ def test_the_band_of_the_chart_holds_the_headways_that_collide(study_of, rule):
     assert max(filter(None, bounds)) == pytest.approx(6, abs=0.2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rule", RULES)
 def test_the_picture_draws_what_the_scenario_judges(page, study_of, rule):
     shape, words = RULES[rule]
@@ -146,6 +147,7 @@ def test_beside_humans_who_say_nothing_stands_what_they_did(humans):
     assert "net gap when the first vehicle reaches the merge point" in text
 
 
+@pytest.mark.long
 def test_no_sign_stands_under_a_car_and_every_car_stands_within_the_picture(page, humans):
     box = "it => (b => [b.left, b.top, b.right, b.bottom])(it.getBoundingClientRect())"
     name, _ = a_trial(humans)

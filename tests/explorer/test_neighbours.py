@@ -35,6 +35,7 @@ def test_keys_and_links_go_to_the_neighbours_as_the_list_was_sorted(page, names)
     expect(page.locator("#next-trial")).to_be_visible()
 
 
+@pytest.mark.long
 def test_the_list_keeps_its_place_and_goes_on_from_there(page, names):
     page.keyboard.press("j")
     opened(page, names[2])
@@ -45,6 +46,7 @@ def test_the_list_keeps_its_place_and_goes_on_from_there(page, names):
     expect(page.locator("tr.chosen th a")).to_have_text(names[3])
 
 
+@pytest.mark.long
 def test_a_list_of_decisions_leads_on_by_trials(page):
     page.goto("/words?q=merge")
     every = [row.split(" ")[0] for row in page.locator(".hits tbody th").all_inner_texts()]
@@ -58,12 +60,14 @@ def test_a_list_of_decisions_leads_on_by_trials(page):
     expect(page.locator("h1")).to_have_text(names[2])
 
 
+@pytest.mark.long
 def test_a_trial_that_no_list_led_to_has_no_neighbours(page):
     page.goto("/trials/emulator/baseline/N_0_0/rep01")
     expect(page.locator("#track")).to_be_visible()
     expect(page.locator("#next-trial")).to_be_hidden()
 
 
+@pytest.mark.long
 def test_the_next_page_of_the_list_follows_its_last_row(page, monkeypatch):
     monkeypatch.setattr("analysis.explorer.catalogue.PAGE", 2)
     monkeypatch.setattr("analysis.explorer.pages.trials.PAGE", 2)

@@ -57,6 +57,7 @@ def watch_the_worst(page):
     page.wait_for_load_state()
 
 
+@pytest.mark.long
 def test_a_newcomer_finds_why_it_collides_most_and_a_colleague_sees_the_same(page, db, tmp_path):
     page.goto("/")
     watch_the_worst(page)

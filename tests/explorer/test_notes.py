@@ -201,6 +201,7 @@ def _write(db, reader):
         notes.add((TRIAL, "spec"), None, [f"t{number}"], "x" * 3000)
 
 
+@pytest.mark.long
 def test_two_explorers_that_write_at_once_lose_nothing(tmp_path):
     db = tmp_path / "t.duckdb"
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
@@ -358,6 +359,7 @@ def test_notes_are_written_from_the_keyboard(page, db):
     expect(page.locator(".all-notes tbody tr")).to_have_count(1)
 
 
+@pytest.mark.long
 def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(
     page, db, tmp_path, monkeypatch
 ):

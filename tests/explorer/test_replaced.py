@@ -15,6 +15,8 @@ from analysis.explorer.site import Site
 from merge_runner.results.database import SCHEMA_VERSION
 from tests.analysis.studies import write_study, yielding
 
+pytestmark = pytest.mark.long
+
 HOST = "127.0.0.1:8700"
 TRIAL = "/trials/o3/baseline/N_0_0/rep01"
 PAGES = ("/", "/sweeps", "/trials", TRIAL)
@@ -62,7 +64,6 @@ def client(db):
     return TestClient(application, base_url=f"http://{HOST}", raise_server_exceptions=False)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("what", ["garbage", "empty", "half", "zeros", "foreign"])
 @pytest.mark.parametrize("back_in_place", [True, False])
 @pytest.mark.parametrize("in_place", [True, False])
@@ -79,7 +80,6 @@ def test_the_good_one_is_shown_again_after_a_plain_message(
     assert [client.get(page).status_code for page in PAGES] == [200] * 4
 
 
-@pytest.mark.slow
 def test_nobody_who_asks_meanwhile_gets_an_error_page(client, db, good, bad):
     codes, done = [], threading.Event()
 

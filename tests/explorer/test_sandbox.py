@@ -25,6 +25,8 @@ from merge_runner.paths import PROJECT
 from merge_runner.results.database import open_database
 from tests.analysis.studies import write_study, yielding
 
+pytestmark = pytest.mark.long
+
 PROC = Path("/proc")
 LOADED_S = 60  # what a process may wait for its turn on a machine that does much else
 ENDLESS = "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM r) SELECT max(n) FROM r"
@@ -144,7 +146,6 @@ def test_a_download_is_whole_or_refused(run):
     assert "has more" in run("FROM range(1000)", as_csv=True, size=1000)["error"]
 
 
-@pytest.mark.slow
 def test_a_query_is_answered_and_a_refusal_is_one_line(queries):
     before = contents(queries.db.parent)
     result = queries.result("SELECT '\u202e<é' AS x")
@@ -184,14 +185,12 @@ def test_what_needs_too_much_memory_is_stopped_soon(queries):
     assert time.monotonic() - began < 2 * LOADED_S
 
 
-@pytest.mark.slow
 def test_an_endless_query_is_stopped_in_time(queries):
     began = time.monotonic()
     assert refusal(Sandbox(queries.db, Caps(seconds=2)), ENDLESS) == "stopped after 2 s"
     assert time.monotonic() - began < 2 + LOADED_S
 
 
-@pytest.mark.slow
 def test_a_sweep_writes_while_a_query_runs(own, monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", "sk-secret")
     processes = recorded(monkeypatch, "subprocess.Popen")
@@ -330,7 +329,6 @@ def test_what_lies_in_the_log_beside_the_database_is_read(own, tmp_path):
     assert texts(result.rows) == [["-1"]]
 
 
-@pytest.mark.slow
 def test_a_copy_lasts_while_the_file_stays_and_no_longer(own):
     queries = Sandbox(own)
     first = queries._current()

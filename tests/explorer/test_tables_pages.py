@@ -121,7 +121,7 @@ def listed(text):
     return int(re.search(r"<strong>(\d+)</strong> trials", text)[1])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "every"), [("ablation-quantitative", 3), ("contrasts", 9)])
 def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, every):
     study = Study(db)
@@ -397,7 +397,7 @@ def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
     computing.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_process_of_its_own_answers_alike_and_another_one_takes_its_place(db):
     computing = Computing(db)
     request = ("tables", "attempts")

@@ -75,6 +75,7 @@ def test_a_trial_is_played_to_its_end(page):
     expect(page.locator("#play")).to_have_text("Play")
 
 
+@pytest.mark.long
 def test_brackets_go_through_the_decisions_and_escape_goes_back(page):
     page.goto(TRIAL)
     for _ in range(3):
@@ -91,6 +92,7 @@ def test_brackets_go_through_the_decisions_and_escape_goes_back(page):
     page.wait_for_url("**/trials")
 
 
+@pytest.mark.long
 def test_escape_leads_back_to_the_list_as_it_was_filtered(page):
     page.goto("/trials?condition=N_0_0&sort=-end")
     page.locator("tbody a").first.click()
@@ -105,6 +107,7 @@ def test_escape_leads_back_to_the_list_as_it_was_filtered(page):
     page.wait_for_url("**/trials?condition=N_0_0&sort=-end")
 
 
+@pytest.mark.long
 def test_brackets_begin_where_the_replay_was_stopped(page):
     page.goto(f"{TRIAL}?t=3.4")
     driven = page.locator("a.decision.now")
@@ -118,6 +121,7 @@ def test_brackets_begin_where_the_replay_was_stopped(page):
     expect(driven.first).to_have_attribute("data-n", "2")
 
 
+@pytest.mark.long
 def test_the_rows_of_a_trials_tables_are_no_list(page):
     page.goto(TRIAL)
     page.keyboard.press("j")
@@ -138,6 +142,7 @@ def test_an_address_brings_everything_back(page):
     expect(page.locator("#clock")).to_have_text(re.compile(r"^4\.2 s"))
 
 
+@pytest.mark.long
 def test_keys_are_off_while_one_types(page):
     page.goto("/trials")
     page.keyboard.press("/")
@@ -150,6 +155,7 @@ def test_keys_are_off_while_one_types(page):
     expect(page.locator("#help")).to_be_visible()
 
 
+@pytest.mark.long
 def test_j_k_and_enter_open_a_trial(page):
     page.goto("/trials?q=emulator")
     for key in "jjk":
@@ -160,6 +166,7 @@ def test_j_k_and_enter_open_a_trial(page):
     expect(page.locator("h1")).to_have_text(name)
 
 
+@pytest.mark.long
 def test_a_click_into_a_chart_moves_the_clock(page):
     page.goto(TRIAL)
     chart = page.locator("#chart-h .u-over")
@@ -187,6 +194,7 @@ def test_what_a_model_wrote_is_text(page, side):
     assert len(panel.inner_text()) < 50_000
 
 
+@pytest.mark.long
 def test_who_wants_no_motion_gets_pictures(browser, site):
     context = browser.new_context(base_url=site, reduced_motion="reduce")
     page = context.new_page()
@@ -204,6 +212,7 @@ def test_who_wants_no_motion_gets_pictures(browser, site):
     assert 1 <= pictures <= 4
 
 
+@pytest.mark.long
 def test_figures_choose_the_speed_and_c_the_other_trial(page):
     page.goto(TRIAL)
     for key, speed in zip("12345", ("0.25", "0.5", "1", "2", "4"), strict=True):
@@ -218,6 +227,7 @@ def test_figures_choose_the_speed_and_c_the_other_trial(page):
     expect(page.locator("#play")).to_have_text("Pause")
 
 
+@pytest.mark.long
 def test_the_other_trial_goes_on_where_this_one_ended(page):
     page.goto(f"{COLLIDED}?compare=emulator/baseline/N_0_0/rep01")
     expect(page.locator("#ghost-key")).to_contain_text("dashed")
@@ -233,12 +243,14 @@ def test_the_other_trial_goes_on_where_this_one_ended(page):
     expect(page.locator("#clock")).to_have_text(f"{own:.1f} s of {own:.1f} s")
 
 
+@pytest.mark.long
 def test_a_trial_that_is_not_there_to_compare_with_is_said(page):
     page.goto(f"{TRIAL}?compare=emulator/baseline/L_4_0/rep99")
     expect(page.locator("#ghost-key")).to_contain_text("is not there to compare with")
     expect(page.locator("#compare")).to_have_value("")
 
 
+@pytest.mark.long
 def test_a_call_without_an_answer_can_be_read(page):
     page.goto("/trials/o4/baseline/L_4_0/rep01")
     lost = page.get_by_role("link", name="left, decision 2 at 2.0 s")
@@ -255,6 +267,7 @@ def test_a_call_without_an_answer_can_be_read(page):
     expect(panel.locator("li")).to_have_text("The trial ended.")
 
 
+@pytest.mark.long
 def test_of_a_decision_that_is_not_there_the_panel_says_so(page):
     page.goto(f"{TRIAL}?side=left&decision=99")
     expect(page.locator("#track .own.left")).to_be_visible()
@@ -263,6 +276,7 @@ def test_of_a_decision_that_is_not_there_the_panel_says_so(page):
     expect(page.locator(".decision-panel h2")).to_contain_text("left decision 0")
 
 
+@pytest.mark.long
 def test_the_last_words_of_both_lead_to_their_decisions(page):
     page.goto(COLLIDED)
     words = page.locator("#decision article")
@@ -275,6 +289,7 @@ def test_the_last_words_of_both_lead_to_their_decisions(page):
     expect(words).to_have_count(2)
 
 
+@pytest.mark.long
 def test_a_block_that_did_not_change_is_folded(page):
     page.goto(f"{TRIAL}?side=left&decision=2")
     blocks = page.locator("details.block")
@@ -283,6 +298,7 @@ def test_a_block_that_did_not_change_is_folded(page):
     expect(same.locator("pre")).to_be_hidden()
 
 
+@pytest.mark.long
 def test_nothing_that_is_typed_into_the_search_is_lost(page):
     page.goto("/trials")
     page.locator("#search").press_sequentially("n_0_0/rep0", delay=260)
@@ -295,6 +311,7 @@ def test_nothing_that_is_typed_into_the_search_is_lost(page):
     expect(page.locator("#search")).to_be_focused()
 
 
+@pytest.mark.long
 def test_who_filters_by_keyboard_stays_where_he_was(page):
     page.goto("/trials")
     page.get_by_label("outcome").focus()

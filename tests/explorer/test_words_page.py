@@ -190,6 +190,7 @@ def test_words_are_searched_from_the_keyboard_and_lead_to_the_decision(page):
     assert "owned" not in page.title()
 
 
+@pytest.mark.long
 def test_an_exported_study_finds_the_same_in_the_browser(page, db, tmp_path, client):
     list(export_folder(db, tmp_path / "pages", ["*"]))
     page.context.set_offline(True)

@@ -21,7 +21,7 @@ FAULTS = FaultPlan(seed=2, rates=dict.fromkeys(BROKEN, 0.04))
 STARTING_S = 60
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.long,
     pytest.mark.skipif(
         LITELLM is None, reason="litellm is not installed: pip install 'litellm[proxy]'"
     ),

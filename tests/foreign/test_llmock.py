@@ -15,6 +15,8 @@ from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot
 
+pytestmark = pytest.mark.long
+
 WIRES = {
     "openai-chat": "openai",
     "openai-responses": "openai",
@@ -144,7 +146,6 @@ async def test_a_real_quota_costs_few_refusals(llmock, llmock_server, client_of)
     llmock.assert_resilient(strict=True)
 
 
-@pytest.mark.slow
 async def test_a_sweep_in_each_format_passes_what_a_foreign_server_breaks(llmock, sweeps, plan):
     for wire in WIRES:
         for status in (429, 503):

@@ -43,7 +43,7 @@ def run(merge_runner, tmp_path):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_one_of_each_kind_goes_through_every_command(run, tmp_path):
     talker = Talker()
     async with listening(talker) as url:

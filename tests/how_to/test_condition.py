@@ -14,7 +14,7 @@ from tests.harness import FAST, how_to, plugin
 CHOSEN = ("--reps", 1, "--conditions", "N_0_0,far,fast-tie")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_conditions_from_outside_go_through_every_command(merge_runner, tmp_path):
     env = plugin(tmp_path / "installed", how_to("add-a-condition"))
 

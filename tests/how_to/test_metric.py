@@ -43,7 +43,7 @@ def report(study, installed):
     return (study.folder / "report.html").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_stands_in_the_tables_in_every_format(study, installed):
     shown = study.run("tables", *TABLES, "--format", "json", **installed).out
     for table in json.loads(shown)["tables"]:
@@ -71,7 +71,7 @@ def test_its_number_is_that_of_the_states_and_leads_to_its_trials(study, install
     assert len(source["trials"]) == rows["emulator/A1"]["n"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_report_shows_and_tells_it(report):
     text = unescape(report)
     assert HEADING in text
@@ -84,7 +84,7 @@ def test_the_report_shows_and_tells_it(report):
     assert any(f"<!-- {HEADING} -->" in b64decode(figure).decode() for figure in drawn)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_exported_pages_show_it(study, installed):
     run = study.run("view", "--export", "pages", **installed)
     assert run.code == 0, run.err

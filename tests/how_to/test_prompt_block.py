@@ -53,7 +53,7 @@ def test_a_block_is_in_the_variants_that_add_it_and_changes_no_other(study, play
     assert len(set(hashes.values())) == 4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_is_in_every_command_that_reads(study, played):
     for command in (("audit",), ("view", "--export", "pages")):
         done = study.run(*command, **played)
@@ -67,7 +67,7 @@ def test_it_is_in_every_command_that_reads(study, played):
     assert "A8" in str(rows)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_where_it_is_not_installed_it_is_shown_by_name(study, played):
     for command in (("audit",), ("view", "--export", "bare")):
         done = study.run(*command)

@@ -12,6 +12,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import BLOCKS, NAMES, VARIANTS, Variant
 from merge_runner.prompts.render import render_prompt
 from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.unsent import unsent
 from merge_runner.study.file import StudyFile
 from tests.harness import PROJECT
 from tests.prompts.test_render import FIRST
@@ -31,7 +32,7 @@ def keys(model: type[BaseModel]):
 def plan_of(folder, example, **asked):
     (folder / "study.toml").write_text(EXAMPLES[example])
     (folder / "plugin.py").touch()
-    return make_plan(str(folder / "study.toml"), **asked)
+    return make_plan(str(folder / "study.toml"), trust=True, **asked)
 
 
 @pytest.mark.parametrize(
@@ -51,6 +52,22 @@ def test_every_example_can_be_played(example, arms, tmp_path):
     assert len(plan.arms) == arms
     assert len(plan.trial_specs()) == plan.trials
     plan.within_budget(Options(tmp_path / "db", tmp_path / "cache"))
+
+
+async def test_the_study_of_the_readme_fits_its_cap_with_models_that_answer_in_2027(tmp_path):
+    readme = (PROJECT / "README.md").read_text()
+    ((text, trials, usd),) = re.findall(
+        r"^```toml\n(.*?)^```\n\n(\d+) trials, about (\d+) USD", readme, re.DOTALL | re.MULTILINE
+    )
+    (tmp_path / "study.toml").write_text(text)
+    plan = make_plan(str(tmp_path / "study.toml"))
+    options = plan.within_budget(Options(tmp_path / "db", tmp_path / "cache"))
+    expected = await unsent(plan, options, say=pytest.fail)
+    assert (expected.trials, round(expected.cost_usd)) == (int(trials), int(usd))
+    assert expected.cost_usd < options.max_cost_usd
+    assert expected.trials_within_cap == expected.trials
+    for entry in plan.entries.values():
+        assert entry.shutdown is None or entry.shutdown.year > 2027
 
 
 def test_no_example_is_left_out():

@@ -33,7 +33,7 @@ WHERE before_m < 120 AND position_m >= 120 GROUP BY ALL ORDER BY ALL
 MEASURED = "SELECT trial_id, time_to_merge_s FROM trial_metrics ORDER BY ALL"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_scenario_from_outside_goes_through_every_command(merge_runner, tmp_path):
     env = plugin(tmp_path / "installed", how_to("add-a-scenario"))
     (tmp_path / "long.toml").write_text(FILE)

@@ -90,7 +90,7 @@ def sweep(*options):
             *options)  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_format_from_outside_goes_through_the_whole_house(run, tmp_path):
     busy = {"error": {"code": "busy", "message": "Busy.", "details": {"wait_ms": 900}}}
     talker = Talker(first=(503, busy))

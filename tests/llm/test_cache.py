@@ -555,7 +555,7 @@ def change_a_byte(folder, data):
     return name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(deadline=None, max_examples=100)
 @given(st.data())
 def test_any_one_changed_byte_of_the_file_is_harmless_or_an_error_of_ours(model_folder, data):

@@ -6,7 +6,9 @@ import gzip
 import itertools
 import json
 import socket
+from base64 import b64encode
 from dataclasses import replace
+from urllib.parse import unquote
 
 import pytest
 from aiohttp import web
@@ -272,6 +274,25 @@ async def test_other_hosts_go_through_the_proxy_of_the_environment(recorder, mon
     reply = await send(endpoint_at("http://model.invalid/v1"))
     assert reply.status == 200
     assert recorder.requests[0].headers["host"] == "model.invalid"
+
+
+@pytest.mark.parametrize("user", ["fleet:s3cret-word", "fleet%40work:s3cret%2Fword", "me:pw"])
+async def test_nothing_of_a_proxys_user_info_is_left_of_what_it_answers(
+    recorder, monkeypatch, user
+):
+    decoded = unquote(user)
+    monkeypatch.setenv("http_proxy", recorder.url.replace("//", f"//{user}@"))
+
+    def refuse(request):
+        got = request.headers["proxy-authorization"]
+        assert got == f"Basic {b64encode(decoded.encode()).decode()}"
+        text = f"{got} {user} {decoded}" if len(user) >= 8 else got
+        return web.json_response({"error": {"message": text}}, status=407)
+
+    recorder.reply = refuse
+    reply = await send(endpoint_at("http://model.invalid/v1"))
+    message = json.loads(reply.body)["error"]["message"]
+    assert set(message.removeprefix("Basic ").split()) == {"[key]"}
 
 
 async def test_no_reply_in_time_is_a_timeout(emulator):

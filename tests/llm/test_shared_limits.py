@@ -16,6 +16,8 @@ from merge_runner.llm.shared_limits import SharedLimits, limits_file
 from tests.llm.test_limiter import MINUTE, Queue, fullest_window, on_a_clock
 from tests.virtual_time import now_s
 
+pytestmark = pytest.mark.long
+
 KEY = {"authorization": "Bearer sk-a-secret-key"}
 
 

@@ -77,7 +77,7 @@ async def rows(merge_runner, query, db="results/merge.duckdb"):
     return json.loads((await merge_runner("sql", query, "--db", db, "--format", "json")).out)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("model", ["o3", "gpt-6-sol", "claude-sonnet-4-6", "gemini-3.8-flash"])
 async def test_a_sweep_in_batches_has_the_digest_of_a_plain_one(merge_runner, tmp_path, model):
     with_terms(tmp_path, model)
@@ -157,7 +157,7 @@ async def test_a_sweep_that_is_killed_at_20_instants_pays_nothing_twice(
     assert used["n"] == batched.total()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path, priced):
     sweep = ("sweep", "short.toml", "--model", "priced", "--yes")
     plan = FaultPlan(latency_s=0.02, batch=BatchPlan(delay_s=0.5))
@@ -183,6 +183,7 @@ async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path, p
     assert digest == results_digest(tmp_path / "plain")
 
 
+@pytest.mark.long
 async def test_detached_runs_bring_a_sweep_to_its_end(merge_runner, priced):
     sweep = (
         "sweep",
@@ -207,6 +208,7 @@ async def test_detached_runs_bring_a_sweep_to_its_end(merge_runner, priced):
     assert len(runs) == 5  # a decision each, and the end
 
 
+@pytest.mark.long
 async def test_first_situations_take_one_batch(merge_runner, tmp_path):
     first = ("seat", "first", "--samples", 1)
     async with watched(faults=FaultPlan(batch=BatchPlan(polls=2))) as server:
@@ -222,6 +224,7 @@ async def test_first_situations_take_one_batch(merge_runner, tmp_path):
     assert results_digest(tmp_path / "results/merge.duckdb") == results_digest(tmp_path / "plain")
 
 
+@pytest.mark.long
 async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly(merge_runner):
     sweep = ("seat", "first", "--samples", 1, "--batch")
     plan = BatchPlan(delay_s=1.0, slow=0.5, slow_factor=1000)
@@ -235,6 +238,7 @@ async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly
     assert (batched + alone).total() == len(batched + alone) == 22
 
 
+@pytest.mark.long
 async def test_an_account_that_takes_few_tokens_gets_smaller_batches(merge_runner):
     plan = BatchPlan(delay_s=0.2, enqueued_tokens=5000)
     async with watched(faults=FaultPlan(batch=plan)) as server:
@@ -245,6 +249,7 @@ async def test_an_account_that_takes_few_tokens_gets_smaller_batches(merge_runne
     assert (len(batched), max(batched.values()), alone) == (22, 1, Counter())
 
 
+@pytest.mark.long
 async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
     sweep = ("sweep", "short.toml", *TWO, "--model", "priced", "--batch", "--yes")
     async with watched(faults=FaultPlan(batch=BatchPlan(delay_s=1.0))) as server:

@@ -91,7 +91,7 @@ async def test_a_sweep_that_is_killed_at_20_instants_asks_nothing_answered_again
     assert digest[1] == 22
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_attempts_of_a_run_that_died_are_found_in_the_next_one(merge_runner):
     async def middle(request, handler):
         if "L_4_0" in request.headers.get(SLOT_HEADER, "") and not release.is_set():

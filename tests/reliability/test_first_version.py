@@ -15,6 +15,8 @@ from merge_runner.results.database import SCHEMA_VERSION
 from merge_runner.results.store import Store
 from tests.harness import PROJECT
 
+pytestmark = pytest.mark.long
+
 ARCHIVE = PROJECT / "tests/data/first-version.tar.gz"
 # As the first version printed it.
 DIGEST = "994fd80fb9b17a385b8aac6086b4c3cb4ed1db1f7abf75af83222c6a07ba3203  1 trials\n"
@@ -32,7 +34,6 @@ def content(path: Path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-@pytest.mark.slow
 async def test_its_database_is_brought_up_to_date_and_kept(merge_runner, old):
     before = content(old / "results.duckdb")
     run = await merge_runner("replay", "baseline", "--model", "constant", "--reps", 1,
@@ -92,7 +93,6 @@ async def test_what_reads_its_database_writes_nothing_there(merge_runner, old, w
     assert files() == before
 
 
-@pytest.mark.slow
 async def test_a_sweep_goes_on_in_its_database(merge_runner, old):
     run = await merge_runner("sweep", "baseline", "--reps", 1, "--model", "constant",
                              "--db", "results.duckdb", "--json")  # fmt: skip
@@ -101,7 +101,6 @@ async def test_a_sweep_goes_on_in_its_database(merge_runner, old):
     assert both.out.split() == ["n", "12"]
 
 
-@pytest.mark.slow
 async def test_its_cache_replays_to_the_same_digest(merge_runner, old):
     run = await merge_runner(*REPLAY, "--db", "new.duckdb", "--json")
     assert run.code == 0, run.err
@@ -138,7 +137,6 @@ async def test_a_newer_cache_is_left_alone(merge_runner, old, stock):
     assert run.err.count("\n") == 1
 
 
-@pytest.mark.slow
 async def test_a_newer_reply_in_a_cache_of_today_stops_the_sweep(merge_runner, old, stock):
     await merge_runner(*REPLAY)
     with stock(old / "cache") as cache:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from itertools import islice
 
 import pytest
+from aiohttp import web
 from typer.testing import CliRunner
 
 from benchmarks.recorder import longer
@@ -30,10 +31,19 @@ from merge_runner.results.database import (
     schema_sql,
 )
 from merge_runner.results.recording import export_recording, read_recording
-from tests.harness import RECORDING
+from tests.harness import RECORDING, watched
 
 SIZE, REPS = 20_480, 5
 REPLAY = ("replay", "baseline", "--reps", REPS, "--cache", "cache", "--json")
+PATIENT = """
+[patient]
+provider = "emulator"
+format = "openai-chat"
+max_output_tokens = 4000
+price = "free"
+id = "some-model"
+timeout_s = 100
+"""
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +74,7 @@ def command(folder, *arguments):
     return run.stdout
 
 
+@pytest.mark.long
 def test_a_thousand_long_replies_are_audited_and_looked_up_in_the_cache(long):
     told = json.loads(command(long, "audit", "--cache", long / "cache", "--json"))
     assert told["ok"]
@@ -89,6 +100,7 @@ def test_a_query_that_needs_too_much_memory_says_what_to_do(long):
     assert "ask for fewer rows or columns at once" in str(run.exception)
 
 
+@pytest.mark.long
 def test_long_replies_are_recorded_and_replayed_in_an_order_of_their_own(long, prepare):
     file = long / "long.parquet"
     assert prepare(long, "recording", "export", file, "--cache", "cache").code == 0
@@ -167,3 +179,40 @@ def test_small_groups_are_merged_unless_texts_are_long_and_long_or_many_rows_hav
     connection.execute("CHECKPOINT")
     assert told(MANY_BYTES) == (100, short)
     assert told(MANY_BYTES + 1) == (100, long)
+
+
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="a transaction holds all replies of a trial, and merges row groups with those of others",
+)
+@pytest.mark.long
+@pytest.mark.parametrize(("reply_mb", "trials", "seconds"), [(15, 1, 8), (2, 4, 30)])
+async def test_every_reply_below_max_reply_mb_is_stored(
+    merge_runner, tmp_path, reply_mb, trials, seconds
+):
+    thought = "The gap is too small for me. " * round(reply_mb * 1e6 / 29)
+    both_stop = f"M\n\nI brake.\n\n{[-1] * 20}"
+
+    async def middle(request, handler):
+        body = json.loads((await handler(request)).body)
+        said = {"role": "assistant", "content": both_stop, "reasoning_content": thought}
+        body["choices"][0]["message"] = said
+        return web.json_response(body)
+
+    (tmp_path / "models.toml").write_text(PATIENT)
+    (tmp_path / "study.toml").write_text(
+        f"[repetitions]\nbaseline = {trials}\n[scenario]\ntimeout_s = {seconds}\n"
+    )
+    async with watched(middle) as server:
+        run = await merge_runner(
+            "sweep", "study.toml", "--model", "patient", "--conditions", "L_4_0", "--json",
+            EMULATOR_BASE_URL=f"{server.url}/v1",
+        )  # fmt: skip
+    if server.requests != 2 * trials * seconds:
+        pytest.fail(run.err)  # whatever is stored
+    assert run.code == 0, run.err
+    query = "SELECT count(*) AS calls, min(len(reply)) AS shortest FROM calls"
+    (stored,) = json.loads((await merge_runner("sql", query, "--format", "json")).out)
+    assert stored["calls"] == server.requests
+    assert stored["shortest"] > len(thought)

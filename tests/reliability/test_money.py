@@ -97,6 +97,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
     assert whole["usd"] == pytest.approx(bill.usd)
 
 
+@pytest.mark.long
 async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(merge_runner):
     numbers = itertools.count()
 
@@ -246,6 +247,7 @@ async def test_a_dry_run_makes_no_file(merge_runner, tmp_path):
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
 
 
+@pytest.mark.long
 async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(merge_runner):
     async def middle(request, handler):
         if server.requests in (3, 5):

@@ -13,6 +13,8 @@ import pytest
 from merge_runner.results.database import SCHEMA_VERSION, SETTINGS
 from merge_runner.results.store import query
 
+pytestmark = pytest.mark.long
+
 OLDEST = "1.2.2"
 READ = """
 import json, sys
@@ -63,7 +65,6 @@ def read_by(client: Path, db: Path) -> dict[str, int]:
     return rows
 
 
-@pytest.mark.slow
 async def test_an_old_duckdb_reads_every_table_and_view(merge_runner, tmp_path, old_client):
     played = await merge_runner("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
     assert played.code == 0, played.err
@@ -74,7 +75,6 @@ async def test_an_old_duckdb_reads_every_table_and_view(merge_runner, tmp_path, 
     assert min(rows[name] for name in ("states", "attempts", "finished", "geometry")) > 0
 
 
-@pytest.mark.slow
 async def test_a_database_of_a_newer_storage_version_is_brought_to_the_old_one(
     merge_runner, tmp_path, old_client
 ):

@@ -116,6 +116,7 @@ async def test_nobody_listens(merge_runner, tmp_path):
     assert run.summary["trials"]["failed"] == 0
 
 
+@pytest.mark.long
 async def test_waits_are_told(merge_runner, tmp_path):
     async def middle(request, handler):
         if server.requests > 1:
@@ -238,6 +239,7 @@ async def test_what_is_configured_wrongly_ends_the_run_at_its_first_call(
     assert run.summary["trials"]["failed"] == 0
 
 
+@pytest.mark.long
 async def test_two_sweeps_on_one_key_share_its_limits(merge_runner):
     times = []
 

@@ -102,7 +102,7 @@ async def test_a_read_only_folder_is_told_before_anything_is_asked(
         assert server.requests == asked
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_database_that_another_program_holds_for_a_while_is_waited_for(
     merge_runner, tmp_path
 ):

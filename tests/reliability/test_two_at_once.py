@@ -8,10 +8,14 @@ import os
 import signal
 import sys
 
+import pytest
+
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.llm.claims import Claims
 from merge_runner.results.store import results_digest
 from tests.harness import watched
+
+pytestmark = pytest.mark.long
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
 TAKE = """

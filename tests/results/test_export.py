@@ -9,6 +9,7 @@ import pytest
 
 from merge_runner.results.data_dictionary import tables
 from merge_runner.results.recording import COLUMNS, MEANINGS
+from merge_runner.results.wide_trials import FACTORS
 from tests.harness import PROJECT
 
 
@@ -24,6 +25,7 @@ async def test_every_table_and_view_is_written_as_parquet_and_csv(merge_runner, 
     for _ in range(2):  # an earlier export is replaced
         run = await merge_runner("export", "out")
         assert run.code == 0, run.err
+        assert (run.out, run.err) == ("wrote every table into out: begin with out/README.md\n", "")
     folder, db = tmp_path / "out", str(tmp_path / "results/merge.duckdb")
     dictionary = rows(folder / "dictionary.csv")
     with duckdb.connect(db, read_only=True) as connection:
@@ -40,6 +42,61 @@ async def test_every_table_and_view_is_written_as_parquet_and_csv(merge_runner, 
     ]
     assert (gap["type"], gap["unit"]) == ("DOUBLE", "m")
     assert gap["meaning"].startswith("net gap, ")
+
+
+STUDY = """
+models = ["constant", "human-odds"]
+repetitions = 1
+conditions = ["N_0_0", "L_4_0"]
+[factors]
+memory_s = [1, 2.0]
+history_start = ["empty", "cruise"]
+"""
+
+
+@pytest.mark.slow
+async def test_the_wide_trials_have_metrics_and_typed_factors_and_humans_stand_beside_them(
+    merge_runner, tmp_path
+):
+    (tmp_path / "study.toml").write_text(STUDY)
+    assert (await merge_runner("sweep", "study.toml", "--quiet")).code == 0
+    assert (await merge_runner("export", "out")).code == 0
+    wide = duckdb.read_parquet(str(tmp_path / "out/trials_wide.parquet"))
+    types = dict(zip(wide.columns, map(str, wide.types), strict=True))
+    assert (types["memory_s"], types["history_start"]) == ("DOUBLE", "VARCHAR")
+    assert (types["gap_m"], types["joint"], types["driver"]) == ("DOUBLE", "BOOLEAN", "VARCHAR")
+    counts = wide.aggregate("driver, memory_s, history_start, count(*)").fetchall()
+    assert len(counts) == 8
+    assert {count for *_, count in counts} == {2}
+    assert len(rows(tmp_path / "out/trials_wide.csv")) == 16
+    described = rows(tmp_path / "out/dictionary.csv")
+    assert {row["meaning"] != "" for row in described if row["table"] == "trials_wide"} == {True}
+    humans = duckdb.read_parquet(str(tmp_path / "out/human_outcomes.parquet"))
+    ended = humans.aggregate("sum(left_first + right_first + collided), sum(collided)").fetchall()
+    assert ended == [(990, 28)]
+    told = {row["column"]: row["type"] for row in described if row["table"] == "human_outcomes"}
+    assert told == dict(zip(humans.columns, map(str, humans.types), strict=True))
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
+        trials = connection.execute("SELECT trial_id, gap_m FROM trial_metrics ORDER BY ALL")
+        assert wide.select("trial_id, gap_m").order("ALL").fetchall() == trials.fetchall()
+
+
+@pytest.mark.parametrize(
+    ("levels", "kind"),
+    [
+        (["0.2", "1"], "DOUBLE"),
+        (["1", "2"], "BIGINT"),
+        (["1", "99999999999999999999"], "DOUBLE"),
+        (["true", "false"], "BOOLEAN"),
+        (["default", "1"], "VARCHAR"),
+        (["true", "1"], "VARCHAR"),
+    ],
+)
+def test_a_factor_has_the_type_that_all_its_levels_have(levels, kind):
+    with duckdb.connect() as connection:
+        connection.execute("CREATE TABLE trial_factors (factor VARCHAR, value VARCHAR)")
+        connection.executemany("INSERT INTO trial_factors VALUES ('f', ?)", [[x] for x in levels])
+        assert connection.execute(FACTORS.format(only="")).fetchall() == [("f", kind)]
 
 
 @pytest.mark.slow

@@ -81,6 +81,9 @@ def test_a_checkout_is_named_by_its_commit_and_whether_it_is_changed(tmp_path, c
     checkout = copied(tmp_path)
     commit = committed(checkout, "merge_runner")
     assert said_in(checkout) == [f"('{commit}', False)", f"merge-runner at commit {commit}"]
+    (checkout / "my-study").mkdir()
+    (checkout / "my-study/study.toml").write_text("a user's own")
+    assert said_in(checkout)[0] == f"('{commit}', False)"
     (checkout / "study.txt").write_text("changed")
     assert said_in(checkout) == [
         f"('{commit}', True)",

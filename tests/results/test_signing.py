@@ -9,7 +9,10 @@ import pytest
 from merge_runner.results import signing
 from tests.harness import RECORDING
 
-pytestmark = pytest.mark.skipif(shutil.which("ssh-keygen") is None, reason="no ssh-keygen")
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(shutil.which("ssh-keygen") is None, reason="no ssh-keygen"),
+]
 
 
 def key(folder, name):

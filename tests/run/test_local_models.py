@@ -60,7 +60,7 @@ def models_asked(folder):
     return [name for (name,) in found]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_the_one_model_that_a_server_lists_is_asked_and_found_again_in_a_replay(
     merge_runner, tmp_path
 ):
@@ -84,7 +84,7 @@ async def test_the_one_model_that_a_server_lists_is_asked_and_found_again_in_a_r
         assert (await merge_runner("digest", "--db", db)).out == played.out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_of_several_models_one_must_be_chosen(merge_runner, tmp_path):
     async with watched(serving("qwen3-8b", "llama3.2:latest")) as server:
         at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
@@ -125,6 +125,7 @@ async def test_a_server_without_a_list_needs_a_name(merge_runner, registry):
         assert "name one with LOCAL_MODEL" in run.err
 
 
+@pytest.mark.long
 async def test_where_nothing_listens_the_run_ends_within_seconds_with_what_to_start(
     merge_runner, tmp_path
 ):
@@ -136,7 +137,7 @@ async def test_where_nothing_listens_the_run_ends_within_seconds_with_what_to_st
     assert "or set LOCAL_BASE_URL" in line
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("where", [(), ("--dask", "local:1")])
 async def test_no_trial_has_failed_where_nothing_was_ever_answered(
     merge_runner, registry, tmp_path, where
@@ -154,6 +155,7 @@ async def test_no_trial_has_failed_where_nothing_was_ever_answered(
     assert stored.summary["trials"]["stored_before"] == 1
 
 
+@pytest.mark.long
 async def test_a_host_that_there_is_not_is_named(merge_runner):
     run = await merge_runner(*LOCAL, LOCAL_BASE_URL="http://gpu.invalid:8000/v1")
     assert run.code == 1

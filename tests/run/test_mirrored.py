@@ -13,7 +13,7 @@ from tests.harness import watched
 PAIR = ("baseline", "--model", "emulator+projected-order", "--mirror", "--reps", 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_mirrored_pair_is_killed_resumed_and_replayed_to_the_same_end(
     merge_runner, tmp_path
 ):

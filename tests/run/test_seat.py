@@ -54,7 +54,7 @@ async def test_22_situations_are_asked_as_often_as_wanted_and_nothing_else_is(me
     assert "66 live" in run.err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_sweep_answers_the_situations_and_they_answer_its_first_decisions(merge_runner):
     sweep = ("sweep", "baseline", "--reps", 2, *TWO, "--json")
     first = ("seat", "first", "--samples", 2, *TWO, "--json")
@@ -114,7 +114,7 @@ async def test_what_is_forgotten_is_asked_again_without_a_call(merge_runner):
     assert (await merge_runner("digest")).out == stored.out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_killed_run_goes_on_without_asking_anything_again(merge_runner, tmp_path):
     async def slow(request, handler):
         await asyncio.sleep(0.05)

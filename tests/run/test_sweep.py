@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import json
+import os
 import signal
+import termios
 
 import pytest
 from aiohttp import web
@@ -14,7 +17,7 @@ from merge_runner.records import SLOT_HEADER
 from merge_runner.results.database import open_database
 from merge_runner.results.store import results_digest
 from tests.gate import HANGS_S, Gate
-from tests.harness import FAST, watched
+from tests.harness import FAST, PROGRAM, environment, watched
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--json")
 TWO = ("--conditions", "N_0_0,L_4_8")
@@ -236,6 +239,41 @@ async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(
     assert results_digest(tmp_path / DB) == quiet
 
 
+@pytest.mark.slow
+async def test_a_terminal_that_closes_loses_no_call_that_is_in_flight(
+    merge_runner, tmp_path, quiet
+):
+    gate = Gate(40)
+    ours, theirs = os.openpty()
+    async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await asyncio.create_subprocess_exec(
+            PROGRAM,
+            *map(str, SMALL),
+            cwd=tmp_path,
+            env=environment(**env),
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        )
+        os.close(theirs)
+        asyncio.get_running_loop().add_reader(ours, os.read, ours, 2**16)
+        await gate.quiet(tmp_path / "cache/responses", trials=4)
+        asyncio.get_running_loop().remove_reader(ours)
+        os.close(ours)
+        # As the shell does, and the service that ends what a login has left.
+        process.send_signal(signal.SIGHUP)
+        process.send_signal(signal.SIGTERM)
+        gate.open()
+        assert await process.wait() == 130
+        again = await merge_runner(*SMALL, **env)
+        assert again.code == 0, again.err
+        assert not gate.asked_again
+    assert results_digest(tmp_path / DB) == quiet
+
+
 async def test_two_signals_at_once_end_it_as_one_does(merge_runner):
     async with watched(faults=FaultPlan(latency_s=0.2)) as server:
         process = await merge_runner.fork(*SMALL, EMULATOR_BASE_URL=f"{server.url}/v1")
@@ -334,3 +372,12 @@ async def test_a_dry_run_tells_and_touches_nothing(merge_runner, tmp_path):
     assert run.summary["calls"] == pytest.approx(495 * 21, rel=0.01)
     assert run.summary["cost_usd"] > 50
     assert list(tmp_path.iterdir()) == []
+
+
+async def test_a_dry_run_counts_the_trials_of_programs_that_are_not_stored(merge_runner):
+    part = ("sweep", "baseline", "--model", "idm", "--model", "idm+constant", "--reps", 2)
+    told = await merge_runner(*part, "--dry-run", "--json")
+    assert (told.summary["trials"], told.summary["calls"]) == (44, 0)
+    await merge_runner(*part, "--conditions", "N_0_0")
+    told = await merge_runner(*part, "--dry-run", "--json")
+    assert told.summary["trials"] == 40

@@ -15,6 +15,8 @@ from merge_runner.run.until import deadline
 from tests.gate import Gate
 from tests.harness import FAST, watched
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(autouse=True)
 def amsterdam(monkeypatch):
@@ -53,7 +55,6 @@ def in_s(seconds):
     return (datetime.now(UTC) + timedelta(seconds=seconds)).isoformat()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("where", [(), ("--dask", "local:2")], ids=["here", "on a cluster"])
 async def test_at_its_time_a_sweep_begins_no_trial_and_the_same_command_goes_on(
     merge_runner, where

@@ -160,6 +160,21 @@ def test_a_registry_that_is_wrong(program, tmp_path, content, says):
         (scenario("horizon_s = '4'"), "scenario.horizon_s: Input should be a valid number"),
         (scenario("horizon_s = 4.1"), "scenario: horizon_s = 4.1 s is no whole number of 0.2 s"),
         (scenario("horizon_s = 1e308"), "scenario: horizon_s = 1e+308 s is more than 100000 steps"),
+        (
+            scenario("vehicle_length_m = 1e308"),
+            "vehicle_length_m: Input should be less than or equal",
+        ),
+        (scenario("vehicle_width_m = 101"), "less than or equal to 100"),
+        (scenario("max_acceleration_mps2 = 1e308"), "less than or equal to 1000000"),
+        (scenario("perception_left = { speed_sd_mps = 1e308 }"), "less than or equal to 1000000"),
+        (scenario("perception_left = { position_sd_m = 1e308 }"), "less than or equal to 1000000"),
+        (
+            sweep(
+                "conditions = [{ name = 'X', projected_headway_m = 0, relative_velocity_mps = 0, "
+                "mean_speed_mps = 1e308 }]"
+            ),
+            "mean_speed_mps: Input should be less than or equal to 1000000",
+        ),
         (scenario("step_s = 5e-324"), "is more than 100000 steps"),
         (scenario("prompt_rate_hz = 5e-324"), "is more than 100000 steps"),
         (scenario("prompt_rate_hz = 1e308"), "is no whole number"),
@@ -218,17 +233,17 @@ def test_a_file_of_faults_that_cannot_be_read(program, tmp_path, content):
     [
         (
             ["nope"],
-            "there is no sweep 'nope'; valid: ablations, baseline, mine, reference, or a path",
+            "unknown sweep 'nope'; valid: ablations, baseline, mine, reference (or a path)",
         ),
-        ([""], "there is no sweep ''; valid: ablations, baseline, mine"),
-        (["models"], "there is no sweep 'models'; valid: ablations, baseline, mine"),
-        (["../mine"], "there is no sweep '../mine'; valid: ablations, baseline, mine"),
-        (["a\nb\x1b"], "there is no sweep 'a\\nb\\x1b'; valid: ablations"),
+        ([""], "unknown sweep ''; valid: ablations, baseline, mine"),
+        (["models"], "unknown sweep 'models'; valid: ablations, baseline, mine"),
+        (["../mine"], "unknown sweep '../mine'; valid: ablations, baseline, mine"),
+        (["a\nb\x1b"], "unknown sweep 'a\\nb\\x1b'; valid: ablations"),
         (["x" * 5000], "valid: ablations"),
         (["nowhere.toml"], "nowhere.toml does not exist"),
         (["folder.toml"], "folder.toml cannot be read: Is a directory"),
-        (["mine", "--model", "gpt9"], "unknown model 'gpt9'; valid: emulator, o3, "),
-        (["mine", "--model", "m+gpt9"], "unknown model 'gpt9'; valid: emulator, o3, "),
+        (["mine", "--model", "gpt9"], "unknown model 'gpt9'; valid: emulator, random, o3, "),
+        (["mine", "--model", "m+gpt9"], "unknown model 'gpt9'; valid: emulator, random, o3, "),
         (["mine", "--conditions", "X"], f"unknown condition 'X'; valid: {', '.join(CONDITIONS)}"),
         (["mine", "--variants", "Z"], f"unknown variant 'Z'; valid: {', '.join(VARIANTS)}"),
         (["mine", "--reps", "-1"], "--reps is a whole number from 1"),

@@ -81,3 +81,44 @@ async def test_no_command_shows_a_file_that_a_database_names(merge_runner, tmp_p
         assert SECRET not in run.out + run.err
         assert "Traceback" not in run.err
     assert not (tmp_path / "out.html").exists()
+
+
+def change(db, sql):
+    with duckdb.connect(str(db)) as opened:
+        opened.execute(sql)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("status", ["exploded", "", "<b>\n\x1b[2J" * 20])
+async def test_a_status_that_no_trial_has_is_refused_in_one_line(merge_runner, tmp_path, status):
+    assert (await merge_runner("sweep", *PART, "--model", "idm")).code == 0
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb")) as opened:
+        opened.execute("UPDATE trials SET status = ?", [status])
+    for command in (("tables",), ("report",), ("explain", "gap", "human/intercept:b")):
+        run = await merge_runner(*command)
+        assert (run.code, run.out) == (2, "")
+        (line,) = run.err.splitlines()
+        assert "idm/baseline/N_0_0/rep01 has the status " in line
+        assert "valid: finished, collided, timeout, failed" in line
+        assert line.isprintable()
+        assert len(line) < 500
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="the name of a condition is part of a path as it is",
+)
+@pytest.mark.parametrize("name", ["a/b", "../up"])
+async def test_no_name_of_a_condition_leads_out_of_the_folder_of_an_export(
+    merge_runner, tmp_path, name
+):
+    if (await merge_runner("sweep", *PART, "--model", "constant")).code:
+        pytest.fail("no trial is stored")
+    change(tmp_path / "results/merge.duckdb", f"UPDATE trials SET condition = '{name}'")
+    run = await merge_runner("view", "--trials", "*", "--export", "shared/pages")
+    assert run.code == 0, run.err
+    assert [path.name for path in (tmp_path / "shared").iterdir()] == ["pages"]
+    pages = [path for path in (tmp_path / "shared/pages").iterdir() if path.is_file()]
+    assert any("constant/baseline/N_0_0/rep01" in page.read_text() for page in pages)

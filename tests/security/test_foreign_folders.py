@@ -19,6 +19,8 @@ from merge_runner.llm.claims import Claims
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.records import Attempt, Slot
 
+pytestmark = pytest.mark.long
+
 SECRET = "what nobody else may read"
 PART = ("baseline", "--reps", 1, "--conditions", "N_0_0")
 
@@ -416,7 +418,6 @@ def test_of_a_file_that_is_cut_off_is_taken_what_can_be_read(folder, own, kept):
     assert list(own.entries())
 
 
-@pytest.mark.slow
 async def test_the_command_takes_a_folder_and_says_what_it_left(merge_runner, tmp_path):
     assert (await merge_runner("sweep", *PART)).code == 0
     (tmp_path / "cache/responses").rename(tmp_path / "theirs")

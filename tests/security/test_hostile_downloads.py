@@ -96,7 +96,7 @@ def test_a_zip_within_the_zip_is_not_opened(imported, tmp_path):
     assert trials(tmp_path) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("content", "says"),
     [(bytes(10**6), "unpacks from"), (os.urandom(65 * 2**20), "bytes unpacked")],

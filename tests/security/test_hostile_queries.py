@@ -175,7 +175,7 @@ SEVERAL = [
 NO_QUERY = ["", " ", "-- nothing", ";", "SELEKT", "SELECT ?", "SELECT $x", "SELECT 1 FROM nowhere"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "queries",
     [READING_FILES, WRITING, CHANGING_THE_PROGRAM, SEVERAL, NO_QUERY],
@@ -187,7 +187,7 @@ def test_what_is_more_than_one_query_of_the_database_is_refused_and_changes_noth
     assert contents(here) == before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_setting_alone_holds_where_a_statement_slips_through(here, monkeypatch):
     """As if the check of statements let everything pass."""
     monkeypatch.setattr("merge_runner.results.store._reads", lambda statement: True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import random
@@ -16,7 +17,7 @@ import pytest
 
 from merge_runner.errors import MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import call_key, make_request
+from merge_runner.llm.content_hashes import call_key, canonical_json, make_request
 from merge_runner.records import Attempt, Slot
 from merge_runner.results.recording import COLUMNS, export_recording, import_recording, summarise
 
@@ -98,6 +99,20 @@ def planted(file, **columns):
         f"{name} = {'NULL' if value is None else quoted(str(value))}" for name, value in row.items()
     )
     return rewritten(file, f"UPDATE calls SET {sets} WHERE decision = 0")
+
+
+def forged(file, **columns):
+    """The same under hashes that fit: that of the content, and that of what the file says."""
+    bad = planted(file, **columns)
+    with duckdb.connect() as connection:
+        rows = connection.execute(f"SELECT call_key, attempts FROM '{bad}'").fetchall()
+        pairs = connection.execute(f"FROM parquet_kv_metadata('{bad}')").fetchall()
+    told = {key.decode(): value.decode() for _, key, value in pairs}
+    lines = "".join(f"{key} {attempts}\n" for key, attempts in rows)
+    told["content_sha256"] = hashlib.sha256(lines.encode()).hexdigest()
+    del told["provenance_sha256"]
+    told["provenance_sha256"] = hashlib.sha256(canonical_json(told).encode()).hexdigest()
+    return rewritten(bad, **told)
 
 
 def refusal(bad, cache):
@@ -185,6 +200,52 @@ def attempts(**changes):
 )
 def test_a_reply_that_a_replay_or_a_table_cannot_take_is_refused(file, cache, changes):
     assert "is damaged" in refusal(planted(file, attempts=attempts(**changes)), cache)
+
+
+OK = {"number": 1, "outcome": "ok", "http_status": 200, "reply": ANSWER}
+LOST = {"number": 1, "outcome": "timeout"}
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"repetition": 0},
+        {"repetition": 100_001},
+        {"decision": -1},
+        {"decision": 100_001},
+        {"sample_set": -1},
+        {"condition": ""},
+        {"condition": "../../etc"},
+        *(
+            {"attempts": json.dumps(attempts)}
+            for attempts in (
+                [OK | {"outcome": "won"}],
+                [LOST, OK | {"number": 2, "outcome": "OK"}],
+                [LOST],
+                [OK | {"http_status": 500}],
+                [OK | {"http_status": None}],
+                [OK | {"http_status": 1000, "outcome": "refusal"}],
+                [LOST, OK],
+                [LOST | {"number": 3}, OK | {"number": 2}],
+                [OK | {"number": 0}],
+                [LOST | {"outcome": "<b>"}, OK | {"number": 2}],
+                [LOST | {"outcome": "a" * 41}, OK | {"number": 2}],
+            )
+        ),
+    ],
+    ids=lambda columns: str(columns)[-60:],
+)
+def test_a_place_or_an_attempt_that_cannot_be_is_refused_under_hashes_that_fit(
+    file, cache, columns
+):
+    assert "row 1 is damaged: " in refusal(forged(file, **columns), cache)
+
+
+def test_a_failure_a_refusal_and_a_large_sample_set_are_taken(file):
+    attempts = [LOST, LOST | {"number": 4, "outcome": "http_418", "http_status": 418},
+                {"number": 5, "outcome": "refusal", "http_status": 400}]  # fmt: skip
+    changed = forged(file, attempts=json.dumps(attempts), sample_set=2**40, repetition=100_000)
+    assert summarise(changed).attempts == CALLS + 2
 
 
 def test_nothing_is_kept_of_a_file_whose_last_row_is_wrong(file, cache, monkeypatch):
@@ -342,6 +403,7 @@ def test_the_measurement_sees_memory():
     assert peak_mb(used)[1] >= 290  # less what was free before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [

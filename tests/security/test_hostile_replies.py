@@ -164,7 +164,7 @@ def check(text, actions=N):
     return "plan"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_hundred_thousand_mutated_replies_give_plans_or_named_refusals_and_run_nothing(
     every_audit_event,
 ):
@@ -279,7 +279,7 @@ def grows_too_fast(frame, unit):
     return False
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("unit", UNITS, ids=repr)
 def test_a_megabyte_takes_time_in_proportion_to_its_length(unit):
     assert [frame for frame in FRAMES if grows_too_fast(frame, unit)] == []

@@ -317,7 +317,7 @@ async def test_a_bad_certificate_ends_a_sweep_at_once_and_nothing_is_sent(
         ({"ALL_PROXY": f"socks5://u:{KEY}@proxy.invalid"}, "ALL_PROXY names a socks5:// proxy"),
         ({"https_proxy": "http://[::1"}, "https_proxy is no URL of a proxy"),
         ({"NO_PROXY": "http://a b:c", "HTTP_PROXY": "http://x"}, "cannot be read: correct them"),
-        ({"OPENAI_BASE_URL": "https://a..b/v1"}, "'https://a..b/v1' is no base URL"),
+        ({"OPENAI_BASE_URL": "https://a..b/v1"}, "OPENAI_BASE_URL is no base URL"),
         ({"OPENAI_BASE_URL": f"https://{'a' * 300}/v1"}, "is no base URL: there can be no such"),
     ],
     ids=lambda value: str(value)[:40],

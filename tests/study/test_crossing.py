@@ -52,6 +52,21 @@ def test_models_factors_and_prompts_are_crossed_and_named_by_what_varies(plan_of
     assert bodies(plan) == {0.2, 1.0}
 
 
+def test_more_trials_than_can_be_played_are_refused_before_they_are_built(plan_of):
+    many = f"[factors]\nseed = {[*range(10_000)]}\nmax_output_tokens = {[*range(1, 10_001)]}\n"
+    with pytest.raises(UsageError) as refused:
+        plan_of(many)
+    assert str(refused.value) == (
+        "10,000 levels of seed x 10,000 levels of max_output_tokens x 2 repetitions make "
+        "200,000,000 trials, and at most 1,000,000 can be played: leave out levels of seed, in the "
+        "file or by --only, --conditions or --reps"
+    )
+    part = {"seed": ["7", "8"], "max_output_tokens": ["300"]}
+    assert plan_of(many, only=part).trials == 4
+    with pytest.raises(UsageError, match="100,000 repetitions x 11 conditions make 1,100,000"):
+        make_plan("baseline", repetitions=100_000)
+
+
 def test_a_level_is_another_request_and_another_spec(plan_of):
     plan = plan_of("[factors]\ntemperature = [0.2, 1.0]\n")
     first, second = plan.trial_specs()[0], plan.trial_specs()[1]
@@ -193,7 +208,17 @@ def test_plain_sweeps_have_one_arm_for_each_prompt():
         ("[factors]\ntemperature = [0.2]\n", ["o3"], 'skip = [{ model = "o3", temperature = 0.2'),
         ("[factors]\ntemperature = [0.2]\n", ["constant"], "is a program and takes no temperature"),
         ("[factors]\ntemperature = []\n", ["o3"], "the factor temperature needs levels"),
-        ("[factors]\ntemperature = [1, 1]\n", ["o3"], "needs levels, each of them once"),
+        (
+            "[factors]\ntemperature = [1, 1]\n",
+            ["o3"],
+            "each of its levels once: 1 and 1 are the same",
+        ),
+        (
+            "[factors]\nmemory_s = [2, 1, 2.0]\n",
+            [],
+            "memory_s needs each of its levels once: 2 and 2.0",
+        ),
+        ('[factors]\nseed = ["2", 2.0]\n', [], "seed needs each of its levels once: 2 and 2.0"),
         ('[factors]\nmodel = ["o3"]\n', [], "models are no factor"),
         ('[factors]\nprompt = ["A9"]\n', [], "unknown variant 'A9'; valid: baseline, A1"),
         ('[factors]\nopponent = ["nobody"]\n', [], "unknown model 'nobody'; valid: emulator"),
@@ -267,3 +292,27 @@ def test_a_delay_has_to_fit_the_step_of_the_world_that_is_played(plan_of, scenar
 def test_a_perception_that_no_factor_names_is_noted(plan_of):
     (note,) = plan_of(FOGGY).notes()
     assert note.endswith("foggy")
+
+
+def test_the_reference_of_a_factor_is_its_first_level_or_the_one_that_is_named(plan_of):
+    text = (
+        '{}models = ["emulator", "local"]\n[factors]\nprompt = ["A2", "baseline"]\nseed = [7, 1]\n'
+    )
+    listed = {"model": ["emulator", "local"], "prompt": ["A2", "baseline"], "seed": ["7", "1"]}
+    assert plan_of(text.format("")).config()["levels"] == listed
+    plan = plan_of(text.format('reference = { model = "local", seed = 1 }\n'), only={"seed": ["7"]})
+    chosen = {"model": ["local", "emulator"], "prompt": ["A2", "baseline"], "seed": ["1", "7"]}
+    assert plan.config()["levels"] == chosen
+    assert next(iter(plan.arms)).model == "local", "power compares with the first arm"
+
+
+@pytest.mark.parametrize(
+    ("reference", "says"),
+    [
+        ("seed = 3", "unknown level of seed '3'; valid: 7, 1"),
+        ('mood = "good"', "unknown factor 'mood'; valid: model, seed, prompt"),
+    ],
+)
+def test_a_reference_that_is_no_level_is_refused(plan_of, reference, says):
+    with pytest.raises(UsageError, match=says):
+        plan_of(f"reference = {{ {reference} }}\n[factors]\nseed = [7, 1]\n")

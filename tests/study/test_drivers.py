@@ -46,7 +46,7 @@ def plan_of(tmp_path):
         file = tmp_path / "mine.toml"
         head = f'repetitions = 1\nconditions = ["N_0_0"]\n{text}\n{scenario}\n'
         file.write_text(f'{head}[plugins]\nfiles = ["mine.py"]\n')
-        return make_plan(str(file), models)
+        return make_plan(str(file), models, trust=True)
 
     yield plan
     make_plan("baseline", "constant")  # what the study added is taken out again

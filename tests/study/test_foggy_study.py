@@ -62,7 +62,7 @@ def db(prepare, tmp_path_factory):
     return folder / "results/merge.duckdb"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_foggy_study_that_is_killed_goes_on_and_replays_sealed_to_the_same_digest(
     merge_runner, foggy
 ):

@@ -8,11 +8,14 @@ import re
 import shlex
 import subprocess
 import tomllib
+from pathlib import Path
 
 import pytest
 
+from merge_runner import Study
 from merge_runner.config import ModelEntry
 from merge_runner.emulator.faults import FaultPlan
+from merge_runner.paths import DEFAULT_DB, home_of
 from merge_runner.results.store import results_digest
 from merge_runner.study.folder import FILES, TEMPLATE, write_folder
 from tests.harness import PROGRAM, watched
@@ -56,9 +59,32 @@ async def test_a_new_study_is_killed_resumed_replayed_and_shown(merge_runner, st
     assert "emulator+hesitant [temperature=0.2]/hurry" in tables.out
 
 
-@pytest.mark.slow
+async def test_results_lie_beside_the_study_wherever_it_is_started(merge_runner, study, tmp_path):
+    outside = ("mine/study.toml", "--only", "temperature=0.2", "--only", "prompt=baseline")
+    begun = await merge_runner("sweep", *outside, "--json")
+    assert begun.code == 0, begun.err
+    assert not (tmp_path / "results").exists()
+    assert not (tmp_path / "cache").exists()
+    inside = await merge_runner("sweep", "study.toml", *outside[1:], "--json", cwd=study)
+    assert inside.summary["trials"]["stored_before"] == begun.summary["trials"]["planned"]
+    made = Study(study / "study.toml")
+    assert (made.db, made.cache) == (study / "results/merge.duckdb", study / "cache/responses")
+    tables = await merge_runner("tables", "gap", "--study", "mine/study.toml")
+    assert "hesitant" in tables.out
+    named = await merge_runner("tables", "gap", "--study", "mine/study.toml", "--db", DEFAULT_DB)
+    assert "there is no database results/merge.duckdb" in named.err
+
+
+def test_a_study_of_a_folder_experiments_has_its_results_beside_that_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert home_of("baseline") == home_of("experiments/mine.toml") == Path()
+    assert home_of(str(tmp_path.parent / "experiments/mine.toml")) == tmp_path.parent
+
+
+@pytest.mark.long
 async def test_the_commands_of_its_readme_and_its_makefile_work(merge_runner, study):
     (block,) = re.findall(r"```sh\n(.*?)```", (study / "README.md").read_text(), re.DOTALL)
+    assert "pip install merge_runner-*.whl " in block  # as the project's own README says
     commands = [shlex.split(line, comments=True) for line in block.splitlines()]
     ours = [words[1:] for words in commands if words[0] == "merge-runner" and words[1] != "view"]
     assert len(ours) >= 8

@@ -12,6 +12,7 @@ from merge_runner.prompts.blocks import block_digests, blocks_of
 from merge_runner.prompts.render import render_prompt
 from merge_runner.run.plan import make_plan
 from merge_runner.scenarios.registry import new_world
+from tests.harness import how_to
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 DRIVER = """
@@ -37,7 +38,7 @@ def plan_of(tmp_path):
         file.write_text((HEAD if conditions else "repetitions = 1\n") + text)
         if plugin is not None:
             (tmp_path / "mine.py").write_text(plugin)
-        return make_plan(str(file), models)
+        return make_plan(str(file), models, trust=True)
 
     return plan
 
@@ -51,6 +52,23 @@ def prompt(variant):
 def persona(text="You are a taxi driver."):
     added = f'add = [{{ after = "C3.human", text = "{text}" }}]'
     return f'[factors]\nprompt = ["taxi"]\n[prompts.taxi]\n{added}\n'
+
+
+MODELS = """
+[talker-1]
+provider = "talker"
+format = "say"
+id = "talker-1"
+max_output_tokens = 2000
+price = "free"
+"""
+
+
+def test_models_beside_a_study_may_speak_a_wire_format_of_its_plug_ins(plan_of, tmp_path):
+    (tmp_path / "models.toml").write_text(MODELS)
+    named = 'models = ["talker-1"]\n[plugins]\nfiles = ["mine.py"]\n'
+    plan = plan_of(named, plugin=how_to("add-a-wire-format"))
+    assert plan.entries["talker-1"].format == "say"
 
 
 def test_a_paragraph_is_added_where_it_belongs(plan_of):
@@ -156,7 +174,7 @@ def test_an_edit_of_what_a_plug_in_imports_is_another_driver(tmp_path):
     hashes = []
     for gain in (-0.1, -0.9):
         (tmp_path / "gains.py").write_text(f"GAIN = {gain}\n")
-        hashes.append(make_plan(str(study), ["braking"]).trial_specs()[0].spec_hash)
+        hashes.append(make_plan(str(study), ["braking"], trust=True).trial_specs()[0].spec_hash)
     assert hashes[0] != hashes[1]
 
 

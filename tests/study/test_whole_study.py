@@ -46,7 +46,7 @@ def with_budget(folder, usd):
     (folder / "study.toml").write_text(f"{text}\n[budget]\ntotal_usd = {usd}\n")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_study_in_one_file_runs_within_its_budget_and_is_shown_by_factor(
     merge_runner, tmp_path, monkeypatch
 ):

@@ -21,11 +21,13 @@ from analysis.explorer.urls import HOME
 from analysis.metrics import GAP, LEFT_FIRST
 from analysis.tables.formats import notes_of, printed
 from analysis.tables.model import Table, from_text
+from merge_runner.results.levels import DESCRIPTIONS
+from merge_runner.results.validity import not_judged
 from merge_runner.study.crossing import PROMPT
 
 # More groups than these cannot be told apart in a picture.
 DRAWN = 12
-COUNTS = ("trials", "ended", "failed", "collided", "decisions", "invalid", "cost_usd")
+COUNTS = ("trials", "ended", "failed", "collided", "asked", "invalid", "cost_usd")
 # What is published as one class of collisions, and the two that it holds.
 SAME, SAME_ACTION = "same action", ("both insisted", "both gave way")
 DRIVER_AND_PROMPT = "driver and prompt"
@@ -47,6 +49,12 @@ class Played:
         """The counts over all conditions."""
         return {name: sum(cell[name] for cell in self.cells.values()) for name in COUNTS}
 
+    @property
+    def unjudged(self) -> str:
+        """Why nothing is concluded from its trials; empty where something is."""
+        total = self.total
+        return not_judged(self.label, total["invalid"], total["asked"])
+
     def share(self, condition: str) -> float:
         """How many of the trials that ended collided; -1 where none ended."""
         cell = self.cells.get(condition)
@@ -67,6 +75,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     panels = computed(site, ("home", by, str(imported)), given, wait_s=0.0)
     verdicts = computed(site, ("tables", "indicators"), given, wait_s=0.0)
     (unpriced,) = site.catalogue.ask(UNPRICED)
+    descriptions = site.catalogue.ask(DESCRIPTIONS)
     return site.render(
         "home.html",
         here="index",
@@ -84,6 +93,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
             _grouped(site, by, Filter(outcome="collided"), "account"), published_accounts()
         ),
         unpriced=unpriced["attempts"],
+        description="; ".join(row["description"] for row in descriptions),
         panels=panels,
         charts=_charts(site, panels),
         verdicts=verdicts,
@@ -104,7 +114,9 @@ def groupings(site: Site) -> list[str]:
 def groups_of(site: Site, by: str) -> list[Played]:
     """Drivers and prompts, or the levels of a factor; before several their sum."""
     found = [group for group in _grouped(site, by, Filter()) if group.who != "humans"]
-    return [*_sums(site, found), *found]
+    # What is concluded from a part of them alone is no sum.
+    whole = [] if any(group.unjudged for group in found) else _sums(site, found)
+    return [*whole, *found]
 
 
 def _grouped(site: Site, by: str, wanted: Filter, cell: str = "condition") -> list[Played]:
@@ -154,7 +166,8 @@ def _sum_of(cells: Sequence[Mapping[str, Any]]) -> dict[str, int]:
 
 def ranking(groups: Sequence[Played]) -> Played | None:
     """The group by which conditions are ordered: the first that collided, if any did."""
-    return next((group for group in groups if group.total["collided"]), next(iter(groups), None))
+    judged = [group for group in groups if not group.unjudged]
+    return next((group for group in judged if group.total["collided"]), next(iter(judged), None))
 
 
 def worst_first(groups: Sequence[Played]) -> list[dict[str, Any]]:

@@ -77,5 +77,6 @@ PROGRAMS.register(
         sets={BY_RESISTANCE: {}, **{name: asdict(one) for name, one in SETS.items()}},
         check=check,
         check_clock=check_clock,
+        chance=True,
     ),
 )

@@ -228,7 +228,7 @@ class Exchange:
 
     def told(self, line: BatchLine) -> str:
         """What our own emulator alone is told of a line, as members of its JSON object."""
-        if self.endpoint.provider != "emulator":
+        if not self.endpoint.is_emulator:
             return ""
         slot = canonical_json(line.request.slot.as_dict())
         return f',"{SLOT_HEADER}":{slot},"{ATTEMPT_HEADER}":{line.attempt}'

@@ -269,9 +269,11 @@ class Following:
         """Nobody knows what became of a batch: what was set aside for it stays so."""
         batch = followed.batch
         gives_up = self._deadline_s == 0
-        if batch.model in self._free or gives_up:
-            end = LineEnd(batch.batch_id, outcome="batch_lost", message=str(exc), unclear=True)
-            followed.end(end)
+        free = batch.model in self._free
+        if free or gives_up:
+            followed.end(
+                LineEnd(batch.batch_id, outcome="batch_lost", message=str(exc), unclear=not free)
+            )
             return
         error = EndpointRefused(
             f"{batch.model}: {batch.batch_id} is refused to this key ({exc}): set the key of the "

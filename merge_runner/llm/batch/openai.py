@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 from uuid import uuid4
 
+from merge_runner.config import is_own_host
 from merge_runner.llm.batch.exchange import (
     Exchange,
     Line,
@@ -36,6 +37,7 @@ from merge_runner.llm.batch.service import (
 )
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import as_count, as_dict, as_text, first_of, read_error
+from merge_runner.llm.verify import LARGEST_STATUS
 
 # Where the files of a batch stand, whatever the base URL of the server is.
 API = "/v1"
@@ -77,7 +79,9 @@ class OpenAIBatches:
             "completion_window": "24h",
             "metadata": {MARK: mark},
         }
-        if self._exchange.endpoint.identity == "openai":  # others may not know the member
+        if is_own_host(
+            "openai", self._exchange.endpoint.identity
+        ):  # others may not know the member
             batch["output_expires_after"] = {"anchor": "created_at", "seconds": KEPT_S}
         body = canonical_json(batch).encode()
         return id_of(await self._exchange.create("/batches", body, lines=lines))
@@ -178,7 +182,7 @@ def _read(line: dict[str, Any]) -> LineResult:
     key = text_at(line, "custom_id")
     response, error = as_dict(line.get("response")), as_dict(line.get("error"))
     status, body = as_count(response.get("status_code")), response.get("body")
-    if status and isinstance(body, dict):
+    if status and status <= LARGEST_STATUS and isinstance(body, dict):
         return LineResult(key, as_reply(status, body))
     message = as_message(error.get("message"))
     if as_text(error.get("code")) in NOT_ASKED:

@@ -59,7 +59,7 @@ class BatchWays:
 class Rounds:
     """The rounds of a run; ``services`` are the batch modes of its models, by registered name.
 
-    Those that are ``free`` cost nothing.
+    For those that are ``free`` nobody charges.
     """
 
     def __init__(

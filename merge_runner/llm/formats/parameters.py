@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pydantic import JsonValue
 
 from merge_runner.config import PROVIDERS, ModelEntry
-from merge_runner.errors import UsageError
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.formats import FORMATS
 
 CAP, EFFORT = "max_output_tokens", "reasoning_effort"
@@ -72,7 +72,7 @@ def _check_range(parameter: str, level: JsonValue) -> None:
 
 def _with_effort(name: str, entry: ModelEntry, level: JsonValue) -> ModelEntry:
     if level not in entry.efforts:
-        raise UsageError(f"{name} has no {EFFORT} {level!r}; valid: {', '.join(entry.efforts)}")
+        raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)
     parameters = {**entry.parameters, **entry.efforts[str(level)]}
     return entry.model_copy(update={"parameters": parameters})
 

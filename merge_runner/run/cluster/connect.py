@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from merge_runner.errors import UsageError
+from merge_runner.signals import FROM_TERMINAL
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -95,12 +96,12 @@ def _choose_how_workers_start() -> None:
 
 @contextmanager
 def _for_children() -> Iterator[None]:
-    """Processes started in this block ignore Ctrl-C and import nothing from the current folder."""
+    """Processes started here ignore the terminal's signals, and import nothing of this folder."""
     resource_tracker.ensure_running()  # starting it in the block would unblock Ctrl-C again
     name = "PYTHONSAFEPATH"
     kept = os.environ.get(name)
     os.environ[name] = "1"
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # children inherit it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, FROM_TERMINAL)  # children inherit it
     try:
         yield
     finally:

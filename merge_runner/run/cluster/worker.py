@@ -20,14 +20,16 @@ from merge_runner.run.cluster.batch import Batch, fingerprint
 from merge_runner.run.cluster.link import Link, LinkLost, taken_apart
 from merge_runner.run.cluster.remote import RemoteBudget, RemoteCache, RemoteRateLimit
 from merge_runner.run.local_runner import LocalRunner
+from merge_runner.signals import FROM_TERMINAL
 from merge_runner.study.parts import adopt
 
 REPORT_EVERY_S = 0.5
 
 
 def dask_setup(_: object) -> None:
-    """Called by Dask where this is a worker's preload: Ctrl-C is for the coordinator alone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Called by Dask where this is a worker's preload: signals are for the coordinator alone."""
+    for number in FROM_TERMINAL:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def play_batch(address: str, token: str) -> None:

@@ -10,6 +10,9 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
 from merge_runner.scenarios.merge.geometry import TRACK
 
+NO_CONFLICT_MPS = 0.01
+"""Vehicles that close in no faster are in no conflict: equal speeds differ by a rounding."""
+
 
 def measures_sql() -> str:
     """Definitions that replace older ones, and note in a comment which version they are."""
@@ -31,6 +34,7 @@ def _definitions() -> str:
         "mean_speed_mps": MEAN_SPEED_MPS,
         "usual_length_m": ScenarioConfig().vehicle_length_m,
         "usual_width_m": ScenarioConfig().vehicle_width_m,
+        "no_conflict_mps": NO_CONFLICT_MPS,
     }
     macros = [f"CREATE OR REPLACE MACRO {name}() AS {n!r}::DOUBLE;" for name, n in numbers.items()]
     views = Path(__file__).with_name("measures.sql").read_text(encoding="utf-8")

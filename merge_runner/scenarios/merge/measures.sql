@@ -166,7 +166,7 @@ distances AS (
         FROM pairs JOIN geometry USING (spec_hash)
         WHERE greatest(left_m, right_m) >= merge_point_m
     )
-    WHERE closing_mps > 0 AND abs(left_m - right_m) > length_m
+    WHERE closing_mps > no_conflict_mps() AND abs(left_m - right_m) > length_m
     GROUP BY ALL
 ), resolutions AS (
     SELECT trial_id, spec_hash, min(time_s) AS conflict_resolution_s
@@ -212,6 +212,7 @@ SELECT
     CASE WHEN finished AND left_s < right_s THEN right_front_s - left_rear_s
         WHEN finished THEN left_front_s - right_rear_s END AS post_encroachment_s,
     -- smallest time to collision once a vehicle is past the merge point; NULL if they never close in
+    -- faster than 0.01 m/s: no conflict
     min_ttc_s,
     -- largest absolute acceleration of either vehicle under the drivers' control
     max_acceleration_mps2,

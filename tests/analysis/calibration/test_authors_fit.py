@@ -14,6 +14,8 @@ from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
 from tests.analysis.calibration.synthetic import write_humans
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def humans(tmp_path_factory):
@@ -39,7 +41,6 @@ def test_a_database_without_humans_says_what_to_type(tmp_path, command):
     assert "human import PATH" in printed.err
 
 
-@pytest.mark.slow
 def test_the_order_of_the_drivers_is_found_again(humans):
     estimates = estimated(load(REACTIONS, humans))
     for n, threshold in enumerate(("lower", "upper")):
@@ -52,7 +53,6 @@ def test_the_order_of_the_drivers_is_found_again(humans):
         assert spearmanr(found, [planted[name] for name in found.index])[0] > 0.8
 
 
-@pytest.mark.slow
 def test_an_agent_of_the_grid_is_given_its_own_thresholds_or_equal_ones():
     speeds = grid_speeds()
     assert {len(found) for found in speeds.values()} == {len(GRID)} == {625}
@@ -63,7 +63,6 @@ def test_an_agent_of_the_grid_is_given_its_own_thresholds_or_equal_ones():
     assert isinstance(GRID[agent], Base)
 
 
-@pytest.mark.slow
 def test_the_command_prints_a_driver_that_a_study_can_play(humans, command):
     code, printed = command("fit", "--db", humans)
     assert code == 0

@@ -12,6 +12,8 @@ from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.results.store import Store
 from tests.drivers.cei.trials import cei, model, played, scenario, simulated
 
+pytestmark = pytest.mark.long
+
 # Among them are trials that collide.
 TRIALS = [
     (condition, repetition)

@@ -11,6 +11,8 @@ from merge_runner.drivers.cei.driver import check
 from merge_runner.drivers.cei.parameters import SETS
 from tests.drivers.cei.trials import scenario, simulated
 
+pytestmark = pytest.mark.long
+
 
 def test_the_design_has_each_pair_ten_times_in_each_condition_with_the_seeds_of_the_slots():
     trials = design(SETS["K0"], experiment(), 0)
@@ -28,7 +30,6 @@ def test_a_miss_by_its_tolerance_costs_one_and_a_number_without_a_fit_much():
     assert cost(exact, wanted) == MISSING**2
 
 
-@pytest.mark.slow
 def test_a_search_looks_only_for_thresholds_that_a_study_may_set():
     edge = replace(SETS["K0"], lower_spread=0.0, upper_spread=0.0, upper_mean=1.0)
     for found in search(
@@ -37,7 +38,6 @@ def test_a_search_looks_only_for_thresholds_that_a_study_may_set():
         check({"pair": 0, **asdict(found.thresholds)})
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_the_search_for_a_set_can_be_repeated(name):
     def last():

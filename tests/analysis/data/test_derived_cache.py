@@ -11,13 +11,13 @@ import duckdb
 import pytest
 
 from analysis.data import derived_cache as kept
-from analysis.data.derived_cache import finished, keep_finished, present_state
+from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
 from analysis.data.study import Study
 from analysis.report.writer import finished_figures
 from analysis.table_format import TableFormat
 from analysis.tables import TABLES, finished_tables, make_tables
 from analysis.tables.formats import render
-from analysis.tables.model import from_text, options_text, to_text
+from analysis.tables.model import from_text, to_text
 from merge_runner.errors import UsageError
 from merge_runner.results.store import results_digest
 from tests.analysis.studies import write_study, yielding
@@ -151,7 +151,7 @@ def test_tables_of_a_study_that_was_read_before_a_change_are_not_kept(db):
     study = Study(db)
     change(db, CHANGES["an outcome"])
     finished_tables(db, None, ["attempts"], study)
-    assert finished(db, present_state(db), options_text(db, None), ["attempts"]) == {}
+    assert finished(db, present_state(db), options_text(db), ["attempts"]) == {}
 
 
 @pytest.mark.slow
@@ -182,7 +182,7 @@ def test_a_figure_is_not_taken_for_the_table_of_its_name(db, monkeypatch):
     monkeypatch.setattr("analysis.report.writer.FIGURES", {"attempts": None})
     monkeypatch.setattr("analysis.report.writer.rendered", lambda *_: b"<svg/>")
     (table,) = finished_tables(db, None, ["attempts"])
-    assert finished_figures(Study(db), options_text(db, None)) == {"attempts": "PHN2Zy8+"}
+    assert finished_figures(Study(db)) == {"attempts": "PHN2Zy8+"}
     (again,) = finished_tables(db, None, ["attempts"])
     assert to_text(again) == to_text(table)
 
@@ -194,15 +194,15 @@ def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
     monkeypatch.setattr(
         "analysis.report.writer.rendered", lambda *wanted: drawn.append(wanted[1:]) or b"<svg/>"
     )
-    first = finished_figures(Study(db), "")
-    assert finished_figures(Study(db), "") == first == dict.fromkeys(first, "PHN2Zy8+")
+    first = finished_figures(Study(db))
+    assert finished_figures(Study(db)) == first == dict.fromkeys(first, "PHN2Zy8+")
     assert drawn == [("figure2", "svg"), ("distributions", "svg")]
     change(db, CHANGES["an outcome"])
-    finished_figures(Study(db), "")
+    finished_figures(Study(db))
     assert drawn == [("figure2", "svg"), ("distributions", "svg")] * 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_warm_table_waits_for_no_heavy_library(db, tmp_path):
     check = (
         "import sys; from analysis.commands import app; "
@@ -221,7 +221,7 @@ def test_a_warm_table_waits_for_no_heavy_library(db, tmp_path):
 @pytest.mark.slow
 def test_unknown_names_are_refused_also_beside_kept_tables(db):
     finished_tables(db, None, ["attempts"])
-    with pytest.raises(UsageError, match="no table 'gaps'"):
+    with pytest.raises(UsageError, match="unknown table 'gaps'"):
         finished_tables(db, None, ["gaps"])
-    with pytest.raises(UsageError, match="no driver 'o4'"):
+    with pytest.raises(UsageError, match="unknown driver 'o4'"):
         finished_tables(db, ["o4"], ["attempts"])

@@ -1,4 +1,4 @@
-"""Who stands in which group: endpoints, stand-ins, and drivers without chance."""
+"""Who stands in which group: endpoints, stand-ins, and deterministic drivers."""
 
 from __future__ import annotations
 
@@ -82,13 +82,16 @@ def test_stand_ins_stand_last_and_every_row_of_theirs_says_so(db):
     for table in make_tables(study):
         for row, plain in zip(table.rows, value_rows(table), strict=True):
             if row.groups[0].startswith("o3/"):
-                assert plain["driver"].startswith("o3 (scripted stand-in, not o3)"), table.name
+                assert plain["driver"] in {"o3*", "o3*, of 2 models"}, table.name
+        if any(row.groups[0].startswith("o3/") for row in table.rows):
+            assert table.notes.count("* o3: scripted stand-in, not o3") == 1, table.name
 
 
-def test_the_emulator_is_a_stand_in_for_no_model(tmp_path):
-    db = write_study(tmp_path / "t.duckdb", yielding("emulator", reps=1))
+@pytest.mark.parametrize("name", ["emulator", "random"])
+def test_a_mock_model_is_a_stand_in_for_no_model(tmp_path, name):
+    db = write_study(tmp_path / "t.duckdb", yielding(name, reps=1))
     (group,) = changed(db, "UPDATE trials SET scripted = true").models
-    assert group.label == "emulator (scripted stand-in, no language model)"
+    assert group.label == f"{name} (scripted stand-in, no language model)"
     assert alarms(Study(db), provenance(db)) == [], "nobody takes it for a model"
 
 
@@ -121,8 +124,18 @@ def same_each_time(db, who="trial_id LIKE 'o3/%'"):
     ]
 
 
-def test_a_driver_without_chance_counts_each_trial_once(db):
-    study = changed(db, *same_each_time(db))
+def as_programs(chance, **scenario):
+    """Statements after which o3 is two programs, ``b`` of which declares its ``chance``."""
+    drivers = {"left": {"program": "a"}, "right": {"program": "b"} | chance}
+    spec = json.dumps(drivers | {"scenario": scenario})
+    return [
+        f"UPDATE specs SET spec = '{spec}' WHERE spec_hash = 'o3-baseline'",
+        "UPDATE trials SET source = 'driver' WHERE trial_id LIKE 'o3/%'",
+    ]
+
+
+def test_programs_that_declare_no_chance_count_each_trial_once(db):
+    study = changed(db, *same_each_time(db), *as_programs({}))
     o3, other = study.models
     assert (len(o3.trials), o3.repeated, len(other.trials), other.repeated) == (11, 22, 33, 0)
     (table,) = make_tables(study, ["ablation-quantitative"])
@@ -134,20 +147,60 @@ def test_a_driver_without_chance_counts_each_trial_once(db):
     (alarm,) = alarms(study, provenance(db))
     assert alarm.title == "Repetitions are the same trial"
     assert alarm.text.startswith("22 of 33 trials of o3/baseline repeat an earlier one")
+    (accounts,) = make_tables(study, ["attempts"])
+    assert accounts.rows[0].values["trials"] == 33, "nothing is dropped from accounts"
+    (source,) = explain(study, accounts, "o3/baseline:trials").sources
+    assert len(load(source.query, db)) == len(source.trials) == 33
 
 
-def test_two_equal_trials_of_a_driver_that_samples_are_two_samples(db):
-    one = "trial_id LIKE 'o3/baseline/N_0_0/%'"
-    study = changed(db, *same_each_time(db, one))
+@pytest.mark.parametrize(
+    ("chance", "scenario"),
+    [
+        ({"chance": True}, {}),
+        ({}, {"perception_right": {"speed_sd_mps": 0.5}}),
+        ({}, {"perception_left": {"dropout": 0.1}}),
+    ],
+)
+def test_equal_trials_count_where_a_driver_or_what_it_perceives_has_chance(db, chance, scenario):
+    study = changed(db, *same_each_time(db), *as_programs(chance, **scenario))
+    assert (len(study.models[0].trials), study.models[0].repeated) == (33, 0)
+    assert alarms(study, provenance(db)) == []
+
+
+def test_what_is_perceived_late_and_not_far_is_perceived_without_chance(db):
+    late = {"perception_left": {"delay_s": 0.2, "range_m": 30}}
+    study = changed(db, *same_each_time(db), *as_programs({}, **late))
+    assert study.models[0].repeated == 22
+
+
+def test_repetitions_that_differ_contradict_who_declares_no_chance_and_all_count(db):
+    alike = "trial_id LIKE 'o3/%' AND trial_id NOT LIKE 'o3/baseline/N_0_0/%'"
+    study = changed(db, *same_each_time(db, alike), *as_programs({}))
     assert study.models[0].repeated == 0
 
 
 @pytest.mark.slow
-def test_equal_trials_of_a_driver_that_samples_are_told_and_count(db):
-    study = changed(db, *same_each_time(db, "trial_id LIKE 'o3/baseline/N_0_0/%'"))
+@pytest.mark.parametrize(("where", "equal"), [("o3/baseline/N_0_0/%", 2), ("o3/%", 22)])
+def test_equal_trials_of_a_language_model_are_told_and_count(db, where, equal):
+    study = changed(db, *same_each_time(db, f"trial_id LIKE '{where}'"))
+    assert study.models[0].repeated == 0
     (alarm,) = alarms(study, provenance(db))
     assert alarm.title == "Some trials are equal"
-    assert "2 of 33 trials of o3/baseline are as an earlier one to the last state" in alarm.text
+    says = f"o3/baseline: {equal} of 33 trials are as an earlier one to the last state; each counts"
+    assert says in alarm.text
+    (table,) = make_tables(study, ["ablation-quantitative"])
+    assert says in table.notes
+
+
+def test_a_sweep_records_which_programs_have_chance(in_process, tmp_path):
+    db = tmp_path / "t.duckdb"
+    for pair in ("human-odds+constant", "projected-order+constant"):
+        sweep = ("sweep", "baseline", "--model", pair, "--mirror", "--reps", 3)
+        assert in_process(*sweep, "--conditions", "L_4_0,R_-4_0", "--db", db) == 0
+    assert {group.driver: (len(group.trials), group.repeated) for group in Study(db).models} == {
+        "constant+human-odds": (12, 0),
+        "constant+projected-order": (2, 10),
+    }
 
 
 @pytest.mark.parametrize(
@@ -156,6 +209,7 @@ def test_equal_trials_of_a_driver_that_samples_are_told_and_count(db):
         ("o3", ("left", "right"), "scripted stand-in, not o3"),
         ("o3", ("left",), "scripted stand-in on the left, not o3"),
         ("emulator", ("left", "right"), "scripted stand-in, no language model"),
+        ("random", ("left", "right"), "scripted stand-in, no language model"),
         ("emulator+constant", ("left",), "scripted stand-in, no language model"),
         ("emulator+o3", ("left",), "scripted stand-in on the left, no language model"),
         ("emulator+o3", ("left", "right"), "scripted stand-in, not o3"),
@@ -195,16 +249,6 @@ def test_the_sides_are_those_of_the_scripted_calls(tmp_path):
         "UPDATE trials SET scripted = true",
     )
     assert study.models[0].label == "o3 (scripted stand-in on the left, not o3)"
-
-
-def test_a_program_repeats_itself_wherever_it_does(db):
-    one = "trial_id LIKE 'o3/baseline/N_0_0/%'"
-    study = changed(
-        db,
-        *same_each_time(db, one),
-        "UPDATE trials SET source = 'driver' WHERE trial_id LIKE 'o3/%'",
-    )
-    assert study.models[0].repeated == 2
 
 
 def test_answers_that_are_word_for_word_as_before_are_told_in_the_report(tmp_path):

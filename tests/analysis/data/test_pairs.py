@@ -63,7 +63,9 @@ def played(in_process, tmp_path):
 
     def play(head, name):
         (tmp_path / f"{name}.toml").write_text(STUDY.format(head=head))
-        assert in_process("sweep", f"{name}.toml", "--yes", "--db", f"{name}.duckdb") == 0
+        assert (
+            in_process("sweep", f"{name}.toml", "--yes", "--trust", "--db", f"{name}.duckdb") == 0
+        )
         return Study(tmp_path / f"{name}.duckdb")
 
     return play

@@ -26,8 +26,9 @@ from analysis.figures.panels import (
 )
 from analysis.figures.variant_figure import figure_2_variants
 from analysis.stats.intervals import mean, proportion
+from analysis.tables import make_tables
 from merge_runner.errors import UsageError
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
 
@@ -39,7 +40,7 @@ def written(small, tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_equal_results_give_equal_files(small, written):
     again = Study(small.db)
     for name, form in (("figure2", "pdf"), ("distributions", "png")):
@@ -137,6 +138,19 @@ def test_where_no_human_drove_no_human_line_is_drawn_and_none_is_missed(tmp_path
     assert [len(lines) for lines in dashed] == [1, 1, 1, 0]
     texts = [" ".join(text.get_text() for text in axis.texts) for axis in curves[8:]]
     assert ["not imported" in text for text in texts] == [True, True, True, False]
+
+
+def test_conditions_that_were_not_played_are_not_drawn(tmp_path):
+    drives = [d for d in yielding("o3", reps=1) if d.condition in {"N_0_0", "L_4_0"}]
+    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    assert {*study.conditions} == {"N_0_0", "L_4_0"}
+    (axis, *others) = figure_2(study).subfigs[1].axes
+    assert len(others) == 2, "one relative velocity"
+    assert sorted({round(x) for line in axis.lines for x in line.get_xdata()}) == [0, 4]
+    (resolved,) = make_tables(study, ["conflict-resolution"])
+    assert {row.values["condition"] for row in resolved.rows} == {"N_0_0", "L_4_0"}
+    humans = Study(write_study(tmp_path / "h.duckdb", []))
+    assert {*humans.conditions} == {*HUMAN_CONDITIONS}
 
 
 @pytest.mark.slow
@@ -276,7 +290,7 @@ def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
     assert sum(low < one.low and one.high < high for one in found) >= 0.8 * len(found)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     "drives",

@@ -97,7 +97,7 @@ def test_what_cannot_be_read_says_why(content, says):
         read_first_actions(content)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_page_is_imported_once_and_drivers_are_compared_with_it(human, tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
     (tmp_path / "initial_action.html").write_bytes(first_action_page(TRIALS))

@@ -70,7 +70,7 @@ def test_the_pages_are_named_as_in_the_publications():
     assert condition_of("experiment_4_iter_1.csv") is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("form", [list, packed])
 def test_a_page_gives_the_trials_that_the_recordings_give(tmp_path, form):
     one, other = tmp_path / "pages.duckdb", tmp_path / "recordings.duckdb"

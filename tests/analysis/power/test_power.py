@@ -183,7 +183,7 @@ def test_a_planted_study_is_told_by_what_is_planted(tmp_path):
     assert "the whole study costs nothing" in shown
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_usual_study_takes_less_than_20_seconds_of_one_core_and_costs_what_it_would(tmp_path):
     began = time.process_time()
     found = powered(tmp_path, "ablations", ("o3",), simulations=200)

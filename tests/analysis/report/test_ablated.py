@@ -57,8 +57,8 @@ def test_what_a_variant_changes_is_said_with_interval_and_what_not_with_what_cou
     ("drives", "words"),
     [
         (
-            yielding("o3", "A1", 1),
-            "it has no baseline of its own, so what A1 changes cannot be said",
+            [*yielding("o3", "A1", 1), *yielding("other", reps=1)],
+            "it has no baseline to compare with: what A1 changes cannot be said",
         ),
         (
             [*LEVEL, *as_variant(LEVEL)],
@@ -68,7 +68,7 @@ def test_what_a_variant_changes_is_said_with_interval_and_what_not_with_what_cou
             ),
         ),
         ([*yielding("o3", reps=3), *CRASHES], "differs from the baseline (33), also after Holm's"),
-        ([*yielding("o3", reps=3), *CRASHES], "not compared with the baseline, for want of"),
+        ([*yielding("o3", reps=3), *CRASHES], "not compared with the baseline: "),
     ],
 )
 def test_what_cannot_be_said_is_named(drives, words, tmp_path):
@@ -128,4 +128,6 @@ def test_the_smallest_p_is_that_of_the_most_extreme_outcome(tmp_path):
         == pytest.approx(1 / 3)
         == pytest.approx(found.p, abs=0.02)
     )
-    assert smallest_p(variant, baseline, COLLISIONS) == contrast_rates((2, 2), (0, 2)).p
+    assert smallest_p(variant, baseline, COLLISIONS) == pytest.approx(
+        contrast_rates((2, 2), (0, 2)).p
+    )

@@ -14,6 +14,7 @@ from analysis.report.conclusions import not_shown, nothing, shown
 from analysis.stats.ceiling import Ceiling
 from analysis.stats.group_scores import Score, score
 from analysis.stats.indicators import TESTED
+from analysis.tables import make_tables
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
@@ -50,7 +51,7 @@ def test_a_difference_that_chance_seldom_makes_is_called_so(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("robust", "paper", "strength"),
-    [(0.99, 0.83, "strong"), (0.9, 0.5, "some"), (0.3, 0.39, "weak")],
+    [(0.99, 0.83, "strong"), (0.9, 0.5, "some"), (0.3, 0.39, "weak"), (0.04, 0.0, "no")],
 )
 def test_a_missing_mark_weighs_by_how_often_humans_have_it(
     tmp_path, monkeypatch, robust, paper, strength
@@ -150,7 +151,7 @@ def test_a_separated_fit_is_not_judged_and_the_robust_verdict_stands(tmp_path):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stand_in_is_in_no_conclusion_whatever_name_it_answered_in(tmp_path):
     db = write_study(tmp_path / "t.duckdb", [*yielding("o3", reps=1), *yielding("other", reps=1)])
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%'")
@@ -169,3 +170,33 @@ def test_failed_trials_alone_show_nothing(tmp_path):
         db, "UPDATE trials SET status = 'failed', merged_first = NULL, error = 'no answer'"
     )
     assert shown(study) == ["o3: no trial ended (2 failed)."]
+
+
+REPLAYED = {"program": "human-replay"}
+
+
+def test_a_human_who_is_replayed_is_not_judged(tmp_path):
+    study = Study(write_study(tmp_path / "t.duckdb", yielding("human-replay"), asked=REPLAYED))
+    (group,) = study.models
+    found = score(study, group)
+    assert {v.passed for rule in found.rules.values() for v in rule.values()} == {None}
+    why = "both humans are replayed and do not react"
+    for table in make_tables(study, ["contrasts", "differences"]):
+        assert table.rows == []
+        assert any(f"{group.id}: {why}: it is not judged" in note for note in table.notes)
+    said, limits = texts(study)
+    assert said == ""
+    assert f"{group.id}: {why}: it is not judged" in limits
+    assert nothing(study) == "Nothing: with the baseline prompt only replayed humans were played."
+
+
+def test_holm_is_named_wherever_it_decides(tmp_path):
+    """A driver whose first action is that of no human, and whose gaps are beside theirs."""
+    drives = [replace(d, left=(1.0,) * 3, right=(-1.0,) * 3) for d in yielding("o3", reps=4)]
+    said, _ = texts(Study(write_study(tmp_path / "t.duckdb", drives)))
+    for claim in (
+        r"differs from the humans, in one model of both and after Holm's correction",
+        r"no difference from the humans is shown, after Holm's correction",
+        r"In its first action o3 differs from the humans, after Holm's correction",
+    ):
+        assert re.search(claim, said), claim

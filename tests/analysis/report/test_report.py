@@ -59,7 +59,7 @@ def one_figure():
 
 @pytest.fixture(scope="module")
 def page(study, tables):
-    return Page(report_html(study, list(tables.values()), finished_figures(study, "")))
+    return Page(report_html(study, list(tables.values()), finished_figures(study)))
 
 
 def test_the_page_needs_no_network_and_runs_nothing(page):
@@ -87,6 +87,25 @@ def test_numbers_lead_to_the_trials_behind_them(page):
 
 
 @pytest.mark.usefixtures("few_draws")
+def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_factors(tmp_path):
+    drives = [*yielding("o3", reps=1)[:3], *yielding("o3", "A1", reps=1)[:3]]
+    db = write_study(tmp_path / "t.duckdb", drives, config={"description": "Who is <first>?"})
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(
+            "UPDATE decisions SET prompt = 'Drive.\n' || CASE WHEN trial_id LIKE '%/A1/%' "
+            "THEN 'You are late.' ELSE 'There is time.' END"
+        )
+    study = Study(db)
+    text = report_html(study, make_tables(study, ["factors", "gap"]), {})
+    assert "<body>\n<h1>Who is &lt;first&gt;?</h1>" in text
+    conditions = ", ".join(sorted(study.conditions))
+    parts = ['id="design"', conditions, "There is time.", "-There is time.\n+You", 'id="factors"',
+             'id="conclusions"', 'id="gap"']  # fmt: skip
+    places = [text.index(part) for part in parts]
+    assert places == sorted(places)
+    assert text.count('id="factors"') == 1
+
+
 def test_equal_results_give_equal_reports(small):
     again = Study(small.db)
     texts = {report_html(study, make_tables(study, ["gap"]), {}) for study in (small, again)}
@@ -138,7 +157,7 @@ def test_another_served_model_is_loud_and_its_name_is_shown_as_text(tmp_path):
     assert "o3 was asked for, <script>alert(1)</script> answered: 6 answers" in page.text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_alias_that_the_sweep_declares_is_no_other_model(tmp_path):
     db = asking(tmp_path, Said(served="o3-2025")).db
     for models, found in (

@@ -13,15 +13,21 @@ from hypothesis import strategies as st
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
+from analysis.stats import intervals
 from analysis.stats.contrasts import (
     PERMUTATIONS,
+    contrast_cells,
     contrast_means,
     contrast_rates,
     corrected,
     detectable_rate,
     first_in_shuffles,
+    interaction_of_means,
+    interaction_of_rates,
     rejected,
+    shared_cells,
     shuffled_sums,
+    within,
 )
 
 
@@ -65,6 +71,102 @@ def test_rates_are_compared_by_fishers_test_and_newcombes_interval(first, second
     assert (found.low, found.high) == pytest.approx(newcombe(first, second), abs=1e-6)
     assert found.p == pytest.approx(fisher(first, second), rel=1e-6)
     assert found.low <= found.value <= found.high
+
+
+# By condition: successes and trials of one group, and of the other.
+STRATA = [
+    {"a": (3, 10, 1, 20), "b": (9, 10, 12, 15)},
+    {"a": (0, 5, 0, 5), "b": (2, 5, 0, 5), "c": (1, 4, 3, 9)},
+    {"a": (4, 4, 0, 6), "b": (0, 3, 3, 3)},
+]
+
+
+def trials(strata) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """One row a trial, of either group."""
+    groups = ([], [])
+    for name, (a, n, b, m) in strata.items():
+        for group, k, size in zip(groups, (a, b), (n, m), strict=True):
+            group += [(name, i < k) for i in range(size)]
+    return tuple(pd.DataFrame(group, columns=["condition", "hit"]) for group in groups)
+
+
+def standardised(strata) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Both rates by the weights of Mantel and Haenszel, with the trials that they are as good as.
+
+    Those are the trials with which an unweighted rate had the variance, of equal rates.
+    """
+    rates, spreads, total = [0.0, 0.0], [0.0, 0.0], 0.0
+    for a, n, b, m in strata.values():
+        weight = n * m / (n + m)
+        total += weight
+        for i, (k, size) in enumerate(((a, n), (b, m))):
+            rates[i] += weight * k / size
+            spreads[i] += weight**2 / size
+    return tuple((rates[i] / total, total**2 / spreads[i]) for i in (0, 1))
+
+
+@pytest.mark.parametrize("strata", STRATA)
+def test_rates_are_compared_within_conditions(strata):
+    found = contrast_cells(shared_cells(*trials(strata), "hit"))
+    (p, n), (q, m) = standardised(strata)
+    assert found.value == pytest.approx(p - q)
+    assert (found.low, found.high) == pytest.approx(newcombe((p * n, n), (q * m, m)), abs=1e-6)
+    # How likely each sum of the first group is, where each condition has as many successes.
+    chances: dict[int, float] = {0: 1.0}
+    for a, n, b, m in strata.values():
+        ways = {k: comb(n, k) * comb(m, a + b - k) for k in range(n + 1) if 0 <= a + b - k <= m}
+        chances = {
+            total: sum(chances.get(total - k, 0) * w / sum(ways.values()) for k, w in ways.items())
+            for total in range(max(chances) + n + 1)
+        }
+    seen = chances[sum(a for a, *_ in strata.values())]
+    expected = sum(chance for chance in chances.values() if chance <= seen * (1 + 1e-9))
+    assert found.p == pytest.approx(expected)
+
+
+def test_a_condition_that_one_group_lacks_changes_nothing_of_its_rates():
+    first, second = trials(STRATA[0])
+    more = pd.concat([first, pd.DataFrame({"condition": ["c"] * 50, "hit": [True] * 50})])
+    expected = contrast_cells(shared_cells(first, second, "hit"))
+    assert contrast_cells(shared_cells(more, second, "hit")) == expected
+    assert (
+        shared_cells(first[first["condition"] == "a"], second[second["condition"] == "b"], "hit")
+        is None
+    )
+
+
+def test_rates_that_differ_by_their_conditions_alone_do_not_differ():
+    """Simpson's paradox: each condition is the same for both, but not how often it was driven."""
+    first, second = trials({"easy": (1, 10, 10, 100), "hard": (90, 100, 9, 10)})
+    found = contrast_cells(shared_cells(first, second, "hit"))
+    assert (found.value, found.p) == (pytest.approx(0), pytest.approx(1))
+    assert abs(first["hit"].mean() - second["hit"].mean()) > 0.6
+
+
+def test_an_interaction_of_rates_is_excluded_at_the_level_of_its_p():
+    one, other = (shared_cells(*trials(strata), "hit") for strata in STRATA[:2])
+    found = interaction_of_rates(one, other)
+    rates = (*standardised(STRATA[0]), *reversed(standardised(STRATA[1])))
+    (p, n), (q, m), (r, k), (s, j) = rates
+    assert found.value == pytest.approx(p - q - (s - r))
+    bounds = [wilson(rate * size, size) for rate, size in ((p, n), (q, m), (r, k), (s, j))]
+    (pl, pu), (ql, qu), (rl, ru), (sl, su) = bounds
+    low = sqrt((p - pl) ** 2 + (qu - q) ** 2 + (r - rl) ** 2 + (su - s) ** 2)
+    high = sqrt((pu - p) ** 2 + (q - ql) ** 2 + (ru - r) ** 2 + (s - sl) ** 2)
+    assert (found.low, found.high) == pytest.approx((found.value - low, found.value + high))
+    z = stats.norm.isf(found.p / 2)
+    low, high = intervals.newcombe(rates, z)
+    assert min(abs(low), abs(high)) == pytest.approx(0, abs=1e-9)
+    assert interaction_of_rates(one, one).p == 1
+
+
+def test_an_interaction_of_means_is_the_difference_of_both_differences_with_welchs_test():
+    found = interaction_of_means(within(FIRST, SECOND, "gap_m"), within(SECOND, FIRST, "gap_m"))
+    one = contrast_means(FIRST, SECOND, "gap_m")
+    assert found.value == pytest.approx(2 * one.value)
+    half = (one.high - one.low) / 2 / stats.t.ppf(0.975, 11 - 2 - 1)
+    width = (found.high - found.low) / 2 / stats.t.ppf(0.975, 2 * (11 - 2 - 1))
+    assert width == pytest.approx(half * sqrt(2))
 
 
 def test_o3s_collisions_do_not_differ_from_the_humans_and_geminis_do():
@@ -118,7 +220,7 @@ SECOND = group(N_0_0=[2.0, 3.0], L_4_8=[6.0, 7.5, 7.0, 9.5])
 NAMES = ("N_0_0", "L_4_8")
 
 
-def within(first, second) -> float:
+def within_conditions(first, second) -> float:
     """The difference of means within conditions, weighted by n m / (n + m)."""
     total = weights = 0.0
     for name in NAMES:
@@ -143,7 +245,7 @@ def enumerated(first, second) -> float:
     (u, one), (v, two) = ways
     found = [abs(u * a + v * b) / (u + v) for a in one for b in two]
     assert len(found) == 150
-    observed = abs(within(first, second))
+    observed = abs(within_conditions(first, second))
     return sum(difference >= observed - 1e-9 for difference in found) / len(found)
 
 
@@ -170,7 +272,7 @@ def test_the_interval_is_that_of_least_squares_with_a_level_for_each_condition()
     freedom = len(y) - 3
     se = sqrt(residual[0] / freedom * np.linalg.inv(x.T @ x)[0, 0])
     half = stats.t.ppf(0.975, freedom) * se
-    assert found.value == pytest.approx(b[0]) == pytest.approx(within(FIRST, SECOND))
+    assert found.value == pytest.approx(b[0]) == pytest.approx(within_conditions(FIRST, SECOND))
     assert (found.low, found.high) == pytest.approx((b[0] - half, b[0] + half))
     t = stats.t(freedom)
     assert found.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * se)

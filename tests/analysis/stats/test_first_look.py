@@ -127,7 +127,7 @@ def lower(acts) -> Acts:
     return replace(acts, first=acts.first - 0.2, second=acts.second - 0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_intervals_cover_the_truth_in_93_to_97_percent():
     rng = np.random.default_rng(4)
     true_slope = np.polyfit(*zip(*((v, o.mean) for v, o in CLASSES.items()), strict=True), 1)[0]

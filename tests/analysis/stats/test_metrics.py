@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 
 from analysis.data.load import load, load_trials
+from analysis.data.study import Study
+from analysis.tables.conflicts import criticality
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -141,7 +143,7 @@ def test_every_measure_of_random_trials_equals_its_definition(drives, scenario, 
             (abs(s[1] - s[2]) - length_m) / rate
             for s in trace
             if max(s[1], s[2]) >= 100
-            and (rate := (s[4] - s[3]) if s[1] > s[2] else (s[3] - s[4])) > 0
+            and (rate := (s[4] - s[3]) if s[1] > s[2] else (s[3] - s[4])) > 0.01
             and abs(s[1] - s[2]) > length_m
         ]
         assert (
@@ -232,3 +234,22 @@ def test_the_measures_of_vehicles_of_8_m_are_those_worked_out_by_hand(tmp_path):
     assert np.isnan(first["min_ttc_s"])
     closing_mps, distance_m = 8 - 6.5, (136.75 + 6.5 * 2.2) - (108 + 8 * 2.2)
     assert second["min_ttc_s"] == pytest.approx((distance_m - 8) / closing_mps)
+
+
+@pytest.mark.parametrize(("closing_mps", "in_conflict"), [(0.009, False), (0.011, True)])
+def test_vehicles_that_close_in_by_a_centimetre_a_second_are_in_no_conflict(
+    closing_mps, in_conflict, tmp_path
+):
+    """From 14 and 8 m/s the one ahead brakes for 4 s, until it is that much slower."""
+    braking = (-(6 + closing_mps) / 10,) * 4
+    drive = Drive("hand", "baseline", "L_4_0", 1, (0.8, 0.8, *braking), (-0.4, -0.4))
+    study = Study(write_study(tmp_path / "hand.duckdb", [drive]))
+    table = criticality(study)
+    row = table.rows[0]
+    assert row.values["min_ttc_s_n"] == in_conflict
+    assert any("never close in faster than 0.01 m/s are in no conflict" in n for n in table.notes)
+    if in_conflict:
+        assert row.values["min_ttc_s"] == pytest.approx(17.5 / closing_mps, rel=0.01)
+    else:
+        assert row.values.get("min_ttc_s") is None
+        assert row.note == "no finished trial with min. TTC (s)"

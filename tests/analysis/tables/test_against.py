@@ -125,7 +125,7 @@ def test_a_stand_in_never_stands_beside_the_model_in_whose_name_it_answered(met)
     for driver in (None, "gemini-2.5-pro"):
         table = beside(met, driver=driver)
         assert cell(table, "gemini-2.5-pro/baseline", "gap_m_in_paper") is None
-        note = "gemini-2.5-pro (scripted stand-in, not gemini-2.5-pro) does not stand beside the"
+        note = "gemini-2.5-pro* does not stand beside the"
         assert sum(note in text for text in table.notes) == 1
     assert cell(beside(met), "o3/baseline", "gap_m_in_paper") == paper("o3")
 

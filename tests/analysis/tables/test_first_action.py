@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import duckdb
@@ -172,13 +173,15 @@ def test_a_driver_without_chance_in_a_mixed_pair_counts_once_in_each_situation(t
     db = write_study(tmp_path / "t.duckdb", drives)
     with duckdb.connect(str(db)) as connection:
         connection.execute("UPDATE trials SET model_right = 'zero'")
+        spec = {"left": {"body": {}}, "right": {"program": "zero"}}
+        connection.execute("UPDATE specs SET spec = ?", [json.dumps(spec)])
     (table,) = make_tables(Study(db), ["first-action"])
     rows = {row.id: row.values for row in table.rows}
     assert rows["alike+zero/baseline/left/all"]["n"] == 44
     assert rows["alike+zero/baseline/right/all"]["n"] == 11
     assert rows["alike+zero/baseline/right/all"]["mean"] == pytest.approx(0.25)
-    (note,) = [note for note in table.notes if "without chance" in note]
-    assert note.startswith("zero of alike+zero: it does the same first")
+    (note,) = [note for note in table.notes if "declares no chance" in note]
+    assert note.startswith("zero of alike+zero: it declares no chance, and does the same")
 
 
 @pytest.mark.slow
@@ -188,12 +191,12 @@ def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
     (table,) = make_tables(Study(tmp_path / "results/merge.duckdb"), ["first-action"])
     names = {row.values["driver"] for row in table.rows} - {"human"}
     assert names == {
-        "emulator of emulator+projected-order (scripted stand-in, no language model)",
+        "emulator of emulator+projected-order*",
         "projected-order of emulator+projected-order",
     }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_actions(
     prepare, tmp_path
 ):

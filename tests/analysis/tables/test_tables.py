@@ -19,7 +19,7 @@ from analysis.stats.intervals import proportion
 from analysis.table_format import TableFormat
 from analysis.tables import TABLES, make_tables
 from analysis.tables.against import against, in_paper
-from analysis.tables.formats import render
+from analysis.tables.formats import as_text, render, with_columns
 from analysis.tables.model import Column, Row, Table
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
@@ -40,6 +40,28 @@ def cell(table, row_id, column):
 def test_a_table_reads_as_its_golden_file(tables, name):
     text = render([tables[name]], TableFormat.TEXT)
     assert text + "\n" == (GOLDEN / f"{name}.txt").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_a_table_fits_the_terminal_and_names_the_columns_that_do_not(tables, width):
+    for table in tables.values():
+        lines = render([table], TableFormat.TEXT, width).splitlines()
+        assert all(len(line) <= width for line in lines), table.name
+        if not table.rows:
+            continue
+        left_out = re.search(r"so without (.*?): --columns", " ".join(map(str.strip, lines)))
+        assert bool(left_out) == (len(as_text(table).splitlines()[2]) > width), table.name
+        if left_out:
+            names = left_out[1].split(", ")
+            (chosen,) = with_columns([table], names)
+            assert [column.name for column in chosen.columns[-len(names) :]] == names
+
+
+def test_columns_are_chosen_by_their_names(tables):
+    (table,) = with_columns([tables["who-first"]], ["b"])
+    assert [column.name for column in table.columns] == ["term", "driver", "b"]
+    with pytest.raises(UsageError, match=r"unknown column 'bb'; .* Did you mean b\?"):
+        with_columns([tables["who-first"]], ["bb"])
 
 
 def test_human_rows_carry_the_golden_numbers(tables):
@@ -190,6 +212,20 @@ def test_a_table_that_the_paper_has_not_says_so(tables):
     assert "no such table" in against(tables["robustness"], "paper").notes[-1]
 
 
+@pytest.mark.usefixtures("few_draws")
+def test_prompts_are_contrasted_without_one_that_is_called_baseline(tmp_path):
+    drives = [*yielding("o3", "hurry"), *yielding("o3", "calm")]
+    config = {"levels": {"model": ["o3"], "prompt": ["hurry", "calm"]}}
+    (table,) = make_tables(
+        Study(write_study(tmp_path / "t.duckdb", drives, config=config)), ["contrasts"]
+    )
+    assert cell(table, "o3/calm/hurry/gap_m", "difference") == pytest.approx(0, abs=1e-12)
+    assert cell(table, "o3/calm/hurry/gap_m", "reference") == "hurry"
+    ids = [row.id for row in table.rows]
+    assert "o3/hurry/human/collided_boxes_percent" in ids
+    assert not any(name.startswith("o3/calm/human/") for name in ids)
+
+
 EMPTY = "holds no trial of a model"
 TROUBLE = {
     "nothing": ([], EMPTY),
@@ -208,7 +244,7 @@ TROUBLE = {
             for n in CONDITIONS
             for r in (1, 2)
         ],
-        "the right vehicle merged first in all 11 trials",
+        "the right vehicle merged first in all 22 trials",
     ),
     "only a variant": (yielding("o3", "A3", reps=1), "o3/A3"),
 }
@@ -286,7 +322,7 @@ def test_models_can_be_chosen_and_an_unknown_one_names_the_valid(study):
     assert [group.id for group in chosen.groups] == ["other/baseline"]
     with pytest.raises(UsageError, match="valid: human, o3, other"):
         Study(study.db, ["gpt"])
-    with pytest.raises(UsageError, match="nothing that --models names"):
+    with pytest.raises(UsageError, match="unknown driver"):
         Study(study.db, [])
     humans = make_tables(Study(study.db, ["human"]))
     assert not any("holds no trial" in note for table in humans for note in table.notes)
@@ -337,6 +373,30 @@ def test_every_cell_can_be_traced_to_its_trials_and_the_query_that_lists_them(st
 def test_n_is_the_number_of_trials_that_explain_lists(study, tables, name, row, column):
     found = explain(study, tables[name], f"{row}:{column}")
     assert str(len(found.sources[0].trials)) == found.value
+
+
+def test_explain_marks_the_trials_that_a_share_counts(study, tables):
+    shares = [
+        (row.id, column.name)
+        for row in tables["ablation-quantitative"].rows
+        for column in tables["ablation-quantitative"].columns
+        if column.kind == "percent" and row.values.get(column.name) is not None
+    ]
+    marked = 0
+    for row, column in shares:
+        (source,) = explain(study, tables["ablation-quantitative"], f"{row}:{column}").sources
+        if source.trials:
+            share = 100 * len(source.numerator) / len(source.trials)
+            assert share == pytest.approx(
+                cell(tables["ablation-quantitative"], row, column), rel=1e-9
+            )
+            assert {*source.numerator} <= {*source.trials}
+            marked += bool(source.numerator)
+    assert marked > 2
+    shown = explain(study, tables["ablation-quantitative"], "o3/baseline:collided_percent").lines()
+    collided = study.models[0].ended.set_index("trial_id")["collided"]
+    for line in shown[-len(collided) :]:
+        assert line.startswith("* " if collided[line[2:]] else "  ")
 
 
 def test_explain_names_the_valid_rows_and_columns(study, tables):

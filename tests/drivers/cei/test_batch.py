@@ -16,6 +16,7 @@ def trace(record, side):
     return np.array([[row.position_m, row.velocity_mps] for row in rows])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("resistance", ["human", "none"])
 @pytest.mark.parametrize("rule", ["rectangle", "euclid2d"])
 async def test_a_trial_of_many_is_the_one_that_the_runner_plays(resistance, rule):

@@ -157,6 +157,7 @@ def test_the_usual_set_suits_the_resistance_unless_one_is_chosen(resistance):
     assert USUAL_SETS["human"] != USUAL_SETS["none"]
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("clock_s", [None, 1.0])
 @pytest.mark.parametrize("perception", [{"view_from_m": 25.0}, {"range_m": 7.0}])

@@ -153,16 +153,15 @@ def cache(tmp_path):
 class Run:
     """A run's client, and the rounds that it asks in."""
 
-    def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", **ways):
+    def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", free=False, **ways):
         self.said = []
         self.alone = Alone()
         usual = {"submits": True, "deadline_s": 7200.0, "detach": False, "most_rounds": 30}
-        free = {"m"} if price == "free" else set()
         self.rounds = Rounds(
             Journal(cache),
             {"m": service},
             BatchWays(**{**usual, **ways}),
-            free=free,
+            free={"m"} if free or price == "free" else set(),
             say=self.said.append,
         )
         self.ledger = Ledger(cache, scope)
@@ -738,6 +737,20 @@ async def test_a_batch_that_is_gone_stops_the_run_unless_its_deadline_is_over(ca
     (reply,) = await anew.ask()
     assert [attempt.outcome for attempt in reply.attempts] == ["batch_lost", "ok"]
     assert anew.ledger.read().open_attempts == 1  # nobody knows what it cost
+
+
+@in_virtual_time
+async def test_a_batch_that_is_gone_is_asked_anew_and_costs_nothing_where_nobody_charges(cache):
+    service = Memory()
+    service.states = [BatchStatus("waiting", "in_progress")]
+    first = Run(cache, service, free=True, detach=True)
+    await first.ask()
+    await first.end()
+    service.batches.clear()
+    again = Run(cache, service, free=True)
+    (reply,) = await again.ask()
+    assert [attempt.outcome for attempt in reply.attempts] == ["batch_lost", "ok"]
+    assert again.ledger.read().open_attempts == 0
 
 
 @in_virtual_time

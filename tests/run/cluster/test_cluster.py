@@ -64,7 +64,7 @@ async def test_a_word_that_names_no_cluster_is_told_in_one_line(merge_runner):
     assert len(run.err.splitlines()) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_where_no_scheduler_listens_it_says_so_soon(merge_runner):
     async with asyncio.timeout(HANGS_S):
         run = await merge_runner(*SMALL, "--dask", "127.0.0.1:1")
@@ -92,7 +92,7 @@ async def test_without_the_extra_it_says_what_to_install(merge_runner, tmp_path,
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_what_stops_a_sweep_stops_it_at_all_workers_in_one_line(merge_runner):
     async def middle(request, handler):
         if server.requests > 12:
@@ -167,7 +167,7 @@ async def test_a_worker_with_other_source_is_refused(merge_runner, scheduler, tm
     assert "Traceback" not in run.err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, scheduler):
     async def middle(request, handler):
         if server.requests == 10:

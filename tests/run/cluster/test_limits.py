@@ -14,7 +14,7 @@ from aiohttp import web
 from tests.harness import FAST, PROJECT, watched
 from tests.llm.test_limiter import fullest_window
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
 ON_THREE = ("--dask", "local:3")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 
 import psutil
 import pytest
 
+from merge_runner.signals import FROM_TERMINAL
 from tests.gate import HANGS_S, Gate
 from tests.harness import watched
 from tests.run.cluster.workers import SWEEP, held_from, workers_of
@@ -49,6 +49,7 @@ async def test_a_worker_that_is_killed_costs_its_calls_in_flight_and_nothing_els
     assert (await merge_runner("digest")).out == quiet_digest
 
 
+@pytest.mark.long
 async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
     merge_runner, started, quiet_digest, tmp_path
 ):
@@ -72,6 +73,7 @@ async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
     assert (await merge_runner("digest")).out == quiet_digest
 
 
+@pytest.mark.long
 async def test_a_coordinator_that_is_killed_loses_the_calls_in_flight(
     merge_runner, started, quiet_digest, tmp_path
 ):
@@ -95,15 +97,19 @@ async def test_a_coordinator_that_is_killed_loses_the_calls_in_flight(
     assert (await merge_runner("digest")).out == quiet_digest
 
 
-async def test_ctrl_c_saves_what_the_workers_have_in_flight(merge_runner, started, tmp_path):
+@pytest.mark.long
+@pytest.mark.parametrize("number", FROM_TERMINAL)
+async def test_ctrl_c_saves_what_the_workers_have_in_flight(
+    merge_runner, started, tmp_path, number
+):
     gate = Gate(40)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)
         await gate.quiet(tmp_path / "cache/responses", trials=4)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         for worker in workers_of(process.pid):
-            worker.send_signal(signal.SIGINT)  # as a terminal does
+            worker.send_signal(number)  # as a terminal does
         await process.said("are saved first")
         gate.open()
         code, _, err = await ended(process)

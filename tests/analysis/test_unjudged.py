@@ -1,0 +1,97 @@
+"""A driver of which too many decisions are invalid: shown with the reason, and in nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from analysis.data.provenance import provenance
+from analysis.data.study import Study
+from analysis.report.alarms import alarms
+from analysis.report.conclusions import not_shown, nothing, shown
+from analysis.tables import make_tables
+from merge_runner.audit import audit_database
+from merge_runner.results.validity import not_judged
+from tests.analysis.studies import Said, changed, write_study, yielding
+
+PROSE = Said(failure="no_array")
+
+
+def failing(drives, decisions=range(99)):
+    """The drives, of whose left decisions these are invalid."""
+    return [replace(drive, said=dict.fromkeys(decisions, PROSE)) for drive in drives]
+
+
+@pytest.fixture(scope="module")
+def drives():
+    return [*yielding("o3"), *yielding("o3", "A2"), *yielding("other")]
+
+
+@pytest.fixture(scope="module")
+def mixed(drives, tmp_path_factory):
+    """Drivers, and beside them a variant and a driver with too many invalid decisions."""
+    bad = [*failing(yielding("o3", "A1", reps=2)), *failing(yielding("bad"))]
+    return write_study(tmp_path_factory.mktemp("mixed") / "t.duckdb", [*drives, *bad])
+
+
+def test_more_than_a_fifth_is_too_much_and_a_fifth_is_not():
+    assert not_judged("m", 20, 100) == not_judged("m", 0, 0) == ""
+    assert not_judged("m", 21, 100) == (
+        "not judged: 21 of the 100 decisions of m are invalid (21.0 %, more than 20 %)"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_draws")
+def test_tables_show_it_without_a_value_and_the_rest_as_if_it_were_not_there(
+    mixed, drives, tmp_path
+):
+    alone = Study(write_study(tmp_path / "alone.duckdb", drives))
+    for table, expected in zip(make_tables(Study(mixed)), make_tables(alone), strict=True):
+        unjudged = [row for row in table.rows if {"o3/A1", "bad/baseline"} & {*row.groups}]
+        if table.name == "attempts":  # which counts the calls of all
+            assert [row.values["calls"] > 0 for row in unjudged] == [True, True]
+            continue
+        for row in unjudged:
+            names = {name for name, value in row.values.items() if value is not None}
+            assert names <= {"driver", "setting", table.columns[0].name}, table.name
+            assert row.note.startswith("not judged: "), table.name
+        only_asked = table.name == "first-look-surface"
+        assert len(unjudged) == (0 if only_asked else 2), table.name
+        judged = [row for row in table.rows if row not in unjudged]
+        assert [(row.id, row.note) for row in judged] == [
+            (row.id, row.note) for row in expected.rows
+        ]
+        # The last digits of a fit depend on where in memory its numbers lie.
+        for row, other in zip(judged, expected.rows, strict=True):
+            assert row.values == {name: pytest.approx(v) for name, v in other.values.items()}
+
+
+def test_report_and_audit_say_that_it_is_not_judged_and_conclude_nothing(mixed):
+    study, origin = Study(mixed), provenance(mixed)
+    assert not any("bad" in text or "A1" in text for text in shown(study))
+    (alarm,) = alarms(study, origin)
+    assert alarm.title == "Too few valid decisions"
+    for group in ("bad/baseline", "o3/A1"):
+        assert f"{group}: not judged: " in alarm.text
+        assert any(text.startswith(f"{group}: not judged: ") for text in not_shown(study, origin))
+        notes = [note for audit in audit_database(mixed) for note in audit.notes]
+        assert any(note.startswith(f"{group}: not judged: ") for note in notes)
+
+
+def test_where_no_driver_is_judged_nothing_is_concluded(tmp_path):
+    study = Study(write_study(tmp_path / "t.duckdb", failing(yielding("bad", reps=1))))
+    assert shown(study) == []
+    assert "too many decisions are invalid" in nothing(study)
+    assert "too many decisions are invalid" in nothing(Study(study.db, ["bad"]))
+
+
+@pytest.mark.parametrize(("first", "judged"), [([0], True), (range(3), False)])
+def test_of_a_pair_the_decisions_of_each_model_count_by_themselves(tmp_path, first, judged):
+    db = write_study(tmp_path / "t.duckdb", failing(yielding("m", reps=1), first))
+    study = changed(db, "UPDATE trials SET model_right = 'constant'",
+                    "UPDATE decisions SET call_key = NULL WHERE side = 'right'")  # fmt: skip
+    (group,) = study.played
+    assert study.models == ([group] if judged else [])
+    assert ("decisions of m are invalid" in group.unjudged) is not judged
