@@ -41,7 +41,7 @@ GRID = np.arange(-600, 401) * STEP_MPS2
 DRAWS = 200
 # Of so many trials imported first actions stand in the place of the published aggregates.
 LEAST_TRIALS = 100
-# Equal but for the last digits of a vehicle that drove on the other side.
+# Equal but for the last digits, as of a vehicle that drove on the other side, and of a mean.
 SAME_MPS2 = 1e-9
 # A skill is told where the ceiling is at least this part of the floor away from it.
 LEAST_REACH = 0.1
@@ -411,6 +411,7 @@ def _late(own: Acts, known: Humans) -> Fault | None:
 def _delay(found: Acts) -> Coefficient | None:
     """How much more it accelerates, either way, over the first second than at first."""
     apart = (np.abs(found.second) - np.abs(found.first))[:, found.sides]
+    apart = np.where(np.abs(apart) < SAME_MPS2, 0.0, apart)  # else its error is as small
     counted = np.isfinite(apart)
     return clustered_mean(apart, counted, found.unit) if counted.any() else None
 

@@ -164,7 +164,7 @@ def ablations(quantitative: Table, contrasts: Table) -> list[DriverVariants]:
     of_baseline = {
         (row.groups[1], row.id.rpartition("/")[2]): row.values["n_reference"]
         for row in contrasts.rows
-        if row.values["reference"] == BASELINE
+        if row.values.get("reference") == BASELINE  # a driver that is not judged has none
     }
     drivers: dict[str, DriverVariants] = {}
     for row in quantitative.rows:
@@ -194,7 +194,7 @@ def _cell(
     limits = row.values.get(interval.name)
     n = of_baseline.get((row.id, column.name)) if found is None else found.values["n"]
     # Collisions are counted over all that ended, which is the n of the row.
-    n = row.values["n"] if column.name == COLLISIONS.name else n
+    n = row.values.get("n") if column.name == COLLISIONS.name else n
     return Estimate(
         column.name,
         row.id,

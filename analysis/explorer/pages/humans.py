@@ -101,5 +101,5 @@ def human_collisions(groups: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 def against_humans(contrasts: Table) -> Table:
     """The rows in which humans are the reference."""
     return replace(
-        contrasts, rows=[row for row in contrasts.rows if row.values["reference"] == HUMAN]
+        contrasts, rows=[row for row in contrasts.rows if row.values.get("reference") == HUMAN]
     )

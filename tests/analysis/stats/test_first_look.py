@@ -117,6 +117,17 @@ def test_a_planted_fault_is_named_and_no_other(fault, make):
     assert sum(map(bool, others)) <= 0.08 * STUDIES
 
 
+def test_a_driver_that_often_does_nothing_at_all_is_not_late():
+    acts = drawn(np.random.default_rng(4), SITUATIONS // 2)
+    first = np.where(np.arange(len(acts.first))[:, None] % 2, acts.first, 0.0)
+    rounded = first * (1 + 4e-16)  # as the mean of a second is
+    assert (np.abs(rounded) > np.abs(first)).any()
+    found = faults(replace(acts, first=first, second=rounded), published_humans())
+    (late_one,) = (one for one in found if one.name == LATE)
+    assert late_one.found.p < 0.001  # it holds more often than humans
+    assert (late_one.p, late_one.shown) == (1, False)
+
+
 @pytest.mark.slow
 def test_a_driver_that_accelerates_less_in_every_situation_is_named_for_its_level():
     named = studies(3, lambda rng: lower(drawn(rng, SITUATIONS // 2)))

@@ -1,0 +1,282 @@
+"""The tables of a results database, recomputed: {table: {row: {column: number or None}}}.
+
+Nothing of the project is imported. Rates are in percent. A row of ``contrasts`` or ``factors`` with
+a p has its ``family``, whose p are corrected together, and says whether p is ``simulated``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from tests.independent import recompute_statistics as statistics
+from tests.independent import recompute_trials as measured
+
+WHO_FIRST = ("intercept", "projected_headway", "relative_velocity")
+GAP = ("intercept", "abs_projected_headway", "abs_relative_velocity", "headway_x_velocity")
+# Name of the table's columns, column of the trials, what sums it up, in the paper's Table VII.
+METRICS = (
+    ("collided_percent", "collided", "rate", True),
+    ("collided_boxes_percent", "boxes", "rate", True),
+    ("left_first_percent", "left_first", "rate", False),
+    ("gap_m", "gap", "mean", True),
+    ("rmse_mps", "rmse", "mean", True),
+    ("joint_percent", "joint", "rate", True),
+    ("time_to_merge_s", "time_to_merge", "median", False),
+    ("post_encroachment_s", "pet", "median", False),
+    ("min_ttc_s", "ttc", "median", False),
+    ("max_acceleration_mps2", "hardest", "median", False),
+)
+MARGIN_S = 1 / 0.8  # 1 m at the largest relative velocity, 0.8 m/s
+MOST_INVALID = 0.2
+
+
+def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
+    """The tables of a database, or of one of its studies."""
+    trials = measured.read(db, study)
+    for _, column, *_ in METRICS:
+        if column not in trials:
+            trials[column] = None
+    recorded = trials[trials["source"] == "human"]
+    driven = trials[trials["source"] != "human"]
+    groups = dict([*driven.groupby(["driver", "variant"])])
+    judged = {key: rows for key, rows in groups.items() if _is_judged(rows)}
+    baselines = {key: rows for key, rows in judged.items() if key[1] == "baseline"}
+    humans = {} if recorded.empty else {("human", ""): recorded}
+    # Who went first is published, trial by trial.
+    who = (humans or {("human", ""): measured.published_humans()}) | baselines
+    found = {
+        "who-first": _by_term(who, WHO_FIRST, _who_first) | _mixed(recorded, "who-first"),
+        "gap": _by_term(humans | baselines, GAP, _gap) | _mixed(recorded, "gap"),
+        "ablation-quantitative": {_id(k): _quantities(v) for k, v in (humans | judged).items()},
+        "contrasts": _prompts(judged, trials.attrs["orders"]),
+        "factors": _factors(judged, trials.attrs["orders"]),
+    }
+    for rows in found.values():
+        rows |= {_id(key): {} for key in groups.keys() - judged.keys()}
+    return found
+
+
+def _id(key: tuple[str, str]) -> str:
+    return "/".join(filter(None, key))
+
+
+def _is_judged(rows: pd.DataFrame) -> bool:
+    """Whether at most a fifth of the decisions of each model that was asked are invalid."""
+    counts: dict[str, np.ndarray] = {}
+    for asked in rows.loc[rows["status"] != "failed", "asked"]:
+        for model, pair in asked.items():
+            counts[model] = counts.get(model, 0) + np.array(pair)
+    return all(invalid <= MOST_INVALID * n for n, invalid in counts.values())
+
+
+def _by_term(groups, terms, rows_of) -> dict[str, dict]:
+    return {
+        f"{_id(key)}/{term}": row
+        for key, trials in groups.items()
+        for term, row in zip(terms, rows_of(trials), strict=True)
+    }
+
+
+def who_first_data(trials: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, pd.DataFrame]:
+    """Design of intercept, h and dv; left first as 0 or 1; their trials."""
+    used = trials[(trials["status"] == "finished") & trials["first"].notna()]
+    x = np.column_stack([np.ones(len(used)), used[["h", "dv"]].to_numpy(float)])
+    return x, (used["first"] == "left").to_numpy(float), used
+
+
+def gap_data(
+    trials: pd.DataFrame, measure: str = "gap"
+) -> tuple[np.ndarray, np.ndarray, pd.DataFrame]:
+    """Design of intercept, |h|, |dv| and h dv; the gaps in m; their trials."""
+    used = trials[(trials["status"] == "finished") & trials[measure].notna()]
+    h, dv = used["h"].to_numpy(float), used["dv"].to_numpy(float)
+    x = np.column_stack([np.ones(len(used)), np.abs(h), np.abs(dv), h * dv])
+    return x, used[measure].to_numpy(float), used
+
+
+def _columns(names: str, rows: np.ndarray | None, k: int) -> dict:
+    """The values of a term by column, None where there is no fit."""
+    values = [None] * len(names.split()) if rows is None else rows[k]
+    return dict(zip(names.split(), values, strict=True))
+
+
+def _who_first(trials: pd.DataFrame) -> list[dict]:
+    x, y, _ = who_first_data(trials)
+    plain, penalised = statistics.logit(x, y), statistics.firth(x, y)
+    return [
+        {"n": len(y)}
+        | _columns("b se z p", plain, k)
+        | _columns("firth_b firth_se firth_p", penalised, k)
+        for k in range(x.shape[1])
+    ]
+
+
+def _gap(trials: pd.DataFrame) -> list[dict]:
+    x, y, _ = gap_data(trials)
+    plain, robust = statistics.least_squares(x, y)
+    rows = []
+    for k, term in enumerate(GAP):
+        hc3 = _columns("b hc3_se t hc3_p", robust, k)
+        row = {"n": len(y)} | _columns("b se t p", plain, k)
+        row |= {"hc3_se": hc3["hc3_se"], "hc3_p": hc3["hc3_p"], "equivalence_p": None}
+        if term == "abs_relative_velocity" and robust is not None:
+            away = (MARGIN_S - abs(robust[k, 0])) / robust[k, 1]
+            row["equivalence_p"] = stats.t.sf(away, len(y) - x.shape[1])
+        rows.append(row)
+    return rows
+
+
+def _mixed(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
+    """The humans with a random intercept per pair."""
+    if recorded.empty:
+        return {}
+    if table == "who-first":
+        fits = {"mixed": (statistics.mixed_logit, who_first_data(recorded))}
+        terms, names, other = WHO_FIRST, "b se z p", ("firth_b", "firth_se", "firth_p")
+    else:
+        fits = {
+            "mixed": (statistics.mixed_least_squares, gap_data(recorded)),
+            "mixed-mean100": (statistics.mixed_least_squares, gap_data(recorded, "gap_mean100")),
+        }
+        terms, names, other = GAP, "b se t p", ("hc3_se", "hc3_p", "equivalence_p")
+    return {
+        f"human/{name}/{term}": {"n": len(y)} | _columns(names, rows, k) | dict.fromkeys(other)
+        for name, (fit, (x, y, used)) in fits.items()
+        for rows in [fit(x, y, used["pair"].to_numpy())]
+        for k, term in enumerate(terms)
+    }
+
+
+def _values(trials: pd.DataFrame, column: str, kind: str) -> pd.Series:
+    """The values that count; of a rate as 0 and 1."""
+    return trials[column].dropna().astype(float)
+
+
+def _estimate(trials: pd.DataFrame, column: str, kind: str) -> tuple:
+    """Value, ends of its interval, n."""
+    values = _values(trials, column, kind).to_numpy()
+    if not len(values):
+        return None, None, None, 0
+    if kind == "rate":
+        low, high = statistics.wilson(values.mean(), len(values))
+        return 100 * values.mean(), 100 * low, 100 * high, len(values)
+    if kind == "mean":
+        return values.mean(), *statistics.mean_interval(values), len(values)
+    return np.median(values), *statistics.median_interval(values), len(values)
+
+
+def _quantities(trials: pd.DataFrame) -> dict:
+    row = {"n": int((trials["status"] != "failed").sum())}
+    for name, column, kind, shown in METRICS:
+        if shown:
+            value, low, high, _ = _estimate(trials, column, kind)
+            row |= {name: value, f"{name}_ci_low": low, f"{name}_ci_high": high}
+    return row
+
+
+def _order(orders) -> dict[str, list[str]]:
+    """The levels of each factor as the study lists them; of several studies none says it."""
+    return next(iter(orders.values())) if len(orders) == 1 else {}
+
+
+def _together(orders, *groups: pd.DataFrame) -> bool:
+    """Whether one study was played with all these trials."""
+    every = [studies for trials in groups for studies in trials["studies"]]
+    return len(orders) < 2 or bool(frozenset.intersection(*every))
+
+
+def _compared(one: pd.DataFrame, other: pd.DataFrame, column: str, kind: str) -> dict:
+    frames = [trials[trials[column].notna()] for trials in (one, other)]
+    values = [_values(trials, column, kind) for trials in frames]
+    test = statistics.rates_within if kind == "rate" else statistics.means_within
+    return test(*values, tuple(trials["cell"] for trials in frames))
+
+
+def _prompts(groups, orders) -> dict[str, dict]:
+    """Every prompt of a driver against the first that its study lists."""
+    listed = _order(orders).get("prompt", ["baseline"])
+    rows = {}
+    for (driver, variant), trials in groups.items():
+        reference = groups.get((driver, listed[0]))
+        if reference is None or variant == listed[0] or not _together(orders, trials, reference):
+            continue
+        for name, column, kind, shown in METRICS:
+            found = _compared(trials, reference, column, kind) if shown else {}
+            if found:
+                sizes = [int(one[column].notna().sum()) for one in (trials, reference)]
+                found |= {"n": sizes[0], "n_reference": sizes[1], "family": (driver, name)}
+                rows[f"{driver}/{variant}/{listed[0]}/{name}"] = found
+    return rows
+
+
+def _factors(groups, orders) -> dict[str, dict]:
+    """Every level of each factor, its differences from the first, pooled over other factors."""
+    rows: dict[str, dict] = {}
+    scripted = {bool(one["scripted"].any()) for one in groups.values()}
+    order = _order(orders)
+    for stand_in in sorted(scripted):
+        chosen = [one for one in groups.values() if bool(one["scripted"].any()) == stand_in]
+        mark = " [scripted]" if stand_in and len(scripted) > 1 else ""
+        levels = [one["levels"].iloc[0] for one in chosen]
+        for factor in dict.fromkeys(name for each in levels for name in each):
+            found = {each[factor] for each in levels if factor in each}
+            first = [*order.get(factor, ()), "baseline", "self"]
+            names = sorted(found, key=lambda n: (first.index(n) if n in first else len(first), n))
+            if len(names) < 2:
+                continue
+            pooled = {}
+            for name in names:
+                parts = [
+                    t for t, each in zip(chosen, levels, strict=True) if each.get(factor) == name
+                ]
+                pooled[name] = _with_other_levels(pd.concat(parts), factor)
+            for name in names:
+                for metric, column, kind, _ in METRICS:
+                    row = _level(pooled[name], pooled[names[0]], column, kind, orders)
+                    rows[f"{factor}={name}{mark}/{metric}"] = row
+    return rows
+
+
+def _with_other_levels(trials: pd.DataFrame, factor: str) -> pd.DataFrame:
+    cells = [
+        (cell, *sorted((n, v) for n, v in levels.items() if n != factor))
+        for cell, levels in zip(trials["cell"], trials["levels"], strict=True)
+    ]
+    return trials.assign(cell=pd.Series(cells, trials.index, dtype=object))
+
+
+def _level(trials, reference, column, kind, orders) -> dict:
+    value, low, high, n = _estimate(trials, column, kind)
+    ended = int((trials["status"] != "failed").sum())
+    row = {"trials": ended, "n": n, "value": value, "ci_low": low, "ci_high": high}
+    names = ("difference", "difference_ci_low", "difference_ci_high", "p", "p_holm")
+    row |= dict.fromkeys(names)
+    if trials is reference or not _together(orders, trials, reference):
+        return row
+    if kind == "median":
+        one, other = (each[each[column].notna()] for each in (trials, reference))
+        shared = set(one["cell"]) & set(other["cell"])
+        if shared:
+            a, b = (each[each["cell"].isin(shared)][column].median() for each in (one, other))
+            row["difference"] = a - b
+        return row
+    found = _compared(trials, reference, column, kind)
+    if found:
+        row |= {"difference": found["difference"], "p": found["p"], "family": "all"}
+        row |= {f"difference_{end}": found[end] for end in ("ci_low", "ci_high")}
+        row["simulated"] = found.get("simulated", False)
+    return row
+
+
+def correct(rows: dict[str, dict]) -> None:
+    """Fill in the corrected p of each family."""
+    families: dict = {}
+    for row in rows.values():
+        if "family" in row:
+            families.setdefault(row["family"], []).append(row)
+    for family in families.values():
+        found = statistics.corrections([row["p"] for row in family])
+        for row, holm, bh in zip(family, *found, strict=True):
+            row |= {"p_holm": holm, "p_bh": bh}

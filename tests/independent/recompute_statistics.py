@@ -1,0 +1,284 @@
+"""The tests and intervals that docs/reference/analysis.md names, from their definitions.
+
+Nothing of the project is imported.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import statsmodels.api as sm
+from scipy import optimize, stats
+
+DRAWS = 20_000
+Z = stats.norm.ppf(0.975)
+
+
+def separated(x: np.ndarray, y: np.ndarray) -> bool:
+    """Whether a hyperplane has all successes on one side, by linear programming (Konis 2007)."""
+    signed = x * (2 * y - 1)[:, None]
+    found = optimize.linprog(
+        -signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(y)), bounds=[(-1, 1)] * x.shape[1]
+    )
+    return -found.fun > 1e-7
+
+
+def logit(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
+    """Maximum likelihood: a row (b, se, z, p) a term; None without a finite estimate."""
+    if unidentified(x, y) or separated(x, y):
+        return None
+    fit = sm.GLM(y, x, family=sm.families.Binomial()).fit(tol=1e-12, maxiter=200)
+    z = fit.params / fit.bse
+    return np.column_stack([fit.params, fit.bse, z, 2 * stats.norm.sf(np.abs(z))])
+
+
+def unidentified(x: np.ndarray, y: np.ndarray) -> bool:
+    """Whether trials are too few, in too few conditions, or all of one outcome."""
+    few = len(y) <= x.shape[1] or np.linalg.matrix_rank(x) < x.shape[1]
+    return few or len(np.unique(y)) < 2
+
+
+def firth(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
+    """Firth's penalised fit (1993): a row (b, se, p) a term, p of penalised likelihood ratios.
+
+    The restricted fits keep the penalty of the whole design (Heinze and Schemper 2002).
+    """
+    if unidentified(x, y):
+        return None
+
+    def parts(b):
+        p = 1 / (1 + np.exp(-x @ b))
+        information = x.T @ (x * (p * (1 - p))[:, None])
+        return p, information
+
+    def penalised(b):
+        eta = x @ b
+        _, information = parts(b)
+        return y @ eta - np.logaddexp(0, eta).sum() + np.linalg.slogdet(information)[1] / 2
+
+    def fitted(free):
+        b = np.zeros(x.shape[1])
+        for _ in range(5000):
+            p, information = parts(b)
+            w = p * (1 - p)
+            leverage = w * np.einsum("ij,jk,ik->i", x, np.linalg.inv(information), x)
+            score = (x.T @ (y - p + leverage * (0.5 - p)))[free]
+            if np.abs(score).max() < 1e-10:
+                break
+            step = np.zeros_like(b)
+            step[free] = np.linalg.solve(information[np.ix_(free, free)], score)
+            while penalised(b + step) < penalised(b) - 1e-12:
+                step /= 2
+            b = b + step
+        return b
+
+    every = np.arange(x.shape[1])
+    b = fitted(every)
+    se = np.sqrt(np.diag(np.linalg.inv(parts(b)[1])))
+    p = [
+        stats.chi2.sf(max(0.0, 2 * (penalised(b) - penalised(fitted(np.delete(every, k))))), 1)
+        for k in every
+    ]
+    return np.column_stack([b, se, p])
+
+
+def least_squares(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Rows (b, se, t, p) of the usual errors and of HC3's; None where there are no such."""
+    freedom = len(y) - x.shape[1]
+    if freedom < 1 or np.linalg.matrix_rank(x) < x.shape[1] or np.ptp(y) < 0.01:
+        return None, None
+    bread = np.linalg.inv(x.T @ x)
+    b = bread @ x.T @ y
+    rest = y - x @ b
+    hat = np.einsum("ij,jk,ik->i", x, bread, x)
+    plain = bread * (rest @ rest) / freedom
+    found = [_wald(b, np.sqrt(np.diag(plain)), freedom), None]
+    if hat.max() < 1 - 1e-9:
+        meat = x.T @ (x * ((rest / (1 - hat)) ** 2)[:, None])
+        found[1] = _wald(b, np.sqrt(np.diag(bread @ meat @ bread)), freedom)
+    return tuple(found)
+
+
+def _wald(b, se, freedom=np.inf) -> np.ndarray:
+    return np.column_stack([b, se, b / se, 2 * stats.t.sf(np.abs(b / se), freedom)])
+
+
+def mixed_least_squares(x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray:
+    """A random intercept per pair, by restricted maximum likelihood; normal tests."""
+    groups = [(x[pair == name], y[pair == name]) for name in np.unique(pair)]
+
+    def solved(ratio):
+        inverses = [
+            np.eye(len(v)) - ratio / (1 + len(v) * ratio) * np.ones((len(v), len(v)))
+            for _, v in groups
+        ]
+        a = sum(u.T @ w @ u for (u, _), w in zip(groups, inverses, strict=True))
+        b = np.linalg.solve(a, sum(u.T @ w @ v for (u, v), w in zip(groups, inverses, strict=True)))
+        rest = sum(
+            (v - u @ b) @ w @ (v - u @ b) for (u, v), w in zip(groups, inverses, strict=True)
+        )
+        variance = rest / (len(y) - x.shape[1])
+        logs = sum(np.log1p(len(v) * ratio) for _, v in groups) + np.linalg.slogdet(a)[1]
+        return (len(y) - x.shape[1]) * np.log(variance) + logs, b, variance, a
+
+    best = optimize.minimize_scalar(
+        lambda log: solved(np.exp(log))[0], bounds=(-12, 6), options={"xatol": 1e-9}
+    )
+    _, b, variance, a = solved(np.exp(best.x))
+    return _wald(b, np.sqrt(variance * np.diag(np.linalg.inv(a))))
+
+
+def mixed_logit(x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray:
+    """The same of a logit, its likelihood integrated by adaptive quadrature of 41 points."""
+    nodes, weights = np.polynomial.hermite.hermgauss(41)
+    groups = [(x[pair == name], y[pair == name]) for name in np.unique(pair)]
+
+    def loss(theta):
+        b, sd = theta[:-1], theta[-1]
+        total = 0.0
+        for u, v in groups:
+            eta = u @ b
+            mode = 0.0
+            for _ in range(100):
+                p = 1 / (1 + np.exp(-eta - sd * mode))
+                curve = 1 + sd**2 * (p * (1 - p)).sum()
+                step = (sd * (v - p).sum() - mode) / curve
+                mode += step
+                if abs(step) < 1e-12:
+                    break
+            at = mode + np.sqrt(2 / curve) * nodes
+            line = eta[:, None] + sd * at
+            logs = v @ line - np.logaddexp(0, line).sum(axis=0) - at**2 / 2 + nodes**2
+            total += np.log(np.exp(logs - logs.max()) @ weights) + logs.max() - np.log(curve) / 2
+        return -total
+
+    start = np.r_[logit(x, y)[:, 0], 0.5]
+    best = optimize.minimize(loss, start, method="BFGS", options={"gtol": 1e-7}).x
+    best = optimize.minimize(loss, best, method="Nelder-Mead", options={"xatol": 1e-9}).x
+    step = 1e-4 * np.eye(len(best))
+    second = [
+        [
+            (loss(best + i + j) - loss(best + i - j) - loss(best - i + j) + loss(best - i - j))
+            / 4e-8
+            for j in step
+        ]
+        for i in step
+    ]
+    return _wald(best[:-1], np.sqrt(np.diag(np.linalg.inv(np.array(second))))[:-1])
+
+
+def wilson(rate: float, n: float) -> tuple[float, float]:
+    """The score interval of a rate of ``n`` trials (Wilson 1927)."""
+    middle = (rate + Z**2 / (2 * n)) / (1 + Z**2 / n)
+    half = Z / (1 + Z**2 / n) * np.sqrt(rate * (1 - rate) / n + Z**2 / (4 * n**2))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def mean_interval(values: np.ndarray) -> tuple[float | None, float | None]:
+    """Student's t interval of a mean."""
+    if len(values) < 2:
+        return None, None
+    half = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
+    return values.mean() - half, values.mean() + half
+
+
+def median_interval(values: np.ndarray) -> tuple[float | None, float | None]:
+    """The order statistics that enclose a median with 95 %."""
+    k = max(k for k in range(len(values)) if stats.binom.cdf(k - 1, len(values), 0.5) <= 0.025)
+    ordered = np.sort(values)
+    return (ordered[k - 1], ordered[len(values) - k]) if k else (None, None)
+
+
+def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
+    """Two rates in the cells that both have: Mantel and Haenszel, Newcombe, Fisher.
+
+    Empty where there is no such cell.
+    """
+    first, second = (
+        v.astype(float).groupby(c).agg(["sum", "size"])
+        for v, c in zip((one, other), cells, strict=True)
+    )
+    both = first.join(second, how="inner", suffixes=("1", "2"))
+    if both.empty:
+        return {}
+    a, n, b, m = (both[name].to_numpy(int) for name in ("sum1", "size1", "sum2", "size2"))
+    w = n * m / (n + m)
+    w = w / w.sum()
+    p, q = w @ (a / n), w @ (b / m)
+    (low1, high1), (low2, high2) = wilson(p, 1 / (w**2 @ (1 / n))), wilson(q, 1 / (w**2 @ (1 / m)))
+    # The distribution of the successes of the first, all margins of all cells given.
+    chances, least = np.ones(1), 0
+    for k in range(len(a)):
+        total = a[k] + b[k]
+        there = np.arange(max(0, total - m[k]), min(n[k], total) + 1)
+        chances = np.convolve(chances, stats.hypergeom(n[k] + m[k], total, n[k]).pmf(there))
+        least += there[0]
+    return {
+        "difference": 100 * (p - q),
+        "ci_low": 100 * (p - q - np.hypot(p - low1, high2 - q)),
+        "ci_high": 100 * (p - q + np.hypot(high1 - p, q - low2)),
+        "p": min(1.0, chances[chances <= chances[a.sum() - least] * (1 + 1e-7)].sum()),
+        "detectable": _detectable(int(n.sum()), int(m.sum()), q),
+    }
+
+
+def _detectable(n: int, m: int, rate: float) -> float | None:
+    """The smallest difference from ``rate`` that Fisher's test finds with a power of 0.8."""
+    found = np.zeros((n + 1, m + 1))
+    for total in range(n + m + 1):
+        there = np.arange(max(0, total - m), min(n, total) + 1)
+        chance = stats.hypergeom(n + m, total, n).pmf(there)
+        p = [chance[chance <= one * (1 + 1e-7)].sum() for one in chance]
+        found[there, total - there] = np.array(p) < 0.05
+    by_first = found @ stats.binom.pmf(np.arange(m + 1), m, rate)
+
+    def lacking(other):
+        return stats.binom.pmf(np.arange(n + 1), n, other) @ by_first - 0.8
+
+    ends = [end for end in (0.0, 1.0) if lacking(end) >= 0]
+    return min((100 * abs(optimize.brentq(lacking, rate, e) - rate) for e in ends), default=None)
+
+
+def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
+    """Two means by least squares with a level for each cell; p by permutation within cells.
+
+    Empty where no cell has both.
+    """
+    y = np.r_[one.to_numpy(float), other.to_numpy(float)]
+    group = np.r_[np.ones(len(one)), np.zeros(len(other))]
+    cell = pd.factorize(pd.concat(cells))[0]
+    levels = (cell[:, None] == np.unique(cell)).astype(float)
+    if len(set(cells[0]) & set(cells[1])) == 0:
+        return {}
+    x = np.column_stack([group, levels])
+    bread = np.linalg.inv(x.T @ x)
+    b = bread @ x.T @ y
+    found = {"difference": b[0], "ci_low": None, "ci_high": None, "detectable": None}
+    freedom = len(y) - x.shape[1]
+    if freedom > 0:
+        se = np.sqrt(bread[0, 0] * ((y - x @ b) ** 2).sum() / freedom)
+        t = stats.t(freedom)
+        found |= {"ci_low": b[0] - t.ppf(0.975) * se, "ci_high": b[0] + t.ppf(0.975) * se}
+        found["detectable"] = (t.ppf(0.975) + t.ppf(0.8)) * se
+    # The estimate is linear in y: what a shuffle of the groups makes of it needs no other fit.
+    centred = y - levels @ np.linalg.lstsq(levels, y, rcond=None)[0]
+    rng, sums, spread = np.random.default_rng(1), np.zeros(DRAWS), 0.0
+    for k in np.unique(cell):
+        here, count = centred[cell == k], int(group[cell == k].sum())
+        spread += count * (len(here) - count) / len(here)
+        order = rng.random((DRAWS, len(here))).argsort(axis=1)[:, :count]
+        sums += here[order].sum(axis=1)
+    extreme = (np.abs(sums / spread) >= abs(b[0]) - 1e-9).sum()
+    return found | {"p": (extreme + 1) / (DRAWS + 1), "simulated": True}
+
+
+def corrections(p: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """A family's p by Holm (1979) and by Benjamini and Hochberg (1995)."""
+    p, m = np.array(p), len(p)
+    order = np.argsort(p, kind="stable")
+    holm, bh = np.empty(m), np.empty(m)
+    holm[order] = np.minimum(np.maximum.accumulate(p[order] * (m - np.arange(m))), 1)
+    bh[order] = np.minimum(
+        np.minimum.accumulate((p[order] * m / np.arange(1, m + 1))[::-1])[::-1], 1
+    )
+    return holm, bh

@@ -1,0 +1,131 @@
+"""The program's tables are those that independent code makes of the same database."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import math
+import subprocess
+from itertools import groupby
+from pathlib import Path
+
+import pytest
+
+from tests.analysis.odd_databases import made, replayed
+from tests.harness import PROGRAM, environment
+from tests.independent import recompute
+from tests.independent.recompute_trials import overlap
+
+ALLOWED = {"__future__", "json", "numpy", "scipy", "statsmodels", "pandas", "duckdb"}
+OWN = "tests.independent"
+TABLES = ("who-first", "gap", "ablation-quantitative", "contrasts", "factors")
+# Columns that are found by iteration; all others follow from closed forms.
+ITERATED = {"b", "se", "z", "t", "p", "firth_b", "firth_se", "firth_p", "detectable"}
+PERMUTATIONS = 9999  # of the program
+RECORDINGS = ("emulator", "smollm2", "smollm2-free")
+KINDS = (
+    "two_studies", "mirrored_chance", "no_valid_reply", "separated", "all_tied", "complete_import",
+)  # fmt: skip
+
+
+def test_the_recomputation_imports_nothing_of_the_project():
+    files = sorted(Path(__file__).parent.glob("recompute*.py"))
+    assert len(files) == 3
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [f"{node.module}.{a.name}" if node.module == OWN else node.module
+                         for a in node.names]  # fmt: skip
+            else:
+                continue
+            for name in names:
+                own = name.startswith(f"{OWN}.recompute")
+                assert own or name.partition(".")[0] in ALLOWED, (file.name, name)
+
+
+@pytest.mark.parametrize(
+    ("left", "low", "high"),
+    [(91, 90.61, 95.51), (95, 90.61, 99.64), (97, 92.45, 101.60), (102, 97.39, 106.49)],
+)
+def test_its_boxes_overlap_where_those_of_the_human_experiment_did(left, low, high):
+    assert [overlap(left, low + at) for at in (-0.01, 0.01)] == [False, True]
+    assert [overlap(left, high + at) for at in (-0.01, 0.01)] == [True, False]
+
+
+def program_tables(db: Path, *options: str) -> dict[str, dict[str, dict[str, str]]]:
+    """The tables as the program prints them: by table, row and column."""
+    done = subprocess.run(
+        [PROGRAM, "tables", *TABLES, "--format", "csv", "--db", db.name, *options],
+        cwd=db.parent, env=environment(), capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    found: dict[str, dict[str, dict[str, str]]] = {}
+    for is_name, lines in groupby(done.stdout.splitlines(), lambda line: line.startswith("# ")):
+        if is_name:
+            name = [*lines][-1].removeprefix("# ")
+        else:
+            found[name] = {row["row"]: row for row in csv.DictReader(filter(None, lines))}
+    return found
+
+
+def disagreements(program, own, *, imported: bool):
+    """Every row and number in which the program and the recomputation differ."""
+    for table, rows in own.items():
+        printed = {
+            name: row
+            for name, row in program[table].items()
+            if not _of_paper(table, name, imported)
+        }
+        yield from (f"{table} {name}: in one alone" for name in printed.keys() ^ rows.keys())
+        both = {name: (printed[name], row) for name, row in rows.items() if name in printed}
+        for name, (said, row) in both.items():
+            if row.get("simulated"):
+                p, found = float(said["p"]), row["p"]
+                error = math.sqrt(found * (1 - found) / PERMUTATIONS)
+                if abs(p - found) > 6 * error + 2 / PERMUTATIONS:
+                    yield f"{table} {name} p: {p}, and {found} by other shuffles"
+                row["p"] = p
+        recompute.correct(rows)
+        for name, (said, row) in both.items():
+            for column, value in row.items():
+                if column in said and not _equal(said[column], value, column):
+                    yield f"{table} {name} {column}: {said[column]}, and {value} recomputed"
+            if not row and any(said[c] for c in ("n", "p", "value", "difference") if c in said):
+                yield f"{table} {name}: judged, and not by the recomputation"
+
+
+def _of_paper(table: str, row: str, imported: bool) -> bool:
+    """Whether a row holds what the paper prints, and is not computed."""
+    if table == "contrasts":
+        return "/human/" in row
+    return row.startswith("human") and table != "who-first" and not imported
+
+
+def _equal(said: str, value, column: str) -> bool:
+    if value is None or said == "":
+        return said == "" and value is None
+    tolerance = 1e-4 if column in ITERATED else 1e-6
+    return math.isclose(float(said), float(value), rel_tol=tolerance, abs_tol=1e-9)
+
+
+@pytest.fixture(params=[*RECORDINGS, *KINDS])
+def database(request, tmp_path):
+    if request.param in KINDS:
+        return made(tmp_path, request.param)
+    db = tmp_path / "merge.duckdb"
+    replayed(db, request.param)
+    return db
+
+
+@pytest.mark.long
+def test_independent_code_finds_the_numbers_of_the_tables(database):
+    imported = database.parent.name == "complete_import"
+    found = disagreements(
+        program_tables(database), recompute.tables(str(database)), imported=imported
+    )
+    assert [*found] == []
+    if (study := database.with_name("study.toml")).exists():
+        program = program_tables(database, "--study", study.name)
+        found = disagreements(program, recompute.tables(str(database), study.stem), imported=False)
+        assert [*found] == []
