@@ -333,5 +333,7 @@ _criticality(
 RULES_NOTE = (
     f"{COLLISIONS.heading}: by the rule of the trials' scenario, in the paper centres closer than "
     f"a vehicle length at a step of 0.2 s; {BOXES.heading}: by the rule of the human experiment, "
-    "boxes that overlap, looked for at 20 Hz, the one by which drivers are compared with humans"
+    "boxes that overlap, looked for at 20 Hz, the one by which drivers are compared with humans. A "
+    "rate with undecided trials has no value and is not compared; its interval holds whether all "
+    "of them collide or none (Manski 1989)"
 )

@@ -22,6 +22,7 @@ from analysis.stats.measures import (
     human_reference,
     known,
     no_human_value,
+    undecided_note,
 )
 from analysis.stats.mixed import MIN_PAIRS
 from analysis.tables.notes import one_sided_note, replayed_notes
@@ -182,7 +183,10 @@ def _collisions(study: Study, group: Group) -> str:
     humans = _alike(study.human, group)
     found, human = estimate(group, BOXES), estimate(humans, BOXES)
     if found.value is None:
-        return f"{group.driver}: of no trial is it decided whether boxes would have overlapped."
+        return (
+            f"{group.driver} is not compared with humans by its collisions: "
+            f"{undecided_note(group, BOXES)}."
+        )
     # By the humans' own collision rule for both: the paper's rule for drivers is another one.
     contrast = contrast_rates(counts(group, BOXES), counts(humans, BOXES))
     assert contrast.low is not None

@@ -20,7 +20,7 @@ from analysis.stats.contrasts import (
     within,
 )
 from analysis.stats.intervals import Difference
-from analysis.stats.measures import trials_of
+from analysis.stats.measures import trials_of, undecided
 
 Cell = tuple[str, ...]
 
@@ -90,9 +90,10 @@ def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) 
 def difference(study: Study, level: Level, first: Level, metric: Metric) -> Difference | None:
     """A level minus the first one, within the cells that both have.
 
-    None where these are of several studies, or share no cell; and for medians, which have no test.
+    None where these are of several studies, share no cell or have undecided trials; and for
+    medians, which have no test.
     """
-    if metric.estimator == "median" or not in_one_study(study, level.pooled, first.pooled):
+    if metric.estimator == "median" or not _comparable(study, metric, level, first):
         return None
     one, other = _by_cell(metric, level, first)
     if metric.rate:
@@ -103,7 +104,7 @@ def difference(study: Study, level: Level, first: Level, metric: Metric) -> Diff
 
 def difference_of_medians(study: Study, level: Level, first: Level, metric: Metric) -> float | None:
     """A level's median minus that of the first one, in the cells that both have."""
-    if not in_one_study(study, level.pooled, first.pooled):
+    if not _comparable(study, metric, level, first):
         return None
     one, other = (each[metric.column].median() for each in _in_shared_cells(metric, level, first))
     return None if isnan(one) or isnan(other) else float(one - other)
@@ -117,13 +118,18 @@ def interaction(
     It is taken in the cells that all four have; None as in ``difference``.
     """
     every = (*pair, *others)
-    if metric.estimator == "median" or not in_one_study(study, *(each.pooled for each in every)):
+    if metric.estimator == "median" or not _comparable(study, metric, *every):
         return None
     a, b, c, d = _in_shared_cells(metric, *every)
     if metric.rate:
         one, other = (shared_cells(*each, metric.column) for each in ((a, b), (c, d)))
         return interaction_of_rates(one, other) if one and other else None
     return interaction_of_means(within(a, b, metric.column), within(c, d, metric.column))
+
+
+def _comparable(study: Study, metric: Metric, *levels: Level) -> bool:
+    groups = [level.pooled for level in levels]
+    return in_one_study(study, *groups) and not any(undecided(group, metric) for group in groups)
 
 
 def _by_cell(metric: Metric, *levels: Level) -> list[pd.DataFrame]:

@@ -31,16 +31,25 @@ def counts(group: Group, metric: Metric) -> tuple[int, int]:
 
 
 def estimate(group: Group, metric: Metric) -> Estimate:
-    """The metric of a group with its 95 % interval, rates in percent."""
+    """The metric of a group with its 95 % interval, rates in percent.
+
+    Where trials end undecided a rate has no value, and the interval is that of both worst cases
+    (Manski 1989): from none of them to all of them.
+    """
     match metric.estimator:
         case "mean":
             return mean(values(group, metric).to_numpy(float))
         case "median":
             return median(values(group, metric).to_numpy(float))
-    found = proportion(*counts(group, metric))
-    if found.value is None or found.low is None or found.high is None:
-        return found
-    return Estimate(100 * found.value, 100 * found.low, 100 * found.high, found.n)
+    k, n = counts(group, metric)
+    cut_off = undecided(group, metric)
+    if not n + cut_off:
+        return Estimate(None, None, None, 0)
+    least, most = (proportion(k + more, n + cut_off) for more in (0, cut_off))
+    assert least.value is not None
+    assert least.low is not None
+    assert most.high is not None
+    return Estimate(None if cut_off else 100 * least.value, 100 * least.low, 100 * most.high, n)
 
 
 def median(sample: np.ndarray) -> Estimate:
@@ -61,15 +70,26 @@ def median(sample: np.ndarray) -> Estimate:
     return Estimate(value, float(ordered[k - 1]), float(ordered[n - k]), n)
 
 
-def undecided(group: Group, metric: Metric) -> str:
-    """How many trials are left out of a collision rate, since their traces leave it open."""
-    if not (metric.rate and metric.trials == "ended" and known(group, metric)):
+def undecided(group: Group, metric: Metric) -> int:
+    """How many trials another collision rule ended, so that they are not known to collide by it."""
+    if metric.value not in JUDGED or not known(group, metric):
+        return 0
+    trials = trials_of(group, metric)
+    return int((trials[metric.column].isna() & (trials["status"] != "failed")).sum())
+
+
+def undecided_note(group: Group, metric: Metric) -> str:
+    """What is known of a rate some of whose trials are undecided; empty where none is."""
+    cut_off = undecided(group, metric)
+    if not cut_off:
         return ""
-    ended = int((trials_of(group, metric)["status"] != "failed").sum())
-    left_open = ended - len(values(group, metric))
-    if not left_open:
-        return ""
-    return f"{metric.heading}: {left_open} of {ended} trials end undecided and are left out"
+    k, n = counts(group, metric)
+    every = n + cut_off
+    return (
+        f"{metric.heading}: {cut_off} of {every} trials are undecided, since another collision "
+        f"rule ended them; between {100 * k / every:.1f} and {100 * (k + cut_off) / every:.1f} %. "
+        'A study whose [scenario] has collision_rule = "rectangle" decides them'
+    )
 
 
 def known(group: Group, metric: Metric) -> bool:

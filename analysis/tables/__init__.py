@@ -36,7 +36,6 @@ TABLES = {
     "criticality": "conflicts",
     "speed-windows": "windows",
     "gap-definitions": "gaps",
-    "robustness": "robustness",
     "attempts": "attempts",
     "fallbacks": "fallbacks",
     "first-action": "first_action",

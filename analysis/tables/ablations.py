@@ -10,7 +10,7 @@ from analysis.stats.measures import (
     estimate_or_reference,
     no_human_value,
     outcomes_note,
-    undecided,
+    undecided_note,
 )
 from analysis.tables.indicators import (
     RULES,
@@ -164,9 +164,13 @@ def _quantitative_row(group: Group) -> Row:
             values[f"{metric.name}_ci"] = interval
         if isinstance(found, HumanReference):
             shipped.setdefault(found.source, []).append(metric)
-        elif found.value is None:
+        elif found.bounds() is None and found.value is None:
             missing.append(metric.heading)
-    remarks = [outcomes_note(group), *(undecided(group, metric) for metric in metrics), *absent]
+    remarks = [
+        outcomes_note(group),
+        *(undecided_note(group, metric) for metric in metrics),
+        *absent,
+    ]
     if missing:
         remarks.append(f"no trial with {', '.join(missing)}")
     remarks += [_shipped_note(found, source) for source, found in shipped.items()]

@@ -154,7 +154,7 @@ def _corrected(pairs: list[tuple[Group, Group]], metric: Metric, reference: str)
                 "n": _n(group, metric),
                 "n_reference": _n(other, metric),
             },
-            "; ".join(filter(None, (_note(group, other, metric), _powerless(contrast, metric)))),
+            "; ".join(filter(None, (_note(other, metric), _powerless(contrast, metric)))),
             counts=metric.counts,
             published=COLUMNS if metric.humans_from == "outcomes" else (),
         )
@@ -162,15 +162,14 @@ def _corrected(pairs: list[tuple[Group, Group]], metric: Metric, reference: str)
     ]
 
 
-def _note(group: Group, other: Group, metric: Metric) -> str:
-    named = {group.id: undecided(group, metric), other.id: undecided(other, metric)}
-    remarks = [f"{name}, {remark}" for name, remark in named.items() if remark]
-    if not known(other, metric):
-        remarks.append(_published_note(metric))
-    return "; ".join(filter(None, [*remarks, outcomes_note(other)]))
+def _note(other: Group, metric: Metric) -> str:
+    published = "" if known(other, metric) else _published_note(metric)
+    return "; ".join(filter(None, (published, outcomes_note(other))))
 
 
 def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
+    if undecided(group, metric) or undecided(other, metric):
+        return None
     frames = trials_of(group, metric), trials_of(other, metric)
     if not metric.rate:
         return contrast_means(*frames, metric.column)

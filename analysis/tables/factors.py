@@ -18,7 +18,7 @@ from analysis.stats.factors import (
     levels_by_factor,
 )
 from analysis.stats.intervals import Difference
-from analysis.stats.measures import estimate, undecided
+from analysis.stats.measures import estimate, undecided_note
 from analysis.tables.model import Column, Kind, Row, Table, Value
 from analysis.tables.notes import sample_notes
 from merge_runner.registry import require
@@ -34,8 +34,9 @@ INTERACTIONS = (
     "in the cells that all four have: of rates by Newcombe's intervals, p being the level at which "
     "they exclude 0; of means by Welch's t test"
 )
-
-NO_INTERACTION = "no interaction without cells that all four have, or without spread within cells"
+NO_INTERACTION = (
+    "no interaction without cells that all four have, spread within cells, or with undecided trials"
+)
 
 
 def factors(study: Study) -> Table:
@@ -122,12 +123,12 @@ def _row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
             cells |= {"difference": difference_of_medians(study, level, first, metric)}
         else:
             cells |= _difference(difference(study, level, first, metric), metric)
-    nothing = "" if found.n else f"{metric.heading}: no trial with this measure"
+    nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
     return Row(
         f"{level.id}/{metric.name}",
         level.groups,
         cells,
-        "; ".join(filter(None, (nothing, undecided(level.pooled, metric)))),
+        "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric)))),
         counts=metric.counts,
         references=() if level is first else first.groups,
     )

@@ -7,7 +7,7 @@ from analysis.metrics import GAP, LEFT_FIRST, RULES_NOTE, Metric, intervals_of, 
 from analysis.stats.group_scores import Fits, fits
 from analysis.stats.indicators import INDICATORS, PAPER, ROBUST, TESTED, Verdict, disagree, verdicts
 from analysis.stats.intervals import Estimate
-from analysis.stats.measures import estimate, undecided, values
+from analysis.stats.measures import estimate, undecided_note, values
 from analysis.tables.attempts import FALLBACK
 from analysis.tables.indicators import RULES
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
@@ -121,9 +121,9 @@ def _metric_row(group: Group, clean: Group, metric: Metric, why: str) -> Row:
         # No test: the two sides share trials, so they are not independent samples.
         cells["difference"] = without.value - found.value
     # A side that is empty because of ``why`` needs no second explanation.
-    missing = found.value is None or (without.value is None and not why)
+    missing = found.bounds() is None or (without.bounds() is None and not why)
     nothing = f"{metric.heading}: no trial with this measure" if missing else ""
-    remarks = (why, nothing, undecided(group, metric))
+    remarks = (why, nothing, undecided_note(group, metric))
     return row_of(group, cells, *remarks, item=metric.name, counts=metric.counts)
 
 

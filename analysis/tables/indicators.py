@@ -11,7 +11,7 @@ from analysis.stats.measures import (
     estimate_or_reference,
     no_human_value,
     outcomes_note,
-    undecided,
+    undecided_note,
 )
 from analysis.tables.model import Column, Row, Table, Value, row_of
 from analysis.tables.notes import ceiling_notes, intermittency_notes, no_ceiling, sample_notes
@@ -204,8 +204,8 @@ def _metric_row(group: Group, metric: Metric) -> Row:
     return row_of(
         group,
         values | {"n": found.n},
-        "" if found.value is not None else f"{metric.heading}: no trial has it",
-        undecided(group, metric),
+        "" if found.n or found.bounds() else f"{metric.heading}: no trial has it",
+        undecided_note(group, metric),
         outcomes_note(group),
         item=item,
         counts=metric.counts,

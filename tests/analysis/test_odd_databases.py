@@ -80,7 +80,7 @@ SAID = {
     "mirrored_chance": (
         [
             "constant merged first in all 104 trials: nothing to explain",
-            "collided, by boxes that overlap, in 53.0 % of 219 trials",
+            "116 of 220 trials are undecided, since another collision rule ended them",
         ],
         ["repeat an earlier one"],
     ),

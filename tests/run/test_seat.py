@@ -93,7 +93,7 @@ async def test_a_situation_is_driven_for_a_second_as_its_trial_begins(merge_runn
 @pytest.mark.slow
 async def test_the_trials_that_were_driven_are_shown_as_before(merge_runner, tmp_path):
     await merge_runner("sweep", "baseline", "--reps", 1, *TWO)
-    shown = ("tables", "ablation-quantitative", "robustness", "attempts", "--format", "csv")
+    shown = ("tables", "ablation-quantitative", "attempts", "--format", "csv")
     before = await merge_runner(*shown)
     await merge_runner("seat", "first", "--samples", 1)
     after = await merge_runner(*shown)

@@ -31,7 +31,6 @@ ABOUT = {
     "criticality": "times to merge and to collision, the hardest acceleration",
     "speed-windows": "RMSE and joint rate over other windows",
     "gap-definitions": "the gap and its regression by three definitions of the gap",
-    "robustness": "outcomes under other collision rules",
     "attempts": "what became of the calls",
     "fallbacks": "the measures with and without trials that had a fallback",
     "first-action": "the first action of every driver, by own relative velocity, beside humans",

@@ -167,7 +167,7 @@ def test_a_partial_import_has_both_numbers_of_trials_in_its_row(stored):
 def test_another_data_set_is_named_in_every_table_with_humans(stored):
     more = changed(published_trials(), "N_0_0", LEFT, CRASH, 8)
     study = Study(stored(more[::2]))
-    for table in make_tables(study, ["who-first", "ablation-quantitative", "robustness"]):
+    for table in make_tables(study, ["who-first", "ablation-quantitative"]):
         drivers = {row.values["driver"] for row in table.rows if row.groups == ("human",)}
         assert all("another data set, 495 trials" in driver for driver in drivers), table.name
         assert any("N_0_0 collided 6 instead of 5" in note for note in table.notes), table.name

@@ -107,7 +107,7 @@ def test_a_study_and_its_mirror_image_give_the_same_rows(played, tmp_path):
     one_way, other_way = (part(both.db, tmp_path, side) for side in ("left", "right"))
     assert len(load("FROM trials", both.db)) == 44
     assert pooled(one_way) == pooled(other_way)
-    tables = ("who-first", "gap", "ablation-quantitative", "robustness", "conflict-resolution")
+    tables = ("who-first", "gap", "ablation-quantitative", "conflict-resolution")
     assert values(one_way, *tables) == values(other_way, *tables) == values(both, *tables)
     assert [(group.id, group.seats, group.repeated) for group in both.models] == [
         ("goes+brakes/baseline", (11, 11), 11),

@@ -15,6 +15,7 @@ from analysis.stats.ceiling import Ceiling
 from analysis.stats.group_scores import Score, score
 from analysis.stats.indicators import TESTED
 from analysis.tables import make_tables
+from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
@@ -43,7 +44,10 @@ def test_a_difference_that_chance_seldom_makes_is_called_so(tmp_path):
         for name in ("N_0_0", "L_4_0")
         for rep in range(1, 4)
     ]
-    said, _ = texts(Study(write_study(tmp_path / "t.duckdb", drives)))
+    cut_off, _ = texts(Study(write_study(tmp_path / "cut_off.duckdb", drives)))
+    assert "o3 is not compared with humans by its collisions: coll. boxes (%): 4 of 6" in cut_off
+    boxes = ScenarioConfig(collision_rule="rectangle")
+    said, _ = texts(Study(write_study(tmp_path / "t.duckdb", drives, boxes)))
     assert "o3 collided, by boxes that overlap, in 100.0 % of 6 trials" in said
     assert "p < 0.001: a difference that chance alone seldom makes" in said
 

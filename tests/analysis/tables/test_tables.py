@@ -208,8 +208,8 @@ def test_the_gap_is_told_by_each_of_its_definitions(study, tables):
 
 
 def test_a_table_that_the_paper_has_not_says_so(tables):
-    assert not in_paper(tables["robustness"])
-    assert "no such table" in against(tables["robustness"], "paper").notes[-1]
+    assert not in_paper(tables["words"])
+    assert "no such table" in against(tables["words"], "paper").notes[-1]
 
 
 @pytest.mark.usefixtures("few_draws")
@@ -356,7 +356,6 @@ def test_every_cell_can_be_traced_to_its_trials_and_the_query_that_lists_them(st
         ("indicators", "o3/baseline/joint_percent", "n"),
         ("indicators", "o3/baseline/collided_percent", "n"),
         ("velocity-profiles", "o3/A2", "n"),
-        ("robustness", "o3/A2/rectangle", "n"),
         ("gap-definitions", "o3/A2/gap_mean100_m", "n"),
         ("attempts", "other/baseline", "trials"),
         ("attempts", "other/baseline", "failed"),
