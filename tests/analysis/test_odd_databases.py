@@ -80,7 +80,7 @@ SAID = {
     "mirrored_chance": (
         [
             "constant merged first in all 104 trials: nothing to explain",
-            "116 of 220 trials are undecided, since another collision rule ended them",
+            "95 of 220 trials are undecided, since another collision rule ended them",
         ],
         ["repeat an earlier one"],
     ),
