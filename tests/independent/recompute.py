@@ -28,6 +28,9 @@ METRICS = (
     ("min_ttc_s", "ttc", "median", False),
     ("max_acceleration_mps2", "hardest", "median", False),
 )
+# The paper's regression of the human gap, with its errors, of 962 trials.
+HUMAN_GAP = ((3.54, 0.146), (0.17, 0.034), (-0.20, 0.166), (0.06, 0.029))
+HUMAN_TRIALS = 962
 MARGIN_S = 1 / 0.8  # 1 m at the largest relative velocity, 0.8 m/s
 MOST_INVALID = 0.2
 
@@ -50,6 +53,8 @@ def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
         "who-first": _by_term(who, WHO_FIRST, _who_first) | _mixed(recorded, "who-first"),
         "gap": _by_term(humans | baselines, GAP, _gap) | _mixed(recorded, "gap"),
         "ablation-quantitative": {_id(k): _quantities(v) for k, v in (humans | judged).items()},
+        "indicators": _indicators(who),
+        "differences": _differences(recorded, baselines),
         "contrasts": _prompts(judged, trials.attrs["orders"]),
         "factors": _factors(judged, trials.attrs["orders"]),
     }
@@ -192,6 +197,79 @@ def _compared(one: pd.DataFrame, other: pd.DataFrame, column: str, kind: str) ->
     values = [_values(trials, column, kind) for trials in frames]
     test = statistics.rates_within if kind == "rate" else statistics.means_within
     return test(*values, tuple(trials["cell"] for trials in frames))
+
+
+def _indicators(groups) -> dict[str, dict]:
+    """Table V: I1 to I4 by the paper's rule and by the robust one, and the measures."""
+    rows: dict[str, dict] = {}
+    for key, trials in groups.items():
+        _, headway, velocity = _who_first(trials)
+        verdicts = {
+            "I1": (headway, *_both(headway, ("p", "firth_p"), ("b", "firth_b"), 1)),
+            "I2": (velocity, *_both(velocity, ("p", "firth_p"), ("b", "firth_b"), -1)),
+        }
+        if "gap" in trials:
+            _, slope, level, _ = _gap(trials)
+            p, equivalence = level["p"], level["equivalence_p"]
+            verdicts["I3"] = (slope, *_both(slope, ("p", "hc3_p"), ("b", "b"), 1))
+            verdicts["I4"] = (
+                level,
+                None if p is None else p >= 0.05,
+                None if equivalence is None else equivalence < 0.05,
+            )
+        for name, (fit, paper, robust) in verdicts.items():
+            rows[f"{_id(key)}/{name}"] = {"paper": paper, "robust": robust, "n": fit["n"]}
+        for name, column, kind, shown in METRICS:
+            if shown and "gap" in trials:
+                value, low, high, n = _estimate(trials, column, kind)
+                row = {"value": value, "interval_low": low, "interval_high": high, "n": n}
+                rows[f"{_id(key)}/{name}"] = row
+    return rows
+
+
+def _both(row: dict, p: tuple, b: tuple, sign: int) -> tuple[bool | None, bool | None]:
+    """Whether an effect of this sign is significant, by either test; None without a fit."""
+    return tuple(
+        None if row[one] is None else bool(sign * row[other] > 0 and row[one] < 0.05)
+        for one, other in zip(p, b, strict=True)
+    )
+
+
+def _differences(recorded: pd.DataFrame, baselines) -> dict[str, dict]:
+    """Every baseline less the humans, term by term of one model of both."""
+    if recorded.empty:
+        who = statistics.logit(*who_first_data(measured.published_humans())[:2])[:, :2]
+        gap, freedom = np.array(HUMAN_GAP), (np.inf, HUMAN_TRIALS - len(GAP))
+        sizes = HUMAN_TRIALS, HUMAN_TRIALS
+    else:
+        found = [who_first_data(recorded), gap_data(recorded)]
+        fits = (statistics.logit, lambda x, y: statistics.least_squares(x, y)[0])
+        who, gap = (
+            statistics.by_pairs(fit, x, y, used["pair"].to_numpy())
+            for fit, (x, y, used) in zip(fits, found, strict=True)
+        )
+        sizes = [len(y) for _, y, _ in found]
+        freedom = [used["pair"].nunique() - 1 for _, _, used in found]
+    rows = {}
+    for key, trials in baselines.items():
+        x, y, _ = who_first_data(trials)
+        u, v, _ = gap_data(trials)
+        sides = (
+            ("who-first", WHO_FIRST, statistics.logit(x, y), np.inf, len(y), who),
+            ("gap", GAP, statistics.least_squares(u, v)[1], len(v) - 4, len(v), gap),
+        )
+        for k, (outcome, terms, own, own_freedom, n, human) in enumerate(sides):
+            for i, term in enumerate(terms):
+                row = {"n": n, "n_human": sizes[k]}
+                if own is None or human is None:
+                    row |= dict.fromkeys(("b_driver", "b_human", "difference", "ci_low", "p"))
+                else:
+                    row |= {"b_driver": own[i, 0], "b_human": human[i, 0]}
+                    row |= statistics.difference(
+                        (*own[i, :2], own_freedom), (*human[i, :2], freedom[k])
+                    )
+                rows[f"{_id(key)}/{outcome}/{term}"] = row
+    return rows
 
 
 def _prompts(groups, orders) -> dict[str, dict]:

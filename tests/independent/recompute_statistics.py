@@ -167,6 +167,32 @@ def mixed_logit(x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray:
     return _wald(best[:-1], np.sqrt(np.diag(np.linalg.inv(np.array(second))))[:-1])
 
 
+def by_pairs(fit, x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray | None:
+    """Coefficients of humans with the errors of a jackknife over their pairs (CV3): (b, se)."""
+    parts = [fit(x[pair != name], y[pair != name]) for name in np.unique(pair)]
+    whole = fit(x, y)
+    if whole is None or any(part is None for part in parts):
+        return None
+    moved = sum((part[:, 0] - whole[:, 0]) ** 2 for part in parts)
+    return np.column_stack([whole[:, 0], np.sqrt(moved * (len(parts) - 1) / len(parts))])
+
+
+def difference(one: tuple, other: tuple) -> dict:
+    """Of two estimates (b, se, freedom), by t with Satterthwaite's freedom (1946)."""
+    value, se = one[0] - other[0], np.hypot(one[1], other[1])
+    spread = sum(part[1] ** 4 / part[2] for part in (one, other))
+    freedom = se**4 / spread if spread else np.inf
+    t = stats.t(freedom)
+    return {
+        "difference": value,
+        "ci_low": value - t.ppf(0.975) * se,
+        "ci_high": value + t.ppf(0.975) * se,
+        "p": 2 * t.sf(abs(value) / se),
+        "freedom": freedom if np.isfinite(freedom) else None,
+        "detectable": (t.ppf(0.975) + t.ppf(0.8)) * se,
+    }
+
+
 def wilson(rate: float, n: float) -> tuple[float, float]:
     """The score interval of a rate of ``n`` trials (Wilson 1927)."""
     middle = (rate + Z**2 / (2 * n)) / (1 + Z**2 / n)
