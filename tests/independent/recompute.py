@@ -162,14 +162,26 @@ def _values(trials: pd.DataFrame, column: str, kind: str) -> pd.Series:
 def _estimate(trials: pd.DataFrame, column: str, kind: str) -> tuple:
     """Value, ends of its interval, n."""
     values = _values(trials, column, kind).to_numpy()
-    if not len(values):
+    cut_off = _undecided(trials, column)
+    if not len(values) + cut_off:
         return None, None, None, 0
     if kind == "rate":
-        low, high = statistics.wilson(values.mean(), len(values))
-        return 100 * values.mean(), 100 * low, 100 * high, len(values)
+        # Both worst cases, where trials are undecided (Manski 1989).
+        k, every = values.sum(), len(values) + cut_off
+        low = statistics.wilson(k / every, every)[0]
+        high = statistics.wilson((k + cut_off) / every, every)[1]
+        value = None if cut_off else 100 * k / every
+        return value, 100 * low, 100 * high, len(values)
     if kind == "mean":
         return values.mean(), *statistics.mean_interval(values), len(values)
     return np.median(values), *statistics.median_interval(values), len(values)
+
+
+def _undecided(trials: pd.DataFrame, column: str) -> int:
+    """How many trials another collision rule ended, so that this one did not see what follows."""
+    if column not in ("collided", "boxes"):
+        return 0
+    return int((trials[column].isna() & (trials["status"] != "failed")).sum())
 
 
 def _quantities(trials: pd.DataFrame) -> dict:
@@ -193,6 +205,8 @@ def _together(orders, *groups: pd.DataFrame) -> bool:
 
 
 def _compared(one: pd.DataFrame, other: pd.DataFrame, column: str, kind: str) -> dict:
+    if _undecided(one, column) or _undecided(other, column):
+        return {}
     frames = [trials[trials[column].notna()] for trials in (one, other)]
     values = [_values(trials, column, kind) for trials in frames]
     test = statistics.rates_within if kind == "rate" else statistics.means_within

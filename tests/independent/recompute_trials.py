@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 LENGTH, WIDTH = 4.5, 1.8
-MERGE, END = 100.0, 150.0
+MERGE = 100.0
 # Each branch leaves the centre line by 12.5 m in its 100 m.
 SINE = 12.5 / 100
 COSINE = np.sqrt(1 - SINE**2)
@@ -55,8 +55,7 @@ def read(db: str, study: str = "") -> pd.DataFrame:
         specs = dict(connection.sql("SELECT spec_hash, spec::TEXT FROM specs").fetchall())
         states = connection.sql("FROM states ORDER BY trial_id, spec_hash, side, step").df()
         decisions = connection.sql(
-            "SELECT trial_id, spec_hash, side, time_s, plan, applied, valid, call_key IS NOT NULL "
-            "AS asked FROM decisions ORDER BY trial_id, spec_hash, side, decision"
+            "SELECT trial_id, spec_hash, side, valid, call_key IS NOT NULL AS asked FROM decisions"
         ).df()
         factors = connection.sql("FROM trial_factors").df()
         played = connection.sql(
@@ -90,7 +89,7 @@ def read(db: str, study: str = "") -> pd.DataFrame:
         sign = -1 if row["ego"] == "right" else 1
         row |= {"h": sign * trial.projected_headway_m, "dv": sign * trial.relative_velocity_mps}
         if key in samples and trial.status != "failed":
-            row |= _measured(trial, row["ego"], samples[key], own)
+            row |= _measured(trial, row["ego"], samples[key])
         found.append(row)
     every = _with_cells(pd.DataFrame(found))
     every.attrs["orders"] = orders
@@ -154,9 +153,9 @@ def _passed(t: np.ndarray, s: np.ndarray, level: float) -> float:
     return t[k] + (t[k + 1] - t[k]) * (level - s[k]) / (s[k + 1] - s[k])
 
 
-def _measured(trial, ego: str, at: dict, own: pd.DataFrame) -> dict:
+def _measured(trial, ego: str, at: dict) -> dict:
     t, s, v = at["t"], at["s"], at["v"]
-    boxes = _boxes(trial, at, own)
+    boxes = _boxes(trial, at)
     near = [_apart(x, y) < LENGTH for x, y in zip(s["left"], s["right"], strict=True)]
     looks = np.isclose(t / 0.2, np.round(t / 0.2), atol=1e-6) if trial.source == "human" else True
     collided = bool((np.array(near) & looks).any())
@@ -235,8 +234,8 @@ def _moved(s: float, v: float, a: float, dt: float) -> tuple[float, float]:
     return s - v**2 / (2 * a), 0.0
 
 
-def _boxes(trial, at: dict, own: pd.DataFrame) -> bool | None:
-    """Whether boxes overlapped at 20 Hz; None where the plans end before that is decided."""
+def _boxes(trial, at: dict) -> bool | None:
+    """Whether boxes overlapped at 20 Hz; None where another rule ended the trial before."""
     if trial.source == "human":
         return trial.status == "collided"
     t, s, v = at["t"], at["s"], at["v"]
@@ -252,29 +251,4 @@ def _boxes(trial, at: dict, own: pd.DataFrame) -> bool | None:
             places = [_moved(s[x][k], v[x][k], a[x], dt * look / looks)[0] for x in SIDES]
             if overlap(*places):
                 return True
-    if trial.status != "collided":
-        return False
-    return _driven_on(t[-1], {side: (s[side][-1], v[side][-1]) for side in SIDES}, own)
-
-
-def _driven_on(now: float, vehicles: dict, own: pd.DataFrame) -> bool | None:
-    """Whether boxes overlap if both go on by their stored plans from ``now``."""
-    actions = {}
-    for side, rows in own.groupby("side"):
-        last, times = rows.iloc[-1], rows["time_s"].to_numpy(float)
-        period = np.diff(times)[-1] if len(times) > 1 else 1.0
-        plan = last["plan"] if isinstance(last["plan"], np.ndarray | list) else []
-        queue = [*last["applied"], *plan[len(last["applied"]) :]]
-        actions[side] = (times[-1], period / len(last["applied"]), queue)
-    while now < 30 - 1e-6:
-        for side, (begin, lasting, queue) in actions.items():
-            k = int((now - begin) / lasting + 1e-6)
-            if k >= len(queue):
-                return None
-            vehicles[side] = _moved(*vehicles[side], 2.5 * queue[k], 0.05)
-        now += 0.05
-        if overlap(vehicles["left"][0], vehicles["right"][0]):
-            return True
-        if max(s for s, _ in vehicles.values()) >= END:
-            return False
-    return False
+    return None if trial.status == "collided" else False

@@ -118,6 +118,23 @@ def _equal(said: str, value, column: str) -> bool:
     return math.isclose(float(said), float(value), rel_tol=tolerance, abs_tol=1e-9)
 
 
+def test_a_number_that_differs_or_is_in_one_alone_is_told():
+    own = {"gap": {"a/baseline/x": {"n": 3, "se": 0.5, "hc3_se": None}, "b/baseline/x": {}}}
+    same = {"n": "3", "se": "0.50000001", "hc3_se": ""}
+    for said, expected in [
+        (same, []),
+        (same | {"se": "0.5002"}, ["gap a/baseline/x se: 0.5002, and 0.5 recomputed"]),
+        (same | {"hc3_se": "1"}, ["gap a/baseline/x hc3_se: 1, and None recomputed"]),
+    ]:
+        program = {"gap": {"a/baseline/x": said, "b/baseline/x": dict.fromkeys(same, "")}}
+        assert [*disagreements(program, own, imported=False)] == expected
+    program["gap"] |= {"a/baseline/x": same, "b/baseline/x": same, "c": same}
+    assert [*disagreements(program, own, imported=False)] == [
+        "gap c: in one alone",
+        "gap b/baseline/x: judged, and not by the recomputation",
+    ]
+
+
 @pytest.fixture(params=[*RECORDINGS, *KINDS])
 def database(request, tmp_path):
     if request.param in KINDS:
