@@ -17,6 +17,8 @@ digits of a simulation from ruling.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -24,6 +26,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SAMPLE_S = 0.2
+CLOCK_SAMPLES = 5  # 1 s: the clock of the paper's drivers
+RANDOM_DRIVES, RANDOM_SECONDS, RANDOM_SEED = 1000, 10, 260409609
+HIGHEST_MPS2 = 2.5
 TOLERANCE = 0.04
 LINE_COEFFICIENTS, CUBIC_COEFFICIENTS = 2, 4
 LINE_SAMPLES, CUBIC_SAMPLES = 3, 5  # one more than coefficients; 3 are 0.6 s
@@ -37,22 +42,35 @@ KEY = ["trial_id", "spec_hash", "side"]
 def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
     """Measure vehicles: rows with KEY, lists time_s and velocity_mps, and whether ``resisted``.
 
-    Adds to KEY: ``steady``, no control action, the speed stays within STEADY_MPS of its mean; and
-    ``gain``, NaN where the vehicle was steady or under control for less than 2 s.
+    Adds to KEY: ``steady``, no control action, the speed or what it would be without resistance
+    stays within STEADY_MPS of its mean; ``gain``; and ``clocked_gain``, that of ``clocked`` speeds.
+    Both gains are NaN where the vehicle was steady or under control for less than 2 s.
     """
     sampled: dict[int, list[tuple[int, Array]]] = {}
-    steady, gain = np.zeros(len(speeds), bool), np.full(len(speeds), np.nan)
+    steady = np.zeros(len(speeds), bool)
+    gain, clocked_gain = np.full((2, len(speeds)), np.nan)
     columns = (speeds[name] for name in ("time_s", "velocity_mps", "resisted"))
     for row, (time_s, velocity_mps, resisted) in enumerate(zip(*columns, strict=True)):
         time, v = np.asarray(time_s, dtype=float), np.asarray(velocity_mps, dtype=float)
-        steady[row] = len(v) > 0 and np.abs(v - v.mean()).max() <= STEADY_MPS
-        at = at_5_hz(time, without_resistance(time, v) if resisted else v)
+        driven = without_resistance(time, v) if resisted else v
+        steady[row] = _is_steady(v) or _is_steady(driven)
+        at = at_5_hz(time - time[:1], driven)
         if not steady[row] and len(at) >= SHORTEST_SAMPLES:
             sampled.setdefault(len(at), []).append((row, at))
     for alike in sampled.values():
         rows, profiles = zip(*alike, strict=True)
-        gain[list(rows)] = gains(np.stack(profiles))
-    return speeds[KEY].reset_index(drop=True).assign(steady=steady, gain=gain)
+        at = np.stack(profiles)
+        gain[list(rows)], clocked_gain[list(rows)] = gains(at), gains(clocked(at))
+    return (
+        speeds[KEY]
+        .reset_index(drop=True)
+        .assign(steady=steady, gain=gain, clocked_gain=clocked_gain)
+    )
+
+
+def _is_steady(velocity_mps: Array) -> bool:
+    v = velocity_mps
+    return len(v) > 0 and bool(np.abs(v - v.mean()).max() <= STEADY_MPS)
 
 
 def at_5_hz(time_s: Array, velocity_mps: Array) -> Array:
@@ -64,10 +82,33 @@ def at_5_hz(time_s: Array, velocity_mps: Array) -> Array:
 def without_resistance(time_s: Array, velocity_mps: Array) -> Array:
     """The speeds had the human simulator not slowed the vehicle, by 0.5 + 0.005 v^2 in m/s^2.
 
-    A pedal that is held gives a straight line here, and an exponential there.
+    A pedal that is held gives a straight line here, and an exponential there. A vehicle that stands
+    is slowed by nothing.
     """
-    lost = (0.5 + 0.005 * velocity_mps[:-1] ** 2) * np.diff(time_s)
+    moves = velocity_mps[1:] > 0
+    lost = moves * (0.5 + 0.005 * velocity_mps[:-1] ** 2) * np.diff(time_s)
     return np.asarray(velocity_mps + np.concatenate([[0.0], np.cumsum(lost)]))
+
+
+def clocked(velocity_mps: Array) -> Array:
+    """Speeds at 5 Hz, (vehicles, samples), with one acceleration from each full second to the next.
+
+    So drives whoever decides once a second and holds its acceleration, whatever it decides.
+    """
+    n = velocity_mps.shape[1]
+    at = np.arange(n)
+    knots = np.union1d(at[::CLOCK_SAMPLES], at[-1:])
+    return np.stack([np.interp(at, knots, v[knots]) for v in velocity_mps])
+
+
+@cache
+def random_gain() -> float:
+    """The mean gain of drives at random: each second an acceleration is drawn anew, and held."""
+    rng = np.random.default_rng(RANDOM_SEED)
+    drawn = rng.uniform(-HIGHEST_MPS2, HIGHEST_MPS2, (RANDOM_DRIVES, RANDOM_SECONDS))
+    steps = np.repeat(drawn, CLOCK_SAMPLES, axis=1) * SAMPLE_S
+    start = np.zeros((RANDOM_DRIVES, 1))
+    return float(gains(np.hstack([start, np.cumsum(steps, axis=1)])).mean())
 
 
 def gains(velocity_mps: Array) -> Array:

@@ -92,7 +92,8 @@ FROM states JOIN trial_drivers USING (trial_id, spec_hash)
 SEMI JOIN (FROM trials WHERE status = 'finished') USING (trial_id, spec_hash)
 WHERE time_s >= 0 AND side = ego GROUP BY ALL ORDER BY ALL
 """
-# One row a vehicle: its speeds under control, and whether the simulator slowed it by itself.
+# One row a vehicle: its speeds under control, and whether the simulator slowed it by itself. It
+# cruises until its first decision; those of humans are not on record.
 SPEEDS = """
 SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
     list(velocity_mps ORDER BY step) AS velocity_mps,
@@ -101,7 +102,10 @@ FROM states JOIN (
     SELECT spec_hash,
         coalesce(spec->>'$.source', spec->>'$.scenario.resistance', '') = 'human'
         AS resisted FROM specs
-) USING (spec_hash) WHERE time_s >= 0 GROUP BY ALL ORDER BY ALL
+) USING (spec_hash) LEFT JOIN (
+    SELECT trial_id, spec_hash, side, min(time_s) AS first_s FROM decisions GROUP BY ALL
+) USING (trial_id, spec_hash, side)
+WHERE time_s >= greatest(0, coalesce(first_s, 0)) GROUP BY ALL ORDER BY ALL
 """
 _ODD_STATUS = f"""
 SELECT trial_id, coalesce(status, 'NULL') AS status FROM trials

@@ -14,8 +14,17 @@ from analysis.report.alarms import mismatch
 from analysis.report.first_look import first_look
 from analysis.report.unlike import unlike
 from analysis.stats.contrasts import contrast_rates
-from analysis.stats.group_scores import Score, score, unjudged
-from analysis.stats.indicators import ALPHA, INDICATORS, Verdict
+from analysis.stats.group_scores import Score, fits, score, unjudged
+from analysis.stats.indicators import (
+    ALPHA,
+    GAP_MARGIN_M,
+    INDICATORS,
+    TESTED,
+    Verdict,
+    furthest_apart,
+)
+from analysis.stats.intervals import interval
+from analysis.stats.likeness import difference, held, mean_gain
 from analysis.stats.measures import (
     counts,
     estimate,
@@ -25,6 +34,7 @@ from analysis.stats.measures import (
     undecided_note,
 )
 from analysis.stats.mixed import MIN_PAIRS
+from analysis.stats.regressions import Regression
 from analysis.tables.notes import one_sided_note, replayed_notes
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
@@ -35,7 +45,7 @@ NAMES = {
     "I2": "going first becomes less likely with a relative velocity advantage",
     "I3": "the gap grows with the projected headway",
     "I4": "the gap does not depend on the relative velocity",
-    "I5": "accelerations are held and jump as the humans' do",
+    "I5": "the acceleration is piecewise constant",
 }
 # That a driver lacks an indicator is strong evidence against it where at least the first share of
 # human data sets of the study's size show this indicator, weak where fewer than the second do, and
@@ -123,7 +133,7 @@ def _shown(study: Study, group: Group) -> list[str]:
 def _marks(study: Study, group: Group) -> list[str]:
     """Which indicators hold, which do not, and how strong the evidence of a missing one is."""
     found = score(study, group)
-    both = {name: (found.paper[name].passed, found.robust[name].passed) for name in INDICATORS}
+    both = {name: (found.paper[name].passed, found.robust[name].passed) for name in TESTED}
     agreed = [NAMES[name] for name, verdicts in both.items() if verdicts == (True, True)]
     # Passed is None where a rule cannot judge: that is no failure, and the other rule decides.
     failed = [name for name, verdicts in both.items() if False in verdicts and True not in verdicts]
@@ -140,7 +150,53 @@ def _marks(study: Study, group: Group) -> list[str]:
     ]
     if mixed:
         texts.append(f"{group.driver}, by one rule alone: {_listed(mixed)}.")
+    if found.robust["I4"].passed is not None:
+        texts.append(_velocity(group, fits(group).hc3))
+    if found.robust["I5"].passed is not None:
+        texts.append(_intermittency(study, group, found.robust["I5"]))
     return texts
+
+
+def _velocity(group: Group, fit: Regression) -> str:
+    """How far relative velocity alone moves the gap at most, which the robust test of I4 judges."""
+    pair = furthest_apart(fit)
+    headway, more, less = pair
+    term = fit.apart[pair]
+    low, high = interval(term.b, term.se, fit.freedom, 1 - 2 * ALPHA)
+    joint = "" if fit.velocity_p is None else f"; all terms with it jointly: p {_p(fit.velocity_p)}"
+    verdict = (
+        f"it is less than {GAP_MARGIN_M:g} m, as of all of them"
+        if max(-low, high) < GAP_MARGIN_M
+        else f"a difference of {GAP_MARGIN_M:g} m is shown"
+        if max(low, -high) > GAP_MARGIN_M
+        else f"a difference of {GAP_MARGIN_M:g} m is not excluded"
+    )
+    return (
+        f"{group.driver}: at {headway:g} m of projected headway its gap changes, by the "
+        f"regression, by {term.b:+.2f} m from a relative velocity of {less:g} to one of {more:g} "
+        f"m/s (90 % CI {low:+.2f} to {high:+.2f}{joint}). Of the conditions that differ in "
+        f"relative velocity alone these two decide: {verdict}."
+    )
+
+
+def _intermittency(study: Study, group: Group, verdict: Verdict) -> str:
+    """I5 in numbers: what it says of this driver, of its clock, and beside the humans."""
+    found, share = mean_gain(study, group), held(study, group)
+    clock, beside = mean_gain(study, group, "clocked_gain"), difference(study, group)
+    assert share.value is not None
+    humans = ""
+    if beside is not None and beside.value is not None:
+        bounds = beside.bounds()
+        ends = f" (95 % CI {bounds[0]:+.2f} to {bounds[1]:+.2f})" if bounds else ""
+        humans = f" Its mean gain is {beside.value:+.2f} human SD from that of the humans{ends}."
+    return (
+        f"{group.driver}: {NAMES['I5']} rather than moving in {100 * share.value:.0f} % of "
+        f"{_trials(share.n)} with control action; mean gain {found.value:.2f} (95 % CI "
+        f"{found.low:.2f} to {found.high:.2f}), so that this is "
+        f"{'shown' if verdict.passed else 'not shown'}. With one acceleration from each full "
+        "second to the next, as any driver has that decides once a second and holds, the same "
+        f"speeds have a mean gain of {clock.value:.2f}.{humans}"
+    )
 
 
 def _weight(group: Group, found: Score, name: str) -> str:
@@ -264,12 +320,6 @@ def _limits(study: Study, group: Group) -> list[str]:
             f"({sum(group.sizes)} in all), {100 * found.ceiling.paper['I1-I4']:.0f} % pass I1 to "
             f"I4 together by the paper's tests, {100 * found.ceiling.robust['I1-I4']:.0f} % by the "
             "robust ones; one that a test cannot judge does not pass."
-        )
-    # The paper's rule passes I4 on a large p, which too few trials give as well as no effect does.
-    if found.paper["I4"].passed and found.robust["I4"].passed is False:
-        texts.append(
-            f"{group.driver}: that the gap does not depend on relative velocity is not shown; the "
-            "effect is not significant, but one of 1 m is not excluded either."
         )
     if group.one_sided:
         texts.append(f"{group.driver}: {one_sided_note(group)}.")

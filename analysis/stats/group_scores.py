@@ -12,14 +12,12 @@ from analysis.data.reference_data import published
 from analysis.data.study import Group, Study
 from analysis.stats.ceiling import Ceiling, Population, ceiling, imported_humans, published_humans
 from analysis.stats.indicators import INDICATORS, PAPER, ROBUST, Verdict, verdicts
-from analysis.stats.likeness import likeness
+from analysis.stats.likeness import piecewise_constant
 from analysis.stats.regressions import Regression, gap_ols, who_first_firth, who_first_logit
 
 PUBLISHED = "as published, no human traces are imported"
 BY_EYE = "by eye, the paper"
-NO_RULE = "the paper judged by eye"
 PAPER_RULE, ROBUST_RULE = "by the paper's test", "by the robust tests"
-REFERENCE = "the humans are the reference"
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +105,9 @@ def score(study: Study, group: Group) -> Score:
         robust["I5"] = Verdict(None, BY_EYE)
     elif group.caution:
         paper = robust = dict.fromkeys(INDICATORS, Verdict(None, group.caution))
-    elif group is study.human:
-        paper["I5"] = robust["I5"] = Verdict(None, REFERENCE)
     else:
-        paper["I5"], robust["I5"] = Verdict(None, NO_RULE), likeness(study, group)
+        # The paper judged by eye: there is no rule to apply, whatever is driven.
+        paper["I5"], robust["I5"] = Verdict(None), piecewise_constant(study, group)
     return Score(paper, robust, population(study), group.sizes)
 
 

@@ -99,9 +99,11 @@ def standard_error(sample: NDArray[np.float64]) -> float:
     return float(sample.std(ddof=1) / sqrt(len(sample)))
 
 
-def interval(value: float, se: float, freedom: float = inf) -> tuple[float, float]:
-    """The 95 % interval of an estimate with this standard error."""
-    half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * se
+def interval(
+    value: float, se: float, freedom: float = inf, level: float = LEVEL
+) -> tuple[float, float]:
+    """The interval of an estimate with this standard error, of 95 % unless told."""
+    half = float(stats.t.ppf((1 + level) / 2, freedom)) * se
     return value - half, value + half
 
 

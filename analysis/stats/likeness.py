@@ -1,9 +1,9 @@
-"""Are a driver's speeds as intermittent as the humans'? Indicator I5, in human standard deviations.
+"""Is the acceleration piecewise constant, and as much as the humans'? Indicator I5.
 
-A trial counts once, with the mean gain (see ``intermittency``) of its vehicles that acted. The
-difference from the humans is taken within conditions, as another mix of conditions is none. A
-driver is like the humans where the whole 95 % interval lies within the margin, and unlike them
-where all of it lies beyond (an equivalence test; Schuirmann 1987): otherwise nothing is shown.
+A trial counts once, with the mean gain (see ``intermittency``) of its vehicles that acted. The test
+is one-sided: I5 holds where the whole 95 % interval of the mean gain lies above 0. How like the
+humans a driver is in it is a number beside that, in human standard deviations, which decides
+nothing. That difference is taken within conditions, as another mix of conditions is none.
 """
 
 from __future__ import annotations
@@ -15,35 +15,49 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from analysis.data.study import ENOUGH_PER_CONDITION, Group, Study
+from analysis.data.study import Group, Study
 from analysis.stats import intervals
 from analysis.stats.indicators import Verdict
-from analysis.stats.intervals import Estimate, finite, mean, standard_error
+from analysis.stats.intervals import Estimate, finite, mean, proportion, standard_error
 
 Array = NDArray[np.float64]
 
-# Half a standard deviation is a medium effect (Cohen 1988): the distributions overlap by 80 %.
-MARGIN_SD = 0.5
 NO_ACTION = "no finished trial with control action"
 
 
 @cache
 def gains(study: Study, group: Group) -> pd.DataFrame:
-    """One row a finished trial: condition, pair, ``steady`` (nobody acted), ``gain`` or NaN."""
+    """One row a finished trial: condition, pair, ``steady`` (nobody acted), and its two gains.
+
+    ``gain`` and ``clocked_gain`` are NaN where no vehicle has them.
+    """
     trials = group.finished[["trial_id", "condition", "pair"]]
     by_trial = study.profiles_of(group).groupby("trial_id")
-    found = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
+    found = by_trial.agg(
+        steady=("steady", "all"), gain=("gain", "mean"), clocked_gain=("clocked_gain", "mean")
+    )
     return trials.merge(found, left_on="trial_id", right_index=True)
 
 
-def mean_gain(study: Study, group: Group) -> Estimate:
+def mean_gain(study: Study, group: Group, column: str = "gain") -> Estimate:
     """The mean gain of a group's trials; that of humans over the means of their pairs."""
-    trials = gains(study, group).dropna(subset="gain")
-    return replace(mean(_independent(trials, "gain")), n=len(trials))
+    trials = gains(study, group).dropna(subset=column)
+    return replace(mean(_independent(trials, column)), n=len(trials))
 
 
-def difference(study: Study, group: Group) -> Estimate:
-    """The mean gain less that of humans in the same conditions, in human standard deviations."""
+def held(study: Study, group: Group) -> Estimate:
+    """The share of trials with control action whose gain is above 0."""
+    found = gains(study, group)["gain"].dropna()
+    return proportion(int((found > 0).sum()), len(found))
+
+
+def difference(study: Study, group: Group) -> Estimate | None:
+    """The mean gain less that of humans in the same conditions, in human standard deviations.
+
+    None for the humans, and without a spread of human trials in every condition.
+    """
+    if group is study.human or not study.calibrated:
+        return None
     return compared(gains(study, group), gains(study, study.human))
 
 
@@ -80,29 +94,11 @@ def _independent(trials: pd.DataFrame, column: str) -> Array:
     return np.asarray(units[column].mean(), dtype=float)
 
 
-def likeness(study: Study, group: Group) -> Verdict:
-    """I5 of a driver: whether its accelerations are held as humans hold theirs."""
-    if gains(study, group)["gain"].isna().all():
+def piecewise_constant(study: Study, group: Group) -> Verdict:
+    """I5: whether the accelerations of a group are held and jump, rather than move."""
+    found = mean_gain(study, group)
+    if not found.n:
         return Verdict(None, NO_ACTION)
-    if not study.human.measured:
-        return Verdict(None, "no human traces to compare with: the number alone")
-    if not study.calibrated:
-        return Verdict(
-            None,
-            f"fewer than {ENOUGH_PER_CONDITION} human traces in a condition: the number alone",
-        )
-    return judged(difference(study, group))
-
-
-def judged(found: Estimate) -> Verdict:
-    """Whether a difference in human standard deviations lies within the margin."""
-    if found.value is None and found.n:
-        return Verdict(None, "human trials of a condition are alike: no spread to compare by")
-    if found.low is None or found.high is None:
-        return Verdict(None, "too few trials or human pairs to compare")
-    if found.low > -MARGIN_SD and found.high < MARGIN_SD:
-        return Verdict(True)
-    if found.low > MARGIN_SD or found.high < -MARGIN_SD:
-        return Verdict(False)
-    interval = f"{found.low:.2f} to {found.high:.2f} SD"
-    return Verdict(None, f"{interval} from the humans, which settles nothing")
+    if found.low is None:
+        return Verdict(None, "a single trial, or a single human pair, with control action")
+    return Verdict(found.low > 0)

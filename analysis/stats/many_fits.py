@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import expit
 
-from analysis.stats.indicators import Criterion
-from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, gap_design
+from analysis.stats.indicators import APART, Criterion
+from analysis.stats.regressions import (
+    GAP_TERMS,
+    WHO_FIRST_TERMS,
+    gap_design,
+    velocity_contrasts,
+)
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 Array = NDArray[np.float64]
@@ -36,6 +41,18 @@ NORMAL = np.array(np.inf)
 
 
 @dataclass(frozen=True, eq=False)
+class Apart:
+    """``Regression.apart`` of each data set: arrays of shape (sets, differences).
+
+    ``played`` is False where a data set lacks one of the two conditions.
+    """
+
+    b: Array
+    se: Array
+    played: Holds
+
+
+@dataclass(frozen=True, eq=False)
 class Fits:
     """One regression of each data set: arrays of shape (sets, terms).
 
@@ -49,9 +66,15 @@ class Fits:
     p: Array
     freedom: Array
     sound: Holds
+    apart: Apart | None = None
 
     def passes(self, criterion: Criterion) -> Holds:
         """In which data sets an indicator holds; where there is no fit it fails."""
+        if criterion.term == APART:
+            assert self.apart is not None
+            b, se, played = self.apart.b, self.apart.se, self.apart.played
+            each = criterion.holds(b, se, np.ones_like(b), self.freedom[:, None])
+            return self.sound & played.any(axis=1) & (each | ~played).all(axis=1)
         at = self.terms.index(criterion.term)
         # An error is 0 where no residual is left: what is divided by it is judged right as well.
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -230,12 +253,12 @@ def gap_fits(draws: Draws) -> tuple[Fits, Fits]:
     # Sums of squares per condition, whose trials share their regressors and so their leverage.
     residual = draws.squared_gap - 2 * fitted * draws.gap + n * fitted**2
     freedom = np.maximum(n.sum(axis=1) - x.shape[1], 1)
-    classic = np.einsum("bjj->bj", inverse) * (residual.sum(axis=1) / freedom)[:, None]
+    classic = inverse * (residual.sum(axis=1) / freedom)[:, None, None]
     # HC3 divides each residual by 1 - leverage (MacKinnon and White 1985).
     leverage = np.einsum("ij,bjk,ik->bi", x, inverse, x)
     meat = np.einsum("bi,ij,ik->bjk", residual / np.maximum(1 - leverage, 1e-9) ** 2, x, x)
-    hc3 = np.einsum("bjk,bkl,blj->bj", inverse, meat, inverse)
-    return _gap_fit(b, classic, freedom, alive), _gap_fit(b, hc3, freedom, alive)
+    hc3 = inverse @ meat @ inverse
+    return _gap_fit(draws, b, classic, freedom, alive), _gap_fit(draws, b, hc3, freedom, alive)
 
 
 def mean_gap_differences(draws: Draws, others: Draws) -> tuple[Array, Array]:
@@ -259,12 +282,18 @@ def mean_gap_differences(draws: Draws, others: Draws) -> tuple[Array, Array]:
     return difference, p
 
 
-def _gap_fit(b: Array, variances: Array, freedom: Array, alive: Holds) -> Fits:
+def _gap_fit(draws: Draws, b: Array, covariance: Array, freedom: Array, alive: Holds) -> Fits:
+    more, less, contrasts = velocity_contrasts(draws.headways_m, draws.velocities_mps)
     # Where nothing varies, rounding leaves variances just below 0.
-    se = np.sqrt(np.maximum(variances, 0))
+    se, apart_se = (
+        np.sqrt(np.maximum(np.einsum("cj,bjk,ck->bc", rows, covariance, rows), 0))
+        for rows in (np.eye(len(GAP_TERMS)), contrasts)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         p = 2 * stats.t.sf(np.abs(b / se), freedom[:, None])
-    return Fits(GAP_TERMS, b, se, p, freedom, alive)
+    played = (draws.n[:, more] > 0) & (draws.n[:, less] > 0)
+    apart = Apart(b @ contrasts.T, apart_se, played)
+    return Fits(GAP_TERMS, b, se, p, freedom, alive, apart)
 
 
 def _inverse(design: Array, weights: Array, alive: Holds) -> tuple[Array, Holds]:

@@ -7,8 +7,8 @@ columns of ``load_trials``; only finished trials count.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from math import inf
+from dataclasses import dataclass, field
+from math import inf, sqrt
 from typing import Protocol
 
 import numpy as np
@@ -54,12 +54,19 @@ class Term:
     p: float
 
 
+# A projected headway in m, and two relative velocities in m/s, the higher one first.
+VelocityPair = tuple[float, float, float]
+
+
 @dataclass(frozen=True, slots=True)
 class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms, and is else empty.
 
     ``freedom`` is the residual degrees of freedom of a linear fit, infinite where tests are normal;
-    ``remark`` is what to know of a fit that has terms.
+    ``remark`` is what to know of a fit that has terms. Of a gap alone: ``apart``, by how much the
+    predicted gaps of two played conditions differ that differ in relative velocity alone, and
+    ``velocity_p``, the p-value that no term with relative velocity has an effect (an F test of all
+    of them; None where they have no error).
     """
 
     n: int
@@ -67,6 +74,8 @@ class Regression:
     problem: str = ""
     freedom: float = inf
     remark: str = ""
+    apart: dict[VelocityPair, Term] = field(default_factory=dict)
+    velocity_p: float | None = None
 
 
 def wald_term(b: float, se: float, freedom: float = inf) -> Term:
@@ -133,6 +142,20 @@ def gap_design(headway_m: Array, velocity_mps: Array) -> Array:
     )
 
 
+def velocity_contrasts(
+    headway_m: Array, velocity_mps: Array
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Pairs of conditions that differ in relative velocity alone, and by how much in regressors.
+
+    The conditions with the higher relative velocity, those with the lower one, and the differences
+    of their rows of ``gap_design``.
+    """
+    alike = headway_m[:, None] == headway_m
+    more, less = np.nonzero(alike & (velocity_mps[:, None] > velocity_mps))
+    design = gap_design(headway_m, velocity_mps)
+    return more, less, design[more] - design[less]
+
+
 def who_first_logit(trials: pd.DataFrame) -> Regression:
     """Logit of left-first on h and dv by maximum likelihood, with Wald tests (eq. 1)."""
     from statsmodels.discrete.discrete_model import Logit
@@ -194,7 +217,7 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
     """
     from statsmodels.regression.linear_model import OLS
 
-    design, gap, _ = gap_data(trials, measure)
+    design, gap, chosen = gap_data(trials, measure)
     if not np.isfinite(gap).all():
         return Regression(len(gap), {}, "a gap is not finite")
     freedom = len(gap) - design.shape[1]
@@ -207,7 +230,23 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
         if fit.get_influence().hat_matrix_diag.max() > 1 - 1e-9:
             return Regression(len(gap), {}, "a single trial decides a coefficient: no HC3 errors")
         fit = fit.get_robustcov_results("HC3", use_t=True)
-    return Regression(len(gap), _terms(GAP_TERMS, fit), freedom=freedom)
+    played = chosen[["projected_headway_m", "relative_velocity_mps"]].drop_duplicates()
+    headways, velocities = played.to_numpy(float).T
+    covariance = np.asarray(fit.cov_params())
+    apart = {
+        (float(headways[i]), float(velocities[i]), float(velocities[j])): wald_term(
+            # Rounding leaves variances just below 0 where nothing varies.
+            float(row @ fit.params),
+            sqrt(max(float(row @ covariance @ row), 0.0)),
+            freedom,
+        )
+        for i, j, row in zip(*velocity_contrasts(headways, velocities), strict=True)
+    }
+    with_velocity = np.eye(len(GAP_TERMS))[2:]
+    velocity_p = float(fit.f_test(with_velocity).pvalue) if (fit.bse > 0).all() else None
+    return Regression(
+        len(gap), _terms(GAP_TERMS, fit), freedom=freedom, apart=apart, velocity_p=velocity_p
+    )
 
 
 def _terms(names: tuple[str, ...], fit: _Fit) -> dict[str, Term]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from analysis.data.study import Group, Study
 from analysis.metrics import RULES_NOTE, HumanReference, Metric, shown_in
 from analysis.stats.group_scores import Score, score, total, unjudged
-from analysis.stats.indicators import INDICATORS, TESTED, Verdict, disagree
-from analysis.stats.likeness import gains
+from analysis.stats.indicators import GAP_MARGIN_M, INDICATORS, TESTED, Verdict, disagree
+from analysis.stats.likeness import difference, gains, held, mean_gain
 from analysis.stats.measures import (
     estimate_or_reference,
     no_human_value,
@@ -20,9 +20,11 @@ from analysis.tables.profiles import gain_values
 # The indicators that rest on who merged first, and the columns of their rows that do so too.
 OF_OUTCOMES = ("I1", "I2")
 EVERY = ("paper", "robust", "differ", "value", "interval", "n")
+BESIDE_I5 = {"held": "I5 held (%)", "clock": "I5 at 1 Hz", "humans": "I5 - humans (SD)"}
 RULES = (
     "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
-    "Firth's fit (I1, I2), HC3 errors (I3), equivalence (I4)"
+    "Firth's fit (I1, I2), HC3 errors (I3), gaps that relative velocity alone moves by less than "
+    f"{GAP_MARGIN_M:g} m (I4), gains above 0 (I5, which the paper judged by eye)"
 )
 
 
@@ -31,6 +33,8 @@ def indicators(study: Study) -> Table:
     rows = []
     for name in INDICATORS:
         rows += [_verdict_row(study, group, name) for group in study.baselines]
+    beside = [_beside_i5(study, group) for group in study.baselines if group.measured]
+    rows += [found[name] for name in BESIDE_I5 for found in beside if name in found]
     rows += [_total_row(study, group) for group in study.baselines]
     for metric in shown_in("tables"):
         rows += [_metric_row(group, metric) for group in study.baselines]
@@ -45,7 +49,7 @@ def indicators(study: Study) -> Table:
             ),
             Column("robust", "robust", "verdict", meaning="by robust tests", optional=True),
             Column("differ", "", meaning="where the two rules disagree", optional=True),
-            Column("value", "value", "number", 2, "gain (I5) or measure", optional=True),
+            Column("value", "value", "number", 2, "mean gain (I5) or measure", optional=True),
             Column(
                 "interval", "95 % CI", "interval", 2, "Wilson for rates, t for means", optional=True
             ),
@@ -125,10 +129,13 @@ def score_text(judged: dict[str, Verdict]) -> str | None:
 
 
 def score_note(found: Score) -> str:
-    """Which indicators a score leaves out of both its numbers, by rule."""
+    """Which indicators a score leaves out of both its numbers, by rule.
+
+    But for those that a rule never judges, whatever is driven.
+    """
     rules: dict[tuple[str, ...], list[str]] = {}
     for rule, judged in found.rules.items():
-        if left_out := total(judged).open:
+        if left_out := tuple(name for name in total(judged).open if judged[name].why):
             rules.setdefault(left_out, []).append(rule)
     return "; ".join(
         f"the score {' and '.join(which)} leaves out {', '.join(left_out)}"
@@ -163,6 +170,33 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
         item=name,
         published=EVERY if of_outcomes else (),
     )
+
+
+def _beside_i5(study: Study, group: Group) -> dict[str, Row]:
+    """The numbers beside the gain of I5, by name; none of them decides."""
+    share, clock = held(study, group), mean_gain(study, group, "clocked_gain")
+    if share.value is None or share.low is None or share.high is None:
+        return {}
+    numbers: dict[str, tuple[Value, Value]] = {
+        "held": (100 * share.value, (100 * share.low, 100 * share.high)),
+        "clock": (clock.value, clock.bounds()),
+    }
+    if found := difference(study, group):
+        numbers["humans"] = (found.value, found.bounds())
+    return {
+        name: row_of(
+            group,
+            {
+                "indicator": BESIDE_I5[name],
+                "value": value,
+                "interval": bounds,
+                "n": len(group.finished),
+            },
+            _inaction(study, group, "I5"),
+            item=f"I5-{name}",
+        )
+        for name, (value, bounds) in numbers.items()
+    }
 
 
 def _inaction(study: Study, group: Group, name: str) -> str:

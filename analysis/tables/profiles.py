@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from analysis.data.study import Group, Study, of_group
-from analysis.stats.likeness import NO_ACTION, difference, gains, mean_gain
+from analysis.stats.likeness import NO_ACTION, difference, gains, held, mean_gain
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import intermittency_notes, sample_notes
 
@@ -20,6 +20,14 @@ def velocity_profiles(study: Study) -> Table:
             Column("gain", "gain", "number", 2, "mean gain of lines over cubics (I5)"),
             Column("gain_ci", "95 % CI", "interval", 2, "t, of humans over pairs", optional=True),
             Column("held_percent", "held (%)", "percent", 1, "trials with a gain above 0"),
+            Column(
+                "clocked_gain",
+                "gain at 1 Hz",
+                "number",
+                2,
+                "gain of the same speeds, one acceleration a second",
+                optional=True,
+            ),
             Column(
                 "difference_sd",
                 "- humans (SD)",
@@ -60,15 +68,13 @@ def _row(study: Study, group: Group) -> Row:
     values: dict[str, Value] = {"n": len(group.finished)}
     if not group.measured:
         return row_of(group, values, "no human traces are imported")
-    trials = gains(study, group)
     # A trial in which no vehicle acted has no gain.
-    judged = trials["gain"].dropna()
-    values |= {"no_action": int(trials["steady"].sum())} | gain_values(study, group)
-    if len(judged):
-        values["held_percent"] = float(100 * (judged > 0).mean())
-    # A difference in human SD needs a human spread in every condition.
-    if study.calibrated and group is not study.human:
-        found = difference(study, group)
+    share = held(study, group)
+    values |= {"no_action": int(gains(study, group)["steady"].sum())} | gain_values(study, group)
+    values["clocked_gain"] = mean_gain(study, group, "clocked_gain").value
+    if share.value is not None:
+        values["held_percent"] = 100 * share.value
+    if found := difference(study, group):
         values |= {"difference_sd": found.value, "difference_sd_ci": found.bounds()}
     # Plans are revised in trials that collide, too: ``ended`` here, ``finished`` above.
     plans = of_group(study.plans, group, group.ended)[
@@ -80,7 +86,7 @@ def _row(study: Study, group: Group) -> Row:
     if plans["revised_plans"]:
         values["revision"] = float(plans["total_revision"] / plans["revised_plans"])
         values["revised_percent"] = float(100 * plans["large_revisions"] / plans["revised_plans"])
-    return row_of(group, values, "" if len(judged) else NO_ACTION)
+    return row_of(group, values, "" if share.n else NO_ACTION)
 
 
 def gain_values(

@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 from scipy import stats
 
-from analysis.data.intermittency import SAMPLE_S, at_5_hz, gains, without_resistance
+from analysis.data.intermittency import SAMPLE_S, at_5_hz, clocked, gains, without_resistance
 
 SECONDS = 10
 PROFILES = 200
@@ -244,6 +244,19 @@ def controls_table() -> str:
     return markdown(["control", *map(recording, cells)], rows)
 
 
+def clock_table() -> str:
+    """The gain of each control as it is, and with one acceleration a second (5 Hz, exactly)."""
+    rows = []
+    for control in HELD + MOVING:
+        speeds = at_one_rate(control, 5, 0.0)
+        row = [control.__name__.replace("_", " ")]
+        for v in (speeds, clocked(speeds)):
+            found = gains(v)
+            row.append(f"{found.mean():.2f}, {100 * (found > 0).mean():.0f} %")
+        rows.append(row)
+    return markdown(["control", "as it is", "one acceleration a second"], rows)
+
+
 def recording(cell: tuple[int, float]) -> str:
     rate_hz, noise_mps = cell
     return f"{rate_hz} Hz" + (f", noise {noise_mps} m/s" if noise_mps else "")
@@ -255,4 +268,4 @@ def markdown(headings: list[str], rows: list[list[str]]) -> str:
 
 
 if __name__ == "__main__":
-    print(candidates_table(), controls_table(), sep="\n\n")  # noqa: T201 # it is a command
+    print(candidates_table(), controls_table(), clock_table(), sep="\n\n")  # noqa: T201 # it is a command

@@ -217,7 +217,9 @@ def verdicts_of(site: Site, table: Table) -> dict[str, Any]:
         said = printed(table, row)
         drivers.setdefault(str(row.values["driver"]), {})[str(row.values["indicator"])] = {
             "paper": said["paper"],
-            "robust": said["robust"] if row.values.get("differ") else "",
+            "robust": said["robust"]
+            if row.values.get("differ") or row.values.get("paper") is None
+            else "",
             "ceiling": "" if row.values.get("ceiling_paper") is None else said["ceiling_paper"],
             "link": site.at.cell(table.name, row.id, "n") if row.groups != (HUMAN,) else "",
             "note": row.note,

@@ -16,8 +16,10 @@ from analysis.data.intermittency import (
     LINE_SAMPLES,
     SAMPLE_S,
     at_5_hz,
+    clocked,
     gains,
     measure_profiles,
+    random_gain,
     residuals,
     without_resistance,
 )
@@ -28,6 +30,7 @@ from tests.analysis.controls import (
     HELD,
     MOVING,
     candidates_table,
+    clock_table,
     controls_table,
     separation,
 )
@@ -57,6 +60,9 @@ def test_the_docs_print_what_the_controls_give():
     text = DOCS.read_text("utf-8")
     assert candidates_table() in text
     assert controls_table() in text
+    assert clock_table() in text
+    at_random = f"by chance each second, held, have a mean gain of {random_gain():.2f} over 10 s"
+    assert at_random in " ".join(text.split())
 
 
 def random_speeds(seed, n, rows=4):
@@ -177,6 +183,51 @@ def test_a_pedal_that_is_held_against_the_resistance_is_a_straight_line():
     time, v = np.arange(201) * 0.05, np.array(v)
     assert without_resistance(time, v) == pytest.approx(10 + 1.5 * time)
     assert measured(v, 0.05, resisted=True)["gain"] > 0 > measured(v, 0.05)["gain"]
+
+
+def test_what_drag_did_not_make_is_left_in():
+    """A vehicle that stands is held by nothing: its speed stays 0, and no line rises from it."""
+    v = [2.0]
+    for _ in range(100):
+        v.append(max(0.0, v[-1] + 0.05 * net_acceleration(-0.5, v[-1], "human")))
+    stands = v.index(0.0)
+    time, v = np.arange(101) * 0.05, np.array(v)
+    assert np.ptp(without_resistance(time, v)[stands:]) == 0
+    assert v[stands - 1] > 0
+
+
+def test_a_vehicle_that_nothing_but_drag_slows_took_no_action():
+    v = [10.0]
+    for _ in range(200):
+        v.append(v[-1] + 0.05 * net_acceleration(0.0, v[-1], "human"))
+    found = measured(np.array(v), 0.05, resisted=True)
+    assert found["steady"]
+    assert np.isnan(found["gain"])
+    assert not measured(np.array(v), 0.05)["steady"]
+
+
+def test_a_clock_of_1_hz_makes_one_acceleration_of_each_second():
+    v = random_speeds(5, 33)
+    found = clocked(v)
+    assert (found[:, ::5] == v[:, ::5]).all()
+    assert (found[:, -1] == v[:, -1]).all()
+    bends = np.abs(np.diff(found, 2)) > 1e-9
+    assert not np.delete(bends, np.arange(4, 31, 5), axis=1).any()
+    held = controls.driven(np.repeat([[1.0, -0.5, 0.3]], 5, axis=1), SAMPLE_S)
+    assert clocked(held) == pytest.approx(held)
+    profile = measured(v[0])
+    assert profile["clocked_gain"] == pytest.approx(gains(found)[0])
+    assert profile["gain"] == pytest.approx(gains(v)[0])
+
+
+def test_whoever_draws_an_acceleration_each_second_and_holds_it_has_a_gain_above_0():
+    assert random_gain() == pytest.approx(0.49, abs=0.01)
+
+
+def test_speeds_that_begin_later_are_measured_from_there():
+    speeds = as_speeds([random_speeds(1, 20, 1)[0]])
+    later = speeds.assign(time_s=[[t + 0.6 for t in one] for one in speeds["time_s"]])
+    assert measure_profiles(later)["gain"][0] == pytest.approx(measure_profiles(speeds)["gain"][0])
 
 
 def test_human_samples_at_20_hz_are_taken_at_5_hz():

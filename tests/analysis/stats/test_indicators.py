@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from math import inf
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,18 +15,19 @@ from scipy import stats
 
 from analysis.stats.group_scores import total
 from analysis.stats.indicators import (
+    APART,
     GAP_MARGIN_M,
     INDICATORS,
-    LARGEST_VELOCITY_MPS,
+    NONE_APART,
     PAPER,
     ROBUST,
-    SLOPE_MARGIN_S,
     Verdict,
     equivalence_p,
+    furthest_apart,
     judged,
     verdicts,
 )
-from analysis.stats.regressions import Regression, Term
+from analysis.stats.regressions import Regression, Term, gap_design, gap_ols
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 SEPARATED = "separation: no finite estimate of projected_headway; see Firth's fit"
@@ -40,7 +43,10 @@ def who_first(headway=(1.0, 0.001), velocity=(-3.0, 0.001)) -> Regression:
 
 
 def gap(headway=(0.2, 0.001), velocity=(0.0, 0.9), product=(0.0, 0.9), se=0.2) -> Regression:
-    """A fit of the gap; (b, p) of its slopes."""
+    """A fit of the gap; (b, p) of its slopes, whose errors are taken as independent.
+
+    Two conditions level with each other were played, and two where the left is 4 m ahead.
+    """
     terms = {
         "intercept": (4.0, 0.001),
         "abs_projected_headway": headway,
@@ -48,7 +54,12 @@ def gap(headway=(0.2, 0.001), velocity=(0.0, 0.9), product=(0.0, 0.9), se=0.2) -
         "headway_x_velocity": product,
     }
     fitted = {name: Term(b, se, b / se, p) for name, (b, p) in terms.items()}
-    return Regression(110, fitted, freedom=106)
+    apart = {}
+    for pair in ((0.0, 0.8, 0.0), (4.0, 0.8, -0.8)):
+        one, other = (gap_design(np.array(pair[:1]), np.array([dv]))[0] for dv in pair[1:])
+        b = float((one - other) @ [term.b for term in fitted.values()])
+        apart[pair] = Term(b, se * float(np.linalg.norm(one - other)), None, 1.0)
+    return Regression(110, fitted, freedom=106, apart=apart)
 
 
 @BOTH
@@ -76,7 +87,8 @@ def test_i1_to_i3_need_their_sign_and_p_below_5_percent(by_rule, b, p, i1, i2, i
 def test_each_indicator_reads_its_own_term(by_rule, open_one):
     p = {"I1": 0.011, "I2": 0.012, "I3": 0.013, open_one: 0.5}
     velocity = (3.0, 0.001) if open_one == "I4" else (0.0, 0.9)
-    found = by_rule(who_first((1.0, p["I1"]), (-1.0, p["I2"])), gap((1.0, p["I3"]), velocity))
+    of_gap = gap((1.0, p["I3"]), velocity, se=0.05)
+    found = by_rule(who_first((1.0, p["I1"]), (-1.0, p["I2"])), of_gap)
     assert list(found) == ["I1", "I2", "I3", "I4"]
     assert [name for name, verdict in found.items() if not verdict.passed] == [open_one]
 
@@ -89,27 +101,101 @@ def test_i4_holds_by_the_paper_where_the_effect_is_not_significant(p, passed):
         assert paper_verdicts(who_first(), gap(velocity=(b, p)))["I4"] == Verdict(passed)
 
 
-def test_i4_looks_at_the_main_effect_alone():
+def test_i4_looks_at_the_main_effect_alone_by_the_paper_and_at_all_terms_by_the_robust_test():
     """The product is significant for the humans of the paper, and they have the mark."""
-    humans = gap(velocity=(-0.2, 0.236), product=(0.06, 0.031), se=0.166)
-    plain = gap(velocity=(-0.2, 0.236), product=(0.0, 0.9), se=0.166)
+    humans = gap(velocity=(-0.2, 0.236), product=(0.06, 0.031), se=0.03)
     assert paper_verdicts(who_first(), humans)["I4"].passed is True
     assert robust_verdicts(who_first(), humans)["I4"].passed is True
-    assert robust_verdicts(who_first(), humans)["I4"] == robust_verdicts(who_first(), plain)["I4"]
+    depends = gap(velocity=(-0.2, 0.236), product=(0.2, 0.031), se=0.03)
+    assert paper_verdicts(who_first(), depends)["I4"].passed is True
+    assert robust_verdicts(who_first(), depends)["I4"].passed is False
+    assert furthest_apart(depends) == (4.0, 0.8, -0.8)
 
 
-def test_the_margin_of_i4_is_1_m_for_the_largest_velocity_of_the_experiment():
-    largest = max(abs(condition.relative_velocity_mps) for condition in CONDITIONS.values())
-    assert (1.0, largest) == (GAP_MARGIN_M, LARGEST_VELOCITY_MPS)
-    assert pytest.approx(1.25) == SLOPE_MARGIN_S
+# Of the driver idm, in each of the 11 conditions: it has no spread.
+IDM_GAPS_M = {
+    "N_0_0": 18.375,
+    "L_0_-8": 18.023,
+    "R_0_8": 18.023,
+    "L_2_-8": 17.060,
+    "R_-2_8": 17.060,
+    "L_4_0": 17.973,
+    "R_-4_0": 17.973,
+    "L_4_-8": 17.048,
+    "R_-4_8": 17.048,
+    "L_4_8": 19.134,
+    "R_-4_-8": 19.134,
+}
 
 
-@pytest.mark.parametrize("b", [-2.0, -1.25, -1.0, -0.3, 0.0, 0.3, 1.0, 1.25, 2.0])
+def trials_of(gaps_m) -> pd.DataFrame:
+    columns = ["projected_headway_m", "relative_velocity_mps", "status", "gap_m"]
+    return pd.DataFrame(
+        [
+            (CONDITIONS[name].projected_headway_m, CONDITIONS[name].relative_velocity_mps,
+             "finished", gap_m)
+            for name, gap_m in gaps_m.items()
+        ],
+        columns=columns,
+    )  # fmt: skip
+
+
+def test_a_gap_that_depends_on_who_is_ahead_and_faster_fails_i4():
+    trials = trials_of(IDM_GAPS_M)
+    fit = gap_ols(trials, robust=True)
+    assert paper_verdicts(who_first(), gap_ols(trials))["I4"] == Verdict(True)
+    assert robust_verdicts(who_first(), fit)["I4"] == Verdict(False)
+    headway, more, less = furthest_apart(fit)
+    assert (abs(headway), more, less) == (4.0, 0.8, -0.8)
+    assert abs(fit.apart[headway, more, less].b) == pytest.approx(2.25, abs=0.01)
+    assert fit.velocity_p < 0.001
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("slope", "passed"), [(0.15, True), (0.16, False)])
+def test_gaps_without_spread_are_compared_with_the_margin_themselves(slope, passed):
+    """They lie on the regression: a slope of 1 / 6.4 of the product is 1 m."""
+    gaps_m = {name: 5 + slope * c.projected_headway_m * c.relative_velocity_mps
+              for name, c in CONDITIONS.items()}  # fmt: skip
+    fit = gap_ols(trials_of(gaps_m), robust=True)
+    assert robust_verdicts(who_first(), fit)["I4"] == Verdict(passed)
+    assert fit.velocity_p is None or fit.velocity_p < 0.001
+    for b in (0.0, 0.999, -0.999):
+        assert equivalence_p(b, 0.0, 9) == 0
+    for b in (1.0, -1.0, 2.0):
+        assert equivalence_p(b, 0.0, 9) == 1
+
+
+def test_gaps_that_do_not_vary_leave_nothing_to_test():
+    found = gap_ols(trials_of(dict.fromkeys(CONDITIONS, 3.85)), robust=True)
+    assert "less than 1 cm" in robust_verdicts(who_first(), found)["I4"].why
+
+
+def test_differences_are_of_played_conditions_with_one_projected_headway():
+    fit = gap_ols(trials_of(IDM_GAPS_M), robust=True)
+    velocities = ((0.8, 0.0), (0.8, -0.8), (0.0, -0.8))
+    assert set(fit.apart) == {(h, *pair) for h in (0.0, 4.0, -4.0) for pair in velocities}
+    some = {name: m for name, m in IDM_GAPS_M.items() if name not in {"L_4_8", "R_-4_-8"}}
+    played = gap_ols(trials_of(some)).apart
+    assert {pair for pair in played if pair[0]} == {(4.0, 0.0, -0.8), (-4.0, 0.8, 0.0)}
+    for pair, term in fit.apart.items():
+        rows = [gap_design(np.array(pair[:1]), np.array([dv]))[0] for dv in pair[1:]]
+        predicted = [row @ [t.b for t in fit.terms.values()] for row in rows]
+        assert term.b == pytest.approx(predicted[0] - predicted[1])
+
+
+def test_without_conditions_that_differ_in_relative_velocity_alone_i4_is_not_judged():
+    fit = replace(gap(), apart={})
+    assert robust_verdicts(who_first(), fit)["I4"] == Verdict(None, NONE_APART)
+    assert paper_verdicts(who_first(), fit)["I4"].passed is True
+
+
+@pytest.mark.parametrize("b", [-2.0, -1.0, -0.8, -0.3, 0.0, 0.3, 0.8, 1.0, 2.0])
 @pytest.mark.parametrize("freedom", [3, 106])
 def test_equivalence_is_the_larger_p_of_two_one_sided_t_tests(b, freedom):
     se = 0.4
-    not_below = stats.t.sf((b + 1.25) / se, freedom)  # against a slope of at most -1.25
-    not_above = stats.t.cdf((b - 1.25) / se, freedom)  # against a slope of at least 1.25
+    not_below = stats.t.sf((b + GAP_MARGIN_M) / se, freedom)  # against at most -1 m
+    not_above = stats.t.cdf((b - GAP_MARGIN_M) / se, freedom)  # against at least 1 m
     assert equivalence_p(b, se, freedom) == pytest.approx(max(not_below, not_above))
 
 
@@ -131,19 +217,21 @@ def test_many_fits_are_judged_like_each_of_them(criteria, rows):
     for criterion in criteria.values():
         holds = criterion.holds(*together)
         for i, (b, se, alone_p, freedom) in enumerate(rows):
-            fit = Regression(9, {criterion.term: Term(b, se, None, alone_p)}, freedom=freedom)
+            term = Term(b, se, None, alone_p)
+            terms = {} if criterion.term == APART else {criterion.term: term}
+            fit = Regression(9, terms, freedom=freedom, apart={(0.0, 0.8, 0.0): term})
             assert judged(criterion, fit) == Verdict(bool(holds[i]))
 
 
 def test_equivalence_at_the_margin_is_a_coin_toss():
-    assert equivalence_p(1.25, 0.3, 50) == equivalence_p(-1.25, 0.3, 50) == 0.5
+    assert equivalence_p(1.0, 0.3, 50) == equivalence_p(-1.0, 0.3, 50) == 0.5
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_i4_holds_robustly_where_the_effect_is_shown_to_be_small(sign):
     quantile = stats.t.isf(0.05, 106)
-    for se in (0.1, 0.5):
-        edge = 1.25 - quantile * se
+    for se in (0.02, 0.05):
+        edge = 1.25 - quantile * se  # of a slope that is multiplied by 0.8 m/s
         inside = robust_verdicts(who_first(), gap(velocity=(sign * (edge - 0.01), 0.5), se=se))
         outside = robust_verdicts(who_first(), gap(velocity=(sign * (edge + 0.01), 0.5), se=se))
         assert (inside["I4"].passed, outside["I4"].passed) == (True, False)
@@ -170,7 +258,7 @@ def test_a_score_counts_only_what_can_be_judged_and_names_the_rest():
 @BOTH
 def test_a_fit_that_is_missing_leaves_its_indicators_open(by_rule):
     nobody = Regression(0, {}, "no finished trial with a first merger")
-    found = by_rule(nobody, gap())
+    found = by_rule(nobody, gap(se=0.05))
     assert found["I1"] == found["I2"] == Verdict(None, nobody.problem)
     assert (found["I3"].passed, found["I4"].passed) == (True, True)
     found = by_rule(who_first(), MISSING)
