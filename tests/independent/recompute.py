@@ -31,7 +31,7 @@ METRICS = (
 # The paper's regression of the human gap, with its errors, of 962 trials.
 HUMAN_GAP = ((3.54, 0.146), (0.17, 0.034), (-0.20, 0.166), (0.06, 0.029))
 HUMAN_TRIALS = 962
-MARGIN_S = 1 / 0.8  # 1 m at the largest relative velocity, 0.8 m/s
+MARGIN_M = 1.0
 MOST_INVALID = 0.2
 
 
@@ -119,18 +119,42 @@ def _who_first(trials: pd.DataFrame) -> list[dict]:
 
 
 def _gap(trials: pd.DataFrame) -> list[dict]:
-    x, y, _ = gap_data(trials)
+    x, y, used = gap_data(trials)
     plain, robust = statistics.least_squares(x, y)
+    none = {"equivalence_p": None, "velocity_p": None}
     rows = []
     for k, term in enumerate(GAP):
         hc3 = _columns("b hc3_se t hc3_p", robust, k)
         row = {"n": len(y)} | _columns("b se t p", plain, k)
-        row |= {"hc3_se": hc3["hc3_se"], "hc3_p": hc3["hc3_p"], "equivalence_p": None}
+        row |= {"hc3_se": hc3["hc3_se"], "hc3_p": hc3["hc3_p"]} | none
         if term == "abs_relative_velocity" and robust is not None:
-            away = (MARGIN_S - abs(robust[k, 0])) / robust[k, 1]
-            row["equivalence_p"] = stats.t.sf(away, len(y) - x.shape[1])
+            row |= _of_velocity(x, y, used[["h", "dv"]].drop_duplicates().to_numpy(float))
         rows.append(row)
     return rows
+
+
+def _of_velocity(x: np.ndarray, y: np.ndarray, played: np.ndarray) -> dict:
+    """Whether relative velocity alone moves no gap by the margin, and whether it has no effect."""
+    freedom = len(y) - x.shape[1]
+    apart = [
+        np.array([0, 0, abs(dv) - abs(other), h * (dv - other)])
+        for h, dv in played
+        for same, other in played
+        if same == h and other < dv
+    ]
+    if not apart:
+        return {}
+    # A condition and its mirror image in relative velocity are alike where nobody is ahead.
+    found = [statistics.combined(x, y, one)[:2] for one in apart if one.any()]
+    p = max((stats.t.sf((MARGIN_M - abs(b)) / se, freedom) for b, se in found), default=0.0)
+    size, product = np.eye(4)[2:]
+    (b, se), (c, other_se), (_, both) = (
+        statistics.combined(x, y, one)[:2] for one in (size, product, size + product)
+    )
+    shared = (both**2 - se**2 - other_se**2) / 2
+    errors = np.array([[se**2, shared], [shared, other_se**2]])
+    f = np.array([b, c]) @ np.linalg.solve(errors, np.array([b, c])) / 2
+    return {"equivalence_p": p, "velocity_p": stats.f.sf(f, 2, freedom)}
 
 
 def _mixed(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
@@ -145,7 +169,8 @@ def _mixed(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
             "mixed": (statistics.mixed_least_squares, gap_data(recorded)),
             "mixed-mean100": (statistics.mixed_least_squares, gap_data(recorded, "gap_mean100")),
         }
-        terms, names, other = GAP, "b se t p", ("hc3_se", "hc3_p", "equivalence_p")
+        terms, names = GAP, "b se t p"
+        other = ("hc3_se", "hc3_p", "equivalence_p", "velocity_p")
     return {
         f"human/{name}/{term}": {"n": len(y)} | _columns(names, rows, k) | dict.fromkeys(other)
         for name, (fit, (x, y, used)) in fits.items()

@@ -99,6 +99,14 @@ def least_squares(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray | None, np.n
     return tuple(found)
 
 
+def combined(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """HC3's row of a weighted sum of coefficients, which an equal model has as its own term."""
+    k = int(np.abs(weights).argmax())
+    turned = np.eye(x.shape[1])
+    turned[k] = weights
+    return least_squares(x @ np.linalg.inv(turned), y)[1][k]
+
+
 def _wald(b, se, freedom=np.inf) -> np.ndarray:
     return np.column_stack([b, se, b / se, 2 * stats.t.sf(np.abs(b / se), freedom)])
 

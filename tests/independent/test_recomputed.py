@@ -103,7 +103,8 @@ def _of_paper(table: str, row: str, imported: bool) -> bool:
     """Whether a row holds what the paper prints, and is not computed."""
     if table == "contrasts":
         return "/human/" in row
-    if table == "indicators" and row.endswith(("/I5", "/score")):
+    # I5 and the numbers beside it are not recomputed.
+    if table == "indicators" and row.rpartition("/")[2].startswith(("I5", "score")):
         return True
     outcomes = table == "who-first" or (table == "indicators" and row.endswith(("/I1", "/I2")))
     return row.startswith("human") and not outcomes and not imported
