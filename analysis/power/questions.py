@@ -151,7 +151,7 @@ OF_AN_ARM = (
     Question("who-first", "projected headway (I1)", _of_who_first("I1"), HEADWAY_CUE),
     Question("who-first", "relative velocity (I2)", _of_who_first("I2"), SPEED_CUE),
     Question("gap", "|projected headway| (I3)", _of_gap("I3"), GAP_SLOPE, of_who_first=False),
-    Question("gap", "|relative velocity| small (I4)", _of_gap("I4"), of_who_first=False),
+    Question("gap", "effect of relative velocity small (I4)", _of_gap("I4"), of_who_first=False),
     Question("indicators", "I1 to I4 all hold", _all_hold),
 )
 BESIDE_HUMANS = (

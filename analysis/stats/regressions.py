@@ -66,7 +66,7 @@ class Regression:
     ``remark`` is what to know of a fit that has terms. Of a gap alone: ``apart``, by how much the
     predicted gaps of two played conditions differ that differ in relative velocity alone, and
     ``velocity_p``, the p-value that no term with relative velocity has an effect (an F test of all
-    of them; None where they have no error).
+    of them; None where their errors are not two, as without residuals).
     """
 
     n: int
@@ -243,7 +243,8 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
         for i, j, row in zip(*velocity_contrasts(headways, velocities), strict=True)
     }
     with_velocity = np.eye(len(GAP_TERMS))[2:]
-    velocity_p = float(fit.f_test(with_velocity).pvalue) if (fit.bse > 0).all() else None
+    told_apart = np.linalg.matrix_rank(covariance[2:, 2:]) == len(with_velocity)
+    velocity_p = float(fit.f_test(with_velocity).pvalue) if told_apart else None
     return Regression(
         len(gap), _terms(GAP_TERMS, fit), freedom=freedom, apart=apart, velocity_p=velocity_p
     )

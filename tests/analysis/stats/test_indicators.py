@@ -166,6 +166,16 @@ def test_gaps_without_spread_are_compared_with_the_margin_themselves(slope, pass
         assert equivalence_p(b, 0.0, 9) == 1
 
 
+@pytest.mark.filterwarnings("error")
+def test_terms_whose_errors_hang_together_have_no_joint_test():
+    """Gaps vary in N_0_0 alone: one number says the errors of all coefficients."""
+    rest = {name: 5 + 0.2 * abs(c.projected_headway_m) for name, c in CONDITIONS.items()}
+    level = [trials_of({"N_0_0": gap_m}) for gap_m in (4.0, 6.0)]
+    fit = gap_ols(pd.concat([trials_of(rest), *level]), robust=True)
+    assert fit.velocity_p is None
+    assert robust_verdicts(who_first(), fit)["I4"].passed is not None
+
+
 def test_gaps_that_do_not_vary_leave_nothing_to_test():
     found = gap_ols(trials_of(dict.fromkeys(CONDITIONS, 3.85)), robust=True)
     assert "less than 1 cm" in robust_verdicts(who_first(), found)["I4"].why
