@@ -53,7 +53,7 @@ class Bounded:
 class HumanReference(Bounded):
     """A published human value in the unit of its metric, with its 95 % interval if it has one.
 
-    ``source`` cites it. ``n``: the trials that a share is of, without which it is not tested.
+    ``source`` cites it. ``n``: the trials that a share is of.
     """
 
     value: float

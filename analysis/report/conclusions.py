@@ -13,7 +13,7 @@ from analysis.report.ablated import ablation_sentences
 from analysis.report.alarms import mismatch
 from analysis.report.first_look import first_look
 from analysis.report.unlike import unlike
-from analysis.stats.contrasts import contrast_rates
+from analysis.stats.against_humans import by_known_pairs, contrast_with_humans
 from analysis.stats.group_scores import Score, fits, score, unjudged
 from analysis.stats.indicators import (
     ALPHA,
@@ -26,7 +26,6 @@ from analysis.stats.indicators import (
 from analysis.stats.intervals import interval
 from analysis.stats.likeness import difference, held, mean_gain
 from analysis.stats.measures import (
-    counts,
     estimate,
     human_reference,
     known,
@@ -243,21 +242,30 @@ def _collisions(study: Study, group: Group) -> str:
             f"{group.driver} is not compared with humans by its collisions: "
             f"{undecided_note(group, BOXES)}."
         )
+    sentence = (
+        f"{group.driver} collided, by boxes that overlap, in {found.value:.1f} % of "
+        f"{_trials(found.n)} (95 % CI {found.low:.1f} to {found.high:.1f}), humans in "
+        f"{human.value:.1f} % of {human.n} in the same {_conditions(group)}"
+    )
     # By the humans' own collision rule for both: the paper's rule for drivers is another one.
-    contrast = contrast_rates(counts(group, BOXES), counts(humans, BOXES))
+    contrast = contrast_with_humans(humans, group, BOXES)
+    if isinstance(contrast, str):
+        return f"{sentence}; the difference is not tested: {contrast}."
     assert contrast.low is not None
     assert contrast.high is not None
     verdict = (
         "a difference that chance alone seldom makes"
         if contrast.p < ALPHA
-        else f"no difference is shown, and one from {100 * contrast.low:+.1f} to "
-        f"{100 * contrast.high:+.1f} percentage points is compatible with these trials"
+        else "no difference is shown, and one within this interval is compatible with these trials"
+    )
+    test = (
+        f"errors clustered by {contrast.by}"
+        if by_known_pairs(humans, BOXES)
+        else "Fisher's exact test, all trials taken as independent"
     )
     return (
-        f"{group.driver} collided, by boxes that overlap, in {found.value:.1f} % of "
-        f"{_trials(found.n)} (95 % CI {found.low:.1f} to {found.high:.1f}), humans in "
-        f"{human.value:.1f} % of {human.n} in the same {_conditions(group)} ({human.low:.1f} to "
-        f"{human.high:.1f}); Fisher's exact p "
+        f"{sentence}; within conditions the difference is {100 * contrast.value:+.1f} percentage "
+        f"points (95 % CI {100 * contrast.low:+.1f} to {100 * contrast.high:+.1f}; {test}), p "
         f"{_p(contrast.p)}: {verdict}."
     )
 

@@ -285,7 +285,9 @@ def _unidentified(design: Array, left: Array, called: tuple[str, str]) -> str:
 def _separated(design: Array, left: Array) -> str:
     from firthmodels import detect_separation
 
-    found = detect_separation(design[:, 1:], left)
+    # Trials that are alike separate no better than one of them, and take longer.
+    distinct = np.unique(np.column_stack([design, left]), axis=0)
+    found = detect_separation(distinct[:, 1:-1], distinct[:, -1])
     if not found.separation:
         return ""
     infinite = [

@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
+from math import isinf
 
-from analysis.data.study import Group, Study, in_one_study
-from analysis.metrics import RULES_NOTE, Metric, compared
-from analysis.stats.contrasts import (
-    contrast_cells,
-    contrast_means,
-    contrast_rates,
-    corrected,
-    shared_cells,
-)
+from analysis.data.study import HUMAN, Group, Study, in_one_study
+from analysis.metrics import JUDGED, RULES_NOTE, Metric, compared
+from analysis.stats.against_humans import by_known_pairs, contrast_with_humans
+from analysis.stats.contrasts import contrast_cells, contrast_means, corrected, shared_cells
 from analysis.stats.intervals import Difference
-from analysis.stats.measures import (
-    counts,
-    human_reference,
-    known,
-    outcomes_note,
-    trials_of,
-    undecided,
-    values,
-)
+from analysis.stats.joint import NO_PAIRS
+from analysis.stats.measures import known, outcomes_note, trials_of, undecided
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import listed, replayed_notes, sample_notes
 from merge_runner.study.file import BASELINE
+from merge_runner.text_safety import quoted
 
 # The columns that rest on human outcomes, in rows whose metric does.
 COLUMNS = ("difference", "ci", "p", "p_holm", "p_bh", "n", "n_reference")
+# How measures are tested against humans, by whether the pairs of their trials are known.
+ERRORS = {
+    False: f"the published counts, compared as prompts are; {NO_PAIRS}",
+    True: "by a linear model with a level for each condition (of rates a linear probability "
+    "model), which has the weights above; errors are clustered by human pair (jackknife, CV3) and "
+    "independent over the driver's trials (HC3; of rates at least those that equal rates give); "
+    "Student's t with Satterthwaite's df",
+}
 
 
 def contrasts(study: Study) -> Table:
@@ -42,7 +40,8 @@ def contrasts(study: Study) -> Table:
         # would make the result depend on how many are registered.
         for metric in compared():
             rows += _family(study, driver, metric)
-    rows += _against_humans(study)
+    of_humans, human_notes = _against_humans(study)
+    rows += of_humans
     return Table(
         "contrasts",
         "Differences between prompts, and from humans",
@@ -52,8 +51,10 @@ def contrasts(study: Study) -> Table:
             Column("reference", "against"),
             Column("measure", "measure"),
             Column("difference", "difference", "number", 2, "first minus second"),
-            Column("ci", "95 % CI", "interval", 2, "Newcombe; least squares", optional=True),
-            Column("p", "p", "p", 3, "Fisher's exact or permutation test"),
+            Column(
+                "ci", "95 % CI", "interval", 2, "Newcombe; least squares; by pairs", optional=True
+            ),
+            Column("p", "p", "p", 3, "Fisher's exact or permutation test; t test by pairs"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
             Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
             Column(
@@ -64,25 +65,30 @@ def contrasts(study: Study) -> Table:
                 "smallest difference, in either direction, found at p < .05 with power .8",
                 optional=True,
             ),
-            Column("n", "n", "count", 0, "trials of the setting"),
-            Column("n_reference", "n ref.", "count", 0, "trials of the reference"),
+            Column("n", "n", "count", 0, "trials of the setting in the shared conditions"),
+            Column(
+                "n_reference", "n ref.", "count", 0, "trials of the reference in these conditions"
+            ),
+            Column("errors", "errors", meaning="what is taken as independent: trials, or pairs"),
+            Column("freedom", "df", "number", 0, "of a t test by pairs", optional=True),
         ),
         rows,
         (
-            "prompts are compared within the conditions that both have: rates by the weights of "
-            "Mantel and Haenszel, with Newcombe's interval and Fisher's exact test within "
-            "conditions; means by least squares, with a seeded permutation test. Against humans "
-            "rates are compared over all trials. A family is one measure of one driver over its "
-            "prompts, or over all drivers against humans",
+            "all are compared within the conditions that both have: rates by the weights of Mantel "
+            "and Haenszel, with Newcombe's interval and Fisher's exact test within conditions; "
+            "means by least squares, with a seeded permutation test. A family is one measure of "
+            "one driver over its prompts, or over all drivers against humans",
+            *human_notes,
             "detectable: the smallest difference that is found at p < .05, before correction, with "
-            "a power of .8; rates: by the exact power of Fisher's test, the reference's true rate "
-            "being the observed one, in the direction in which less is enough; means: (t.975 + "
-            "t.8) times the standard error of the linear model",
+            "a power of .8; rates: by the exact power of Fisher's test of all these trials as if "
+            "of one condition, the reference's true rate being the observed one, in the direction "
+            "in which less is enough; means, and all that is tested by pairs: (t.975 + t.8) times "
+            "the standard error of the linear model, with its degrees of freedom",
             RULES_NOTE,
             *_recordings_note(study),
             *replayed_notes(study),
             *shared_notes(study),
-            *sample_notes(study, study.groups),
+            *sample_notes(study, study.groups, pooled=False),
             *([] if rows else ["there is no pair of groups to compare"]),
         ),
     )
@@ -94,129 +100,119 @@ def _family(study: Study, driver: str, metric: Metric) -> list[Row]:
     reference = next((group for group in groups if group.setting == study.reference), None)
     if reference is None:
         return []
-    pairs = [
-        (group, reference)
+    found = {
+        group: _contrast(group, reference, metric)
         for group in groups
         if group is not reference and in_one_study(study, group, reference)
-    ]
-    return _corrected(pairs, metric, study.reference)
+    }
+    return _corrected(found, reference, metric, study.reference)
 
 
-def _against_humans(study: Study) -> Iterator[Row]:
-    """Every driver against the humans, for metrics whose human value can be tested."""
-    if study.human not in study.groups:
-        return
+def _against_humans(study: Study) -> tuple[list[Row], list[str]]:
+    """Every driver against the humans, for metrics that these have, and notes on the tests."""
+    human = study.human
+    if human not in study.groups:
+        return [], []
     prompt = BASELINE if study.compared else study.reference
-    pairs = [
-        (group, study.human)
-        for group in study.models
-        if group.setting == prompt and not group.caution
-    ]
-    for metric in compared():
-        if known(study.human, metric) or _published_rate(metric) is not None:
-            yield from _corrected(pairs, metric, "human")
+    groups = [group for group in study.models if group.setting == prompt and not group.caution]
+    rows: list[Row] = []
+    untested: list[str] = []
+    tested: dict[bool, list[str]] = {}
+    for metric in (metric for metric in compared() if known(human, metric)):
+        found = {group: contrast_with_humans(human, group, metric) for group in groups}
+        untested += [
+            f"{group.id}: {metric.heading} is not tested against humans: {reason}"
+            for group, reason in found.items()
+            if reason and isinstance(reason, str)
+        ]
+        if of_metric := _corrected(found, human, metric, HUMAN):
+            rows += of_metric
+            tested.setdefault(by_known_pairs(human, metric), []).append(metric.heading)
+    notes = [f"{listed(names)} against humans: {ERRORS[pairs]}" for pairs, names in tested.items()]
+    return rows, [*notes, *untested]
 
 
 def _recordings_note(study: Study) -> list[str]:
-    """Which means cannot be compared with humans before the recordings are imported."""
-    means = [one.in_lists for one in compared() if not (one.rate or known(study.human, one))]
-    need = "needs" if len(means) == 1 else "need"
-    command = "merge-runner human import"
-    return [f"{listed(means)} against humans {need} the recordings: {command}"] if means else []
-
-
-def _corrected(pairs: list[tuple[Group, Group]], metric: Metric, reference: str) -> list[Row]:
-    """One family of contrasts; pairs without the measure are left out, also of its correction."""
-    found = [
-        (group, other, contrast)
-        for group, other in pairs
-        if (contrast := _contrast(group, other, metric)) is not None
+    """Which measures cannot be compared with humans before the recordings are imported."""
+    absent = [
+        one.in_lists
+        for one in compared()
+        if one.value not in JUDGED and not known(study.human, one)
     ]
+    need = "needs" if len(absent) == 1 else "need"
+    command = "merge-runner human import"
+    return [f"{listed(absent)} against humans {need} the recordings: {command}"] if absent else []
+
+
+def _corrected(
+    contrasted: Mapping[Group, Difference | str], other: Group, metric: Metric, reference: str
+) -> list[Row]:
+    """One family of contrasts; groups without one are left out, also of its correction."""
+    found = {group: one for group, one in contrasted.items() if isinstance(one, Difference)}
     if not found:
         return []
-    holm, bh = corrected([contrast.p for _, _, contrast in found])
+    holm, bh = corrected([contrast.p for contrast in found.values()])
     return [
-        Row(
-            f"{group.id}/{reference}/{metric.name}",
-            (group.id, other.id),
-            {
-                "driver": group.label,
-                "setting": group.setting,
-                "reference": reference,
-                "measure": metric.heading,
-                # Rates are tested as fractions and shown in percentage points.
-                "difference": contrast.value * (100 if metric.rate else 1),
-                "ci": contrast.bounds(100 if metric.rate else 1),
-                "p": contrast.p,
-                "p_holm": float(holm[i]),
-                "p_bh": float(bh[i]),
-                "detectable": _percent(contrast.detectable, metric),
-                "n": _n(group, metric),
-                "n_reference": _n(other, metric),
-            },
-            "; ".join(filter(None, (_note(other, metric), _powerless(contrast, metric)))),
-            counts=metric.counts,
-            published=COLUMNS if metric.humans_from == "outcomes" else (),
-        )
-        for i, (group, other, contrast) in enumerate(found)
+        _row(group, other, metric, contrast, reference, (float(holm[i]), float(bh[i])))
+        for i, (group, contrast) in enumerate(found.items())
     ]
 
 
-def _note(other: Group, metric: Metric) -> str:
-    published = "" if known(other, metric) else _published_note(metric)
-    return "; ".join(filter(None, (published, outcomes_note(other))))
+def _row(
+    group: Group,
+    other: Group,
+    metric: Metric,
+    contrast: Difference,
+    reference: str,
+    corrected_p: tuple[float, float],
+) -> Row:
+    first, second = (
+        trials_of(one, metric).dropna(subset=[metric.column])["condition"] for one in (group, other)
+    )
+    in_both = first.isin(second), second.isin(first)
+    whole = all(part.all() for part in in_both)
+    named = ", ".join(quoted(name) for name in sorted(first[in_both[0]].unique()))
+    # Rates are tested as fractions and shown in percentage points.
+    factor = 100 if metric.rate else 1
+    return Row(
+        f"{group.id}/{reference}/{metric.name}",
+        (group.id, other.id),
+        {
+            "driver": group.label,
+            "setting": group.setting,
+            "reference": reference,
+            "measure": metric.heading,
+            "difference": contrast.value * factor,
+            "ci": contrast.bounds(factor),
+            "p": contrast.p,
+            "p_holm": corrected_p[0],
+            "p_bh": corrected_p[1],
+            "detectable": None if contrast.detectable is None else contrast.detectable * factor,
+            "n": int(in_both[0].sum()),
+            "n_reference": int(in_both[1].sum()),
+            "errors": contrast.by or "trials",
+            "freedom": None if isinf(contrast.freedom) else contrast.freedom,
+        },
+        "; ".join(filter(None, (outcomes_note(other), _powerless(contrast, metric)))),
+        counts=metric.counts if whole else f"{metric.counts} AND condition IN ({named})",
+        published=COLUMNS if metric.humans_from == "outcomes" else (),
+    )
 
 
-def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
+def _contrast(group: Group, other: Group, metric: Metric) -> Difference | str:
+    """The difference between two prompts; empty where they share no condition or are undecided."""
     if undecided(group, metric) or undecided(other, metric):
-        return None
-    frames = trials_of(group, metric), trials_of(other, metric)
+        return ""
     if not metric.rate:
-        return contrast_means(*frames, metric.column)
-    if other.setting:
-        both = shared_cells(*frames, metric.column)
-        return contrast_cells(both) if both else None
-    first, second = counts(group, metric), _rate(other, metric)
-    return contrast_rates(first, second) if first[1] and second[1] else None
-
-
-def _rate(group: Group, metric: Metric) -> tuple[int, int]:
-    """Successes and n; for humans without traces, as implied by the published rate."""
-    if known(group, metric):
-        return counts(group, metric)
-    return _published_rate(metric) or (0, 0)
-
-
-def _published_rate(metric: Metric) -> tuple[int, int] | None:
-    """The humans' successes and n, if their published rate comes with its number of trials."""
-    found = human_reference(metric)
-    if not metric.rate or found is None or found.n is None:
-        return None
-    # Fisher's test needs whole counts, and a published percentage is rounded.
-    return round(found.n * found.value / 100), found.n
-
-
-def _published_note(metric: Metric) -> str:
-    found, rate = human_reference(metric), _published_rate(metric)
-    assert found is not None
-    assert rate is not None
-    printed = "that the paper prints" if metric.paper_of_humans else f"of {found.source}"
-    k, n = rate
-    return f"human {metric.in_lists}: {k} of {n} trials, from the {found.value:.1f} % {printed}"
-
-
-def _n(group: Group, metric: Metric) -> int:
-    return _rate(group, metric)[1] if metric.rate else len(values(group, metric))
+        return contrast_means(group.trials, other.trials, metric.column) or ""
+    both = shared_cells(group.trials, other.trials, metric.column)
+    return contrast_cells(both) if both else ""
 
 
 def _powerless(contrast: Difference, metric: Metric) -> str:
     if contrast.detectable is not None:
         return ""
     return f"{metric.heading}: so few trials can show no difference, however large"
-
-
-def _percent(value: float | None, metric: Metric) -> float | None:
-    return 100 * value if value is not None and metric.rate else value
 
 
 def shared_notes(study: Study) -> list[str]:

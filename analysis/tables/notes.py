@@ -78,8 +78,8 @@ def _own_notes(study: Study, groups: list[Group]) -> list[str]:
             names = [name for name in study.conditions if name in set(mine)]
             note = (
                 f"no human drove {', '.join(names)} ({len(mine)} trials): beside the humans, rates "
-                "and regressions rest on these too, differences of means and the human ceiling on "
-                "the other conditions alone"
+                "and regressions rest on these too, contrasts with the humans and the human "
+                "ceiling on the other conditions alone"
             )
             whose.setdefault(note, []).append(group.id)
     return [f"{', '.join(ids)}: {note}" for note, ids in whose.items()]

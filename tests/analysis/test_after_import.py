@@ -65,6 +65,16 @@ def test_human_rows_come_from_the_traces(imported):
     assert {row.values["measure"] for row in tables["contrasts"].rows} == {
         *("coll. boxes (%)", "gap (m)", "RMSE (m/s)", "joint (%)")
     }
+    contrasted = {row.values["measure"]: row.values for row in tables["contrasts"].rows}
+    assert {name: of["errors"] for name, of in contrasted.items()} == {
+        "coll. boxes (%)": "trials",
+        **dict.fromkeys(("gap (m)", "RMSE (m/s)", "joint (%)"), "3 pairs"),
+    }
+    assert contrasted["gap (m)"]["freedom"] < 66
+    notes = " ".join(tables["contrasts"].notes)
+    assert "coll. boxes (%) against humans: the published counts" in notes
+    assert "gap (m), RMSE (m/s) and joint (%) against humans: by a linear model" in notes
+    assert "intervals and tests take the trials as independent" not in notes
     assert any("66 of 990 trials" in note for note in tables["who-first"].notes)
     windows = [row.values["window"] for row in tables["speed-windows"].rows if "human" in row.id]
     assert len(windows) == 4

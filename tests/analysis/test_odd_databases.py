@@ -39,12 +39,20 @@ SAID = {
             "humans (129 of 990 imported)",
             "of 5 pairs",
             "humans in 2.8 % of 990 in the same 11 conditions",
+            "Fisher's exact test, all trials taken as independent",
         ],
         ["The human recordings are not imported"],
     ),
     "complete_import": (
-        ["humans 12.93 m in 962 imported trials of the same 11 conditions"],
-        ["The human recordings are not imported", "which pair drove is not published"],
+        [
+            "humans 12.93 m in 962 imported trials of the same 11 conditions",
+            "; errors clustered by 9 pairs), p = ",
+        ],
+        [
+            "The human recordings are not imported",
+            "which pair drove is not published",
+            "Fisher's exact test",
+        ],
     ),
     "other_vehicle_length": (["o3: its task is not the default one: vehicle_length_m = 8.0."], []),
     "temperature": (["temperature = 0.2"], ["no temperature", "default sampling temperature"]),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import duckdb
 import pytest
 
+from analysis.data.human_counts import human_counts
 from analysis.data.load import load_trials
 from analysis.data.study import Study
 from analysis.explain import explain
@@ -84,7 +85,10 @@ def test_a_driver_is_compared_with_humans_by_the_rule_of_the_humans(study, tmp_p
     by_boxes = STRONG.model_copy(update={"collision_rule": "rectangle"})
     played = Study(write_study(tmp_path / "boxes.duckdb", HAND_MADE, by_boxes))
     assert counts(played.models[0], BOXES) == (2, 5)
-    assert against_humans(played)["coll. boxes (%)"]["n"] == 5
+    found = against_humans(played)["coll. boxes (%)"]
+    # In the two conditions that it drove.
+    human = [human_counts()[name] for name in study.models[0].trials["condition"].unique()]
+    assert (found["n"], found["n_reference"]) == (5, sum(of.trials for of in human))
 
 
 @pytest.mark.parametrize("measure", [COLLISIONS, BOXES])
