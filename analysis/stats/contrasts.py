@@ -73,11 +73,6 @@ def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cel
     return Cells(*both.to_numpy(int).T) if len(both) else None
 
 
-def contrast_rates(first: tuple[int, int], second: tuple[int, int]) -> Difference:
-    """Two rates, (successes, n) each: Fisher's exact test, Newcombe's score interval."""
-    return contrast_cells(Cells(*np.array([[*first, *second]]).T))
-
-
 def contrast_cells(both: Cells) -> Difference:
     """Two rates within conditions: Fisher's exact test, Newcombe's interval of weighted rates."""
     (one, _), (other, _) = both.rates

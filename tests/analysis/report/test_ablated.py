@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import duckdb
+import numpy as np
 import pytest
 
 from analysis.data.study import Study
 from analysis.metrics import COLLISIONS, GAP
 from analysis.report.ablated import ablation_sentences, smallest_p
-from analysis.stats.contrasts import contrast_means, contrast_rates
+from analysis.stats.contrasts import Cells, contrast_cells, contrast_means
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Drive, write_study, yielding
@@ -129,5 +130,5 @@ def test_the_smallest_p_is_that_of_the_most_extreme_outcome(tmp_path):
         == pytest.approx(found.p, abs=0.02)
     )
     assert smallest_p(variant, baseline, COLLISIONS) == pytest.approx(
-        contrast_rates((2, 2), (0, 2)).p
+        contrast_cells(Cells(*np.array([[2, 2, 0, 2]]).T)).p
     )

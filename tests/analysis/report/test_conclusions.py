@@ -31,7 +31,7 @@ def test_what_is_not_excluded_is_the_interval_of_these_trials(tmp_path):
     few = Study(write_study(tmp_path / "few.duckdb", yielding("o3", reps=1)[:2]))
     said, _ = texts(few)
     assert "o3 collided, by boxes that overlap, in 0.0 % of 2 trials (95 % CI 0.0 to 65.8)" in said
-    told = re.search(r"one from ([+-][0-9.]+) to ([+-][0-9.]+) percentage points", said)
+    told = re.search(r"points \(95 % CI ([+-][0-9.]+) to ([+-][0-9.]+); Fisher's exact test", said)
     low, high = map(float, told.groups())
     assert low < -2
     assert high > 60, "two trials exclude hardly anything"

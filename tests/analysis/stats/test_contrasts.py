@@ -16,9 +16,9 @@ from statsmodels.stats.multitest import multipletests
 from analysis.stats import intervals
 from analysis.stats.contrasts import (
     PERMUTATIONS,
+    Cells,
     contrast_cells,
     contrast_means,
-    contrast_rates,
     corrected,
     detectable_rate,
     first_in_shuffles,
@@ -29,6 +29,11 @@ from analysis.stats.contrasts import (
     shuffled_sums,
     within,
 )
+
+
+def contrast_rates(first, second):
+    """Two rates of one condition, (successes, n) each."""
+    return contrast_cells(Cells(*np.array([[*first, *second]]).T))
 
 
 def fisher(first, second) -> float:
