@@ -32,7 +32,7 @@ def contrast_with_humans(human: Group, group: Group, metric: Metric) -> Differen
     """
     for whose, one in (("the driver's", group), ("the humans'", human)):
         if cut_off := undecided(one, metric):
-            return f"{cut_off} of {whose} trials are undecided"
+            return f"undecided is whether {cut_off} of {whose} trials collided"
     frames = trials_of(group, metric), trials_of(human, metric)
     if by_known_pairs(human, metric):
         return contrast_by_pairs(*frames, metric.column, rate=metric.rate)

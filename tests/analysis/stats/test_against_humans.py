@@ -18,6 +18,7 @@ from analysis.metrics import BOXES, GAP
 from analysis.stats.against_humans import contrast_by_pairs, contrast_with_humans
 from analysis.stats.intervals import detectable
 from analysis.tables import make_tables
+from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from tests.analysis.stats.copies_of_humans import (
     WORLDS,
@@ -129,7 +130,9 @@ def test_a_driver_of_one_condition_is_set_against_the_human_trials_of_it(tmp_pat
         )
         for rep in range(1, 19)
     ]
-    (table,) = make_tables(Study(write_study(tmp_path / "t.duckdb", drives)), ["contrasts"])
+    by_boxes = ScenarioConfig(collision_rule="rectangle")
+    db = write_study(tmp_path / "t.duckdb", drives, by_boxes)
+    (table,) = make_tables(Study(db), ["contrasts"])
     (row,) = table.rows
     assert (row.values["difference"], row.values["p"]) == (pytest.approx(0), 1)
     assert (row.values["n"], row.values["n_reference"]) == (18, 90)
@@ -195,6 +198,12 @@ def test_a_gap_is_tested_by_pairs_while_collisions_are_still_the_published_ones(
     human.trials["counted_gap_m"] = human.trials["gap_m"]
     assert contrast_with_humans(human, driver, GAP).by == "6 pairs"
     assert contrast_with_humans(human, driver, BOXES).by == ""
+
+
+def test_a_rate_with_undecided_trials_is_not_compared():
+    driver = group(DRIVER.assign(collided_boxes=[None, *DRIVER["collided"][1:]]))
+    found = contrast_with_humans(published(), driver, BOXES)
+    assert found == "undecided is whether 1 of the driver's trials collided"
 
 
 @pytest.mark.slow
