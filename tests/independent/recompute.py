@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from tests.independent import recompute_statistics as statistics
 from tests.independent import recompute_trials as measured
@@ -31,7 +30,6 @@ METRICS = (
 # The paper's regression of the human gap, with its errors, of 962 trials.
 HUMAN_GAP = ((3.54, 0.146), (0.17, 0.034), (-0.20, 0.166), (0.06, 0.029))
 HUMAN_TRIALS = 962
-MARGIN_M = 1.0
 MOST_INVALID = 0.2
 
 
@@ -55,7 +53,7 @@ def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
         "ablation-quantitative": {_id(k): _quantities(v) for k, v in (humans | judged).items()},
         "indicators": _indicators(who),
         "differences": _differences(recorded, baselines),
-        "contrasts": _prompts(judged, trials.attrs["orders"]),
+        "contrasts": _prompts(judged, trials.attrs["orders"]) | _humans(recorded, baselines),
         "factors": _factors(judged, trials.attrs["orders"]),
     }
     for rows in found.values():
@@ -120,41 +118,29 @@ def _who_first(trials: pd.DataFrame) -> list[dict]:
 
 def _gap(trials: pd.DataFrame) -> list[dict]:
     x, y, used = gap_data(trials)
-    plain, robust = statistics.least_squares(x, y)
-    none = {"equivalence_p": None, "velocity_p": None}
+    plain, robust, covariance = statistics.least_squares(x, y)
     rows = []
     for k, term in enumerate(GAP):
         hc3 = _columns("b hc3_se t hc3_p", robust, k)
         row = {"n": len(y)} | _columns("b se t p", plain, k)
-        row |= {"hc3_se": hc3["hc3_se"], "hc3_p": hc3["hc3_p"]} | none
+        row |= {"hc3_se": hc3["hc3_se"], "hc3_p": hc3["hc3_p"]}
+        row |= {"equivalence_p": None, "velocity_p": None}
         if term == "abs_relative_velocity" and robust is not None:
-            row |= _of_velocity(x, y, used[["h", "dv"]].drop_duplicates().to_numpy(float))
+            # Conditions that differ in relative velocity alone.
+            played = dict(zip(used["cell"], x, strict=True))
+            apart = [
+                played[one] - played[two]
+                for one in played
+                for two in played
+                if one[0] == two[0] and one[1] > two[1]
+            ]
+            b, freedom = robust[:, 0], len(y) - x.shape[1]
+            if apart:
+                p = statistics.equivalence_p(b, covariance, np.array(apart), freedom)
+                row["equivalence_p"] = p
+                row["velocity_p"] = statistics.joint_p(b[2:], covariance[2:, 2:], freedom)
         rows.append(row)
     return rows
-
-
-def _of_velocity(x: np.ndarray, y: np.ndarray, played: np.ndarray) -> dict:
-    """Whether relative velocity alone moves no gap by the margin, and whether it has no effect."""
-    freedom = len(y) - x.shape[1]
-    apart = [
-        np.array([0, 0, abs(dv) - abs(other), h * (dv - other)])
-        for h, dv in played
-        for same, other in played
-        if same == h and other < dv
-    ]
-    if not apart:
-        return {}
-    # A condition and its mirror image in relative velocity are alike where nobody is ahead.
-    found = [statistics.combined(x, y, one)[:2] for one in apart if one.any()]
-    p = max((stats.t.sf((MARGIN_M - abs(b)) / se, freedom) for b, se in found), default=0.0)
-    size, product = np.eye(4)[2:]
-    (b, se), (c, other_se), (_, both) = (
-        statistics.combined(x, y, one)[:2] for one in (size, product, size + product)
-    )
-    shared = (both**2 - se**2 - other_se**2) / 2
-    errors = np.array([[se**2, shared], [shared, other_se**2]])
-    f = np.array([b, c]) @ np.linalg.solve(errors, np.array([b, c])) / 2
-    return {"equivalence_p": p, "velocity_p": stats.f.sf(f, 2, freedom)}
 
 
 def _mixed(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
@@ -169,8 +155,7 @@ def _mixed(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
             "mixed": (statistics.mixed_least_squares, gap_data(recorded)),
             "mixed-mean100": (statistics.mixed_least_squares, gap_data(recorded, "gap_mean100")),
         }
-        terms, names = GAP, "b se t p"
-        other = ("hc3_se", "hc3_p", "equivalence_p", "velocity_p")
+        terms, names, other = GAP, "b se t p", ("hc3_se", "hc3_p", "equivalence_p", "velocity_p")
     return {
         f"human/{name}/{term}": {"n": len(y)} | _columns(names, rows, k) | dict.fromkeys(other)
         for name, (fit, (x, y, used)) in fits.items()
@@ -325,6 +310,34 @@ def _prompts(groups, orders) -> dict[str, dict]:
                 sizes = [int(one[column].notna().sum()) for one in (trials, reference)]
                 found |= {"n": sizes[0], "n_reference": sizes[1], "family": (driver, name)}
                 rows[f"{driver}/{variant}/{listed[0]}/{name}"] = found
+    return rows
+
+
+def _humans(recorded: pd.DataFrame, baselines) -> dict[str, dict]:
+    """Every baseline against the humans, within the conditions that both have."""
+    human = measured.published_humans() if recorded.empty else recorded
+    rows = {}
+    for (driver, variant), trials in baselines.items():
+        for name, column, kind, shown in METRICS:
+            if not shown or column not in human or _undecided(trials, column):
+                continue
+            if recorded.empty:
+                found = _compared(trials, human, column, kind)
+            elif _undecided(human, column):
+                continue
+            else:
+                frames = []
+                for each in (trials, human):
+                    counted = each[each[column].notna()]
+                    frames.append(counted.assign(value=counted[column].astype(float)))
+                found = statistics.by_pairs_within(*frames, rate=kind == "rate")
+                unit = 100 if kind == "rate" else 1
+                for scaled in ("difference", "ci_low", "ci_high", "detectable"):
+                    found |= {scaled: unit * found[scaled]} if found else {}
+            if found:
+                sizes = [int(one[column].notna().sum()) for one in (trials, human)]
+                found |= {"n": sizes[0], "n_reference": sizes[1], "family": ("human", name)}
+                rows[f"{driver}/{variant}/human/{name}"] = found
     return rows
 
 

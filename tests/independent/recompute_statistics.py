@@ -82,29 +82,44 @@ def firth(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
     return np.column_stack([b, se, p])
 
 
-def least_squares(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Rows (b, se, t, p) of the usual errors and of HC3's; None where there are no such."""
+def least_squares(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray | None, ...]:
+    """Rows (b, se, t, p) of the usual errors and of HC3's, whose covariance comes third.
+
+    None where there are no such.
+    """
     freedom = len(y) - x.shape[1]
     if freedom < 1 or np.linalg.matrix_rank(x) < x.shape[1] or np.ptp(y) < 0.01:
-        return None, None
+        return None, None, None
     bread = np.linalg.inv(x.T @ x)
     b = bread @ x.T @ y
     rest = y - x @ b
     hat = np.einsum("ij,jk,ik->i", x, bread, x)
     plain = bread * (rest @ rest) / freedom
-    found = [_wald(b, np.sqrt(np.diag(plain)), freedom), None]
+    found = [_wald(b, np.sqrt(np.diag(plain)), freedom), None, None]
     if hat.max() < 1 - 1e-9:
         meat = x.T @ (x * ((rest / (1 - hat)) ** 2)[:, None])
-        found[1] = _wald(b, np.sqrt(np.diag(bread @ meat @ bread)), freedom)
+        found[2] = bread @ meat @ bread
+        found[1] = _wald(b, np.sqrt(np.diag(found[2])), freedom)
     return tuple(found)
 
 
-def combined(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """HC3's row of a weighted sum of coefficients, which an equal model has as its own term."""
-    k = int(np.abs(weights).argmax())
-    turned = np.eye(x.shape[1])
-    turned[k] = weights
-    return least_squares(x @ np.linalg.inv(turned), y)[1][k]
+def equivalence_p(b: np.ndarray, covariance: np.ndarray, rows: np.ndarray, freedom: int) -> float:
+    """The largest p, over differences ``rows`` of two designs, against one of 1 m or more.
+
+    Each is tested by two one-sided t tests (Schuirmann 1987); one without an error is sure.
+    """
+    p = []
+    for row in rows:
+        inside, se = 1 - abs(row @ b), np.sqrt(max(row @ covariance @ row, 0.0))
+        p.append(stats.t.sf(inside / se, freedom) if se else float(inside <= 0))
+    return max(p)
+
+
+def joint_p(b: np.ndarray, covariance: np.ndarray, freedom: int) -> float | None:
+    """The F test that all of these coefficients are 0; None where their errors are one."""
+    if np.linalg.matrix_rank(covariance) < len(b):
+        return None
+    return stats.f.sf(b @ np.linalg.solve(covariance, b) / len(b), len(b), freedom)
 
 
 def _wald(b, se, freedom=np.inf) -> np.ndarray:
@@ -304,6 +319,51 @@ def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
         sums += here[order].sum(axis=1)
     extreme = (np.abs(sums / spread) >= abs(b[0]) - 1e-9).sum()
     return found | {"p": (extreme + 1) / (DRAWS + 1), "simulated": True}
+
+
+def by_pairs_within(one: pd.DataFrame, other: pd.DataFrame, *, rate: bool) -> dict:
+    """A driver's mean less the humans', within the cells that both have; columns value, cell, pair.
+
+    Least squares with a level for each cell. The squared error is that of the humans, a jackknife
+    over their pairs, plus that of the driver, HC3 over its trials, of a rate at least that of its
+    trials if both rates are equal; t with Satterthwaite's freedom. Empty where nothing is tested.
+    """
+    shared = sorted(set(one["cell"]) & set(other["cell"]))
+    one, other = (each[each["cell"].isin(shared)] for each in (one, other))
+    if not shared or len(one) < 2:
+        return {}
+
+    def fitted(humans):
+        both = pd.concat([one, humans])
+        levels = both["cell"].to_numpy()[:, None] == _column(shared)
+        x = np.column_stack([np.arange(len(both)) < len(one), levels]).astype(float)
+        x, y = x[:, x.any(axis=0)], both["value"].to_numpy(float)
+        bread = np.linalg.inv(x.T @ x)
+        return x, y, bread, bread @ x.T @ y
+
+    x, y, bread, b = fitted(other)
+    pairs = other["pair"].unique()
+    moved = [fitted(other[other["pair"] != pair])[3][0] - b[0] for pair in pairs]
+    humans = np.sqrt(np.sum(np.square(moved)) * (len(pairs) - 1) / len(pairs))
+    leverage = np.einsum("ij,jk,ik->i", x, bread, x)
+    own = slice(0, len(one))  # of whose trials the error of the driver is
+    weight = (bread @ x.T)[0]
+    variance = np.sum((weight * (y - x @ b) / (1 - leverage))[own] ** 2)
+    if rate:
+        cell = x[:, 1:].argmax(axis=1)
+        spread = np.array([y[cell == k].var(ddof=1) for k in range(len(shared))])
+        variance = max(variance, np.sum(weight[own] ** 2 * spread[cell[own]]))
+    if max(variance, humans**2) < 1e-24:
+        return {}
+    ends = (b[0], np.sqrt(variance), len(one) - 1), (0.0, humans, len(pairs) - 1)
+    return difference(*ends)
+
+
+def _column(values: list) -> np.ndarray:
+    """An array of objects, which may be tuples."""
+    found = np.empty(len(values), dtype=object)
+    found[:] = values
+    return found
 
 
 def corrections(p: list[float]) -> tuple[np.ndarray, np.ndarray]:

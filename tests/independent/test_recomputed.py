@@ -101,8 +101,6 @@ def disagreements(program, own, *, imported: bool):
 
 def _of_paper(table: str, row: str, imported: bool) -> bool:
     """Whether a row holds what the paper prints, and is not computed."""
-    if table == "contrasts":
-        return "/human/" in row
     # I5 and the numbers beside it are not recomputed.
     if table == "indicators" and row.rpartition("/")[2].startswith(("I5", "score")):
         return True
