@@ -313,7 +313,10 @@ def test_an_ablation_has_the_numbers_of_both_tables(ask, db):
     assert list(drivers["o3"]) == ["baseline", "A1"]
     rows = {row.id: row.values for row in contrasts.rows}
     for cell, base in zip(drivers["o3"]["A1"], drivers["o3"]["baseline"], strict=True):
-        found = rows[f"o3/A1/baseline/{cell.measure}"]
+        found = rows.get(f"o3/A1/baseline/{cell.measure}")
+        if cell.measure == "collided_boxes_percent":  # some of its trials are undecided
+            assert (found, cell.difference) == (None, None)
+            continue
         assert cell.difference.value == found["difference"]
         assert cell.difference.limits == found["ci"]
         assert (cell.n, base.n) == (found["n"], found["n_reference"])
