@@ -50,6 +50,7 @@ def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
     found = {
         "who-first": _by_term(who, WHO_FIRST, _who_first) | _mixed(recorded, "who-first"),
         "gap": _by_term(humans | baselines, GAP, _gap) | _mixed(recorded, "gap"),
+        "ablation-qualitative": {_id(k): _qualities(v) for k, v in (humans | judged).items()},
         "ablation-quantitative": {_id(k): _quantities(v) for k, v in (humans | judged).items()},
         "indicators": _indicators(who),
         "differences": _differences(recorded, baselines),
@@ -227,21 +228,7 @@ def _indicators(groups) -> dict[str, dict]:
     """Table V: I1 to I4 by the paper's rule and by the robust one, and the measures."""
     rows: dict[str, dict] = {}
     for key, trials in groups.items():
-        _, headway, velocity = _who_first(trials)
-        verdicts = {
-            "I1": (headway, *_both(headway, ("p", "firth_p"), ("b", "firth_b"), 1)),
-            "I2": (velocity, *_both(velocity, ("p", "firth_p"), ("b", "firth_b"), -1)),
-        }
-        if "gap" in trials:
-            _, slope, level, _ = _gap(trials)
-            p, equivalence = level["p"], level["equivalence_p"]
-            verdicts["I3"] = (slope, *_both(slope, ("p", "hc3_p"), ("b", "b"), 1))
-            verdicts["I4"] = (
-                level,
-                None if p is None else p >= 0.05,
-                None if equivalence is None else equivalence < 0.05,
-            )
-        for name, (fit, paper, robust) in verdicts.items():
+        for name, (fit, paper, robust) in _verdicts(trials).items():
             rows[f"{_id(key)}/{name}"] = {"paper": paper, "robust": robust, "n": fit["n"]}
         for name, column, kind, shown in METRICS:
             if shown and "gap" in trials:
@@ -249,6 +236,33 @@ def _indicators(groups) -> dict[str, dict]:
                 row = {"value": value, "interval_low": low, "interval_high": high, "n": n}
                 rows[f"{_id(key)}/{name}"] = row
     return rows
+
+
+def _qualities(trials: pd.DataFrame) -> dict:
+    """Table VI: I1 to I4 of a driver and prompt."""
+    row = {"n": int((trials["status"] != "failed").sum())}
+    for name, (_, paper, robust) in _verdicts(trials).items():
+        row |= {f"{name.lower()}_paper": paper, f"{name.lower()}_robust": robust}
+    return row
+
+
+def _verdicts(trials: pd.DataFrame) -> dict[str, tuple]:
+    """By indicator: the row of its fit, and whether it holds by the paper's and the robust rule."""
+    _, headway, velocity = _who_first(trials)
+    found = {
+        "I1": (headway, *_both(headway, ("p", "firth_p"), ("b", "firth_b"), 1)),
+        "I2": (velocity, *_both(velocity, ("p", "firth_p"), ("b", "firth_b"), -1)),
+    }
+    if "gap" in trials:
+        _, slope, level, _ = _gap(trials)
+        p, equivalence = level["p"], level["equivalence_p"]
+        found["I3"] = (slope, *_both(slope, ("p", "hc3_p"), ("b", "b"), 1))
+        found["I4"] = (
+            level,
+            None if p is None else p >= 0.05,
+            None if equivalence is None else equivalence < 0.05,
+        )
+    return found
 
 
 def _both(row: dict, p: tuple, b: tuple, sign: int) -> tuple[bool | None, bool | None]:

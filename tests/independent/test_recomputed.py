@@ -20,8 +20,8 @@ from tests.independent.recompute_trials import overlap
 ALLOWED = {"__future__", "json", "numpy", "scipy", "statsmodels", "pandas", "duckdb"}
 OWN = "tests.independent"
 TABLES = (
-    "who-first", "gap", "indicators", "ablation-quantitative", "contrasts", "differences",
-    "factors",
+    "who-first", "gap", "indicators", "ablation-qualitative", "ablation-quantitative", "contrasts",
+    "differences", "factors",
 )  # fmt: skip
 # Columns that are found by iteration; all others follow from closed forms.
 ITERATED = {"b", "se", "z", "t", "p", "firth_b", "firth_se", "firth_p", "detectable"}
