@@ -92,26 +92,40 @@ async def test_the_json_of_tables_sql_digest_and_models_can_be_read(merge_runner
         assert json.loads((await merge_runner(*arguments, "--json")).out), arguments
 
 
-@pytest.mark.slow
-async def test_a_table_fits_the_terminal_and_is_whole_elsewhere(merge_runner, tmp_path):
-    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--reps", 1)).code == 0
-    whole = (await merge_runner("tables", "indicators")).out.splitlines()
-    assert max(map(len, whole)) > 80
+def on_a_terminal(folder, *command):
+    """What a command prints on a terminal of 80 columns."""
     ours, its = pty.openpty()
     fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-    program = [PROGRAM, "tables", "indicators"]
     env = {name: value for name, value in environment().items() if name != "COLUMNS"}
     with open(ours, "rb", buffering=0) as terminal:
-        process = subprocess.Popen(program, cwd=tmp_path, env=env, stdout=its)
+        process = subprocess.Popen([PROGRAM, *command], cwd=folder, env=env, stdout=its)
         os.close(its)
         text = b""
         with suppress(OSError):  # its other end is closed
             while part := terminal.read(4096):
                 text += part
     assert process.wait() == 0
-    lines = text.decode().splitlines()
+    return text.decode().splitlines()
+
+
+@pytest.mark.slow
+async def test_a_table_fits_the_terminal_and_is_whole_elsewhere(merge_runner, tmp_path):
+    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--reps", 1)).code == 0
+    whole = (await merge_runner("tables", "indicators")).out.splitlines()
+    assert max(map(len, whole)) > 80
+    lines = on_a_terminal(tmp_path, "tables", "indicators")
     assert max(map(len, lines)) <= 80
     assert any("--columns" in line for line in lines)
+
+
+@pytest.mark.slow
+async def test_the_models_fit_the_terminal_and_are_whole_elsewhere(merge_runner, tmp_path):
+    whole = (await merge_runner("models")).out.splitlines()
+    assert any(line.startswith("quantal: ") and "acceleration_mps2" in line for line in whole)
+    lines = on_a_terminal(tmp_path, "models")
+    assert max(map(len, lines)) <= 80
+    assert any(line.split()[::5] == ["o3", "2026-12-11"] for line in lines)
+    assert lines[-1] == "wider than the terminal, so without id, prices: --json has all"
 
 
 async def test_a_quiet_sweep_shows_no_progress(merge_runner):
@@ -218,10 +232,9 @@ async def test_sql_prints_text_csv_and_json_alike(merge_runner):
 async def test_models_lists_keys_prices_and_shutdown_dates(merge_runner):
     out = (await merge_runner("models", OPENAI_API_KEY="k")).out
     o3 = next(line for line in out.splitlines() if line.startswith("o3 ")).split()
-    assert o3[:6] == ["o3", "openai", "o3-2025-04-16", "set", "2", "8"]
-    assert "2026-12-11" in o3
+    assert o3[:7] == ["o3", "openai", "set", "2", "8", "2026-12-11", "o3-2025-04-16"]
     gemini = next(line for line in out.splitlines() if line.startswith("gemini-2.5-pro ")).split()
-    assert gemini[3] == "missing"
+    assert gemini[2] == "missing"
     assert "k" not in out.replace("OPENAI_API_KEY", "").split()
 
 

@@ -91,9 +91,9 @@ def built(kind: str, source: Path, to: Path) -> Path:
     return to / done.out.split()[-1]
 
 
-@pytest.mark.slow
-def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the_sdist(tmp_path):
-    checkout = tmp_path / "checkout"
+def checkout_in(folder: Path) -> Path:
+    """A copy of what a build takes, which leaves its own files there."""
+    checkout = folder / "checkout"
     checkout.mkdir()
     tracked = subprocess.run(
         ["git", "ls-files", "merge_runner", "analysis", "experiments", "cache", "pyproject.toml",
@@ -101,6 +101,12 @@ def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the
         cwd=PROJECT, capture_output=True, text=True, check=True,
     ).stdout.split()  # fmt: skip
     run(PROJECT, "cp", "--parents", "--no-dereference", *tracked, checkout)
+    return checkout
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the_sdist(tmp_path):
+    checkout = checkout_in(tmp_path)
     sdist = built("sdist", checkout, tmp_path)
     shutil.unpack_archive(sdist, tmp_path / "sdist")
     (unpacked,) = (tmp_path / "sdist").iterdir()

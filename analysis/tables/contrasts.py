@@ -42,6 +42,7 @@ def contrasts(study: Study) -> Table:
             rows += _family(study, driver, metric)
     of_humans, human_notes = _against_humans(study)
     rows += of_humans
+    judged = "judged " if study.unjudged else ""
     return Table(
         "contrasts",
         "Differences between prompts, and from humans",
@@ -89,7 +90,7 @@ def contrasts(study: Study) -> Table:
             *replayed_notes(study),
             *shared_notes(study),
             *sample_notes(study, study.groups, pooled=False),
-            *([] if rows else ["there is no pair of groups to compare"]),
+            *([] if rows else [f"there is no pair of {judged}groups to compare"]),
         ),
     )
 

@@ -14,6 +14,7 @@ from analysis.stats.mixed import MIN_PAIRS
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import replayed_notes, sample_notes
 from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
+from merge_runner.study.file import BASELINE
 
 OUTCOMES = {WHO_FIRST: "left first (logit)", GAP: "gap (m)"}
 COUNTS = {WHO_FIRST: WITH_MERGER, GAP: WITH_GAP}
@@ -88,7 +89,14 @@ def differences(study: Study) -> Table:
             "p is not corrected for the number of terms and drivers",
             *replayed_notes(study),
             *sample_notes(study, [study.human, *compared] if rows else [], pooled=False),
-            *([] if rows else ["there is no driver and no human to compare"]),
+            *(
+                []
+                if rows
+                else [
+                    "nothing is compared: that takes the humans, and a driver that is judged with "
+                    f"the prompt `{BASELINE}`"
+                ]
+            ),
         ),
     )
 

@@ -23,6 +23,7 @@ WITHOUT = ("without", "_without", f"NOT {FALLBACK}")
 def fallbacks(study: Study) -> Table:
     """A row per group and measure or indicator: over all trials, and without fallbacks."""
     rows = [row for group in study.models for row in _rows(study, group)]
+    judged = "judged " if study.unjudged else ""
     return Table(
         "fallbacks",
         "Outcomes with and without the trials that had a fallback",
@@ -46,7 +47,7 @@ def fallbacks(study: Study) -> Table:
             RULES_NOTE,
             RULES,
             *(f"{name}: {INDICATORS[name]}" for name in TESTED),
-            *([] if rows else ["there is no trial of a driver to compare"]),
+            *([] if rows else [f"there is no trial of a {judged}driver to compare"]),
             *sample_notes(study, study.models),
         ),
     )

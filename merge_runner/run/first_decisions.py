@@ -93,6 +93,14 @@ class FirstDecisions:
         elif invalid:
             self._add_invalid(model, invalid, failure, text)
 
+    def without_a_valid_one(self) -> list[str]:
+        """A line for each model none of whose decisions is valid."""
+        return [
+            f"none of the {number} decisions of {model} is valid. {self._first[model]}"
+            for model, number in sorted(self._invalid.items())
+            if model not in self._valid
+        ]
+
     def _add_invalid(self, model: str, number: int, failure: str | None, text: str | None) -> None:
         self._invalid[model] += number
         self._first.setdefault(model, _described(failure or "", text or ""))

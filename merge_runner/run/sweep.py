@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -16,6 +16,7 @@ from merge_runner.audit import Audit, audit_sweep
 from merge_runner.config import ModelEntry
 from merge_runner.errors import (
     MergeRunnerError,
+    NoValidDecision,
     ProviderDown,
     ReplayMiss,
     StoreError,
@@ -497,6 +498,11 @@ class Sweep:
                 finished=outcome.exit_code == 0,
                 derive=False,  # these trials have just been driven
             )
+            if not (outcome.exit_code or self._is_silent or self._options.keep_going):
+                stored = FirstDecisions()
+                self._add_stored(stored, [*self._stored_specs, *self._todo])
+                for line in stored.without_a_valid_one():
+                    outcome.fail(NoValidDecision.exit_code, line)
             # Answers from another model are reported elsewhere; only --strict-model stops for them.
             findings = [f for f in outcome.audit.findings if f.kind != "served"]
             if findings:
@@ -534,13 +540,16 @@ class Sweep:
         if self._options.keep_going:
             return FirstDecisions()
         first = FirstDecisions(MOST_INVALID, one_by_one=one_by_one)
-        arms = {spec.spec_hash: self._arms[spec.arm] for spec in self._stored_specs}
+        self._add_stored(first, self._stored_specs)
+        return first
+
+    def _add_stored(self, first: FirstDecisions, specs: Iterable[TrialSpec]) -> None:
+        arms = {spec.spec_hash: self._arms[spec.arm] for spec in specs}
         stored = self._store.decisions_by_spec(arms) if arms else []
         for spec, side, valid, invalid, failure, rationale in stored:
             model = arms[spec].asked[side]
             if model in self._plan.entries:
                 first.add_stored(model, valid, invalid, failure, rationale)
-        return first
 
     @property
     def _is_silent(self) -> bool:

@@ -106,3 +106,16 @@ def test_of_a_pair_the_decisions_of_each_model_count_by_themselves(tmp_path, fir
     (group,) = study.played
     assert study.models == ([group] if judged else [])
     assert ("decisions of m are invalid" in group.unjudged) is not judged
+
+
+def test_a_comparison_without_a_judged_driver_says_what_it_takes(tmp_path):
+    """Not that there is no driver: one was played."""
+    study = Study(write_study(tmp_path / "t.duckdb", failing(yielding("bad"))))
+    for name, said in (
+        ("differences", "nothing is compared: that takes the humans, and a driver that is judged"),
+        ("contrasts", "there is no pair of judged groups to compare"),
+        ("fallbacks", "there is no trial of a judged driver to compare"),
+    ):
+        (table,) = make_tables(study, [name])
+        assert [row.id for row in table.rows] == ["bad/baseline"]
+        assert any(note.startswith(said) for note in table.notes), name

@@ -39,11 +39,11 @@ async def is_ready(client):
     return "refresh" not in reply.headers
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="each of the first queries lists all columns anew, and the pages wait for it",
+    reason="2.6: each of the first queries lists all columns anew, and the pages wait for it",
 )
 async def test_forty_five_refused_queries_take_less_of_the_server_than_25_lists_of_trials(site):
     client, process = site
@@ -73,7 +73,7 @@ async def test_forty_five_refused_queries_take_less_of_the_server_than_25_lists_
 
 @pytest.mark.slow
 @pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="a form of more than ten fields is a fault, 500"
+    strict=True, raises=AssertionError, reason="2.6: a form of more than ten fields is a fault, 500"
 )
 async def test_a_form_of_too_many_fields_is_refused(site):
     client, _ = site

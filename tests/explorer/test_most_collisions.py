@@ -46,7 +46,7 @@ async def test_the_condition_with_the_largest_share_of_collisions_is_named(sweep
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="where all conditions collide alike, the first in order is named as the worst",
+    reason="1.11: where all conditions collide alike, the first in order is named as the worst",
 )
 async def test_where_all_conditions_collide_alike_none_is_named_before_the_others(sweep, tmp_path):
     """Vehicles that keep their speeds collide in each."""
@@ -59,7 +59,7 @@ async def test_where_all_conditions_collide_alike_none_is_named_before_the_other
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="where no trial ended, none is said to have collided",
+    reason="1.11: where no trial ended, none is said to have collided",
 )
 async def test_where_no_trial_ended_nothing_is_said_of_collisions(sweep, tmp_path):
     async def with_a_reply_of_too_many_levels(request, handler):

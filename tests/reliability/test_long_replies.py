@@ -184,7 +184,7 @@ def test_small_groups_are_merged_unless_texts_are_long_and_long_or_many_rows_hav
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="a transaction holds all replies of a trial, and merges row groups with those of others",
+    reason="4.2: a transaction holds all replies of a trial, and merges row groups of others",
 )
 @pytest.mark.long
 @pytest.mark.parametrize(("reply_mb", "trials", "seconds"), [(15, 1, 8), (2, 4, 30)])

@@ -85,7 +85,7 @@ def multiplied(db, times):
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="rows of decisions that no model was asked for wait in memory to be stored",
+    reason="4.3: rows of decisions that no model was asked for wait in memory to be stored",
 )
 def test_a_sweep_of_them_takes_less_than_400_mb(few):
     code, errors, used = run(few, "sweep", "study.toml", "--reps", 100, "--db", "sweep.duckdb")
@@ -97,7 +97,7 @@ def test_a_sweep_of_them_takes_less_than_400_mb(few):
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="the states of all trials are fetched at once, for which DuckDB has no memory",
+    reason="4.3: the states of all trials are fetched at once, for which DuckDB has no memory",
 )
 def test_tables_of_twenty_thousand_of_them_are_printed_in_less_than_1_gb(few):
     many = multiplied(few / "few.duckdb", 20_000 // TRIALS)
@@ -109,7 +109,7 @@ def test_tables_of_twenty_thousand_of_them_are_printed_in_less_than_1_gb(few):
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="each row of a decision is hashed by itself, 14 ms for a trial",
+    reason="4.3: each row of a decision is hashed by itself, 14 ms for a trial",
 )
 def test_the_digest_of_twenty_thousand_of_them_would_take_a_minute(few):
     """On any machine: one such trial takes 3 ms where the program starts in 1 s."""

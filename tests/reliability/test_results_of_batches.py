@@ -84,7 +84,7 @@ async def test_results_in_any_order_need_no_single_call(play):
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="a result that comes twice keeps another one from being read",
+    reason="4.1: a result that comes twice keeps another one from being read",
 )
 async def test_a_result_that_comes_twice_is_one_answer(play):
     assert (await play(with_results(lambda lines: [lines[0], *lines])))[1] == 0
@@ -93,7 +93,7 @@ async def test_a_result_that_comes_twice_is_one_answer(play):
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="results of another batch keep the batch's own from being read",
+    reason="4.1: results of another batch keep the batch's own from being read",
 )
 async def test_results_of_another_batch_are_ignored_and_counted(play):
     def with_foreign(lines):
@@ -108,7 +108,7 @@ async def test_results_of_another_batch_are_ignored_and_counted(play):
 GOES_BACK = pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="a state that goes back once has no results, and they are not asked for again",
+    reason="4.1: a state that goes back once has no results, and they are not asked for again",
 )
 
 

@@ -36,6 +36,27 @@ async def test_a_live_run_stops_after_20_invalid_decisions_and_keeps_what_was_an
     assert replay.code == 0, "a replay plays what is recorded"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [("sweep", "baseline", "--reps", 1), ("seat", "first", "--samples", 1)],
+    ids=["sweep", "seat"],
+)
+async def test_a_run_of_fewer_decisions_says_at_its_end_that_none_is_valid(merge_runner, command):
+    part = (*command, "--conditions", "N_0_0", "--json")
+    async with watched(faults=PROSE) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        for _ in range(2):  # the second asks nothing
+            run = await merge_runner(*part, **env)
+            assert run.code == run.summary["exit_code"] == 1
+            decisions = run.summary["decisions"]
+            assert run.summary["invalid_decisions"] == decisions < MOST_INVALID
+            (message,) = run.summary["messages"]
+            assert message.startswith(f"none of the {decisions} decisions of emulator is valid. ")
+            assert "no_array, it has no list of numbers" in message
+        assert (await merge_runner(*part, "--keep-going", **env)).code == 0
+
+
 async def test_a_run_in_batches_stops_after_the_first_round_and_pays_it_once(merge_runner):
     sweep = (*SWEEP, "--reps", 2, "--batch")
     async with watched(faults=PROSE) as server:

@@ -363,7 +363,7 @@ async def test_no_question_depends_on_an_answer_and_replies_without_a_plan_are_c
     for middle, name in ((None, "usual"), (wordless, "wordless")):
         async with watched(middle) as server:
             places = ("--cache", name, "--db", f"{name}.duckdb")
-            ask = ("seat", "first", "--samples", 2, *TWO, "--json", *places)
+            ask = ("seat", "first", "--samples", 2, "--keep-going", *TWO, "--json", *places)
             run = await merge_runner(*ask, EMULATOR_BASE_URL=f"{server.url}/v1")
             assert run.code == 0, run.err
             asked.append(server.asked)

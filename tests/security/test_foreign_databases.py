@@ -108,7 +108,7 @@ async def test_a_status_that_no_trial_has_is_refused_in_one_line(merge_runner, t
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="the name of a condition is part of a path as it is",
+    reason="2.6: the name of a condition is part of a path as it is",
 )
 @pytest.mark.parametrize("name", ["a/b", "../up"])
 async def test_no_name_of_a_condition_leads_out_of_the_folder_of_an_export(

@@ -15,8 +15,8 @@ FINDABLE_ERRORS = 1.96 + 0.84
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="the gaps supposed of cei are of another definition and world, and scatter almost twice "
-    "as much",
+    reason="1.5: the gaps supposed of cei are of another definition and world, and scatter almost "
+    "twice as much",
 )
 async def test_the_gaps_supposed_of_cei_scatter_as_those_that_it_leaves(merge_runner):
     study = ("baseline", "--model", "cei", "--reps", REPS)
