@@ -124,22 +124,6 @@ def test_what_the_driver_cei_comes_to(column, command):
     assert shown[2:] == found[2:]
 
 
-async def test_how_often_the_driver_cei_collides_by_either_rule(merge_runner, tmp_path):
-    for rule in ("rectangle", "euclid2d"):
-        (tmp_path / f"{rule}.toml").write_text(
-            f'models = ["cei"]\nrepetitions = 90\n[scenario]\ncollision_rule = "{rule}"\n'
-        )
-        assert (await merge_runner("sweep", f"{rule}.toml", "--db", f"{rule}.duckdb")).code == 0
-    count = "select count_if(status = 'collided') as collided, count(*) as n from trials"
-    found = [await sql(merge_runner, count, f"{rule}.duckdb") for rule in ("rectangle", "euclid2d")]
-    assert [rows[0]["n"] for rows in found] == [990, 990]
-    assert told(
-        "docs/reference/cei.md",
-        "Of 990 trials without resistance # collide by it (`repetitions = 90`, sample set 0); "
-        "the paper's rule ends #.",
-    ) == tuple(str(rows[0]["collided"]) for rows in found)
-
-
 async def test_how_the_driver_cei_collides(merge_runner, tmp_path):
     (tmp_path / "cei.toml").write_text(
         'models = ["cei"]\nrepetitions = 90\n'
