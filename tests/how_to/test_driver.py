@@ -129,8 +129,9 @@ def test_a_study_gives_it_other_parameters_and_a_slower_clock(study, installed):
 
 def test_programs_are_listed_with_what_they_do(study, installed):
     listed = (study.run("models", **installed)).out.splitlines()
-    programs = {line.split()[0]: line for line in listed if " program " in line}
-    assert {"constant", "projected-order", "idm", "impulsive", "hesitant"} <= {*programs}
+    named = {line.split()[0] for line in listed if " program " in line}
+    assert {"constant", "projected-order", "idm", "impulsive", "hesitant"} <= named
+    programs = {name: words for name, _, words in (line.partition(": ") for line in listed)}
     assert (
         "(20 times a second); parameters: steady_from_m = 20.0, strength = 0.5"
         in programs["impulsive"]

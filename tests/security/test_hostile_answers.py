@@ -30,7 +30,7 @@ async def test_strange_characters_and_counts_are_stored_and_shown_harmlessly(mer
         return web.Response(text=json.dumps(body), content_type="application/json")
 
     async with watched(middle) as server:
-        run = await merge_runner(*ONE, EMULATOR_BASE_URL=f"{server.url}/v1")
+        run = await merge_runner(*ONE, "--keep-going", EMULATOR_BASE_URL=f"{server.url}/v1")
     assert run.code == 0, run.err
     told = await merge_runner(
         "sql",

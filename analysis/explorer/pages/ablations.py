@@ -119,7 +119,7 @@ def ablations_page(site: Site, asked: Mapping[str, str]) -> str:
             "drivers": [d for d in drivers if set(d.variants) - {BASELINE}],
             "alone": [d.label for d in drivers if not set(d.variants) - {BASELINE}],
             "measures": measures(quantitative),
-            "notes": contrasts.notes,
+            "notes": [*dict.fromkeys((*quantitative.notes, *contrasts.notes))],
         }
     return site.render(
         "ablations.html",
