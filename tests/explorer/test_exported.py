@@ -30,7 +30,7 @@ def exported(study, tmp_path_factory):
 def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     page.context.set_offline(True)
     page.goto(f"file://{exported}/index.html")
-    expect(page.locator("h1")).to_have_text("Do they drive like humans?")
+    expect(page.locator("h1")).to_have_text("The baseline prompt in all 11 conditions")
     expect(page.locator(".strip")).to_have_count(0)
     page.locator("#played").get_by_role("link", name="Watch it").click()
     expect(page.get_by_label("outcome")).to_have_value("collided")

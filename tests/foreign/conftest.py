@@ -40,7 +40,17 @@ def sweeps(merge_runner, tmp_path):
 
         async def sweep(wire):
             return await merge_runner(
-                *("sweep", "short", "--model", wire, "--conditions", "R_-4_8", "--json", "--yes"),
+                *(
+                    "sweep",
+                    "short",
+                    "--model",
+                    wire,
+                    "--conditions",
+                    "R_-4_8",
+                    "--json",
+                    "--yes",
+                    "--trust",
+                ),
                 *("--db", f"{wire}.duckdb", "--cache", wire),
                 *FAST,
                 **KEYS,

@@ -294,7 +294,8 @@ async def test_recordings_that_contradict_each_other_are_not_replayed_together(
             env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
             part = ("baseline", "--model", "o3", "--reps", 1, "--conditions", "L_4_0", "--yes")
             places = ("--db", f"{name}.duckdb", "--cache", name)
-            assert (await merge_runner("sweep", *part, *FAST, *places, **env)).code == 0
+            asked = (*part, *FAST, *places, "--keep-going")
+            assert (await merge_runner("sweep", *asked, **env)).code == 0
         assert (await merge_runner("recording", "export", f"{name}.parquet", *places)).code == 0
     cache = ResponseCache(tmp_path / "one")
     entries = list(read_recording(tmp_path / "bad.parquet"))
