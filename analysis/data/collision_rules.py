@@ -65,11 +65,10 @@ def judged(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
     ``collided_boxes``: by the rule of the human experiment. ``trials`` are rows of ``load_trials``.
     """
     ended = trials["status"] != "failed"
-    recorded = trials["status"].eq("collided").astype("boolean").where(ended)
+    recorded = trials["status"].eq("collided").astype("boolean")
     human = trials["source"] == "human"
-    stored = load_specs(db)
-    configs = {name: stored.get(name, {}) for name in trials.loc[ended, "spec_hash"].unique()}
-    tasks = {name: _task(spec) for name, spec in configs.items()}
+    specs = load_specs(db)
+    tasks = {name: _task(specs.get(name, {})) for name in trials.loc[ended, "spec_hash"].unique()}
     near = {
         (row.trial_id, row.spec_hash): [Sample(*sample) for sample in row.near]
         for row in load_each({"near": _near(tasks)}, db)["near"].itertuples()
@@ -84,9 +83,10 @@ def judged(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
         dtype="boolean",
     )
     # What a trace does not show of a trial that another rule ended is open.
-    by_other = found.where((found | ~recorded).fillna(False))
+    by_other = found.mask(recorded & ~found)
     return trials.assign(
-        collided=recorded.mask(human, by_other), collided_boxes=by_other.mask(human, recorded)
+        collided=recorded.mask(human, by_other).where(ended),
+        collided_boxes=by_other.mask(human, recorded).where(ended),
     )
 
 

@@ -85,11 +85,13 @@ def undecided_note(group: Group, metric: Metric) -> str:
         return ""
     k, n = counts(group, metric)
     every = n + cut_off
-    return (
+    said = (
         f"{metric.heading}: {cut_off} of {every} trials are undecided, since another collision "
-        f"rule ended them; between {100 * k / every:.1f} and {100 * (k + cut_off) / every:.1f} %. "
-        'A study whose [scenario] has collision_rule = "rectangle" decides them'
+        f"rule ended them; between {100 * k / every:.1f} and {100 * (k + cut_off) / every:.1f} %"
     )
+    if metric is not BOXES:  # what humans did is recorded
+        return said
+    return f'{said}. A study whose [scenario] has collision_rule = "rectangle" decides them'
 
 
 def known(group: Group, metric: Metric) -> bool:

@@ -14,7 +14,7 @@ from analysis.stats.intervals import wilson
 from analysis.stats.measures import counts
 from analysis.tables import make_tables
 from merge_runner.config import ScenarioConfig
-from tests.analysis.studies import Drive, write_study, yielding
+from tests.analysis.studies import Drive, changed, write_study, yielding
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 
@@ -50,6 +50,14 @@ def test_each_trial_is_judged_by_both_rules(study):
     assert boxes[[1, 3, 4]].isna().all()
     assert counts(group, COLLISIONS) == (3, 5)
     assert counts(group, BOXES) == (1, 2)
+
+
+def test_a_trial_that_failed_has_not_collided_by_any_rule(tmp_path):
+    """Its boxes had overlapped before the call that was not answered."""
+    path = write_study(tmp_path / "failed.duckdb", HAND_MADE, STRONG)
+    study = changed(path, "UPDATE trials SET status = 'failed' WHERE rep = 2")
+    trials = study.models[0].trials.set_index("rep")
+    assert trials.loc[2, ["collided", "collided_boxes"]].isna().all()
 
 
 def test_both_rates_stand_in_the_tables_with_what_is_left_out(study):
