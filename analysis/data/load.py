@@ -120,7 +120,7 @@ WITH plans AS (
         lag(plan) OVER driver AS before
     FROM decisions WINDOW driver AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
 ), compared AS (
-    SELECT trial_id, spec_hash,
+    SELECT trial_id, spec_hash, side, decision,
         len(list_distinct(plan)) <= 2 AS coarse,
         CASE WHEN before IS NOT NULL AND len(before) > executed THEN list_avg(list_transform(
             range(1, len(before) - executed + 1),
@@ -128,7 +128,8 @@ WITH plans AS (
     FROM plans WHERE plan IS NOT NULL
 )
 SELECT trial_id, spec_hash, count(*) AS plans, count(*) FILTER (coarse) AS coarse_plans,
-    count(revision) AS revised_plans, sum(revision) AS total_revision,
+    count(revision) AS revised_plans,
+    sum(revision ORDER BY side, decision) AS total_revision,
     count(*) FILTER (revision > 0.1) AS large_revisions
 FROM compared GROUP BY ALL ORDER BY ALL
 """

@@ -107,15 +107,18 @@ FROM (SELECT *, coalesce(merge_point_m, merge_point_m()) AS point_m
 -- left it; NULL: never.
 CREATE OR REPLACE VIEW merge_times AS FROM merge_times_in('vehicle_pairs');
 
+-- Squares are added in the order of time: threads would add them in any, and round differently.
 CREATE OR REPLACE MACRO speed_deviations_in(pairs, times) AS TABLE
 SELECT *,
     (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
     least(rmse_left_mps, rmse_right_mps) >= 0.5 AS joint
 FROM (SELECT trial_id, spec_hash, time_window,
     sqrt(avg((left_mps - CASE source WHEN 'human'
-        THEN mean_speed_mps() + relative_velocity_mps / 2 ELSE left_first_mps END) ** 2)) AS rmse_left_mps,
+        THEN mean_speed_mps() + relative_velocity_mps / 2 ELSE left_first_mps END) ** 2
+        ORDER BY step)) AS rmse_left_mps,
     sqrt(avg((right_mps - CASE source WHEN 'human'
-        THEN mean_speed_mps() - relative_velocity_mps / 2 ELSE right_first_mps END) ** 2)) AS rmse_right_mps
+        THEN mean_speed_mps() - relative_velocity_mps / 2 ELSE right_first_mps END) ** 2
+        ORDER BY step)) AS rmse_right_mps
 FROM query_table(pairs)
 JOIN trials USING (trial_id, spec_hash)
 JOIN query_table(times) USING (trial_id, spec_hash)

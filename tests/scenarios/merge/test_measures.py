@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -26,3 +27,12 @@ def version(monkeypatch):
 def test_a_remark_is_no_other_version_of_the_measures_and_a_definition_is(version):
     assert version("") == version("-- A remark.\n") == version("    -- Another one.\n")
     assert version("") != version("SELECT 1;\n")
+
+
+def test_no_mean_depends_on_the_order_in_which_threads_add():
+    """Floating-point sums in another order end in another digit."""
+    text = Path(measures.__file__).with_name("measures.sql").read_text()
+    nested = r"\((?:[^()]|\((?:[^()]|\([^()]*\))*\))*\)"
+    sums = re.findall(rf"\b(?:avg|sum){nested}", text)
+    assert len(sums) == 2
+    assert all("ORDER BY step" in each for each in sums)
