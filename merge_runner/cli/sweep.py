@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -76,13 +75,6 @@ def sweep(
     rpm: RpmOption = None,
     tpm: TpmOption = None,
     max_cost: MaxCostOption = None,
-    until: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Begin no trial from this local time on, such as 07:00; the next run goes on.",
-        ),
-    ] = None,
     dask: Annotated[
         str | None,
         typer.Option(
@@ -121,7 +113,6 @@ def sweep(
 ) -> None:
     """Play all trials of a sweep that are not stored yet."""
     from merge_runner.run.plan import Options, make_plan
-    from merge_runner.run.until import deadline
 
     check_money_and_replay(max_cost, recording, replay=replay)
     if dask is not None and replay:
@@ -141,7 +132,6 @@ def sweep(
         keep_going=keep_going,
         quiet=quiet,
         dask=dask,
-        until=None if until is None else deadline(until, datetime.now(UTC)),
         **batch_options(batch=batch, round_deadline=round_deadline, detach=detach),
     )
     plan = make_plan(

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import takewhile
 from typing import Protocol
 
 from merge_runner.drivers.base import MakeDriver
@@ -75,10 +74,6 @@ class TrialRunner(Protocol):
         """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
         ...
 
-    def begin_no_more(self) -> None:
-        """Begin no other trial; those that have begun go on."""
-        ...
-
     async def drain(self) -> None:
         """Let calls in flight end and be saved, and drop those that still wait for a turn."""
         ...
@@ -96,7 +91,6 @@ class LocalRunner:
     playing: Counter[Cell] = field(default_factory=Counter)
     asking: Counter[int] = field(default_factory=Counter)
     workers: None = None
-    closed: bool = False
 
     @cached_property
     def arms(self) -> Mapping[str, Arm]:
@@ -150,17 +144,10 @@ class LocalRunner:
     async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
         """See TrialRunner."""
         await run_bounded(
-            (partial(self._trial, spec, room) for spec in takewhile(self._open, specs)),
+            (partial(self._trial, spec, room) for spec in specs),
             in_flight=self.in_flight,
             on_done=lambda done: ended(*done),
         )
-
-    def begin_no_more(self) -> None:
-        """See TrialRunner."""
-        self.closed = True
-
-    def _open(self, _: TrialSpec) -> bool:
-        return not self.closed
 
     async def drain(self) -> None:
         """See TrialRunner."""

@@ -6,7 +6,6 @@ import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -68,9 +67,9 @@ class Options:
     ``dask`` names the cluster that plays the trials; if None, this process plays them.
     ``faults_identity`` keeps the answers of an emulator that was told to misbehave apart from those
     of the usual one. A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that
-    is to ``keep_going`` asks a model on that gives no valid decision. From ``until`` on no trial
-    begins. In a ``batch`` run all trials ask together, at a lower price; a batch is
-    cancelled after ``round_deadline_s``, and a run that is to ``detach`` waits for none.
+    is to ``keep_going`` asks a model on that gives no valid decision. In a ``batch`` run all
+    trials ask together, at a lower price; a batch is cancelled after ``round_deadline_s``, and a
+    run that is to ``detach`` waits for none.
     """
 
     db: Path
@@ -89,7 +88,6 @@ class Options:
     quiet: bool = False
     dask: str | None = None
     dry_run: bool = False
-    until: datetime | None = None
     batch: bool = False
     round_deadline_s: float = USUAL_DEADLINE_S
     detach: bool = False

@@ -60,7 +60,6 @@ class Progress:
     ledger: Ledger
     stored: Counter[Cell] = field(default_factory=Counter)
     cap_usd: float | None = None
-    until: datetime | None = None
     by_cell: defaultdict[Cell, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     started: float = field(default_factory=time.monotonic)
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
@@ -111,7 +110,7 @@ class Progress:
             ("cost", f"{self._cost_usd:.2f} USD{self._in_the_end()}{self._spent()}"),
             *(("batches", text) for text in self._batches()),
             *(("calls waiting", "; ".join(texts)) for texts in [self._waiting()] if texts),
-            ("time", f"{elapsed:.0f} s{left}{self._until()}"),
+            ("time", f"{elapsed:.0f} s{left}"),
         ]
 
     def standing(self, sweep_id: str) -> Standing:
@@ -181,9 +180,6 @@ class Progress:
         more = [f"{len(texts) - REASONS_SHOWN} others"] * (len(texts) > REASONS_SHOWN)
         shown = texts[:REASONS_SHOWN] + more
         return [*shown, CLOSE_IT] if shown else []
-
-    def _until(self) -> str:
-        return "" if self.until is None else f", until {self.until:%a %H:%M}"
 
     def _cell(self, cell: Cell) -> CellStanding:
         playing = self.runner.playing

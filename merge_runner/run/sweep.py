@@ -54,7 +54,6 @@ from merge_runner.run.model_names import check_served, recorded_name, served_nam
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
-from merge_runner.run.until import GRACE_S
 from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
@@ -63,7 +62,6 @@ SHOWN = 5
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
 FROM_PROGRAMS = 16
-LOOK_AT_CLOCK_S = 1.0
 
 
 @dataclass(slots=True)
@@ -135,7 +133,6 @@ class Sweep:
         # Keyed by model and its number of answered calls, so that an answer starts a new count.
         self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
         self._suspended: TrialSuspended | None = None
-        self._out_of_time = False
         self._rounds: Rounds | None = None
         self._progress = Progress(
             plan=plan,
@@ -144,7 +141,6 @@ class Sweep:
             runner=LocalRunner(plan, {}, in_flight=0),  # nobody plays yet
             ledger=self._ledger,
             cap_usd=options.max_cost_usd,
-            until=options.until,
         )
 
     def _less_what_is_spent(self, options: Options) -> Options:
@@ -416,11 +412,11 @@ class Sweep:
                 "Ctrl-C again drops them."
             )
 
-        beside = [asyncio.create_task(self._stop_in_time(runner, interrupted))]
+        beside = []
         if self._rounds is not None and isinstance(runner, LocalRunner):
             watching = asyncio.create_task(self._rounds.watch(lambda: runner.is_idle))
             watching.add_done_callback(lambda _: work.cancel())  # nobody would close a round
-            beside.append(watching)
+            beside = [watching]
         with on_interrupt(interrupted, drain.cancel):
             await asyncio.wait([drain])
             await asyncio.wait([work])
@@ -435,37 +431,12 @@ class Sweep:
 
     def _note_end(self, work: asyncio.Task[None], outcome: Outcome) -> None:
         """Note how the playing ended, if not with the last trial."""
-        left = self._progress.total - self._progress.ways.total()
-        if self._out_of_time and left and (work.cancelled() or work.exception() is None):
-            outcome.fail(
-                INTERRUPTED,
-                f"Stopped as --until says; {left} trials have not ended, and their replies are "
-                "kept. Run the same command again to go on.",
-            )
-        elif work.cancelled():
+        if work.cancelled():
             outcome.fail(INTERRUPTED, f"Interrupted. {GO_ON}")
         elif isinstance(error := work.exception(), MergeRunnerError):
             outcome.fail(error.exit_code, str(error))
         elif error is not None:
             raise error
-
-    async def _stop_in_time(self, runner: TrialRunner, interrupt: Callable[[], None]) -> None:
-        """At the time of ``--until`` begin no more trials; a while later stop those under way."""
-        until = self._options.until
-        if until is None:
-            return
-        # In short steps, since a machine that slept wakes up late.
-        while time.time() < until.timestamp():
-            left_s = until.timestamp() - time.time()
-            await asyncio.sleep(max(0.0, min(left_s, LOOK_AT_CLOCK_S)))
-        self._out_of_time = True
-        runner.begin_no_more()
-        self._say(
-            f"It is {until:%H:%M}: no other trial begins, and what the {runner.running} trials "
-            f"under way do not finish in {GRACE_S:.0f} s is left to the next run."
-        )
-        await asyncio.sleep(GRACE_S)
-        interrupt()
 
     async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> None:
         """Store what has ended and is not stored yet; Ctrl-C ends the waiting for that."""

@@ -94,7 +94,6 @@ class Coordinator:
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._failure.add_done_callback(lambda failed: failed.exception())  # it is retrieved
         self._stopping = False
-        self._closed = False
 
     async def __aenter__(self) -> Coordinator:
         """Listen where the scheduler reaches this process."""
@@ -157,15 +156,6 @@ class Coordinator:
             for batch in done:
                 self._batches.pop(batch, None)  # type: ignore[call-overload] # the failure is none
                 batch.result()
-
-    def begin_no_more(self) -> None:
-        """See TrialRunner."""
-        self._closed = True
-        self._drop(self._waiting)
-        self._waiting.clear()
-        self._freed.set()
-        for session in self._sessions:
-            session.link.tell("begin_no_more")
 
     async def drain(self) -> None:
         """See TrialRunner."""
@@ -252,16 +242,9 @@ class Coordinator:
         # Trials it had not ended go to the front, in order. Whichever worker plays them next finds
         # their replies in the cache.
         rest = sorted(session.trials.values(), key=lambda spec: spec.order)
-        if self._closed:
-            self._drop(rest)
-            return
         self._waiting.extendleft(reversed(rest))
         if rest and not session.ended:
             self._note(f"the worker {session.worker} is lost: its {len(rest)} trials go to others")
-
-    def _drop(self, specs: Iterable[TrialSpec]) -> None:
-        """Trials that this run will not play."""
-        self._unfinished -= {spec.order for spec in specs}
 
     def _note(self, line: str) -> None:
         next(iter(self.meters.values())).notes.append(line)

@@ -42,9 +42,7 @@ class _Worker:
 
     def __init__(self) -> None:
         self._work: asyncio.Task[None] | None = None
-        self._runner: LocalRunner | None = None
         self._stopping = False
-        self._closed = False
 
     async def play(self, address: str, token: str) -> None:
         dask = get_worker()
@@ -53,7 +51,7 @@ class _Worker:
             comm = await connect(address, **dask.security.get_connection_args("worker"))
         except OSError:
             return  # the coordinator is gone, and nobody would read an error
-        link = Link(comm, {"stop": self._stop, "begin_no_more": self._begin_no_more})
+        link = Link(comm, {"stop": self._stop})
         serving = asyncio.create_task(link.serve())
         serving.add_done_callback(lambda _: self._stop())
         error: MergeRunnerError | None = None
@@ -86,8 +84,7 @@ class _Worker:
                 connections=2 * batch.in_flight,
                 stack=stack,
             )
-            self._runner = runner = LocalRunner(batch.plan, clients, batch.in_flight)
-            runner.closed = self._closed  # told so before there was a runner
+            runner = LocalRunner(batch.plan, clients, batch.in_flight)
             self._work = asyncio.create_task(runner.play(batch.specs, partial(_tell, link)))
             if self._stopping:  # told to stop before there was anything to cancel
                 self._work.cancel()
@@ -99,11 +96,6 @@ class _Worker:
                 reporting.cancel()
                 _tell_progress(runner, link)
             self._work.result()
-
-    def _begin_no_more(self) -> None:
-        self._closed = True
-        if self._runner is not None:
-            self._runner.begin_no_more()
 
     def _stop(self) -> None:
         self._stopping = True
