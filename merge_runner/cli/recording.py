@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -36,27 +35,18 @@ def recording_export(
             help="A sweep_id, which may be repeated; the newest sweep if none is given.",
         ),
     ] = None,
-    sign: Annotated[
-        Path | None,
-        typer.Option("--sign", metavar="KEY", help="Sign it with ssh-keygen or minisign."),
-    ] = None,
 ) -> None:
     """Write what sweeps asked and were answered into one file."""
     from merge_runner.llm.cache import ResponseCache
-    from merge_runner.results import signing
     from merge_runner.results.recording import export_recording, provenance_of
     from merge_runner.results.store import recorded_sweeps
 
-    if sign is not None:
-        signing.tool_for(sign)
     rows, keys = recorded_sweeps(db, sweeps or ())
     found = " and ".join(row["sweep_id"] for row in rows)
     if not keys:
         raise UsageError(f"the sweep {found} made no call: there is nothing to record")
     calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance_of(rows))
     say(f"{calls} calls of {found} are in {file}")
-    if sign is not None:
-        say(f"signed: {signing.sign(file, sign)}")
 
 
 @recording_app.command("import")
@@ -72,25 +62,14 @@ def recording_import(file: ImportedFile, cache: CacheOption = DEFAULT_CACHE) -> 
 
 
 @recording_app.command("verify")
-def recording_verify(
-    file: RecordingFile,
-    signers: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Whose signature it must have: allowed signers, or a minisign key."
-        ),
-    ] = None,
-) -> None:
-    """Check that a file is as it was exported, and by whom."""
-    from merge_runner.results import signing
+def recording_verify(file: RecordingFile) -> None:
+    """Check that a file is as it was exported."""
     from merge_runner.results.recording import summarise
 
     found = summarise(file)
     say(f"{file} is whole: {found.calls} calls, as they were exported")
     for note in found.notes:
         say(f"note: {note}")
-    if signers is not None:
-        say(signing.verified(file, signers))
 
 
 @recording_app.command("info")
