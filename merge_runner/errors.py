@@ -7,7 +7,6 @@ MergeRunnerError
 ├── SweepStopped           the sweep cannot go on; what is done is kept
 │   ├── EndpointRefused    bad key, unknown or retired model                    exit 2
 │   ├── QuotaExhausted     the account has nothing left                         exit 3
-│   ├── WaitingForBatches  --detach, and all that is left waits for batches     exit 3
 │   ├── ProviderDown       nobody listens, or nothing is answered any more      exit 1
 │   ├── ModelSwapped       --strict-model, and another model answers            exit 1
 │   ├── NoValidDecision    a model answers nothing that can be driven           exit 1
@@ -95,12 +94,6 @@ class EndpointRefused(SweepStopped):
 
 class QuotaExhausted(SweepStopped):
     """The account has no quota or credit left; waiting does not help."""
-
-    exit_code = 3
-
-
-class WaitingForBatches(SweepStopped):
-    """All that is left waits for batches, and the user does not: the same command goes on."""
 
     exit_code = 3
 

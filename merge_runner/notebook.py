@@ -52,8 +52,6 @@ class RunOptions(TypedDict, total=False):
     strict_model: bool
     keep_going: bool
     batch: bool
-    round_deadline_s: float
-    detach: bool
 
 
 @dataclass(frozen=True, repr=False)

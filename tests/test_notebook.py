@@ -153,8 +153,6 @@ async def test_a_study_is_asked_in_batches_for_half_the_price(folder):
     )
     assert half.facts["cost_usd"] == pytest.approx(whole.facts["cost_usd"] / 2)
     assert half.calls()["batch_id"].notna().all()
-    with pytest.raises(UsageError, match="--detach goes with --batch"):
-        await study.arun(detach=True)
 
 
 async def test_trials_that_failed_are_in_the_outcome(folder):

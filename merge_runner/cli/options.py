@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -140,25 +139,6 @@ BatchOption = Annotated[
 ]
 
 
-RoundDeadlineOption = Annotated[
-    str | None,
-    typer.Option(
-        "--round-deadline",
-        metavar="TIME",
-        help="Cancel a batch after this time and ask singly what it has not answered: 2h, unless "
-        "told; 0: at once.",
-    ),
-]
-
-
-DetachOption = Annotated[
-    bool,
-    typer.Option(
-        "--detach", help="With --batch: end when all waits for batches; the next run goes on."
-    ),
-]
-
-
 StrictModelOption = Annotated[
     bool, typer.Option("--strict-model", help="Stop when another model answers.")
 ]
@@ -239,22 +219,6 @@ RecordingOption = Annotated[
         help="Also replay from this file, without importing it; may be repeated.",
     ),
 ]
-
-
-def batch_options(*, batch: bool, round_deadline: str | None, detach: bool) -> dict[str, Any]:
-    """What of ``plan.Options`` is about batches; raises UsageError."""
-    if round_deadline is None:
-        return {"batch": batch, "detach": detach}
-    deadline_s = _duration_s(round_deadline, "--round-deadline")
-    return {"batch": batch, "detach": detach, "round_deadline_s": deadline_s}
-
-
-def _duration_s(text: str, option: str) -> float:
-    """The seconds that a text such as 2h, 90m or 0 names; raises UsageError."""
-    found = re.fullmatch(r"([0-9]{1,6}(?:\.[0-9]{1,3})?)\s*(h|m|min|s|)", text.strip())
-    if found is None or (found[2] == "" and float(found[1])):
-        raise UsageError(f"{option} {text!r} is no duration: write 2h, 90m, 30s or 0")
-    return float(found[1]) * {"h": 3600, "m": 60, "min": 60}.get(found[2], 1)
 
 
 def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:

@@ -11,7 +11,6 @@ from merge_runner.cli.options import (
     CacheOption,
     ConditionsOption,
     DbOption,
-    DetachOption,
     DryRunOption,
     InFlightOption,
     JsonOption,
@@ -23,7 +22,6 @@ from merge_runner.cli.options import (
     QuietOption,
     RecordingOption,
     ReplayOption,
-    RoundDeadlineOption,
     RpmOption,
     SampleSetOption,
     StrictModelOption,
@@ -31,7 +29,6 @@ from merge_runner.cli.options import (
     TrustOption,
     VariantsOption,
     YesOption,
-    batch_options,
     levels,
     listed,
 )
@@ -86,8 +83,6 @@ def first(
     tpm: TpmOption = None,
     max_cost: MaxCostOption = None,
     batch: BatchOption = False,
-    round_deadline: RoundDeadlineOption = None,
-    detach: DetachOption = False,
     strict_model: StrictModelOption = False,
     keep_going: KeepGoingOption = False,
     dry_run: DryRunOption = False,
@@ -117,7 +112,7 @@ def first(
         strict_model=strict_model,
         keep_going=keep_going,
         quiet=quiet,
-        **batch_options(batch=batch, round_deadline=round_deadline, detach=detach),
+        batch=batch,
     )
     plan = make_plan(
         name,

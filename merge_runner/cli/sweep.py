@@ -13,7 +13,6 @@ from merge_runner.cli.options import (
     CacheOption,
     ConditionsOption,
     DbOption,
-    DetachOption,
     DryRunOption,
     InFlightOption,
     JsonOption,
@@ -27,7 +26,6 @@ from merge_runner.cli.options import (
     RecordingOption,
     ReplayOption,
     RepsOption,
-    RoundDeadlineOption,
     RpmOption,
     SampleSetOption,
     StrictModelOption,
@@ -35,7 +33,6 @@ from merge_runner.cli.options import (
     TrustOption,
     VariantsOption,
     YesOption,
-    batch_options,
     levels,
     listed,
 )
@@ -84,8 +81,6 @@ def sweep(
         ),
     ] = None,
     batch: BatchOption = False,
-    round_deadline: RoundDeadlineOption = None,
-    detach: DetachOption = False,
     strict_model: StrictModelOption = False,
     keep_going: KeepGoingOption = False,
     dry_run: DryRunOption = False,
@@ -132,7 +127,7 @@ def sweep(
         keep_going=keep_going,
         quiet=quiet,
         dask=dask,
-        **batch_options(batch=batch, round_deadline=round_deadline, detach=detach),
+        batch=batch,
     )
     plan = make_plan(
         name,

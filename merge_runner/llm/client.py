@@ -312,7 +312,7 @@ class LlmClient:
 
     def _goes_in_batch(self, call: Call) -> bool:
         """Whether the next attempt at a call goes with the next round."""
-        if self.batches is None or not self.batches.rounds.ways.submits or call.singly:
+        if self.batches is None or not self.batches.rounds.submits or call.singly:
             return False
         return sum(attempt.batch_id is not None for attempt in call.own_attempts) < MOST_LINES
 

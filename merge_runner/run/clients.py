@@ -23,7 +23,7 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.batch.batches import Batches
 from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.modes import batch_service, batch_terms, require_batch
-from merge_runner.llm.batch.rounds import BatchWays, Rounds
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.budget import Budget, Unpaid
 from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.client import LlmClient
@@ -201,7 +201,7 @@ def live_clients(
             model=model,
             first=FirstCall(
                 # A round is asked at once: no call of it waits for another one's answer.
-                passed=name in endpoint_plan.passed or (rounds is not None and rounds.ways.submits),
+                passed=name in endpoint_plan.passed or (rounds is not None and rounds.submits),
                 known=name in endpoint_plan.known,
             ),
             batches=_batches(model, entry, cache, budget, rounds),
@@ -248,25 +248,20 @@ def open_rounds(
     if not options.batch and not left:
         return None
     most = max((most_prompts(arm) for arm in plan.arms), default=1)
-    ways = BatchWays(options.batch, options.round_deadline_s, options.detach, most)
     free = {
         plan.registered[name]
         for name, entry in plan.entries.items()
         if plan.is_rehearsal or entry.price == "free"
     }
-    return Rounds(journal, {}, ways, free=free, say=say)
+    return Rounds(journal, {}, submits=options.batch, most_rounds=most, free=free, say=say)
 
 
 def check_batches(plan: Plan, options: Options) -> None:
     """Raise UsageError where a run cannot use batches as it is told to."""
-    if options.detach and not options.batch:
-        raise UsageError("--detach goes with --batch")
     if not options.batch:
         return
     if options.replay:
         raise UsageError("a replay asks nothing: leave --batch out")
-    if options.round_deadline_s == 0:
-        raise UsageError("--round-deadline 0 ends batches: leave --batch out, or give it longer")
     if options.dask is not None:
         raise UsageError("--batch plays in this process: leave --dask out")
     if not plan.entries:
@@ -274,12 +269,6 @@ def check_batches(plan: Plan, options: Options) -> None:
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         require_batch(plan.registered[name], entry, registry)
-        started = entry.provider == "emulator" and running_emulator_url() is None
-        if options.detach and (started or plan.is_rehearsal):
-            raise UsageError(
-                "an emulator that a sweep starts ends with it: for --detach start `merge-runner "
-                "emulate` and name it in EMULATOR_BASE_URL"
-            )
 
 
 def _allow_open_files(wanted: int) -> None:

@@ -22,7 +22,6 @@ from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials, require
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.rounds import USUAL_DEADLINE_S
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Caps
@@ -68,8 +67,7 @@ class Options:
     ``faults_identity`` keeps the answers of an emulator that was told to misbehave apart from those
     of the usual one. A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that
     is to ``keep_going`` asks a model on that gives no valid decision. In a ``batch`` run all
-    trials ask together, at a lower price; a batch is cancelled after ``round_deadline_s``, and a
-    run that is to ``detach`` waits for none.
+    trials ask together, at a lower price.
     """
 
     db: Path
@@ -89,8 +87,6 @@ class Options:
     dask: str | None = None
     dry_run: bool = False
     batch: bool = False
-    round_deadline_s: float = USUAL_DEADLINE_S
-    detach: bool = False
 
     @property
     def caps(self) -> Caps:

@@ -16,6 +16,9 @@ import pytest
 
 from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
+from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.seat import first_situations
+from merge_runner.run.sweep import Sweep
 from tests.harness import FAST, PROJECT, watched
 
 KILLS = 20
@@ -71,6 +74,18 @@ async def answered(server):
         where = alone if each["custom_id"] is None else batched
         where[each["slot"]] += each["answered"]
     return batched, alone
+
+
+async def interrupted(merge_runner, server, *command, **env):
+    """What a run prints that gets Ctrl-C when a batch waits."""
+    before = len(server.paths)
+    process = await merge_runner.fork(*command, **env)
+    while not any(re.fullmatch(".*/batches/.+", path) for path in server.paths[before:]):
+        await asyncio.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    out, err = await process.communicate()
+    assert process.returncode == 130, err
+    return out.decode()
 
 
 async def rows(merge_runner, query, db="results/merge.duckdb"):
@@ -168,9 +183,7 @@ async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path, p
             await asyncio.sleep(0.02)
         process.send_signal(signal.SIGINT)
         assert await process.wait() == 130
-        left = await merge_runner(*sweep, "--batch", "--detach", **env)
-        assert left.code == 3, left.err
-        assert "the same command goes on" in left.err
+        await interrupted(merge_runner, server, *sweep, "--batch", **env)
         last = await merge_runner(*sweep, **env)
         batched, alone = await answered(server)
         plain = await merge_runner(*sweep, "--db", "plain", "--cache", "new", **env)
@@ -184,55 +197,35 @@ async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path, p
 
 
 @pytest.mark.long
-async def test_detached_runs_bring_a_sweep_to_its_end(merge_runner, priced):
-    sweep = (
-        "sweep",
-        "short.toml",
-        *TWO,
-        "--model",
-        "priced",
-        "--batch",
-        "--detach",
-        "--yes",
-        "--json",
-    )
-    async with watched() as server:
-        runs = [await merge_runner(*sweep, **account(server))]
-        while runs[-1].code == 3 and len(runs) < 12:
-            runs.append(await merge_runner(*sweep, **account(server)))
-    assert [run.code for run in runs[-2:]] == [3, 0], runs[-1].err
-    (told,) = runs[0].summary["open_batches"]
-    assert "round 1 of at most 4: 4 calls of priced in batch batch_" in told
-    assert told not in runs[0].err.splitlines()[-1]
-    assert runs[-1].summary["open_batches"] == []
-    assert len(runs) == 5  # a decision each, and the end
-
-
-@pytest.mark.long
 async def test_first_situations_take_one_batch(merge_runner, tmp_path):
     first = ("seat", "first", "--samples", 1)
-    async with watched(faults=FaultPlan(batch=BatchPlan(polls=2))) as server:
+    async with watched(faults=FaultPlan(batch=BatchPlan(polls=8))) as server:
         env = account(server)
-        left = await merge_runner(*first, "--batch", "--detach", **env)
-        again = await merge_runner(*first, "--batch", "--detach", **env)
+        left = await interrupted(merge_runner, server, *first, "--batch", **env)
         run = await merge_runner(*first, "--batch", **env)
         plain = await merge_runner(*first, "--db", "plain", "--cache", "new", **env)
-    assert [left.code, again.code, run.code, plain.code] == [3, 3, 0, 0], again.err + run.err
-    assert left.out.count("round 1 of at most 1: 22 calls of emulator") == 1
+    assert [run.code, plain.code] == [0, 0], run.err
+    assert left.count("open batch: round 1 of at most 1: 22 calls of emulator") == 1
     (batches,) = await rows(merge_runner, "select count(distinct batch_id) as n from calls")
     assert batches["n"] == 1
     assert results_digest(tmp_path / "results/merge.duckdb") == results_digest(tmp_path / "plain")
 
 
 @pytest.mark.long
-async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly(merge_runner):
-    sweep = ("seat", "first", "--samples", 1, "--batch")
+async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr("merge_runner.llm.batch.following.ROUND_DEADLINE_S", 2.0)
+    said = []
     plan = BatchPlan(delay_s=1.0, slow=0.5, slow_factor=1000)
     async with watched(faults=FaultPlan(batch=plan)) as server:
-        run = await merge_runner(*sweep, "--round-deadline", "2s", **account(server))
+        monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
+        first = first_situations(make_plan("baseline", "emulator", repetitions=1))
+        options = Options(tmp_path / "m.duckdb", tmp_path / "c", batch=True)
+        outcome = await Sweep(first, options, say=said.append).run()
         batched, alone = await answered(server)
-    assert run.code == 0, run.err
-    assert "is cancelled: what it has answered is taken, the rest is asked singly" in run.err
+    assert outcome.exit_code == 0, outcome.messages
+    assert any("is cancelled: what it has answered is taken, the rest" in line for line in said)
     assert batched
     assert alone
     assert (batched + alone).total() == len(batched + alone) == 22
@@ -254,15 +247,13 @@ async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
     sweep = ("sweep", "short.toml", *TWO, "--model", "priced", "--batch", "--yes")
     async with watched(faults=FaultPlan(batch=BatchPlan(delay_s=1.0))) as server:
         env = account(server)
-        process = await merge_runner.fork(*sweep, **env)
-        while not any("/batches" in each for each in server.paths):  # as above
-            await asyncio.sleep(0.02)
-        await asyncio.sleep(0.3)
-        process.send_signal(signal.SIGINT)
-        assert await process.wait() == 130
-        last = await merge_runner(*sweep, **env)
+        left = json.loads(await interrupted(merge_runner, server, *sweep, "--json", **env))
+        last = await merge_runner(*sweep, "--json", **env)
         batched, alone = await answered(server)
     assert last.code == 0, last.err
+    (told,) = left["open_batches"]
+    assert "round 1 of at most 4: 4 calls of priced in batch batch_" in told
+    assert last.summary["open_batches"] == []
     assert max(batched.values()) == 1
     assert not alone
 
@@ -270,13 +261,10 @@ async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--detach",), "--detach goes with --batch"),
         (("--batch", "--replay"), "leave --batch out"),
         (("--batch", "--dask", "local:1"), "leave --dask out"),
         (("--batch", "--model", "constant"), "no language model is asked: leave --batch out"),
         (("--batch", "--model", "local"), "local has no batch mode that is known; valid with"),
-        (("--batch", "--round-deadline", "2"), "is no duration: write 2h, 90m, 30s or 0"),
-        (("--batch", "--round-deadline", "0"), "ends batches: leave --batch out"),
     ],
 )
 async def test_what_cannot_go_in_batches_is_refused_in_one_line(merge_runner, options, says):
@@ -284,12 +272,6 @@ async def test_what_cannot_go_in_batches_is_refused_in_one_line(merge_runner, op
     assert run.code == 2
     assert says in run.err.splitlines()[-1]
     assert (run.out, run.err.count("error: ")) == ("", 1)
-
-
-async def test_an_emulator_that_a_sweep_starts_cannot_be_left(merge_runner):
-    run = await merge_runner("sweep", "baseline", "--batch", "--detach", EMULATOR_BASE_URL="")
-    assert run.code == 2
-    assert "for --detach start `merge-runner emulate`" in run.err
 
 
 async def test_a_dry_run_says_what_batches_cost_beside_single_calls(merge_runner):
@@ -301,5 +283,5 @@ async def test_a_dry_run_says_what_batches_cost_beside_single_calls(merge_runner
     assert lines[5].endswith("minutes, asked singly")
     assert lines[6] == (
         "batch   about 0.27 USD in about 11 rounds, at most 30; a round takes as long as its "
-        "slowest batch: minutes, an hour, at most a day"
+        "slowest batch: minutes, an hour; after two the rest is asked singly"
     )

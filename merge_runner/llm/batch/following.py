@@ -25,6 +25,8 @@ from merge_runner.llm.batch.service import (
 SHORTEST_POLL_S, LONGEST_POLL_S, POLL_SHARE = 0.25, 60.0, 0.1
 # A creation whose answer was lost may be in effect only after this: gateways keep requests.
 ARRIVAL_S = 30.0
+# How old a batch may be; then it is cancelled, and what it has not answered is asked singly.
+ROUND_DEADLINE_S = 7200.0
 # How long a batch may take to end once it was asked to, and then to show its results.
 ENDING_S = 3600.0
 T = TypeVar("T")
@@ -84,7 +86,7 @@ class Following:
         services: Mapping[str, BatchService],
         background: Background,
         *,
-        deadline_s: float,
+        submits: bool,
         free: Collection[str],
         split: Callable[[Followed, str], None],
         say: Callable[[str], None],
@@ -93,7 +95,7 @@ class Following:
         self._journal = journal
         self._services = services
         self._background = background
-        self._deadline_s = deadline_s
+        self._submits = submits
         self._free = free
         self._split = split
         self._say = say
@@ -192,7 +194,7 @@ class Following:
 
     def _until_next_look_s(self, followed: Followed) -> float:
         usual_s = min(LONGEST_POLL_S, max(SHORTEST_POLL_S, POLL_SHARE * followed.age_s))
-        left_s = self._deadline_s - followed.age_s
+        left_s = ROUND_DEADLINE_S - followed.age_s
         if followed.batch.cancelled_at or not followed.batch.sure:
             return usual_s
         return max(SHORTEST_POLL_S, min(usual_s, left_s))
@@ -200,7 +202,7 @@ class Following:
     async def _cancel_in_time(self, followed: Followed) -> None:
         if followed.batch.cancelled_at or not followed.batch.sure:
             return
-        if followed.age_s < self._deadline_s:
+        if followed.age_s < ROUND_DEADLINE_S:
             return
         batch = followed.batch
         await self._patiently(followed, partial(self._services[batch.model].cancel, batch.batch_id))
@@ -268,8 +270,9 @@ class Following:
     def lost(self, followed: Followed, exc: BatchFailed) -> None:
         """Nobody knows what became of a batch: what was set aside for it stays so."""
         batch = followed.batch
-        gives_up = self._deadline_s == 0
         free = batch.model in self._free
+        # A key that is refused is another account's, perhaps: there the batch goes on.
+        gives_up = not self._submits and exc.kind not in ("refused", "quota")
         if free or gives_up:
             followed.end(
                 LineEnd(batch.batch_id, outcome="batch_lost", message=str(exc), unclear=not free)
@@ -277,7 +280,7 @@ class Following:
             return
         error = EndpointRefused(
             f"{batch.model}: {batch.batch_id} is refused to this key ({exc}): set the key of the "
-            "account that has submitted it. If it is gone, --round-deadline 0 without --batch asks "
+            "account that has submitted it. If it is gone, the same command without --batch asks "
             "its calls anew"
         )
         for line in followed.lines.values():

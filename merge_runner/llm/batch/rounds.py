@@ -12,9 +12,9 @@ import asyncio
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from merge_runner.errors import EndpointRefused, ProviderDown, TrialSuspended, WaitingForBatches
+from merge_runner.errors import EndpointRefused, ProviderDown, TrialSuspended
 from merge_runner.llm.batch.background import Background
 from merge_runner.llm.batch.following import (
     LONGEST_POLL_S,
@@ -31,7 +31,6 @@ from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatu
 from merge_runner.llm.first_call import NOBODY_S
 from merge_runner.records import Attempt
 
-USUAL_DEADLINE_S = 7200.0
 # How often it is looked whether a round can be closed: what is seen then decides, not the time.
 LOOK_S = 0.05
 # A task that can go on shows that when the loop has come round once; a chain of them, soon after.
@@ -42,37 +41,26 @@ OUTAGE_S = 600.0
 MOST_REFUSALS = 5
 
 
-@dataclass(frozen=True, slots=True)
-class BatchWays:
-    """How a run uses batches: whether it ``submits`` any, or only takes what others have submitted.
-
-    A batch is cancelled ``deadline_s`` after its submission. With ``detach`` the run ends when all
-    that is left waits for batches. ``most_rounds`` is how many there are if no line fails.
-    """
-
-    submits: bool
-    deadline_s: float
-    detach: bool
-    most_rounds: int
-
-
 class Rounds:
     """The rounds of a run; ``services`` are the batch modes of its models, by registered name.
 
-    For those that are ``free`` nobody charges.
+    A run that does not ``submits`` takes only what earlier runs have submitted. There are
+    ``most_rounds`` if no line fails. Nobody charges for the models that are ``free``.
     """
 
     def __init__(
         self,
         journal: Journal,
         services: dict[str, BatchService],
-        ways: BatchWays,
         *,
+        submits: bool,
+        most_rounds: int,
         free: Collection[str] = (),
         say: Callable[[str], None],
     ) -> None:
-        self.ways = ways
+        self.submits = submits
         self.services = services
+        self._most_rounds = most_rounds
         self._journal = journal
         self._say = say
         self._background = Background()
@@ -80,7 +68,7 @@ class Rounds:
             journal,
             services,
             self._background,
-            deadline_s=ways.deadline_s,
+            submits=submits,
             free=free,
             split=self._split,
             say=say,
@@ -91,7 +79,6 @@ class Rounds:
         self._too_large: set[str] = set()  # models of which the last batch was too large
         self._refusals: Counter[str] = Counter()  # of lines alone in their batches, by key
         self._reached: set[str] = set()
-        self._submitting = 0
 
     def open_line(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenLine | None:
         """Where a call with these attempts waits already; None: nowhere that can be reached."""
@@ -133,13 +120,10 @@ class Rounds:
         """Close each round when nothing else goes on; ``is_idle`` says whether that is so."""
         while True:
             await asyncio.sleep(LOOK_S)
-            if not (self._forming or self.ways.detach):
+            if not self._forming:
                 continue
             if await _is_settled(lambda: is_idle() and not self._hands_out):
-                if self._forming:
-                    self._close_round()
-                elif not self._submitting:
-                    self._detach()
+                self._close_round()
 
     def standing(self) -> list[str]:
         """Which batches are waited for, a line each."""
@@ -176,18 +160,14 @@ class Rounds:
                 self._background.start(self._submit(together), together)
 
     async def _submit(self, lines: Sequence[Line], *, instead_of: Sequence[str] = ()) -> None:
-        self._submitting += 1
+        followed = await self._noted(lines, instead_of)
+        if followed is None:
+            return
         try:
-            followed = await self._noted(lines, instead_of)
-            if followed is None:
-                return
-            try:
-                await self._create(followed)
-            except BatchFailed as exc:
-                await self._not_created(followed, exc)
-                return
-        finally:
-            self._submitting -= 1
+            await self._create(followed)
+        except BatchFailed as exc:
+            await self._not_created(followed, exc)
+            return
         work = self._following.follow(followed)
         self._background.start(work, followed.lines.values(), reads=True)
 
@@ -291,7 +271,7 @@ class Rounds:
         if batch.model not in self._too_large:
             self._too_large.add(batch.model)
             self._say(f"{batch.model}: {counted(len(lines))} go in smaller batches: {why}")
-        # Beside what calls this: where a run is to detach, it does not wait for room.
+        # Beside what calls this, and whose end may make room.
         self._background.start(self._in_halves(batch, lines, delay_s), lines)
 
     async def _in_halves(
@@ -358,31 +338,16 @@ class Rounds:
 
     def _form_anew(self, line: Line) -> None:
         """A line whose batch was never created goes with the next round."""
-        if self.ways.submits:
+        if self.submits:
             self._forming.append(line)
         else:
             line.ends(
                 LineEnd(None, outcome="not_created", message="the run ended before", singly=True)
             )
 
-    def _detach(self) -> None:
-        """End the run where all that is left waits for batches, each of which was looked at."""
-        waiting = [each for each in self._all() if each.is_open]
-        lines = [line for each in waiting for line in each.lines.values()]
-        if not lines or not all(each.looked for each in waiting):
-            return
-        batches = "1 batch" if len(waiting) == 1 else f"{len(waiting)} batches"
-        wait = "waits" if len(lines) == 1 else "wait"
-        lines[0].fails(
-            WaitingForBatches(
-                f"{counted(len(lines))} {wait} in {batches}. Nothing is lost: the same command "
-                "goes on"
-            )
-        )
-
     def _described(self, followed: Followed) -> str:
         batch, status = followed.batch, followed.status
-        most = max(self.ways.most_rounds, batch.number)
+        most = max(self._most_rounds, batch.number)
         done = (
             f", {status.done} of {status.total} done"
             if status is not None and status.done is not None and status.total

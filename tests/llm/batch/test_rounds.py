@@ -24,11 +24,10 @@ from merge_runner.errors import (
     EndpointRefused,
     ProviderDown,
     QuotaExhausted,
-    WaitingForBatches,
 )
 from merge_runner.llm.batch.batches import Batches
 from merge_runner.llm.batch.journal import Journal
-from merge_runner.llm.batch.rounds import BatchWays, Rounds
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.service import (
     BatchFailed,
     BatchLimits,
@@ -107,7 +106,7 @@ class Memory:
 
     async def status(self, batch_id):
         if batch_id not in self.batches:
-            raise BatchFailed("single", "HTTP 404: no such batch", sent=False)
+            raise BatchFailed("lost", "HTTP 404: no such batch", sent=False)
         step = self.states.pop(0) if self.states else BatchStatus("ended", "completed")
         if isinstance(step, BatchFailed):
             raise step
@@ -153,14 +152,16 @@ def cache(tmp_path):
 class Run:
     """A run's client, and the rounds that it asks in."""
 
-    def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", free=False, **ways):
+    def __init__(
+        self, cache, service, *, cap=None, price=PRICE, scope="test", free=False, submits=True
+    ):
         self.said = []
         self.alone = Alone()
-        usual = {"submits": True, "deadline_s": 7200.0, "detach": False, "most_rounds": 30}
         self.rounds = Rounds(
             Journal(cache),
             {"m": service},
-            BatchWays(**{**usual, **ways}),
+            submits=submits,
+            most_rounds=30,
             free={"m"} if free or price == "free" else set(),
             say=self.said.append,
         )
@@ -357,21 +358,28 @@ async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache,
     assert Journal(cache).batches() == []
 
 
-async def left_with(cache, service, repetitions=1, **ways):
-    """What a --detach run ends with that leaves a batch behind."""
+async def left_behind(cache, service, repetitions=1, **options):
+    """A run that is interrupted while a batch waits."""
     service.states = [BatchStatus("waiting", "in_progress")] * 1000
-    run = Run(cache, service, detach=True, **ways)
-    (left, *_) = await run.ask(repetitions)
+    run = Run(cache, service, **options)
+    asking = asyncio.create_task(run.ask(repetitions))
+    await asyncio.sleep(5)
+    assert len(run.rounds.standing()) == 1
+    asking.cancel()
     await run.end()
     service.states = []
-    return left
+    return run
 
 
-@pytest.mark.parametrize("deadline_s", [0.0, 7200.0])
+@pytest.fixture
+def no_patience(monkeypatch):
+    """Every batch that waits is over its time."""
+    monkeypatch.setattr("merge_runner.llm.batch.following.ROUND_DEADLINE_S", 0.0)
+
+
+@pytest.mark.usefixtures("no_patience")
 @in_virtual_time
-async def test_a_batch_that_may_be_a_strangers_is_no_ones_own_in_the_next_run_either(
-    cache, deadline_s
-):
+async def test_a_batch_that_may_be_a_strangers_is_no_ones_own_in_the_next_run_either(cache):
     class Dying(Memory):
         async def submit(self, lines, mark):
             await super().submit(lines, mark)
@@ -384,9 +392,9 @@ async def test_a_batch_that_may_be_a_strangers_is_no_ones_own_in_the_next_run_ei
     service = Memory()
     service.batches = {"stranger": [], **dying.batches}
     service.unsure = ["stranger", "batch-0"]
-    assert isinstance(await left_with(cache, service), WaitingForBatches)
+    await left_behind(cache, service)
     service.states = [BatchStatus("waiting", "in_progress")] * 2
-    run = Run(cache, service, deadline_s=deadline_s)
+    run = Run(cache, service)
     (reply,) = await run.ask()
     assert outcomes(reply) == [("ok", "batch-0")]
     assert (service.cancelled, run.alone.asked, len(service.batches)) == ([], [], 2)
@@ -396,18 +404,16 @@ async def test_a_batch_that_may_be_a_strangers_is_no_ones_own_in_the_next_run_ei
 async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
     class Slow(Memory):
         async def status(self, batch_id):
-            ended = batch_id in self.cancelled
-            return BatchStatus("ended" if ended else "waiting", "its word")
+            return BatchStatus("waiting" if batch_id == "batch-0" else "ended", "its word")
 
     service = Slow()
     service.creations = [None, BatchFailed("again", "HTTP 504")]
     with contextlib.closing(ResponseCache(tmp_path / "other")) as other:
-        one, two = Run(cache, service), Run(other, service, deadline_s=0.0)
+        one, two = Run(cache, service), Run(other, service)
         asking = asyncio.create_task(one.ask())
         await asyncio.sleep(10)
         (reply,) = await two.ask()
         assert outcomes(reply) == [("ok", "batch-1")]
-        assert service.cancelled == ["batch-1"]
         asking.cancel()
         await one.end()
         await two.end()
@@ -441,6 +447,7 @@ async def test_a_single_line_that_finds_no_room_is_asked_alone_after_a_few_tries
     assert len(run.said) == 2
 
 
+@pytest.mark.usefixtures("no_patience")
 @in_virtual_time
 async def test_what_a_cancelled_batch_answered_unreadably_stays_set_aside(cache):
     class Unreadable(Memory):
@@ -450,7 +457,7 @@ async def test_what_a_cancelled_batch_answered_unreadably_stays_set_aside(cache)
 
     service = Unreadable()
     service.states = [BatchStatus("waiting", "in_progress")]
-    run = Run(cache, service, deadline_s=0.0)
+    run = Run(cache, service)
     (reply,) = await run.ask()
     assert service.cancelled == ["batch-0"]
     assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
@@ -483,27 +490,10 @@ class WithoutResults(Memory):
 
 
 @in_virtual_time
-async def test_a_detached_run_ends_while_the_results_cannot_be_fetched(cache):
-    service = WithoutResults()
-    await left_with(cache, service)
-    run = Run(cache, service, detach=True)
-    (left,) = await asyncio.wait_for(run.ask(), 60)
-    assert isinstance(left, WaitingForBatches)
-    assert run.said == ["m: HTTP 503; it is asked again until it answers"]
-    await run.end()
-
-
-@in_virtual_time
 async def test_an_answer_whose_money_was_released_is_spent_on_its_model_and_is_no_overrun(cache):
     service = Memory()
-    left = Run(cache, service, cap=10)
-    service.states = [BatchStatus("waiting", "in_progress")] * 1000
-    asking = asyncio.create_task(left.ask())
-    await asyncio.sleep(1)
-    asking.cancel()
-    await left.end()
+    left = await left_behind(cache, service, cap=10)
     left.ledger.release()
-    service.states = []
     run = Run(cache, service, cap=10)
     await run.ask()
     spending = run.ledger.read()
@@ -543,7 +533,7 @@ async def test_the_bound_on_results_that_never_come_counts_from_the_first_run_th
     cache,
 ):
     service = WithoutResults()
-    await left_with(cache, service)
+    await left_behind(cache, service)
     await note(cache, ended_at=HOURS_AGO)
     run, began_s = Run(cache, service), asyncio.get_running_loop().time()
     (reply,) = await run.ask()
@@ -554,7 +544,7 @@ async def test_the_bound_on_results_that_never_come_counts_from_the_first_run_th
 @in_virtual_time
 async def test_a_cancelled_batch_that_does_not_end_is_waited_for_in_bounds(cache):
     service = Endless()
-    await left_with(cache, service)
+    await left_behind(cache, service)
     await note(cache, cancelled_at=HOURS_AGO)
     run = Run(cache, service)
     (reply,) = await run.ask()
@@ -565,9 +555,9 @@ async def test_a_cancelled_batch_that_does_not_end_is_waited_for_in_bounds(cache
 @in_virtual_time
 async def test_a_batch_that_may_be_a_strangers_is_looked_at_as_any_other_after_its_deadline(cache):
     service = Endless()
-    await left_with(cache, service)
+    await left_behind(cache, service)
     await note(cache, submitted_at=HOURS_AGO, sure=False)
-    run = Run(cache, service, deadline_s=3600.0)
+    run = Run(cache, service)
     asking = asyncio.create_task(run.ask())
     service.looks = 0
     await asyncio.sleep(3600)
@@ -635,14 +625,20 @@ async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
     assert run.said == ["m: HTTP 503; it is asked again until it answers"]
 
 
+@pytest.mark.parametrize(("hours", "cancelled"), [(1.9, []), (2.1, ["batch-0"])])
 @in_virtual_time
-async def test_a_batch_is_cancelled_at_the_deadline_and_what_it_has_is_taken(cache):
+async def test_a_batch_is_cancelled_two_hours_after_its_submission_and_what_it_has_is_taken(
+    cache, hours, cancelled
+):
     service = Memory()
+    await left_behind(cache, service, repetitions=2)
+    submitted_at = datetime.now(UTC) - timedelta(hours=hours)
+    await note(cache, submitted_at=submitted_at.isoformat())
     service.states = [BatchStatus("waiting", "in_progress")] * 3
     service.fates = {2: [None]}
-    run = Run(cache, service, deadline_s=0.0)
+    run = Run(cache, service)
     assert texts(await run.ask(2)) == ["batched 1", "alone 2"]
-    assert service.cancelled == ["batch-0"]
+    assert service.cancelled == cancelled
 
 
 async def killed(run, repetitions, when):
@@ -698,11 +694,7 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
 @in_virtual_time
 async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache):
     service = Memory()
-    first = Run(cache, service, detach=True)
-    service.states = [BatchStatus("waiting", "in_progress")] * 2
-    (left, *_) = await asyncio.gather(first.ask(2), return_exceptions=True)
-    assert isinstance(left[0], WaitingForBatches)
-    await first.end()
+    await left_behind(cache, service, repetitions=2)
     later = Run(cache, service, submits=False)
     assert texts(await later.ask(3)) == ["batched 1", "batched 2", "alone 3"]
     assert later.alone.asked == [3]
@@ -711,10 +703,7 @@ async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache):
 @in_virtual_time
 async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache):
     service = Memory()
-    first = Run(cache, service, detach=True, scope="first")
-    service.states = [BatchStatus("waiting", "in_progress")]
-    await asyncio.wait([asyncio.create_task(first.ask(2))], timeout=5)
-    await first.end()
+    first = await left_behind(cache, service, repetitions=2, scope="first")
     second = Run(cache, service, scope="second")
     assert texts(await second.ask(2)) == ["batched 1", "batched 2"]
     assert first.ledger.read().spent_usd == pytest.approx(ONE_USD)
@@ -723,29 +712,38 @@ async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache):
 
 
 @in_virtual_time
-async def test_a_batch_that_is_gone_stops_the_run_unless_its_deadline_is_over(cache):
+async def test_a_batch_that_is_gone_stops_the_run_unless_it_asks_singly(cache):
     service = Memory()
-    service.states = [BatchStatus("waiting", "in_progress")]
-    first = Run(cache, service, detach=True)
-    await first.ask()
-    await first.end()
+    await left_behind(cache, service)
     service.batches.clear()
     (stopped,) = await Run(cache, service).ask()
     assert isinstance(stopped, EndpointRefused)
-    assert "--round-deadline 0" in str(stopped)
-    anew = Run(cache, service, deadline_s=0.0)
+    assert "the same command without --batch" in str(stopped)
+    anew = Run(cache, service, submits=False)
     (reply,) = await anew.ask()
     assert [attempt.outcome for attempt in reply.attempts] == ["batch_lost", "ok"]
     assert anew.ledger.read().open_attempts == 1  # nobody knows what it cost
 
 
+@pytest.mark.parametrize("kind", ["refused", "quota"])
+@in_virtual_time
+async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind):
+    service = Memory()
+    await left_behind(cache, service)
+    for _ in range(2):
+        service.states = [BatchFailed(kind, "HTTP 401", sent=False)]
+        run = Run(cache, service, submits=False)
+        (stopped,) = await run.ask()
+        assert isinstance(stopped, EndpointRefused)
+        await run.end()
+    (reply,) = await Run(cache, service).ask()
+    assert outcomes(reply) == [("ok", "batch-0")]
+
+
 @in_virtual_time
 async def test_a_batch_that_is_gone_is_asked_anew_and_costs_nothing_where_nobody_charges(cache):
     service = Memory()
-    service.states = [BatchStatus("waiting", "in_progress")]
-    first = Run(cache, service, free=True, detach=True)
-    await first.ask()
-    await first.end()
+    await left_behind(cache, service, free=True)
     service.batches.clear()
     again = Run(cache, service, free=True)
     (reply,) = await again.ask()
