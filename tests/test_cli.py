@@ -163,7 +163,6 @@ async def test_a_mistyped_name_is_answered_with_the_nearest(merge_runner):
         (["tables", "gap", "--models", "constnt"], "constant"),
         (["explain", "gap", "constant/baseline/intercept:nn"], "n"),
         (["explain", "gap", "constant/baseline/intercep"], "constant/baseline/intercept"),
-        (["forget", "constant/baseline/N_0_0/rep7"], "constant/baseline/N_0_0/rep"),
     ):
         run = await merge_runner(*arguments)
         assert run.code == 2

@@ -117,38 +117,29 @@ def audit(
 
 
 def forget(
-    names: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="NAME", help="Sweeps or trials; * stands for anything."),
-    ] = None,
     sweeps: Annotated[
-        list[str] | None, typer.Option("--sweep", metavar="ID", help="A sweep_id.")
-    ] = None,
-    trials: Annotated[
-        list[str] | None, typer.Option("--trial", metavar="ID", help="A trial_id.")
+        list[str] | None,
+        typer.Argument(metavar="SWEEP", help="A sweep_id; * stands for anything."),
     ] = None,
     db: DbOption = DEFAULT_DB,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before removing.")] = False,
 ) -> None:
-    """Remove sweeps and trials from the database.
+    """Remove sweeps and their trials from the database.
 
     Their replies stay in the cache.
     """
     from merge_runner.results import forgetting
 
-    # A trial's id has a slash, a sweep's has none.
-    of_trials = [*(trials or ()), *(name for name in names or () if "/" in name)]
-    of_sweeps = [*(sweeps or ()), *(name for name in names or () if "/" not in name)]
-    if not of_trials and not of_sweeps:
-        raise UsageError("name a sweep or a trial; `merge-runner sql 'from sweeps'` lists sweeps")
-    going = forgetting.to_forget(db, of_sweeps, of_trials)
+    if not sweeps:
+        raise UsageError("name a sweep; `merge-runner sql 'from sweeps'` lists them")
+    going = forgetting.to_forget(db, sweeps)
     agree(
         f"these go from {db}: {going}",
         "Remove them?",
         otherwise="nothing was removed",
         yes=yes,
     )
-    gone = forgetting.forget(db, of_sweeps, of_trials, going)
+    gone = forgetting.forget(db, sweeps, going)
     say(
         f"removed: {gone}. Their replies stay in the cache: the same `merge-runner sweep` plays "
         "the trials again without a call"

@@ -1,4 +1,4 @@
-"""Removes named sweeps and trials from the database; their replies stay in the cache."""
+"""Removes sweeps from the database; their replies stay in the cache."""
 
 from __future__ import annotations
 
@@ -19,24 +19,17 @@ GOING_SWEEPS = """
 CREATE OR REPLACE TEMP TABLE going_sweeps AS
 SELECT DISTINCT sweep_id FROM sweeps JOIN (SELECT unnest(?) AS named) ON sweep_id GLOB named
 """
-# The named trials, and those of the going sweeps that no other sweep has.
+# The trials of these sweeps that no other sweep has.
 GOING_TRIALS = """
 CREATE OR REPLACE TEMP TABLE going_trials AS
-SELECT trial_id, spec_hash FROM trials JOIN (SELECT unnest(?) AS named) ON trial_id GLOB named
-UNION
-(SELECT trial_id, spec_hash FROM sweep_trials SEMI JOIN going_sweeps USING (sweep_id)
+SELECT trial_id, spec_hash FROM sweep_trials SEMI JOIN going_sweeps USING (sweep_id)
 EXCEPT
-SELECT trial_id, spec_hash FROM sweep_trials ANTI JOIN going_sweeps USING (sweep_id))
+SELECT trial_id, spec_hash FROM sweep_trials ANTI JOIN going_sweeps USING (sweep_id)
 """
 # Trials that stay, although their sweep goes.
 STAYING = """
 SELECT count(DISTINCT (trial_id, spec_hash)) FROM sweep_trials SEMI JOIN going_sweeps
 USING (sweep_id) ANTI JOIN going_trials USING (trial_id, spec_hash)
-"""
-# A sweep that stays and loses trials no longer claims that all of them ended.
-LOSING = """
-UPDATE sweeps SET exit_code = 1 WHERE coalesce(exit_code, 0) = 0 AND sweep_id IN
-(SELECT sweep_id FROM sweep_trials SEMI JOIN going_trials USING (trial_id, spec_hash))
 """
 
 
@@ -50,16 +43,17 @@ class Forgotten:
 
     def __str__(self) -> str:
         """As a part of a sentence."""
-        named = f" ({', '.join(self.sweeps)})" if self.sweeps else ""
         also = f"; {self.staying} trials that other sweeps have, too, stay" if self.staying else ""
-        return f"{len(self.sweeps)} sweeps{named} and {self.trials} trials{also}"
+        return (
+            f"{len(self.sweeps)} sweeps ({', '.join(self.sweeps)}) and {self.trials} trials{also}"
+        )
 
 
-def to_forget(db: Path, sweeps: Sequence[str], trials: Sequence[str]) -> Forgotten:
-    """What ``forget`` would remove; nothing is changed.
+def to_forget(db: Path, sweeps: Sequence[str]) -> Forgotten:
+    """Return what ``forget`` would remove; change nothing.
 
-    ``sweeps`` and ``trials`` are ids in which * stands for anything. Raises UsageError where one of
-    them names nothing, or a sweep into the database is running.
+    ``sweeps`` are ids in which * stands for anything. Raises UsageError where one of them names
+    nothing, or a sweep into the database is running.
     """
     busy = running(db)
     if busy:
@@ -67,28 +61,30 @@ def to_forget(db: Path, sweeps: Sequence[str], trials: Sequence[str]) -> Forgott
             f"the sweep {busy[0].sweep_id} is running into {db}: stop it, or wait for its end"
         )
     with read_database(db) as connection:
-        for table, column, patterns in (
-            ("sweeps", "sweep_id", sweeps),
-            ("trials", "trial_id", trials),
-        ):
-            _require_each(connection, db, table, column, patterns)
-        return _mark(connection, sweeps, trials)
+        for pattern in sweeps:
+            found = connection.execute(
+                "SELECT 1 FROM sweeps WHERE sweep_id GLOB ? LIMIT 1", [pattern]
+            )
+            if not found.fetchone():
+                ids = connection.execute("SELECT sweep_id FROM sweeps ORDER BY ALL").fetchall()
+                hint = f"in {db}; * stands for anything"
+                raise unknown_name("sweep", pattern, (sweep_id for (sweep_id,) in ids), hint)
+        return _mark(connection, sweeps)
 
 
-def forget(db: Path, sweeps: Sequence[str], trials: Sequence[str], agreed: Forgotten) -> Forgotten:
-    """Remove sweeps and trials, and the specs that no trial is left of; see ``to_forget``.
+def forget(db: Path, sweeps: Sequence[str], agreed: Forgotten) -> Forgotten:
+    """Remove sweeps, their trials, and the specs that no trial is left of; see ``to_forget``.
 
     Raises UsageError where that is not any more what was ``agreed`` to.
     """
-    if to_forget(db, sweeps, trials) != agreed:
+    if to_forget(db, sweeps) != agreed:
         raise UsageError(f"{db} has changed meanwhile, and nothing was removed: ask again")
     Store(db)  # brings an older database up to date
     with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
         try:
             connection.begin()
-            gone = _mark(connection, sweeps, trials)
-            connection.execute(LOSING)
-            for table in (*PLACES, "sweep_trials"):
+            gone = _mark(connection, sweeps)
+            for table in PLACES:
                 connection.execute(
                     f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM going_trials)"  # noqa: S608 # our tables
                 )
@@ -105,33 +101,10 @@ def forget(db: Path, sweeps: Sequence[str], trials: Sequence[str], agreed: Forgo
     return gone
 
 
-def _require_each(
-    connection: duckdb.DuckDBPyConnection,
-    db: Path,
-    table: str,
-    column: str,
-    patterns: Sequence[str],
-) -> None:
-    """Raise UsageError where a pattern matches nothing; the message has the valid names."""
-    for pattern in patterns:
-        found = connection.execute(
-            f"SELECT 1 FROM {table} WHERE {column} GLOB ? LIMIT 1",  # noqa: S608 # our tables
-            [pattern],
-        )
-        if not found.fetchone():
-            names = connection.execute(
-                f"SELECT DISTINCT {column} FROM {table} ORDER BY ALL"  # noqa: S608 # our tables
-            ).fetchall()
-            hint = f"in {db}; * stands for anything"
-            raise unknown_name(table.rstrip("s"), pattern, (name for (name,) in names), hint)
-
-
-def _mark(
-    connection: duckdb.DuckDBPyConnection, sweeps: Sequence[str], trials: Sequence[str]
-) -> Forgotten:
+def _mark(connection: duckdb.DuckDBPyConnection, sweeps: Sequence[str]) -> Forgotten:
     """Make the tables of what goes, and count that."""
     connection.execute(GOING_SWEEPS, [list(sweeps)])
-    connection.execute(GOING_TRIALS, [list(trials)])
+    connection.execute(GOING_TRIALS)
     named = connection.execute("FROM going_sweeps ORDER BY ALL").fetchall()
     ((going,),) = connection.execute("SELECT count(*) FROM going_trials").fetchall()
     ((staying,),) = connection.execute(STAYING).fetchall()

@@ -107,7 +107,7 @@ async def test_what_is_forgotten_is_asked_again_without_a_call(merge_runner):
     assert "2 trials" in stored.out
     again = (await merge_runner("seat", "first", "--samples", 1, *TWO, "--json")).summary
     assert again["trials"]["stored_before"] == 2
-    assert (await merge_runner("forget", "seat/*", "--yes")).code == 0
+    assert (await merge_runner("forget", "*", "--yes")).code == 0
     assert "0 trials" in (await merge_runner("digest")).out
     anew = (await merge_runner("seat", "first", "--samples", 1, *TWO, "--json")).summary
     assert anew["calls"] == {"live": 0, "cached": 4}
