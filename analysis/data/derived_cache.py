@@ -20,12 +20,7 @@ import analysis
 import merge_runner
 from merge_runner.errors import StoreError
 from merge_runner.registry import plugin_sources, plugins, study_texts
-from merge_runner.results.database import (
-    SCHEMA_VERSION,
-    open_database,
-    read_database,
-    schema_version,
-)
+from merge_runner.results.database import open_database, read_database
 from merge_runner.text_safety import first_line
 
 KEPT = """
@@ -141,8 +136,6 @@ def keep_finished(db: Path, made_of: str, options: str, contents: dict[str, str]
     """Keep tables or figures, unless the results have left the state that these are ``made_of``."""
     try:
         with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
-            if schema_version(connection, db) < SCHEMA_VERSION:
-                return  # what was read is a copy in the newer schema: the file itself is older
             connection.begin()
             connection.execute(KEPT)
             if state(connection) == made_of:

@@ -22,7 +22,7 @@ import duckdb
 
 from analysis.explorer.child import Answer, serve
 from merge_runner.errors import MergeRunnerError
-from merge_runner.results.database import Instance, read_database, readable
+from merge_runner.results.database import Instance, read_database
 from merge_runner.results.store import answering
 from merge_runner.text_safety import csv_writer, in_spreadsheet, quoted
 
@@ -80,13 +80,12 @@ def answer(told: dict[str, Any]) -> Answer:
 def _copy(database: Path, copy: Path) -> dict[str, Any]:
     """Copy a database to a new file while it is open for reading here, so that nobody writes."""
     try:
-        file = readable(database)
-        with read_database(file, Instance()):
+        with read_database(database, Instance()):
             # The database last: a process that closes a file loses all its locks on it.
             for log in LOGS:
                 with contextlib.suppress(FileNotFoundError):
-                    shutil.copyfile(f"{file}{log}", f"{copy}{log}")
-            shutil.copyfile(file, copy)
+                    shutil.copyfile(f"{database}{log}", f"{copy}{log}")
+            shutil.copyfile(database, copy)
         with duckdb.connect(copy) as whole:  # the copy loses its name, and its log with it
             whole.execute("CHECKPOINT")
     except (MergeRunnerError, duckdb.Error, OSError) as exc:

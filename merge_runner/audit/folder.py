@@ -61,12 +61,7 @@ def _problem(cache: ResponseCache, row: dict[str, Any]) -> str | None:
         return f"its {f'attempt {number}' if attempts else 'reply'} is not in the cache ({key})"
     request = entry.request if entry else _asked(row)
     wanted = call_row(*place, request, attempts[number - 1], cached=cached)
-    differing = [
-        name
-        for (name, old), new in zip(row.items(), wanted, strict=True)
-        # Older versions stored no clock times.
-        if old != new and not (name == "started_at" and old is None)
-    ]
+    differing = [name for (name, old), new in zip(row.items(), wanted, strict=True) if old != new]
     if not differing:
         return None
     return f"the cache holds another {', '.join(differing)} than the database ({key})"

@@ -244,8 +244,7 @@ def _whole(connection: duckdb.DuckDBPyConnection, path: Path, sweeps: bool) -> A
 def _sweeps(connection: duckdb.DuckDBPyConnection) -> dict[str, tuple[str, bool]]:
     """The sweeps, oldest first: the configuration of each, and whether it ended."""
     rows = connection.execute(
-        # Of sweeps of earlier versions only whether they ended is known, not how.
-        "SELECT sweep_id, config, coalesce(exit_code = 0, ended_at IS NOT NULL) FROM sweeps "
+        "SELECT sweep_id, config, coalesce(exit_code = 0, false) FROM sweeps "
         "ORDER BY started_at, sweep_id"
     ).fetchall()
     return {sweep_id: (config, ended) for sweep_id, config, ended in rows}

@@ -1,4 +1,4 @@
-"""Opens the results database, waits for other users of it, and brings an older one up to date."""
+"""Opens the results database and waits for other programs that hold it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import itertools
 import logging
 import os
 import re
-import shutil
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
@@ -19,7 +18,6 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import StoreError, StoreLocked, UsageError
-from merge_runner.records import SCRIPTED_FIELD
 from merge_runner.scenarios.merge.measures import measures_sql, measures_version
 from merge_runner.text_safety import first_line, quoted
 
@@ -30,7 +28,7 @@ LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
 LOGS = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
 """How the names of a database's own files go on."""
-ROWS_AT_ONCE, COPIED_AT_ONCE = 100, 2_048
+ROWS_AT_ONCE = 100
 ROWS_OF_A_GROUP = 8_192
 """Of what is written: a group is rewritten, in memory, with each transaction until it is full."""
 # How many bytes of the file a call takes where replies are short, compressed and with its share of
@@ -45,7 +43,7 @@ Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
     "memory_limit": "200MB",  # the default is a share of the machine's; most of it caches the file
     "max_vacuum_tasks": 0,  # see merge_small_groups
-    # Of new files: the oldest DuckDB that can open them. Version 5 of the schema began with it.
+    # Of new files: the oldest DuckDB that can open them.
     "storage_compatibility_version": "v1.2.0",
     "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
 }
@@ -303,7 +301,7 @@ def append(
 def read_database(
     path: Path, instance: Instance = SHARED, patience_s: float = PATIENCE_S
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open an existing database for reading, of this schema or an older one; raises UsageError."""
+    """Open an existing database for reading; raises UsageError."""
     if not path.is_file():
         raise UsageError(
             f"there is no database {path}; `merge-runner sweep baseline` makes one, --db names "
@@ -313,57 +311,10 @@ def read_database(
         unreadable_is_usage(),
         open_database(path, read_only=True, patience_s=patience_s, instance=instance) as connection,
     ):
-        if schema_version(connection, path) == SCHEMA_VERSION:
-            if not _has_these_measures(connection):
-                _warn_of_other_measures(path)
-            yield connection
-            return
-    with unreadable_is_usage():
-        copy = _readable_copy(path, patience_s)
-    with open_database(
-        copy, read_only=True, patience_s=patience_s, instance=instance
-    ) as connection:
+        check_schema(connection, path)
+        if not _has_these_measures(connection):
+            _warn_of_other_measures(path)
         yield connection
-
-
-def readable(path: Path) -> Path:
-    """The file from which a database is read: itself, or a copy if its schema is older."""
-    with read_database(path) as connection:
-        row = connection.execute(
-            "SELECT path FROM duckdb_databases() WHERE database_name = current_database()"
-        ).fetchone()
-    assert row is not None
-    return Path(row[0])
-
-
-def _readable_copy(path: Path, patience_s: float) -> Path:
-    """A copy of an older database in the present schema, until this process ends."""
-    told = path.stat()
-    state = (path.resolve(), told.st_mtime_ns, told.st_size)
-    if state not in _COPIES:
-        folder = tempfile.TemporaryDirectory(prefix="merge-runner-")
-        copy = Path(folder.name) / path.name
-        LOG.warning(
-            "%s has an older schema and is left as it is: what is read is a copy of it, %s, which "
-            "is deleted at the end; the next sweep into it brings it up to date",
-            path,
-            copy,
-        )
-        with open_database(
-            path, read_only=True, patience_s=patience_s, instance=Instance(also=copy.parent)
-        ) as connection:
-            try:
-                _copy_rows(connection, copy)
-            except duckdb.Error as exc:
-                raise StoreError(
-                    f"{path} has an older schema and cannot be copied to {copy}: {first_line(exc)}"
-                ) from exc
-        _COPIES[state] = folder, copy
-    return _COPIES[state][1]
-
-
-# The folder of a copy is deleted when the process ends.
-_COPIES: dict[tuple[Path, int, int], tuple[tempfile.TemporaryDirectory[str], Path]] = {}
 
 
 @contextmanager
@@ -386,8 +337,8 @@ def unreadable_is_usage() -> Iterator[None]:
         ) from exc
 
 
-def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
-    """The version of an existing database; raises UsageError for a newer or a foreign one."""
+def check_schema(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
+    """Raise UsageError unless the open database has the schema of this program."""
     # Only a table, and DuckDB's own functions: a view or macro of that name could read any file.
     tables = dict(
         connection.execute(
@@ -397,24 +348,20 @@ def schema_version(connection: duckdb.DuckDBPyConnection, path: Path) -> int:
     )
     if "meta" not in tables:
         raise UsageError(f"{path} is not a database of merge-runner: name another with --db")
-    row = connection.execute("SELECT schema_version FROM meta").fetchone()
-    if row is None:
-        raise UsageError(f"{path} has no schema version: {REBUILD}")
-    version: int = row[0]
-    if version < 1:
-        raise UsageError(f"{path} has schema version {version}, which no program wrote: {REBUILD}")
-    if version > SCHEMA_VERSION:
+    (version,) = connection.execute("SELECT schema_version FROM meta").fetchone() or (None,)
+    if version != SCHEMA_VERSION:
         raise UsageError(
-            f"{path} has schema version {version}, written by a newer merge-runner; this one reads "
-            f"up to {SCHEMA_VERSION}: update merge-runner, or name another file with --db"
+            f"{path} has schema version {version}, and this merge-runner reads version "
+            f"{SCHEMA_VERSION}: rebuild its results in a new file from recorded replies, without "
+            "a call: `merge-runner sweep NAME --replay --recording FILE --db new.duckdb` (without "
+            "--recording from the cache)"
         )
-    for table, columns in _columns().items() if version == SCHEMA_VERSION else ():
+    for table, columns in _columns().items():
         if tables.get(table) != columns:
             raise UsageError(
                 f"{path} has {tables.get(table, 'no')} columns in the table {table}, and "
                 f"merge-runner made {columns}: {REBUILD}. Tables of other names may be added"
             )
-    return version
 
 
 @cache
@@ -426,106 +373,3 @@ def _columns() -> dict[str, int]:
         re.DOTALL | re.MULTILINE,
     )
     return {name: len(re.findall(r"^    [a-z]\w* ", body, re.MULTILINE)) for name, body in tables}
-
-
-def migrate(path: Path) -> None:
-    """Copy a database of an older schema into a new file of the present one, which takes its name.
-
-    What an older schema lacked is NULL or has its default. The old file stays beside the new one,
-    as ``NAME.v1.duckdb``. Raises UsageError where that is not possible.
-    """
-    path = path.resolve()
-    copy = path.with_name(f"{path.name}.migrating")  # on the same disk, so that it can be renamed
-    try:
-        # Opened for writing, so that nobody else writes while it is copied.
-        with open_database(path, read_only=False, patience_s=PATIENCE_S) as connection:
-            version = schema_version(connection, path)
-            if version == SCHEMA_VERSION:
-                return  # another process was quicker
-            _discard(copy)  # left by a process that died here
-            try:
-                connection.execute("CHECKPOINT")
-                _copy_rows(connection, copy)
-                kept = _free_name(path, version)
-                shutil.copy2(path, kept)
-                os.replace(copy, path)
-            finally:
-                _discard(copy)
-    except StoreLocked:
-        raise
-    except (OSError, duckdb.Error, StoreError) as exc:
-        raise UsageError(
-            f"{path} has an older schema and cannot be brought to version {SCHEMA_VERSION} where "
-            f"it lies: {first_line(exc)}. Copy it to a folder that can be written and name the "
-            "copy with --db"
-        ) from exc
-    LOG.warning(
-        "%s was brought from schema %d to %d; the old file is kept as %s",
-        path,
-        version,
-        SCHEMA_VERSION,
-        kept,
-    )
-
-
-def _discard(copy: Path) -> None:
-    for name in (copy, copy.with_name(f"{copy.name}.wal")):
-        with contextlib.suppress(OSError):
-            name.unlink()
-
-
-def _free_name(path: Path, version: int) -> Path:
-    """A free name for the old file, so that it never replaces another one."""
-    numbers = itertools.chain([""], (f"-{number}" for number in itertools.count(2)))
-    names = (f"{path.stem}.v{version}{number}{path.suffix}" for number in numbers)
-    return next(kept for kept in map(path.with_name, names) if not kept.exists())
-
-
-def _copy_rows(connection: duckdb.DuckDBPyConnection, copy: Path) -> None:
-    """Make a new file with all rows of the open one."""
-    with duckdb.connect(str(copy), config=SETTINGS) as made:
-        made.execute(schema_sql())
-    connection.execute(f"ATTACH {quoted(copy)} AS copied")
-    try:
-        with room_for_texts(connection):
-            _fill_copy(connection)
-    finally:
-        connection.execute("DETACH copied")
-
-
-def _fill_copy(connection: duckdb.DuckDBPyConnection) -> None:
-    old = {
-        table
-        for (table,) in connection.execute(
-            "SELECT table_name FROM duckdb_tables() WHERE database_name = current_database()"
-        ).fetchall()
-    }
-    new = connection.execute(
-        "SELECT table_name FROM duckdb_tables() WHERE database_name = 'copied'"
-    ).fetchall()
-    for (table,) in new:
-        if table in old and table != "meta":
-            _copy_table(connection, table)
-    # Before version 4, replies were not searched for the mark of a stand-in.
-    connection.execute(
-        "UPDATE copied.calls SET scripted = true WHERE CASE WHEN provider = 'emulator' THEN true "
-        "WHEN contains(reply::VARCHAR, ?) THEN reply->>? = 'true' ELSE false END",
-        [SCRIPTED_FIELD, f"$.{SCRIPTED_FIELD}"],
-    )
-    connection.execute(
-        "UPDATE copied.trials SET scripted = true WHERE NOT scripted AND (trial_id, spec_hash) IN "
-        "(SELECT (trial_id, spec_hash) FROM copied.calls WHERE scripted)"
-    )
-    connection.execute("INSERT INTO copied.meta VALUES (?)", [SCHEMA_VERSION])
-
-
-def _copy_table(connection: duckdb.DuckDBPyConnection, table: str) -> None:
-    """Copy a table, some rows at a time: all rows of a transaction are in memory at once."""
-    row = connection.execute(f"SELECT coalesce(max(rowid), -1) FROM {table}").fetchone()  # noqa: S608 # our tables
-    assert row is not None
-    size = COPIED_AT_ONCE if table in ("calls", "decisions") else max(1, row[0] + 1)
-    for first in range(0, row[0] + 1, size):
-        connection.execute(
-            f"INSERT INTO copied.{table} BY NAME SELECT * FROM {table} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # our tables
-            [first, first + size - 1],
-        )

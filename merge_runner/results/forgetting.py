@@ -12,7 +12,6 @@ from merge_runner.errors import StoreError, UsageError, unknown_name
 from merge_runner.results.comparison import PLACES
 from merge_runner.results.database import PATIENCE_S, open_database, read_database
 from merge_runner.results.progress_file import running
-from merge_runner.results.store import Store
 from merge_runner.text_safety import first_line
 
 GOING_SWEEPS = """
@@ -79,7 +78,6 @@ def forget(db: Path, sweeps: Sequence[str], agreed: Forgotten) -> Forgotten:
     """
     if to_forget(db, sweeps) != agreed:
         raise UsageError(f"{db} has changed meanwhile, and nothing was removed: ask again")
-    Store(db)  # brings an older database up to date
     with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
         try:
             connection.begin()

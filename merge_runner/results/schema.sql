@@ -2,7 +2,7 @@
 
 -- What this program needs to know of the database.
 CREATE TABLE IF NOT EXISTS meta (
-    schema_version INTEGER NOT NULL   -- grows with each change of the tables
+    schema_version INTEGER NOT NULL   -- of the tables: files of another are refused
 );
 
 -- A run of a sweep.

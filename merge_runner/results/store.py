@@ -27,14 +27,13 @@ from merge_runner.results.database import (
     Instance,
     append,
     by_name,
+    check_schema,
     fetched,
     merge_small_groups,
-    migrate,
     open_database,
     read_database,
     room_for_texts,
     schema_sql,
-    schema_version,
     unreadable_is_usage,
     update_measures,
 )
@@ -68,7 +67,7 @@ class Store:
     """Writes sweeps and whole trials; every method is one short transaction."""
 
     def __init__(self, path: Path) -> None:
-        """Open or make the database; raises UsageError for a foreign one."""
+        """Open or make the database; raises UsageError for a foreign one or another schema."""
         self.path = path
         if path.exists() and not path.is_file():
             raise UsageError(f"{path} is not a file: name one with --db")
@@ -78,15 +77,12 @@ class Store:
         except OSError as exc:
             raise UsageError(f"{path.parent} cannot be made: {exc}") from exc
         with unreadable_is_usage(), self._writing() as connection:
-            tables = connection.execute("SHOW TABLES").fetchall()
-            older = bool(tables) and schema_version(connection, path) < SCHEMA_VERSION
-            if not tables:
+            if connection.execute("SHOW TABLES").fetchall():
+                check_schema(connection, path)
+                update_measures(connection)
+            else:
                 connection.execute(schema_sql())
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
-            elif not older:
-                update_measures(connection)
-        if older:
-            migrate(path)
 
     def begin_sweep(
         self,

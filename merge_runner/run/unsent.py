@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from merge_runner.results.database import readable
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
 from merge_runner.run.sweep import Sweep
@@ -29,7 +28,7 @@ def of_all(plan: Plan, options: Options, *, say: Callable[[str], None]) -> Estim
 @contextmanager
 def _prepared(plan: Plan, options: Options, say: Callable[[str], None]) -> Iterator[Sweep]:
     with tempfile.TemporaryDirectory() as folder:
-        db = readable(options.db) if options.db.is_file() else Path(folder) / "none.duckdb"
+        db = options.db if options.db.is_file() else Path(folder) / "none.duckdb"
         recorded = (options.cache / "cache.db").is_file()
         cache = options.cache if recorded else Path(folder) / "responses"
         prepared = Sweep(plan, replace(options, db=db, cache=cache, dry_run=True), say=say)

@@ -58,14 +58,6 @@ async def test_a_name_of_another_kind_of_database_is_that_of_a_file(merge_runner
         assert (tmp_path / name).is_file()
 
 
-async def test_a_version_that_no_program_wrote_is_told(merge_runner, db):
-    with duckdb.connect(str(db)) as connection:
-        connection.execute("UPDATE meta SET schema_version = -1")
-    run = await merge_runner("digest", "--db", db)
-    assert run.code == 2
-    assert "has schema version -1, which no program wrote" in run.err
-
-
 async def test_ctrl_c_within_a_query_ends_it_in_one_line(merge_runner, db):
     endless = "SELECT count(*) FROM range(1000000) AS a, range(1000000) AS b WHERE a > b"
     process = await merge_runner.fork("sql", endless, "--db", db)

@@ -7,10 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import duckdb
 import pytest
 
-from merge_runner.results.database import SCHEMA_VERSION, SETTINGS
+from merge_runner.results.database import SETTINGS
 from merge_runner.results.store import query
 
 pytestmark = pytest.mark.long
@@ -73,21 +72,6 @@ async def test_an_old_duckdb_reads_every_table_and_view(merge_runner, tmp_path, 
     rows = read_by(old_client, tmp_path / "results/merge.duckdb")
     assert rows["trial_metrics"] == rows["trials"] == 1
     assert min(rows[name] for name in ("states", "attempts", "finished", "geometry")) > 0
-
-
-async def test_a_database_of_a_newer_storage_version_is_brought_to_the_old_one(
-    merge_runner, tmp_path, old_client
-):
-    part = ("replay", "baseline", "--model", "constant", "--reps", 1)
-    assert (await merge_runner(*part, "--db", "new.duckdb")).code == 0
-    with duckdb.connect() as made:  # as an earlier version of the program made it
-        made.execute(f"ATTACH '{tmp_path}/new.duckdb' AS new (READ_ONLY)")
-        made.execute(f"ATTACH '{tmp_path}/old.duckdb' AS old (STORAGE_VERSION 'latest')")
-        made.execute("COPY FROM DATABASE new TO old; UPDATE old.meta SET schema_version = 4")
-    run = await merge_runner(*part, "--db", "old.duckdb")
-    assert f"was brought from schema 4 to {SCHEMA_VERSION}" in run.err
-    rows = read_by(old_client, tmp_path / "old.duckdb")
-    assert rows["trials"] == 11
 
 
 def test_the_promised_version_is_the_one_that_is_tested():

@@ -9,9 +9,11 @@ import signal
 import sqlite3
 import sys
 
+import duckdb
 import pytest
 
-from merge_runner.results.store import results_digest
+from merge_runner.results.database import SCHEMA_VERSION
+from merge_runner.results.store import Store, results_digest
 from merge_runner.run.plan import make_plan
 from tests.gate import HANGS_S, Gate
 from tests.harness import watched
@@ -169,6 +171,32 @@ async def test_a_truncated_database_is_left_alone_and_rebuilt_from_the_cache(
         assert (await merge_runner(*SWEEP, **env)).code == 0
         assert server.requests == asked
     assert results_digest(db) == quiet
+
+
+@pytest.mark.parametrize("version", [SCHEMA_VERSION - 1, SCHEMA_VERSION + 1])
+@pytest.mark.parametrize(
+    "command",
+    [("sweep", "baseline", "--model", "constant"), ("sweep", "baseline", "--dry-run"), ("digest",),
+     ("sql", "FROM trials"), ("tables", "gap"), ("audit",), ("export", "out"),
+     ("recording", "export", "r.parquet"), ("view", "--export", "out")],
+    ids=" ".join,
+)  # fmt: skip
+async def test_a_database_of_another_version_is_refused_in_one_line_and_left_as_it_is(
+    merge_runner, tmp_path, version, command
+):
+    db = tmp_path / "other.duckdb"
+    Store(db)
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("UPDATE meta SET schema_version = ?", [version])
+    before = db.read_bytes()
+    run = await merge_runner(*command, "--db", db)
+    assert run.code == 2
+    (told,) = run.err.splitlines()
+    assert f"other.duckdb has schema version {version}, and" in told
+    assert f"merge-runner reads version {SCHEMA_VERSION}: " in told
+    assert "`merge-runner sweep NAME --replay --recording FILE --db new.duckdb`" in told
+    assert db.read_bytes() == before
+    assert not (tmp_path / "out").exists()
 
 
 async def test_a_damaged_reply_is_asked_again_in_a_sweep_and_never_in_a_replay(
