@@ -24,14 +24,7 @@ from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import canonical_json, without_prompt
 from merge_runner.records import SIDES, Side, Slot
 from merge_runner.results.database import SETTINGS, append, in_memory
-from merge_runner.results.recording import (
-    BATCH,
-    UNCOVERED,
-    is_covered,
-    read_provenance,
-    read_recording,
-    sweeps_of,
-)
+from merge_runner.results.recording import BATCH, read_provenance, read_recording, sweeps_of
 from merge_runner.results.rows import Row
 from merge_runner.served_model import other_models
 
@@ -112,7 +105,6 @@ def audit_recording(file: Path) -> Audit:
         audit.findings += run_checks(connection, ("served", "attempt"))
         for sweep in sweeps:
             audit.findings += _missing(drives, sweep.config) if sweep.ended else ()
-        audit.notes += [] if is_covered(provenance) else [UNCOVERED]
         audit.notes += meaningless_ids(connection)
         audit.notes += [] if sweeps else [NO_CONFIG]
     return audit

@@ -68,8 +68,6 @@ def recording_verify(file: RecordingFile) -> None:
 
     found = summarise(file)
     say(f"{file} is whole: {found.calls} calls, as they were exported")
-    for note in found.notes:
-        say(f"note: {note}")
 
 
 @recording_app.command("info")

@@ -35,12 +35,7 @@ from merge_runner.results.database import Settings, append, in_memory
 from merge_runner.text_safety import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 2"
-# In this format, the file's hash does not cover what it says about its origin.
-FIRST_FORMAT = "merge-runner recording 1"
-UNCOVERED = (
-    "it was exported by an earlier version: its hash does not cover what it says of where it comes "
-    "from"
-)
+"""Read for ever: a model that is shut down cannot be asked again."""
 PROVENANCE_HASH = "provenance_sha256"
 SWEEPS = "sweeps"
 """Holds the rows of several sweeps; a recording of one sweep has the columns of its row instead."""
@@ -97,8 +92,7 @@ READING: Settings = {
 class Summary:
     """A recording's contents: its calls, how many of them a scripted stand-in answered, and so on.
 
-    ``cost_usd`` is what its replies cost when they were made. ``covered`` says whether the file's
-    hash covers the provenance, too, which in the first format it does not.
+    ``cost_usd`` is what its replies cost when they were made.
     """
 
     calls: int
@@ -110,12 +104,6 @@ class Summary:
     endpoints: dict[str, int]
     outcomes: dict[str, int]
     provenance: dict[str, str]
-    covered: bool
-
-    @property
-    def notes(self) -> list[str]:
-        """What a reader should know about the recording even if it is intact."""
-        return [] if self.covered else [UNCOVERED]
 
 
 def export_recording(
@@ -246,7 +234,7 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
             f"{file} is not as it was exported: it holds {number} calls of {told.get('calls')}, "
             "and its content has another hash"
         )
-    if is_covered(told) and told.get(PROVENANCE_HASH) != _provenance_hash(told):
+    if told.get(PROVENANCE_HASH) != _provenance_hash(told):
         raise RecordingError(
             f"{file} is not as it was exported: what it says of where it comes from has another "
             "hash"
@@ -320,7 +308,6 @@ def summarise(file: Path) -> Summary:
         served[entry.attempts[-1].model_served or "unknown"] += 1
         endpoints[entry.request.endpoint] += 1
         outcomes[entry.attempts[-1].outcome] += 1
-    provenance = read_provenance(file)
     return Summary(
         calls=calls,
         scripted=scripted,
@@ -330,8 +317,7 @@ def summarise(file: Path) -> Summary:
         models_served=dict(served),
         endpoints=dict(endpoints),
         outcomes=dict(outcomes),
-        provenance=provenance,
-        covered=is_covered(provenance),
+        provenance=read_provenance(file),
     )
 
 
@@ -347,11 +333,6 @@ def _written(file: Path) -> Iterator[None]:
 def _fingerprint(key: str, attempts: str) -> bytes:
     """The part of a row that the recording's hash covers directly; the key covers the rest."""
     return f"{key} {attempts}\n".encode()
-
-
-def is_covered(provenance: dict[str, str]) -> bool:
-    """Whether the hash of the file covers the provenance, too."""
-    return provenance.get("format") != FIRST_FORMAT
 
 
 def _provenance_hash(metadata: dict[str, str]) -> str:
@@ -448,10 +429,10 @@ def opened(file: Path) -> duckdb.DuckDBPyConnection:
         )
     told = _metadata(file, connection)
     version = told.get("key_version")
-    if told.get("format") not in (FORMAT, FIRST_FORMAT):
+    if told.get("format") != FORMAT:
         raise RecordingError(
-            f"{file} has the format {one_line(repr(told.get('format')))}, and this program reads "
-            f"{FIRST_FORMAT!r} and {FORMAT!r}"
+            f"{file} has the format {one_line(repr(told.get('format')))}, this program reads "
+            f"{FORMAT!r}"
         )
     if version != str(KEY_VERSION):
         raise RecordingError(
