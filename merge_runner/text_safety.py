@@ -56,7 +56,7 @@ class _Lines:
         return self._file.write(row.removesuffix("\r\n") + "\n")
 
 
-def first_line(exc: Exception) -> str:
+def first_line(exc: BaseException) -> str:
     """What an error says: DuckDB adds a stack trace to what it takes for its own fault."""
     return str(exc).partition("\n")[0]
 

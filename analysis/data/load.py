@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pandas as pd
 from pydantic import BaseModel, JsonValue, ValidationError
@@ -17,7 +17,6 @@ from pydantic import BaseModel, JsonValue, ValidationError
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
-from merge_runner.records import Status
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
@@ -107,11 +106,6 @@ FROM states JOIN (
 ) USING (trial_id, spec_hash, side)
 WHERE time_s >= greatest(0, coalesce(first_s, 0)) GROUP BY ALL ORDER BY ALL
 """
-_ODD_STATUS = f"""
-SELECT trial_id, coalesce(status, 'NULL') AS status FROM trials
-WHERE status IS NULL OR status NOT IN ({", ".join(map(quoted, get_args(Status)))})
-ORDER BY ALL LIMIT 1
-"""  # noqa: S608 # constants
 # A plan's revision: |the new plan's first actions - the old plan's for the same instants|. Both
 # plans cover the horizon; the older one is `executed` actions ahead of the new one.
 PLANS = """
@@ -234,16 +228,6 @@ def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:
                 f"{first['msg']}; `merge-runner audit` names what else is wrong"
             ) from exc
     return found
-
-
-def check_statuses(db: Path | str = DEFAULT_DB) -> None:
-    """Raise UsageError where a trial ended as none of the program's does: it would be in no sum."""
-    known = get_args(Status)
-    for row in load_each({"odd": _ODD_STATUS}, db)["odd"].itertuples():
-        raise UsageError(
-            f"{row.trial_id} has the status {row.status[:40]!r}; valid: {', '.join(known)}: "
-            "`merge-runner audit` names what else is wrong"
-        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,7 +54,7 @@ def _loaded(load: Load, metrics: Iterable[Metric], fails: str) -> pd.DataFrame:
     chosen = [metric for metric in metrics if metric.value not in JUDGED]
     try:
         return load(chosen).astype(_types(chosen))
-    except duckdb.Error:
+    except (duckdb.Error, UsageError):  # the latter where a results database is read
         for metric in chosen:
             _try_alone(load, metric, fails)
         raise
@@ -63,8 +63,9 @@ def _loaded(load: Load, metrics: Iterable[Metric], fails: str) -> pd.DataFrame:
 def _try_alone(load: Load, metric: Metric, fails: str) -> None:
     try:
         load([metric])
-    except duckdb.Error as exc:
-        raise UsageError(f"the SQL of the metric {metric.name} {fails}: {first_line(exc)}") from exc
+    except (duckdb.Error, UsageError) as exc:
+        said = first_line(exc.__cause__ or exc)
+        raise UsageError(f"the SQL of the metric {metric.name} {fails}: {said}") from exc
 
 
 def _columns(metrics: Iterable[Metric]) -> str:

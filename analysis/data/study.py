@@ -29,7 +29,6 @@ from analysis.data.load import (
     TRACES,
     WORDS,
     Calls,
-    check_statuses,
     load_calls,
     load_each,
     load_specs,
@@ -228,7 +227,6 @@ class Study:
         self.by = by
         self.options = options_text(self.db, models, where, file, by)
         self.state = present_state(self.db)
-        check_statuses(self.db)
         self.studies = read_studies(self.db)
         self.source = None if file is None else read_study(file)
         self.file, self.order = _chosen(self.db, self.studies, self.source)

@@ -23,7 +23,7 @@ from merge_runner.drivers.human_replay import HUMAN_REPLAY, unresponsive
 from merge_runner.drivers.registry import language_models, stand_in
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
-from merge_runner.results.database import Instance, more_memory, schema_sql, spill_folder
+from merge_runner.results.database import Instance, more_memory, schema_sql
 from merge_runner.results.levels import LEVELS
 from merge_runner.scenarios.merge.geometry import Track, track_of
 from merge_runner.served_model import ALIASES, others_among
@@ -489,7 +489,7 @@ class Catalogue:
     def export(self, wanted: Filter, sort: str, form: str) -> bytes:
         """All trials of a filter as CSV or Parquet."""
         where, values = wanted.where()
-        with tempfile.TemporaryDirectory(dir=spill_folder()) as folder, self._lock:
+        with tempfile.TemporaryDirectory() as folder, self._lock:
             path = Path(folder) / f"trials.{form}"
             columns = f"{EXPORTED}{self._columns()}"
             chosen = self._memory.sql(
@@ -517,7 +517,7 @@ class Catalogue:
     def _begin(self, file: int) -> None:
         """Forget everything."""
         self._instance.drop()
-        self._connection = self._instance.confined(self.db)
+        self._connection = self._instance.cursor()
         self._connection.execute(schema_sql())
         self._connection.execute(LISTED + GROUPED)
         self._file, self._stamp, self._tags = file, None, ()

@@ -21,7 +21,7 @@ from analysis.explorer.catalogue import SEVERAL, Catalogue, Filter
 from analysis.explorer.reading import Row, records
 from analysis.explorer.snippets import Snippet, snippet
 from merge_runner.errors import StoreLocked
-from merge_runner.results.database import more_memory, spill_folder
+from merge_runner.results.database import more_memory
 from merge_runner.text_safety import quoted
 
 PAGE = 50
@@ -181,7 +181,7 @@ class Words:
         names = connection.execute("SELECT database_name FROM duckdb_databases()").fetchall()
         if ("words",) not in names:  # the catalogue has begun anew, or we begin
             self.close()
-            self._folder = tempfile.TemporaryDirectory(dir=spill_folder())
+            self._folder = tempfile.TemporaryDirectory()
             file = quoted(f"{self._folder.name}/words.duckdb")
             connection.execute(f"ATTACH {file} AS words ({WITHOUT_A_LOG})")
         connection.execute(TABLES.format(kind=kind))

@@ -26,8 +26,6 @@ SCHEMA = Path(__file__).with_name("schema.sql")
 """The tables; see ``schema_sql`` for all that a database has."""
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
-LOGS = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
-"""How the names of a database's own files go on."""
 ROWS_AT_ONCE = 100
 ROWS_OF_A_GROUP = 8_192
 """Of what is written: a group is rewritten, in memory, with each transaction until it is full."""
@@ -68,8 +66,8 @@ def update_measures(connection: duckdb.DuckDBPyConnection) -> None:
 
 def _has_these_measures(connection: duckdb.DuckDBPyConnection) -> bool:
     found = connection.execute(
-        "SELECT comment FROM system.main.duckdb_views() WHERE view_name = 'trial_metrics' "
-        "AND database_name = system.main.current_database()"
+        "SELECT comment FROM duckdb_views() WHERE view_name = 'trial_metrics' "
+        "AND database_name = current_database()"
     ).fetchall()
     return found == [(measures_version(),)]
 
@@ -81,13 +79,6 @@ def _warn_of_other_measures(path: Path) -> None:
         "and they are read as they are; `merge-runner sweep` into it brings them up to date",
         path,
     )
-
-
-def spill_folder() -> Path:
-    """The folder in which DuckDB may write besides its database, even if it is confined."""
-    folder = Path(str(SETTINGS["temp_directory"]))
-    folder.mkdir(mode=0o700, exist_ok=True)
-    return folder
 
 
 def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
@@ -105,19 +96,11 @@ class Instance:
 
     Making an instance takes longer than most queries, so one is used for everything. After an error
     it may be unusable, and a new one is made.
-
-    A connection for reading reaches only the file that it reads and those in the folder ``also``.
-    If the instance does not ``confine`` it, whoever opens the connection must.
     """
 
-    def __init__(
-        self, settings: Settings = SETTINGS, *, confine: bool = True, also: Path | None = None
-    ) -> None:
+    def __init__(self, settings: Settings = SETTINGS) -> None:
         self._settings = settings
-        self._confine = confine
-        self._also = [] if also is None else [also]
         self._connection: duckdb.DuckDBPyConnection | None = None
-        self._confined: tuple[Path, duckdb.DuckDBPyConnection] | None = None
         self._numbers = itertools.count()
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
@@ -126,33 +109,13 @@ class Instance:
             self._connection = in_memory(self._settings)
         return self._connection.cursor()
 
-    def confined(self, path: Path) -> duckdb.DuckDBPyConnection:
-        """A connection that can reach no file but one database, which may be anybody's.
-
-        A view or a macro in that database may try to read any file, even under the name of a DuckDB
-        function.
-        """
-        if not self._confine:
-            return self.cursor()
-        whole = path.absolute()  # the same name means another file in another folder
-        if self._confined is None or self._confined[0] != whole:
-            made = in_memory(self._settings)
-            own = ", ".join(
-                quoted(f"{each}{log}") for each in (whole, path.resolve()) for log in LOGS
-            )
-            also = ", ".join(map(quoted, self._also))
-            made.execute(f"SET allowed_directories = [{also}]")
-            made.execute(f"SET allowed_paths = [{own}]; SET enable_external_access = false")
-            self._confined = whole, made
-        return self._confined[1].cursor()
-
     def name(self) -> str:
         """A unique name for a file."""
         return f"results_{next(self._numbers)}"
 
     def drop(self) -> None:
         """Make a new instance next time."""
-        self._connection = self._confined = None
+        self._connection = None
 
 
 SHARED = Instance()
@@ -190,7 +153,7 @@ def _detach(connection: duckdb.DuckDBPyConnection, name: str, instance: Instance
 def _attached(
     path: Path, read_only: bool, patience_s: float, instance: Instance
 ) -> tuple[duckdb.DuckDBPyConnection, str]:
-    connection = instance.confined(path) if read_only else instance.cursor()
+    connection = instance.cursor()
     name = instance.name()
     mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
     began = time.monotonic()
@@ -328,27 +291,18 @@ def unreadable_is_usage() -> Iterator[None]:
         if "No space left" in str(exc):
             raise StoreError(f"{exc}; make room, and run the same command again") from exc
         raise UsageError(f"{exc}; {REBUILD}") from exc
-    except duckdb.IOException as exc:
+    except (duckdb.IOException, duckdb.CatalogException, duckdb.BinderException) as exc:
         raise UsageError(f"the database cannot be read: {first_line(exc)}; {REBUILD}") from exc
-    except duckdb.PermissionException as exc:
-        raise UsageError(
-            f"the database reads files besides itself, which none of merge-runner does, and is not "
-            f"read on: {first_line(exc)}"
-        ) from exc
 
 
 def check_schema(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
     """Raise UsageError unless the open database has the schema of this program."""
-    # Only a table, and DuckDB's own functions: a view or macro of that name could read any file.
-    tables = dict(
-        connection.execute(
-            "SELECT table_name, column_count FROM system.main.duckdb_tables() "
-            "WHERE database_name = system.main.current_database()"
-        ).fetchall()
-    )
-    if "meta" not in tables:
-        raise UsageError(f"{path} is not a database of merge-runner: name another with --db")
-    (version,) = connection.execute("SELECT schema_version FROM meta").fetchone() or (None,)
+    try:
+        (version,) = connection.execute("SELECT schema_version FROM meta").fetchone() or (None,)
+    except (duckdb.CatalogException, duckdb.BinderException) as exc:
+        raise UsageError(
+            f"{path} is not a database of merge-runner: name another with --db"
+        ) from exc
     if version != SCHEMA_VERSION:
         raise UsageError(
             f"{path} has schema version {version}, and this merge-runner reads version "
@@ -356,20 +310,3 @@ def check_schema(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
             "a call: `merge-runner sweep NAME --replay --recording FILE --db new.duckdb` (without "
             "--recording from the cache)"
         )
-    for table, columns in _columns().items():
-        if tables.get(table) != columns:
-            raise UsageError(
-                f"{path} has {tables.get(table, 'no')} columns in the table {table}, and "
-                f"merge-runner made {columns}: {REBUILD}. Tables of other names may be added"
-            )
-
-
-@cache
-def _columns() -> dict[str, int]:
-    """How many columns each table of the schema has."""
-    tables = re.findall(
-        r"^CREATE TABLE IF NOT EXISTS (\w+) \(\n(.*?)^\);",
-        SCHEMA.read_text(encoding="utf-8"),
-        re.DOTALL | re.MULTILINE,
-    )
-    return {name: len(re.findall(r"^    [a-z]\w* ", body, re.MULTILINE)) for name, body in tables}

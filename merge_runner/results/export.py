@@ -46,7 +46,7 @@ def export_tables(
     names = [*(table.name for table in (*tables(), *(table for table, _ in also))), NAME]
     _refuse_other_content(folder, names)
     try:
-        with read_database(db, Instance(TEXTS, also=folder.resolve())) as connection:
+        with read_database(db, Instance(TEXTS)) as connection:
             folder.mkdir(parents=True, exist_ok=True)
             wide = wide_trials(connection.execute(FACTORS.format(only="")).fetchall())
             known = [*tables(), *(table for table, _ in also), _described(connection, wide)]

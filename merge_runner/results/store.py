@@ -230,7 +230,7 @@ def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
     """The result of a query, to be fetched; the database is locked until then."""
     # The settings hold for a whole instance, and cannot be taken back.
     with (
-        read_database(path, Instance(TEXTS, confine=False)) as connection,
+        read_database(path, Instance(TEXTS)) as connection,
         at_signals(connection.interrupt),
         answering(connection, sql) as result,
     ):

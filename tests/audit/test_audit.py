@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from merge_runner.audit import audit_database, audit_sweep
 from merge_runner.cli import app
-from merge_runner.errors import StoreError
+from merge_runner.errors import UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.records import SCRIPTED_FIELD
@@ -901,7 +901,7 @@ def test_a_reply_that_a_replay_would_lack_is_found(db, cache, change, says):
 def test_a_table_that_is_not_ours_is_an_error_and_no_traceback(db):
     with duckdb.connect(str(db)) as connection:
         connection.execute("ALTER TABLE states RENAME COLUMN step TO steps")
-    with pytest.raises(StoreError, match="cannot be audited"):
+    with pytest.raises(UsageError, match='cannot be read: Binder Error: Referenced column "step"'):
         audit_database(db)
 
 
