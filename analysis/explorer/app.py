@@ -250,9 +250,8 @@ def _sql_routes(site: Site) -> list[Route]:
 def _words_routes(site: Site) -> list[Route]:
     """Search in words, and what readers note; see ``Guard`` for who may write."""
 
-    def as_csv(request: Request) -> Response:
-        file = request.url.path.removeprefix("/")
-        return _download(notes.notes_file(site, file), KINDS["csv"], file)
+    def as_csv(_: Request) -> Response:
+        return _download(notes.notes_csv(site), KINDS["csv"], "notes.csv")
 
     def write(request: Request, form: Mapping[str, str]) -> Response:
         site.refresh()
@@ -282,5 +281,5 @@ def _words_routes(site: Site) -> list[Route]:
         Route("/words", page(lambda r: words.words_page(site, r.query_params))),
         Route("/notes", page(lambda _: notes.notes_page(site))),
         Route("/notes", written, methods=["POST"]),
-        *(Route(f"/{name}", as_csv) for name in notes.FILES),
+        Route("/notes.csv", as_csv),
     ]

@@ -25,8 +25,7 @@ from analysis.explorer.pages.computed import computed
 from analysis.explorer.pages.conditions import condition_page, conditions_page, views_of
 from analysis.explorer.pages.home import groupings, home_page
 from analysis.explorer.pages.humans import humans_page
-from analysis.explorer.pages.notes import FILES as NOTE_FILES
-from analysis.explorer.pages.notes import notes_file, notes_page
+from analysis.explorer.pages.notes import notes_csv, notes_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
 from analysis.explorer.pages.tables import (
     FIGURES,
@@ -54,7 +53,7 @@ _LINK_TO_NOWHERE = re.compile(r'<a href="">(.*?)</a>', re.DOTALL)
 _OURS = re.compile(
     rf"(?:{'|'.join(EXPORTED)}|(?:condition|index|sweep|table|trials)-.*)\.html"
     rf"|table-.*\.(?:{'|'.join(FILES)})|(?:{'|'.join(FIGURES)})\.svg"
-    rf"|{'|'.join(map(re.escape, NOTE_FILES))}"
+    r"|notes\.csv"
 )
 # Packed data are searched before they are packed: afterwards their letters may spell a path.
 _PACKED = re.compile(
@@ -146,8 +145,7 @@ def _noted(site: Site, rows: Sequence[Row]) -> Iterator[File]:
     yield site.at.to("words"), exported_words(site, rows, pack)
     trials = {(row["trial_id"], row["spec_hash"]) for row in rows}
     yield site.at.to("notes"), notes_page(site, trials)
-    for name in NOTE_FILES:
-        yield name, notes_file(site, name, trials)
+    yield "notes.csv", notes_csv(site, trials)
 
 
 def _linked(files: Iterable[File]) -> Iterator[File]:

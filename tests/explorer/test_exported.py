@@ -134,7 +134,7 @@ def test_an_earlier_export_in_the_folder_goes_and_nothing_else(study, tmp_path):
     list(export_folder(study, tmp_path, ["emulator/baseline/L_4_0/*"]))
     assert {path.name for path in tmp_path.iterdir()} == {
         *("index.html", "mine.html", "one.html", "trials.html", "trials-L_4_0.html"),
-        *("notes.html", "notes.csv", "agreement.csv", "words.html"),
+        *("notes.html", "notes.csv", "words.html"),
     }
 
 

@@ -1,27 +1,21 @@
-"""What readers note: who may, where it is kept, what is shown of it, and how far they agree."""
+"""What readers note: who may, where it is kept and what is shown of it."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-import os
 import shutil
 from concurrent.futures import ProcessPoolExecutor
-from datetime import UTC, datetime
 from multiprocessing import get_context
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from playwright.sync_api import expect
 from starlette.testclient import TestClient
-from statsmodels.stats.inter_rater import cohens_kappa
 
-from analysis.explorer.agreement import Agreement, agreements
 from analysis.explorer.app import MOST_NOTED, explorer
 from analysis.explorer.export import export_folder
-from analysis.explorer.notes import LONGEST_NAME, LONGEST_TEXT, Note, Notes, reader_of
+from analysis.explorer.notes import LONGEST_NAME, LONGEST_TEXT, Notes, reader_of
 from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
 from tests.explorer.axe import serious
@@ -235,90 +229,6 @@ def test_a_reader_has_a_name():
             reader_of(odd)
 
 
-# ---- agreement
-
-
-def note(reader, trial, tags, decision=None):
-    side = None if decision is None else "left"
-    return Note(
-        os.urandom(4).hex(), datetime.now(UTC), reader, trial, "s", side, decision, tags, ""
-    )
-
-
-@given(
-    st.lists(st.tuples(st.sampled_from([(), ("x",)]), st.sampled_from([(), ("x",)])), max_size=12)
-)
-def test_kappa_is_that_of_statsmodels(pairs):
-    notes = [
-        note(reader, str(i), (*tags, "seen"))
-        for i, pair in enumerate(pairs)
-        for reader, tags in zip(("anna", "ben"), pair, strict=True)
-    ]
-    found = {a.tag: a for a in agreements(notes)}
-    if "x" not in found:
-        assert not all(any(pair[i] for pair in pairs) for i in (0, 1))
-        return
-    a = found["x"]
-    assert a.common == len(pairs)
-    if a.both == len(pairs):
-        assert a.kappa is None
-    else:
-        table = [[a.both, a.first], [a.second, a.neither]]
-        assert a.kappa == pytest.approx(cohens_kappa(table, return_results=False))
-    assert found["seen"].kappa is None
-    assert "all of them" in found["seen"].undefined
-
-
-def test_readers_are_compared_on_what_both_have_tagged_alone():
-    notes = [
-        *(note("anna", t, ("x",)) for t in "ab"),
-        *(note("ben", t, ("x",)) for t in "bc"),
-        note("ben", "b", ("y",), decision=1),
-        note("anna", "d", ()),
-        note("carl", "d", ("x",)),
-    ]
-    found = {
-        (a.readers, a.tag, a.units): (a.both, a.first, a.second, a.neither, a.undefined)
-        for a in agreements(notes)
-    }
-    alike = "both gave it to all of them: there is nothing to tell apart"
-    nothing = "there are no trials that both have tagged"
-    assert found == {
-        (("anna", "ben"), "x", "trials"): (1, 0, 0, 0, alike),
-        (("anna", "carl"), "x", "trials"): (0, 0, 0, 0, nothing),
-        (("ben", "carl"), "x", "trials"): (0, 0, 0, 0, nothing),
-    }  # fmt: skip
-
-
-def test_what_two_readers_agree_on_stands_on_the_page(db):
-    for reader, tags in (("anna", ("x", "x", "y", "y")), ("ben", ("x", "y", "y", "y"))):
-        client = asking(db, reader)
-        for number, tag in enumerate(tags):
-            noted(client, tags=tag, side="left", decision=str(number))
-    text = " ".join(" ".join(Texts(client.get("/notes").text).said).split())
-    assert "x anna, ben 4 decisions 1 1 0 2 0.50" in text
-    assert Agreement("x", "decisions", ("anna", "ben"), 1, 1, 0, 2).kappa == pytest.approx(0.5)
-
-
-def test_what_two_readers_agree_on_is_a_csv(db):
-    for reader in ("anna", "=ben"):
-        noted(asking(db, reader), tags="x")
-        noted(asking(db, reader), tags="x" if reader == "anna" else "y", side="left", decision="1")
-    noted(asking(db, "anna"), tags="y", side="left", decision="2")
-    noted(asking(db, "=ben"), tags="x", side="left", decision="2")
-    client = asking(db)
-    assert 'href="agreement.csv"' in client.get("/notes").text
-    reply = client.get("/agreement.csv")
-    assert 'filename="agreement.csv"' in reply.headers["content-disposition"]
-    rows = list(csv.DictReader(io.StringIO(reply.text)))
-    alike = "both gave it to all of them: there is nothing to tell apart"
-    assert [tuple(row.values()) for row in rows] == [
-        ("trials", "x", "'=ben", "anna", "1", "0", "0", "0", "", alike),
-        ("decisions", "x", "'=ben", "anna", "0", "1", "1", "0", "-1.0", ""),
-        ("decisions", "y", "'=ben", "anna", "0", "1", "1", "0", "-1.0", ""),
-    ]
-
-
 # ---- in a browser
 
 
@@ -374,7 +284,6 @@ def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(
     expect(page.locator("#note")).to_have_count(0)
     (line,) = csv.DictReader((tmp_path / "pages" / "notes.csv").open())
     assert (line["text"], line["trial_id"]) == ("It hesitates.", "emulator/baseline/N_0_0/rep01")
-    assert (tmp_path / "pages" / "agreement.csv").read_text().startswith("units,tag,first_reader")
     page.goto(f"file://{tmp_path}/pages/trials.html?tag=late")
     expect(page.locator("tbody tr:visible")).to_have_count(1)
     noted(client, text="sk-proj-abcdefghijklmnop0123")

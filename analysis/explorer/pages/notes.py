@@ -1,11 +1,10 @@
-"""What readers noted, all of it, and how far they agree."""
+"""What readers noted, all of it."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
-from analysis.explorer.agreement import agreements
 from analysis.explorer.notes import Note, tags_of
 from analysis.explorer.pages.trial import find
 from analysis.explorer.query_worker import csv_cell
@@ -19,8 +18,6 @@ from merge_runner.text_safety import csv_writer
 Trials = Collection[tuple[str, str]]
 """Some trials, each as its name and its spec."""
 COLUMNS = ("at", "reader", "trial_id", "spec_hash", "side", "decision", "tags", "text")
-READERS = ("first_reader", "second_reader")
-COUNTS = ("both", "only_first", "only_second", "neither")
 
 
 def notes_page(site: Site, among: Trials | None = None) -> str:
@@ -31,15 +28,13 @@ def notes_page(site: Site, among: Trials | None = None) -> str:
         here="notes",
         kept=site.notes.kept(),
         shown=[(note, _address(site, note)) for note in reversed(shown)],
-        agreements=list(agreements(shown)),
-        readers=sorted({note.reader for note in shown if note.tags}),
     )
 
 
-def notes_file(site: Site, name: str, among: Trials | None = None) -> str:
-    """One of ``FILES`` as CSV, of all trials or of some."""
+def notes_csv(site: Site, among: Trials | None = None) -> str:
+    """Return the notes of all trials or of some as CSV."""
     lines = io.StringIO()
-    csv_writer(lines).writerows(map(csv_cell, row) for row in FILES[name](_notes(site, among)))
+    csv_writer(lines).writerows(map(csv_cell, row) for row in note_rows(_notes(site, among)))
     return lines.getvalue()
 
 
@@ -49,17 +44,6 @@ def note_rows(notes: Sequence[Note]) -> Iterator[Sequence[object]]:
     for note in notes:
         texts = {"at": note.at.isoformat(), "tags": ", ".join(note.tags)}
         yield [texts.get(name, getattr(note, name)) for name in COLUMNS]
-
-
-def agreement_rows(notes: Sequence[Note]) -> Iterator[Sequence[object]]:
-    """Under their columns how often two readers gave a tag, and Cohen's kappa, or why none."""
-    yield ("units", "tag", *READERS, *COUNTS, "kappa", "undefined")
-    for a in agreements(notes):
-        counts = (a.both, a.first, a.second, a.neither)
-        yield (a.units, a.tag, *a.readers, *counts, a.kappa, a.undefined)
-
-
-FILES = {"notes.csv": note_rows, "agreement.csv": agreement_rows}
 
 
 def add_note(site: Site, given: Mapping[str, str]) -> Row:
