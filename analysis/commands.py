@@ -265,14 +265,6 @@ def view(
     port: Annotated[
         int, typer.Option(metavar="N", help="0: any free port.", min=0, max=65535)
     ] = 8700,
-    bind: Annotated[
-        str,
-        typer.Option(
-            "--bind",
-            metavar="ADDRESS",
-            help="Another address to listen at; needs the token it prints.",
-        ),
-    ] = "127.0.0.1",
     export: Annotated[
         Path | None,
         typer.Option("--export", metavar="DIR", help="Write a folder of pages instead of serving."),
@@ -301,14 +293,14 @@ def view(
     if export is None and single is None:
         if trials is not None:
             raise UsageError("--trials goes with --export DIR or --single FILE.html")
-        _serve(db, port, bind, reader)
+        _serve(db, port, reader)
     elif single is not None and trials is None:
         raise UsageError("--single FILE.html needs --trials: name some, or all with '*'")
     else:
         _export(db, export, single, listed(trials) or [])
 
 
-def _serve(db: Path, port: int, bind: str, reader: str | None) -> None:
+def _serve(db: Path, port: int, reader: str | None) -> None:
     from analysis.explorer.notes import reader_of
     from analysis.explorer.server import serve
 
@@ -316,7 +308,7 @@ def _serve(db: Path, port: int, bind: str, reader: str | None) -> None:
         print_out(address)
         say("open this address in a browser; Ctrl-C ends the explorer")
 
-    serve(db, port, bind, announce, reader_of(reader))
+    serve(db, port, announce, reader_of(reader))
 
 
 def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[str]) -> None:

@@ -41,7 +41,7 @@ INSTALLED = (
     "make() { command make -o .venv/python -o .venv/runtime -o .venv/dev -o .venv/dask "
     '-o .venv-peer/installed ${RUN:+RUN="$RUN"} "$@"; }\n'
 )
-SERVES = re.compile(r" emulate |make view$| view$| view --(port|bind)")
+SERVES = re.compile(r" emulate |make view$| view$| view --port")
 NEEDS_MAKE = pytest.mark.skipif(
     not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv"
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import AsyncIterator, Callable, Collection, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any
@@ -14,6 +14,7 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import (
     HTMLResponse,
@@ -27,7 +28,7 @@ from starlette.staticfiles import StaticFiles
 
 from analysis.explorer.assets import STATIC
 from analysis.explorer.export import page_of_trials
-from analysis.explorer.guard import Guard, from_elsewhere
+from analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
 from analysis.explorer.pages import (
     ablations,
     comparing,
@@ -60,8 +61,8 @@ MOST_NOTED = 65_536  # bytes of a form with a note
 SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
 
 
-def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> Starlette:
-    """The application; see ``Guard`` for who may ask."""
+def explorer(site: Site) -> Starlette:
+    """Return the application, which answers to names of loopback alone."""
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
@@ -78,7 +79,8 @@ def explorer(site: Site, hosts: Collection[str], token: str | None = None) -> St
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
-            Middleware(Guard, hosts=hosts, token=token),
+            Middleware(Guard),
+            Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
         lifespan=lifespan,

@@ -1,19 +1,14 @@
-"""Who may ask, and what a page may do: a middleware around the whole explorer."""
+"""Middleware that refuses other sites' requests and says what a page may do."""
 
 from __future__ import annotations
 
-import hmac
-import ipaddress
-import re
-from collections.abc import Collection
-from urllib.parse import parse_qs, urlencode, urlsplit
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import PlainTextResponse, RedirectResponse
+from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-# One for each port: a browser sends the cookies of a host to all its ports.
-COOKIE = "merge-runner-{port}"
+LOOPBACK = "127.0.0.1"
 # Scripts and styles are files of ours. What a model wrote could not run even if it were let in.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -30,11 +25,10 @@ HEADERS = {
 
 
 def from_elsewhere(headers: Headers) -> bool:
-    """Whether another site's page led here.
+    """Return whether another site's page led here.
 
-    Over HTTP browsers send ``sec-fetch-site`` to loopback alone, and older ones never: then
-    ``origin`` and ``referer`` tell. At other addresses the token is needed, whose cookie is not
-    sent from other sites.
+    Browsers send ``sec-fetch-site`` to loopback; older ones do not: then ``origin`` and
+    ``referer`` tell.
     """
     site = headers.get("sec-fetch-site")
     if site is not None:
@@ -44,27 +38,11 @@ def from_elsewhere(headers: Headers) -> bool:
     return any(urlsplit(address).netloc != host for address in led)
 
 
-def is_address(name: str) -> bool:
-    """Whether a host is an IP address and not a name, which any server may resolve to ours."""
-    try:
-        ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
-    except ValueError:
-        return False
-    return True
-
-
 class Guard:
-    """Lets in requests to one of ``hosts`` (``NAME:PORT``) that no other site's page makes.
+    """Refuses requests of other sites' pages but links, and adds HEADERS to every reply."""
 
-    ``0.0.0.0`` or ``[::]`` among them stands for any IP address. A name that an attacker's server
-    resolves to this machine is no host of ours. With a ``token`` only those who know it come in:
-    from ``?token=`` it goes into a cookie.
-    """
-
-    def __init__(self, app: ASGIApp, hosts: Collection[str], token: str | None = None) -> None:
+    def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._hosts = frozenset(hosts)
-        self._token = token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer, or say why not."""
@@ -79,54 +57,17 @@ class Guard:
                     headers.setdefault(name, value)
             await send(message)
 
-        refusal = self._refusal(scope)
-        if isinstance(refusal, str):
-            await PlainTextResponse(refusal + "\n", 403)(scope, receive, guarded)
-        elif refusal is not None:
-            await refusal(scope, receive, guarded)
-        else:
-            await self._app(scope, receive, guarded)
-
-    def _refusal(self, scope: Scope) -> str | RedirectResponse | None:
-        headers = Headers(scope=scope)
-        host = headers.get("host", "")
-        named = host if re.search(r":\d+$", host) else f"{host}:80"  # which browsers leave out
-        name, _, port = named.rpartition(":")
-        anywhere = {f"0.0.0.0:{port}", f"[::]:{port}"}
-        if named not in self._hosts and (self._hosts.isdisjoint(anywhere) or not is_address(name)):
-            return "this host name is not served here"
-        origin = headers.get("origin")
-        if origin not in {None, f"http://{host}"}:
-            return "another site's page may not ask here"
-        if scope["method"] not in {"GET", "HEAD"} and (origin is None or from_elsewhere(headers)):
-            return "only a page of the explorer may write here"
-        if from_elsewhere(headers) and headers.get("sec-fetch-mode", "navigate") != "navigate":
-            return "another site's page may not ask here"
-        if self._token is None:
-            return None
-        return _without_token(scope, headers, COOKIE.format(port=port), self._token)
+        refusal = _refusal(scope["method"], Headers(scope=scope))
+        app = PlainTextResponse(f"{refusal}\n", 403) if refusal else self._app
+        await app(scope, receive, guarded)
 
 
-def _without_token(
-    scope: Scope, headers: Headers, cookie: str, token: str
-) -> str | RedirectResponse | None:
-    if any(_equal(value, token) for value in _values(headers.get("cookie", ""), cookie)):
-        return None
-    query = parse_qs(scope["query_string"].decode(errors="replace"))
-    if not _equal(query.pop("token", [""])[0], token):
-        return "open the address that `merge-runner view` printed, with its token"
-    rest = urlencode(query, doseq=True)
-    reply = RedirectResponse(scope["path"] + (f"?{rest}" if rest else ""), 303)
-    reply.set_cookie(cookie, token, httponly=True, samesite="strict")
-    return reply
-
-
-def _values(cookies: str, name: str) -> list[str]:
-    """What a cookie holds; no parser of cookies takes all that other programs write into theirs."""
-    pairs = [cookie.strip().partition("=") for cookie in cookies.split(";")]
-    return [value for key, _, value in pairs if key == name]
-
-
-def _equal(given: str, token: str) -> bool:
-    # In a time that does not tell how much of a guess is right.
-    return hmac.compare_digest(given.encode(), token.encode())
+def _refusal(method: str, headers: Headers) -> str:
+    origin = headers.get("origin")
+    if origin not in {None, f"http://{headers.get('host', '')}"}:
+        return "another site's page may not ask here"
+    if method not in {"GET", "HEAD"} and (origin is None or from_elsewhere(headers)):
+        return "only a page of the explorer may write here"
+    if from_elsewhere(headers) and headers.get("sec-fetch-mode", "navigate") != "navigate":
+        return "another site's page may not ask here"
+    return ""

@@ -201,7 +201,7 @@ async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
     tables = await merge_runner("tables", "ablation-quantitative")
     cautioned = "human-replay+idm: the human on the left is replayed and does not react"
     assert cautioned in " ".join(tables.out.split())
-    explored = TestClient(explorer(Site(db), {"127.0.0.1:1"}), base_url="http://127.0.0.1:1")
+    explored = TestClient(explorer(Site(db)), base_url="http://127.0.0.1:1")
     said = "the human on the left is replayed and does not react"
     assert explored.get("/trials").text.count(said) == 1, "of five trials one"
     assert f",{said}," in explored.get("/trials.csv").text

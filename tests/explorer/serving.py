@@ -20,11 +20,9 @@ from analysis.explorer.site import Site
 @contextmanager
 def served(db: Path, port: int = 0):
     """The explorer of a database in a thread of its own; gives its address."""
-    listener = listen("127.0.0.1", port)
+    listener = listen(port)
     host = f"127.0.0.1:{listener.getsockname()[1]}"
-    server = uvicorn.Server(
-        uvicorn.Config(explorer(Site(db), {host}), log_level="warning", ws="none")
-    )
+    server = uvicorn.Server(uvicorn.Config(explorer(Site(db)), log_level="warning", ws="none"))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:

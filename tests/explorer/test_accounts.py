@@ -36,7 +36,7 @@ def db(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def client(db):
-    return TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+    return TestClient(explorer(Site(db)), base_url=f"http://{HOST}")
 
 
 @pytest.fixture

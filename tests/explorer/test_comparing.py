@@ -46,7 +46,7 @@ def db(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def client(db):
-    return TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+    return TestClient(explorer(Site(db)), base_url=f"http://{HOST}")
 
 
 def ask(client, trial, **asked):
@@ -86,7 +86,7 @@ def test_only_a_human_with_the_same_task_is_near(db, tmp_path, other_task):
                 f"WHERE spec_hash {which} {human}",
                 [json.dumps(other_task)],
             )
-        client = TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}")
+        client = TestClient(explorer(Site(path)), base_url=f"http://{HOST}")
         return ask(client, "o3/baseline/N_0_0/rep01", offer="nearest human")
 
     assert nearest("NOT IN") is None
@@ -102,7 +102,7 @@ def test_a_human_is_compared_until_the_first_vehicle_is_at_the_merge_point_of_it
         connection.execute(
             "UPDATE specs SET spec = json_merge_patch(spec, ?)", [json.dumps({"track": near})]
         )
-    client = TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}")
+    client = TestClient(explorer(Site(path)), base_url=f"http://{HOST}")
     # It ended before the other merge point alone.
     assert ask(client, "o3/baseline/N_0_0/rep01", offer="nearest human") == (
         "human/short/N_0_0/rep01"
@@ -154,7 +154,7 @@ def test_a_name_with_several_specs_is_told_with_its_spec(db, tmp_path):
                 f"INSERT INTO {table} BY NAME SELECT * REPLACE ('abc' AS spec_hash) FROM {table} "
                 "WHERE trial_id = 'o4/A1/N_0_0/rep01'"
             )
-    client = TestClient(explorer(Site(twice), {HOST}), base_url=f"http://{HOST}")
+    client = TestClient(explorer(Site(twice)), base_url=f"http://{HOST}")
     keys = {one["key"] for one in ask(client, "o3/A1/N_0_0/rep01", q="o4 a1")["found"]}
     assert "o4/A1/N_0_0/rep01@abc" in keys
     assert len(keys) == 2
@@ -166,7 +166,7 @@ def test_a_page_of_a_trial_with_a_secret_is_refused_with_the_reason(db, tmp_path
     secret = shutil.copy(db, tmp_path / "t.duckdb")
     with duckdb.connect(str(secret)) as connection:
         connection.execute("UPDATE decisions SET rationale = 'sk-proj-abcdefghijklmnop0123'")
-    client = TestClient(explorer(Site(secret), {HOST}), base_url=f"http://{HOST}")
+    client = TestClient(explorer(Site(secret)), base_url=f"http://{HOST}")
     reply = client.get("/trials/o3/A1/N_0_0/rep01", params={"as": "page"})
     assert reply.status_code == 503
     assert "holds what looks like a key: sk-pro" in reply.text

@@ -43,7 +43,7 @@ def db(tmp_path_factory):
 @pytest.fixture
 def ask(db):
     site = Site(db)
-    client = TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
+    client = TestClient(explorer(site), base_url=f"http://{HOST}")
     yield client.get
     site.close()
 
@@ -160,7 +160,7 @@ def mixed(tmp_path_factory):
 
 def test_two_different_drivers_are_told_apart_whichever_side_they_sat_on(mixed, db):
     site = Site(mixed)
-    client = TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
+    client = TestClient(explorer(site), base_url=f"http://{HOST}")
     text = client.get("/conditions/N_0_0?by=driver").text
     # In the first trial the right one went first, who is named first; in the other the left one.
     assert traces(text) == {
@@ -172,7 +172,7 @@ def test_two_different_drivers_are_told_apart_whichever_side_they_sat_on(mixed, 
     assert "Speed of the driver that is named first (m/s)" in text
     site.close()
     alone = Site(db)
-    reply = TestClient(explorer(alone, {HOST}), base_url=f"http://{HOST}").get(
+    reply = TestClient(explorer(alone), base_url=f"http://{HOST}").get(
         "/conditions/N_0_0?by=driver"
     )
     assert reply.status_code == 404

@@ -48,7 +48,7 @@ def site(prepare, hosts, tmp_path_factory):
 
 
 def browser(site):
-    return TestClient(explorer(site, {"127.0.0.1:1"}), base_url="http://127.0.0.1:1")
+    return TestClient(explorer(site), base_url="http://127.0.0.1:1")
 
 
 def test_the_trials_of_two_endpoints_are_listed_apart(site, hosts):

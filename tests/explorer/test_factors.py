@@ -23,7 +23,7 @@ HOST = "127.0.0.1:8700"
 
 @pytest.fixture(scope="module")
 def client(played):
-    return TestClient(explorer(Site(played.db), {HOST}), base_url=f"http://{HOST}")
+    return TestClient(explorer(Site(played.db)), base_url=f"http://{HOST}")
 
 
 def test_the_list_of_trials_filters_by_factor(client):
@@ -62,7 +62,7 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
     with duckdb.connect(str(copy)) as connection:
         connection.execute("UPDATE sweeps SET exit_code = 3")
         connection.execute("DELETE FROM trials WHERE trial_id LIKE '%rep02%'")
-    stopped = TestClient(explorer(Site(copy), {HOST}), base_url=f"http://{HOST}").get(sweep).text
+    stopped = TestClient(explorer(Site(copy)), base_url=f"http://{HOST}").get(sweep).text
     assert "18 of 36 trials have an outcome" in stopped
     assert "<code>merge-runner sweep mine.toml --model cheap --model dear</code>" in stopped
 

@@ -32,9 +32,7 @@ def test_no_mark_of_the_docs_is_left(marks):
 
 
 def test_the_page_says_the_same_as_the_docs(study):
-    text = (
-        TestClient(explorer(Site(study), {HOST}), base_url=f"http://{HOST}").get("/glossary").text
-    )
+    text = TestClient(explorer(Site(study)), base_url=f"http://{HOST}").get("/glossary").text
     shown = unescape(re.sub(r"<[^>]*>", "", text))
     for _, meaning in ROWS[1:5]:
         plain = re.sub(r"\*\*|`|\]\([^)]*\)|\[", "", meaning)

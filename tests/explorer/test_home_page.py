@@ -74,7 +74,7 @@ def own(db):
 
 
 def client_of(site):
-    return TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
+    return TestClient(explorer(site), base_url=f"http://{HOST}")
 
 
 @pytest.fixture(scope="module")

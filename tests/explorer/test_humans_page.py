@@ -47,7 +47,7 @@ def db(tmp_path):
 def ask(db):
     site = Site(db)
     site.computing = Awaited(db, InProcess)
-    client = TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}")
+    client = TestClient(explorer(site), base_url=f"http://{HOST}")
 
     yield lambda: unescape(client.get("/humans").text)
     site.computing.close()

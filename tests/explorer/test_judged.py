@@ -69,7 +69,7 @@ def a_trial(db, number=0):
 
 def page_of(db, number=0):
     name, _ = a_trial(db, number)
-    client = TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+    client = TestClient(explorer(Site(db)), base_url=f"http://{HOST}")
     return client.get(f"/trials/{name}").text
 
 

@@ -34,7 +34,7 @@ def db(study, tmp_path):
 
 
 def asking(db, reader="anna"):
-    app = explorer(Site(db, reader=reader), {HOST})
+    app = explorer(Site(db, reader=reader))
     return TestClient(app, base_url=f"http://{HOST}", headers=OURS, follow_redirects=False)
 
 
@@ -89,19 +89,9 @@ def test_notes_are_shown_on_the_trial_in_the_list_and_on_a_page_of_their_own(db)
 def test_only_a_page_of_ours_writes(db, headers):
     client = asking(db)
     client.headers.pop("origin")
-    assert (
-        client.post("/notes", data={"trial": TRIAL, "text": "x"}, headers=headers).status_code
-        == 403
-    )
+    reply = client.post("/notes", data={"trial": TRIAL, "text": "x"}, headers=headers)
+    assert reply.status_code == (400 if "host" in headers else 403)
     assert lines(db) == []
-
-
-def test_at_another_address_only_who_has_the_token_writes(db):
-    app = explorer(Site(db), {HOST}, token="the-token")
-    client = TestClient(app, base_url=f"http://{HOST}", headers=OURS, follow_redirects=False)
-    assert noted(client, text="x").status_code == 403
-    client.get("/?token=the-token")
-    assert noted(client, text="x").status_code == 303
 
 
 @pytest.mark.parametrize(

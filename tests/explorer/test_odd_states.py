@@ -26,7 +26,7 @@ def db(study, tmp_path):
 
 
 def ask(site, address):
-    return TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}").get(address)
+    return TestClient(explorer(site), base_url=f"http://{HOST}").get(address)
 
 
 def change(db, sql):

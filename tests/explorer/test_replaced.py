@@ -60,7 +60,7 @@ def db(good, tmp_path):
 
 @pytest.fixture
 def client(db):
-    application = explorer(Site(db), {HOST})
+    application = explorer(Site(db))
     return TestClient(application, base_url=f"http://{HOST}", raise_server_exceptions=False)
 
 

@@ -39,7 +39,7 @@ def site(tmp_path_factory):
 
 @pytest.fixture
 def client(site):
-    with TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}") as client:
+    with TestClient(explorer(site), base_url=f"http://{HOST}") as client:
         yield client
 
 

@@ -74,7 +74,7 @@ def study(written, tmp_path):
 
 def browser(db):
     site = Site(db)
-    return TestClient(explorer(site, {"127.0.0.1:1"}), base_url="http://127.0.0.1:1")
+    return TestClient(explorer(site), base_url="http://127.0.0.1:1")
 
 
 def text_of(client, url=URL):

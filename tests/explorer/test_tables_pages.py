@@ -106,7 +106,7 @@ def site(db):
 @pytest.fixture(scope="module")
 def ask(site):
     """Gets a page; returns its text."""
-    client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
+    client = TestClient(explorer(site), base_url=f"http://{HERE}")
 
     def get(address, code=200):
         reply = client.get(address)
@@ -177,7 +177,7 @@ def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at
 
     site = Site(db)
     site.computing = Computing(db, Counting)
-    client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
+    client = TestClient(explorer(site), base_url=f"http://{HERE}")
     address = "/trials?cell=attempts/nobody:n"
     while (waited := client.get(address)).status_code == 200:
         pass
@@ -239,7 +239,7 @@ def test_the_trials_of_a_rate_that_are_in_no_pair_are_counted(tmp_path):
     ]
     db = write_study(tmp_path / "t.duckdb", [*baseline, *yielding("o3", "A1", reps=1)])
     site = Site(db)
-    client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
+    client = TestClient(explorer(site), base_url=f"http://{HERE}")
     with duckdb.connect(str(db), read_only=True) as connection:
         collided = connection.execute(
             "SELECT trial_id FROM trials WHERE status = 'collided' ORDER BY ALL"
@@ -272,7 +272,7 @@ def test_the_trials_of_a_rate_that_are_in_no_pair_are_counted(tmp_path):
         tmp_path / "even.duckdb", [*yielding("o3", reps=1), *yielding("o3", "A1", 1)]
     )
     text = (
-        TestClient(explorer(Site(even), {HERE}), base_url=f"http://{HERE}")
+        TestClient(explorer(Site(even)), base_url=f"http://{HERE}")
         .get("/discordant?model=o3&variant=A1")
         .text
     )
@@ -369,7 +369,7 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
 
     site = Site(db)
     site.computing = Computing(db, Slow)
-    client = TestClient(explorer(site, {HERE}), base_url=f"http://{HERE}")
+    client = TestClient(explorer(site), base_url=f"http://{HERE}")
     first = client.get("/humans").text
     assert "Computing, about 4 s the first time that these 66 trials are read" in first
     assert asked.wait(60)

@@ -53,7 +53,7 @@ def db(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def client(db):
-    with TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}") as client:
+    with TestClient(explorer(Site(db)), base_url=f"http://{HOST}") as client:
         yield client
 
 
@@ -108,7 +108,7 @@ def test_long_replies_that_are_much_alike_are_searched_in_little_memory(db, tmp_
         )
         ((texts,),) = connection.execute("SELECT sum(length(reply)) FROM calls").fetchall()
     assert texts > 40 * path.stat().st_size
-    with TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}") as client:
+    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
         assert len(found(client, **{"q": "i wait", "in": "replies"})) == PAGE
 
 
@@ -145,7 +145,7 @@ def test_what_is_found_comes_in_pages(client, db):
 def test_words_of_new_trials_are_found_and_those_of_removed_ones_are_not(db, tmp_path):
     path = tmp_path / "t.duckdb"
     path.write_bytes(db.read_bytes())
-    with TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}") as client:
+    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
         assert len(found(client, q="brake")) == 2
         with duckdb.connect(str(path)) as connection:
             connection.execute("DELETE FROM trials WHERE trial_id LIKE 'o3/%'")
@@ -161,7 +161,7 @@ def test_words_of_new_trials_are_found_and_those_of_removed_ones_are_not(db, tmp
 def test_while_another_program_holds_the_database_what_was_read_is_searched(db, tmp_path):
     path = tmp_path / "t.duckdb"
     path.write_bytes(db.read_bytes())
-    with TestClient(explorer(Site(path), {HOST}), base_url=f"http://{HOST}") as client:
+    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
         assert len(found(client, q="brake")) == 2
         with held(path):
             assert len(found(client, q="brake")) == 2
@@ -169,7 +169,7 @@ def test_while_another_program_holds_the_database_what_was_read_is_searched(db, 
 
 def test_a_search_leaves_no_file_behind(db):
     site = Site(db)
-    with TestClient(explorer(site, {HOST}), base_url=f"http://{HOST}") as client:
+    with TestClient(explorer(site), base_url=f"http://{HOST}") as client:
         assert found(client, q="brake")
         folder = site.words.folder
         assert folder.exists()

@@ -32,7 +32,7 @@ def cells(text):
 
 @pytest.fixture
 def client(db):
-    return TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+    return TestClient(explorer(Site(db)), base_url=f"http://{HOST}")
 
 
 @pytest.mark.parametrize("begins", list("=+-@\t\r\n"))

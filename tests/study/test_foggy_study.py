@@ -141,7 +141,7 @@ def test_programs_are_told_no_more_than_models(db):
 
 
 def test_the_panel_of_a_decision_shows_both_beside_each_other(db):
-    client = TestClient(explorer(Site(db), {HOST}), base_url=f"http://{HOST}")
+    client = TestClient(explorer(Site(db)), base_url=f"http://{HOST}")
 
     def panel(level):
         trial = f"emulator/told_more/L_4_0/rep01/perception={level}"
