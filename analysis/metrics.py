@@ -15,9 +15,9 @@ from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 
 Estimator = Literal["proportion", "mean", "median"]
 # tables: Tables V and VII, the contrasts, and the sentences and pages made of these; fallbacks,
-# criticality: the tables of these names; distributions: the figure; humans: the page of the
-# explorer; conclusions: a sentence on each driver.
-Place = Literal["tables", "fallbacks", "criticality", "distributions", "humans", "conclusions"]
+# criticality: the tables of these names; distributions: the figure; conclusions: a sentence on
+# each driver.
+Place = Literal["tables", "fallbacks", "criticality", "distributions", "conclusions"]
 PLACES: frozenset[Place] = frozenset(get_args(Place))
 EVERYWHERE = PLACES - {"criticality"}
 # The trials that a metric may be of, in SQL.
@@ -214,7 +214,7 @@ COLLISIONS = register(
         lowest=0.0,
         humans_from="all recordings",
         paper_of_drivers="collided_percent",
-        shown=frozenset({"tables", "fallbacks", "humans"}),
+        shown=frozenset({"tables", "fallbacks"}),
     )
 )
 BOXES = register(
@@ -232,7 +232,7 @@ BOXES = register(
         lowest=0.0,
         humans_from="outcomes",
         paper_of_humans="collided_percent",
-        shown=frozenset({"tables", "fallbacks", "humans"}),
+        shown=frozenset({"tables", "fallbacks"}),
     )
 )
 LEFT_FIRST = register(
@@ -247,7 +247,7 @@ LEFT_FIRST = register(
         lowest=0.0,
         highest=100.0,
         humans_from="outcomes",
-        shown=frozenset({"fallbacks", "humans"}),
+        shown=frozenset({"fallbacks"}),
     )
 )
 GAP = register(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
 from analysis.explorer.child import adopt_given, serve
-from analysis.metrics import GAP, LEFT_FIRST, Metric, shown_in
+from analysis.metrics import GAP, LEFT_FIRST, Metric
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Table, from_text, to_text
@@ -44,8 +44,8 @@ class Numbers:
         Where no table has the cell, the answer says so as ``absent``.
 
         ``study``, which reads it, ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``,
-        ``figure NAME``, ``humans``, or ``home FACTOR`` with an empty factor for drivers and
-        prompts; what follows the last two is ignored. Raises MergeRunnerError.
+        ``figure NAME``, or ``home FACTOR`` with an empty factor for drivers and prompts; what
+        follows the last is ignored. Raises MergeRunnerError.
         """
         match list(request):
             case ["study"]:
@@ -59,8 +59,6 @@ class Numbers:
                 return self._cell(table, row, column)
             case ["cells", *names]:
                 return self._counted() | self._cells(names)
-            case ["humans", *_]:
-                return self._counted() | human_panels(self.study) | self._tables(["contrasts"])
             case ["home", factor, *_]:
                 return self._counted() | home_panels(self.study, factor)
             case ["figure", name]:
@@ -174,21 +172,12 @@ class Numbers:
         }
 
 
-def human_panels(study: Study) -> dict[str, Any]:
-    """The humans and the baseline of every driver, measured in each condition, with notes."""
-    from analysis.tables.notes import sample_notes
-
-    shown = [_group_facts(study, group) for group in study.baselines]
-    found = beside_humans(study, study.baselines, shown, shown_in("humans"))
-    return found | {"notes": sample_notes(study, study.baselines)}
-
-
 def home_panels(study: Study, factor: str) -> dict[str, Any]:
     """Who goes first and the gap: of the humans, and every driver and prompt, or every level."""
     from analysis.stats.factors import levels_by_factor
 
     groups = [group for group in study.groups if group.id == HUMAN]
-    shown = [_group_facts(study, group) for group in groups]
+    shown = [_group_facts(group) for group in groups]
     if factor:
         found = [level for levels in levels_by_factor(study) for level in levels]
         levels = [level for level in found if level.factor == factor]
@@ -198,21 +187,19 @@ def home_panels(study: Study, factor: str) -> dict[str, Any]:
             for level in levels
         ]
         shown += [
-            _group_facts(study, level.pooled) | own
-            for level, own in zip(levels, facts, strict=True)
+            _group_facts(level.pooled) | own for level, own in zip(levels, facts, strict=True)
         ]
     else:
         groups += study.models
         prompts = len({group.setting for group in study.models}) > 1
         shown += [
-            _group_facts(study, group)
-            | ({"label": f"{group.label}, {group.setting}"} if prompts else {})
+            _group_facts(group) | ({"label": f"{group.label}, {group.setting}"} if prompts else {})
             for group in study.models
         ]
-    return beside_humans(study, groups, shown, [LEFT_FIRST, GAP])
+    return _beside_humans(study, groups, shown, [LEFT_FIRST, GAP])
 
 
-def _group_facts(study: Study, group: Group) -> dict[str, Any]:
+def _group_facts(group: Group) -> dict[str, Any]:
     """What a page has to know of a group but its numbers; ``table`` holds its rows."""
     return {
         "id": group.id,
@@ -220,11 +207,10 @@ def _group_facts(study: Study, group: Group) -> dict[str, Any]:
         "table": VARIANTS,
         "measured": group.measured,
         "mirrored": bool(group.seats[1]),
-        "scenario": study.specs.get(group.spec_hash or "", {}).get("scenario"),
     }
 
 
-def beside_humans(
+def _beside_humans(
     study: Study,
     groups: Sequence[Group],
     facts: Sequence[Mapping[str, Any]],
@@ -261,18 +247,13 @@ def beside_humans(
 
 
 def _in_condition(group: Group, condition: str, metrics: Sequence[Metric]) -> dict[str, Any]:
-    """Metrics of a group in one condition: estimates with 95 % intervals, and counts."""
-    from analysis.stats.measures import counts, estimate, known, trials_of
+    """Return the estimates of metrics in one condition, with 95 % intervals, by their names."""
+    from analysis.stats.measures import estimate, known
 
     part = group.part(lambda trials: trials["condition"] == condition)
-    found: dict[str, Any] = {}
-    for metric in metrics:
-        if known(group, metric):
-            found[metric.name] = asdict(estimate(part, metric))
-            found[metric.name]["all"] = len(trials_of(part, metric))
-            if metric.rate:
-                found[metric.name]["k"] = counts(part, metric)[0]
-    return found
+    return {
+        metric.name: asdict(estimate(part, metric)) for metric in metrics if known(group, metric)
+    }
 
 
 def _published(metric: Metric) -> dict[str, Any]:

@@ -34,7 +34,6 @@ from analysis.explorer.pages import (
     comparing,
     conditions,
     home,
-    humans,
     notes,
     sql,
     sweep,
@@ -162,7 +161,6 @@ def _computed_routes(site: Site) -> list[Route]:
 
     page = partial(_page, site)
     return [
-        Route("/conditions", page(lambda r: conditions.conditions_page(site, r.query_params))),
         Route("/conditions/{name:path}", page(condition)),
         Route("/glossary", page(lambda _: site.render("glossary.html", here="glossary"))),
         Route("/tables", page(lambda _: tables.tables_page(site))),
@@ -171,7 +169,6 @@ def _computed_routes(site: Site) -> list[Route]:
         Route("/tables/{name}", page(table)),
         Route("/ablations", page(lambda r: ablations.ablations_page(site, r.query_params))),
         Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),
-        Route("/humans", page(lambda r: humans.humans_page(site, r.query_params))),
     ]
 
 

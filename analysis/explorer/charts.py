@@ -16,7 +16,6 @@ from analysis.explorer.urls import Links
 from analysis.explorer.views import condition_text
 from analysis.figures.styles import COLOURS, HUMAN_STYLE, Style, driver_style
 from analysis.metrics import Metric, intervals_of, shown_in
-from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 SHAPE_WORDS = {"down": "triangle that points down"}
 # Shapes of lines, which have no inside.
@@ -54,11 +53,6 @@ class Kind:
         digits = self.metric.decimals
         return min(digits, PERCENT_DIGITS) if self.metric.rate else digits
 
-    @property
-    def denominators(self) -> bool:
-        """Whether its table tells those who ended from all, of whom some may be undecided."""
-        return self.metric.rate and self.metric.trials == "ended"
-
 
 @dataclass(frozen=True, slots=True)
 class Mark:
@@ -94,7 +88,6 @@ def drawn(
         "human": by_id.get(HUMAN),
         "measured": content["measured"],
         "conditions": {name: condition_text(*of) for name, of in content["conditions"].items()},
-        "own": [name for name in content["conditions"] if name not in HUMAN_CONDITIONS],
         "published": [one["text"] for one in content["published"].values()],
         "groups": groups,
         "undrawn": len(content["groups"]) - len(groups),

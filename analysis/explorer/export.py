@@ -22,9 +22,8 @@ from analysis.explorer.packing_processes import AT_ONCE, Block, packing
 from analysis.explorer.pages.ablations import ablations_page
 from analysis.explorer.pages.comparing import At, offered
 from analysis.explorer.pages.computed import computed
-from analysis.explorer.pages.conditions import condition_page, conditions_page, views_of
+from analysis.explorer.pages.conditions import condition_page, views_of
 from analysis.explorer.pages.home import groupings, home_page
-from analysis.explorer.pages.humans import humans_page
 from analysis.explorer.pages.notes import notes_csv, notes_page
 from analysis.explorer.pages.sweep import sweep_page, sweeps_page
 from analysis.explorer.pages.tables import (
@@ -161,7 +160,6 @@ def _listed_pages(site: Site, watch: Watch) -> Iterator[File]:
         yield at.sweep(entry.sweep_id), sweep_page(site, entry.sweep_id)
     yield at.to("sweeps"), sweeps_page(site)
     yield at.to("glossary"), site.render("glossary.html", here="glossary")
-    yield at.to("conditions"), conditions_page(site, {})
     names = site.catalogue.ask("SELECT DISTINCT condition FROM listed ORDER BY ALL")
     for name in watch([row["condition"] for row in names], "conditions"):
         for by in views_of(site, name).values():
@@ -177,7 +175,6 @@ def _computed_pages(site: Site, links: StaticLinks, watch: Watch) -> Iterator[Fi
         yield at.table(name), table_page(site, name, {})
         yield from table_files(site, name)
     yield at.to("ablations"), ablations_page(site, {})
-    yield at.to("humans"), humans_page(site, {})
     links.figures = figures(site)
     for name, svg in links.figures.items():
         yield at.figure(name), svg

@@ -33,12 +33,10 @@ PAGES = {
     "Study": HOME,
     "Runs": "sweeps",
     "Trials": "trials",
-    "Conditions": "conditions",
     "Words": "words",
     "Notes": "notes",
     "Tables": "tables",
     "Ablations": "ablations",
-    "Humans": "humans",
     "SQL": "sql",
 }
 

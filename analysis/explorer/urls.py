@@ -75,10 +75,7 @@ class Links:
 
 
 # The pages that the export of a whole study has beside the trials, each as a file of this name.
-EXPORTED = (
-    *(HOME, "sweeps", "trials", "conditions", "words", "notes", "tables", "ablations", "humans"),
-    "glossary",
-)
+EXPORTED = (*(HOME, "sweeps", "trials", "words", "notes", "tables", "ablations", "glossary"),)
 
 
 class StaticLinks(Links):
@@ -140,7 +137,7 @@ class StaticLinks(Links):
 
     def condition(self, name: str, **state: object) -> str:
         """All trials of a condition in one picture, or nothing where only trials are exported."""
-        if "conditions" not in self.pages:
+        if HOME not in self.pages:
             return ""
         return f"condition{_grouped(state)}-{_ODD.sub('_', name)}.html" + query_of(state)
 

@@ -11,8 +11,6 @@ from scipy import stats
 
 from analysis.data.metric_values import outcomes_with_metrics
 from analysis.data.study import Study
-from analysis.explorer.analysis_worker import human_panels
-from analysis.explorer.pages.humans import collisions
 from analysis.figures.gallery import distributions
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
@@ -146,9 +144,9 @@ def test_a_sentence_on_published_outcomes_does_not_call_them_imported(added, par
 
 def test_the_trials_of_a_share_are_those_that_it_is_found_in(added, partly):
     added(name="driven_percent", estimator="proportion", trials="ended", value="end_time_s > 0")
-    groups = human_panels(Study(partly))["groups"]
-    assert collisions(groups, "driven_percent")[0]["total"] == (11, 11, 11)
-    assert collisions(groups, BOXES.name)[0]["total"] == (28, 990, 990)
+    human = Study(partly).human
+    assert counts(human, METRICS["driven_percent"]) == (11, 11)
+    assert counts(human, BOXES) == (28, 990)
 
 
 def test_why_humans_have_no_value_is_told_of_collisions_alone_by_their_rule(added):

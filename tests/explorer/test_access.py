@@ -13,7 +13,6 @@ __all__ = ["exported"]
 PAGES = (
     "/sweeps",
     "/",
-    "/conditions",
     "/conditions/N_0_0",
     "/glossary",
     "/tables",
@@ -25,7 +24,6 @@ PAGES = (
     "/trials/human/baseline/N_0_0/rep01",
     "/words?q=script",
     "/notes",
-    "/humans",
     "/sql?q=select+1",
     "/trials",
     "/trials?cell=attempts/emulator%2Fbaseline:calls",

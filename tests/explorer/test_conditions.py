@@ -208,19 +208,16 @@ def test_of_too_many_trials_a_part_is_drawn_and_the_page_says_so(ask, monkeypatc
     assert '<strong id="drawn">3</strong> trials are drawn, taken evenly from the list of 7' in text
 
 
-def test_the_list_leads_to_every_condition_and_counts_by_driver(ask, db):
-    text = ask("/conditions").text
+def test_the_first_page_leads_to_every_condition_and_each_leads_back(ask, db):
+    text = ask("/").text
     with duckdb.connect(str(db), read_only=True) as connection:
         names = connection.execute("SELECT DISTINCT condition FROM trials").fetchall()
     for (name,) in names:
         assert f'href="/conditions/{name}"' in text
-    assert "both would reach the merge point together, at equal speeds" in text
-    link = re.search(r'href="([^"]*outcome=collided)"[^>]*>1<', text)[1]
-    assert "condition=N_0_0&amp;model=o3" in link
-    assert "<strong>1</strong> trials" in ask(html.unescape(link)).text
+        assert 'href="/#collisions"' in ask(f"/conditions/{name}").text
 
 
-@pytest.mark.parametrize("address", ["/", "/trials", "/conditions", "/sweeps/sweep-1"])
+@pytest.mark.parametrize("address", ["/", "/trials", "/sweeps/sweep-1"])
 def test_the_code_of_a_condition_says_itself_in_words_on_every_page(ask, address):
     text = ask(address).text
     (told,) = set(re.findall(r'title="([^"]*)"[^>]*>(?:<[^>]*>\s*)*R_-2_8[< ]', text)) or {None}
@@ -235,10 +232,10 @@ def test_a_condition_that_nobody_drove_is_not_there(ask):
 
 
 def test_a_page_that_looks_for_news_gets_none_where_there_are_none(ask):
-    for page in ("/conditions", "/conditions/N_0_0"):
-        news = html.unescape(re.search(r'hx-get="([^"]*seen=[^"]*)"', ask(page).text)[1])
-        assert ask(news).status_code == 204
-        assert ask(news.replace("seen=", "seen=0")).status_code == 200
+    text = ask("/conditions/N_0_0").text
+    news = html.unescape(re.search(r'hx-get="([^"]*seen=[^"]*)"', text)[1])
+    assert ask(news).status_code == 204
+    assert ask(news.replace("seen=", "seen=0")).status_code == 200
 
 
 def test_a_click_on_a_trace_opens_its_trial_and_a_choice_changes_the_picture(browser, db):
@@ -268,7 +265,7 @@ def test_a_click_on_a_trace_opens_its_trial_and_a_choice_changes_the_picture(bro
 def test_an_export_has_the_same_picture_and_chooses_without_a_server(page, db, tmp_path):
     export_with_a_table(db, tmp_path / "pages")
     page.context.set_offline(True)
-    page.goto(f"file://{tmp_path}/pages/conditions.html")
+    page.goto(f"file://{tmp_path}/pages/index.html")
     page.get_by_role("link", name="N_0_0", exact=True).click()
     expect(page.locator(".overlay path:visible")).to_have_count(7)
     expect(page.locator("#drawn")).to_have_text("7")

@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 from analysis.explorer.app import explorer
 from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.ablations import ablations_page
-from analysis.explorer.pages.humans import humans_page
+from analysis.explorer.pages.home import home_page
 from analysis.explorer.pages.trial import trial_page
 from analysis.explorer.pages.trials import filter_of, trials_page
 from analysis.explorer.site import Site
@@ -105,7 +105,7 @@ def test_every_page_says_who_is_a_stand_in_and_for_whom(site):
     pages = {
         "trials": trials_page(site, {}),
         "trial": trial_page(site, trials[0]["trial_id"], {}),
-        "humans": computed(humans_page, site),
+        "study": computed(home_page, site),
         "ablations": computed(ablations_page, site),
         "csv": site.catalogue.export(Filter(), "trial", "csv").decode(),
     }

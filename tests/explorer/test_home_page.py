@@ -38,7 +38,7 @@ from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK, Track
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import served
-from tests.explorer.test_humans_page import import_some
+from tests.explorer.test_charts import import_some
 from tests.explorer.test_tables_pages import Addresses, Awaited, InProcess, listed
 
 HOST = "127.0.0.1:8700"
@@ -401,10 +401,9 @@ def test_ablations_are_whole_at_1024_pixels_and_numbers_look_like_links(browser,
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("address", ["/", "/humans"])
-def test_nothing_is_cut_off_at_1024_pixels(page, address):
+def test_nothing_is_cut_off_at_1024_pixels(page):
     page.set_viewport_size({"width": 1024, "height": 800})
-    page.goto(address)
+    page.goto("/")
     expect(page.locator(".multiples").first).to_be_visible()
     expect(page.locator(".computing")).to_have_count(0)
     cut = page.eval_on_selector_all(

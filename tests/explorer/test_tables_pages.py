@@ -21,14 +21,12 @@ from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
 from analysis.explorer.child import Ended, NoAnswer
 from analysis.explorer.pages.ablations import ablations
-from analysis.explorer.pages.humans import kinds
 from analysis.explorer.pages.tables import ABOUT
 from analysis.explorer.pictures import ends_and_ticks
 from analysis.explorer.site import Site
 from analysis.metrics import METRICS, shown_in
 from analysis.tables import TABLES, make_tables
 from merge_runner.errors import MergeRunnerError
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Said, write_study, yielding
 from tests.gate import HANGS_S
 
@@ -327,31 +325,7 @@ def test_an_ablation_has_the_numbers_of_both_tables(ask, db):
     assert "/discordant?model=o3&amp;variant=A1&amp;by=outcome" in text
 
 
-def test_humans_stand_in_every_condition_with_both_denominators(ask):
-    text = ask("/humans")
-    panels = re.findall(r'<text class="condition"[^>]*>([^<]+)<', text)
-    assert panels == list(CONDITIONS) * len(kinds())
-    # The published counts: 28 of 990 collided; o3 lost no baseline trial.
-    assert re.search(r"<strong>28</strong> of 990 ended.*?of 990 trials", text, re.DOTALL)
-    assert re.search(r"<strong>0</strong> of 33 ended.*?of 33 trials", text, re.DOTALL)
-    assert "human 5 of 90" in text
-    by_boxes, by_disc = text.split('id="collided_boxes_percent"')[1].split('id="collided_percent"')
-    assert "of 990 ended" in by_boxes
-    assert "of 990 ended" not in by_disc  # of humans only boxes are published
-    assert "The recordings of the humans are not imported" in text
-
-
-def test_a_failed_trial_is_in_one_denominator_alone(tmp_path):
-    drives = yielding("o3", reps=1)
-    drives[0] = replace(drives[0], said={1: Said(("timeout",), lost=True)})
-    found = Numbers(write_study(tmp_path / "t.duckdb", drives)).answer(["humans"])
-    (o3,) = (group for group in found["groups"] if group["id"] == "o3/baseline")
-    condition = o3["conditions"][drives[0].condition]
-    collided = condition["collided_percent"]
-    assert (collided["all"], collided["n"], collided["value"]) == (1, 0, None)
-
-
-@pytest.mark.parametrize("address", ["/tables/attempts", "/ablations", "/humans", "/tables"])
+@pytest.mark.parametrize("address", ["/tables/attempts", "/ablations", "/tables"])
 def test_a_name_is_shown_as_text_and_nothing_is_inline(ask, address):
     text = ask(address)
     assert HOSTILE not in text
@@ -370,13 +344,13 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
     site = Site(db)
     site.computing = Computing(db, Slow)
     client = TestClient(explorer(site), base_url=f"http://{HERE}")
-    first = client.get("/humans").text
+    first = client.get("/tables/attempts").text
     assert "Computing, about 4 s the first time that these 66 trials are read" in first
     assert asked.wait(60)
     assert listed(client.get("/trials").text) == 66
     assert "Computing, about" in client.get("/ablations").text
     going.set()
-    while "Computing, about" in (later := client.get("/humans").text):
+    while "Computing, about" in (later := client.get("/tables/attempts").text):
         pass
     assert "This could not be computed:</strong> it broke &lt;off&gt;" in later
     site.computing.close()
@@ -391,10 +365,10 @@ def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
             return {"counted": len(made)}, b""
 
     computing = Computing(db, Counting)
-    first = computing.ask(("humans",), (1, 1), wait_s=5)
-    assert computing.ask(("humans",), (2, 2)) == first
+    first = computing.ask(("home", ""), (1, 1), wait_s=5)
+    assert computing.ask(("home", ""), (2, 2)) == first
     assert first.state == (1, 1)
-    second = computing.ask(("humans",), (2, 2), since=first.at + 0.001, wait_s=5)
+    second = computing.ask(("home", ""), (2, 2), since=first.at + 0.001, wait_s=5)
     assert isinstance(second, Result)
     assert (second.state, second.content) == ((2, 2), {"counted": 2})
     computing.close()

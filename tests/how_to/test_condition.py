@@ -46,7 +46,7 @@ async def test_conditions_from_outside_go_through_every_command(merge_runner, tm
     assert ["far", "human"] not in rows
     assert "not derived anew in 2 trials" in read["audit"].out
     assert "no human drove" in (tmp_path / "report.html").read_text()
-    assert "No human drove fast-tie, far." in (tmp_path / "pages/humans.html").read_text()
+    assert "no human drove it" in (tmp_path / "pages/index.html").read_text()
 
     # Who keeps a speed of 15 m/s deviates from it by nothing.
     rmse = "SELECT least(rmse_left_mps, rmse_right_mps) FROM trial_metrics JOIN trials "

@@ -1,4 +1,4 @@
-"""All trials of a condition in one picture, and the list of the conditions."""
+"""All trials of a condition in one picture."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from math import ceil
 from typing import Any
 
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.conditions import ordered
 from analysis.explorer.pictures import Axis, Scale
 from analysis.explorer.reading import Row
 from analysis.explorer.site import NotThere, Site, news_of
@@ -62,24 +61,6 @@ VIEWS = {
 TURNED_KIND = {"left-first": "right-first", "right-first": "left-first"}
 
 
-def conditions_page(site: Site, asked: Mapping[str, str]) -> str:
-    """All conditions that trials were played in; raises NothingNew."""
-    state = news_of(site.catalogue.state(), asked.get("seen", ""))
-    found = {
-        (row["condition"], row["model"]): row
-        for row in site.catalogue.counts(Filter(), "condition", "model")
-    }
-    names = ordered({name for name, _ in found})
-    return site.render(
-        "conditions.html",
-        here="conditions",
-        cells=found,
-        names=names,
-        drivers=sorted({model for _, model in found}, key=lambda model: (model == HUMAN, model)),
-        state=state,
-    )
-
-
 def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """The traces of a condition, of a driver and a prompt if these are asked for.
 
@@ -105,7 +86,7 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     humans = _rows(site, Filter(condition=name, model=HUMAN), with_humans=True)
     return site.render(
         "condition.html",
-        here="conditions",
+        here="",
         name=name,
         by=by,
         view=VIEWS[by],
