@@ -6,7 +6,6 @@ import ipaddress
 import json
 import os
 import re
-import tempfile
 import tomllib
 from base64 import b64encode
 from collections.abc import Container, Iterable, Iterator, Mapping
@@ -630,15 +629,6 @@ def proxy_secrets(env: Mapping[str, str] = os.environ) -> Iterator[str]:
             continue
         for given in {info, unquote(info)}:
             yield from (given, given.partition(":")[2], b64encode(given.encode()).decode())
-
-
-def runtime_folder(env: Mapping[str, str] = os.environ) -> Path:
-    """The folder in which a user's processes share what need not outlive the machine's next start.
-
-    It is XDG_RUNTIME_DIR, or else the folder of temporary files.
-    """
-    named = Path(env.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
-    return named if named.is_dir() else Path(tempfile.gettempdir())
 
 
 def state_folder(env: Mapping[str, str] = os.environ) -> Path:

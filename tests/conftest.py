@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -15,9 +14,6 @@ from tests.crossed_study import play
 from tests.harness import PROGRAM, Run, environment
 from tests.zygote import Zygote
 
-RUNTIME = tempfile.TemporaryDirectory()
-# Limits of a key that another test used must hold up none.
-os.environ["XDG_RUNTIME_DIR"] = RUNTIME.name
 # No agreement is kept: no test must pass because another one agreed.
 os.environ["XDG_STATE_HOME"] = os.devnull
 

@@ -3,8 +3,8 @@
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
 only the dispatcher ever asks it, and not before it has room: a turn that was taken early, and then
 held up by a pause, would be counted at the wrong time. Tokens are counted in a sliding window
-of a minute: an estimate at dispatch, settled to the actual usage afterwards. What other processes
-send with the same key counts too, see shared_limits.py.
+of a minute: an estimate at dispatch, settled to the actual usage afterwards. Each process counts
+for itself: where several use one key, the server refuses the excess, which is retried.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from functools import partial
 from asyncio_throttle.throttler import Throttler
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.shared_limits import WINDOW_S, SharedLimits, request_rules
 from merge_runner.llm.shared_services import Settle
 
+WINDOW_S = 60.0
+BURST_S = 0.5
 CLOCK_STEP_S, POLL_S = 1e-6, 1e-3
 
 
@@ -64,9 +65,7 @@ class Limiter:
         tpm: int | None = None,
         pause: Pause | None = None,
         window_s: float = WINDOW_S,
-        shared: SharedLimits | None = None,
     ) -> None:
-        self._shared = shared
         self._limited = rpm is not None or tpm is not None
         self._tpm = tpm
         self._window_s = window_s
@@ -104,15 +103,11 @@ class Limiter:
         """Dispatch nothing for a while: the server asked everybody on this key to wait."""
         now = asyncio.get_running_loop().time()
         self._pause.until = max(self._pause.until, now + seconds)
-        if self._shared is not None:
-            self._shared.pause(seconds)
 
     def _settle(self, turn: _Turn, tokens: int) -> None:
         """Replace the estimate of a turn by the tokens that its request used."""
         if turn.counts:
             self._tokens_in_window += tokens - turn.tokens
-            if self._shared is not None:
-                self._shared.settle(turn.dispatched_at, tokens - turn.tokens)
         turn.tokens = tokens
         self._changed.set()
 
@@ -121,9 +116,6 @@ class Limiter:
         loop = asyncio.get_running_loop()
         while waiter := self._head():
             wait = self._blocked_for(waiter, loop.time())
-            # The others' file last: a turn that is taken there counts for everybody at once.
-            if wait <= 0 and self._shared is not None:
-                wait = self._shared.take(waiter.tokens)
             if wait > 0:
                 await self._wait(wait)
                 continue
@@ -174,4 +166,10 @@ class _Throttle(Throttler):
 
 
 def _throttles(rpm: int, window_s: float) -> list[_Throttle]:
-    return [_Throttle(*rule, retry_interval=POLL_S) for rule in request_rules(rpm, window_s)]
+    """Return throttles for an even flow and for at most ``rpm`` requests in any window.
+
+    Half a second's worth goes at a time: a whole window at once would trip finer limits.
+    """
+    burst = max(1, int(rpm * BURST_S / window_s))
+    rules = [(burst, burst * window_s / rpm), (rpm, window_s)]
+    return [_Throttle(*rule, retry_interval=POLL_S) for rule in rules]

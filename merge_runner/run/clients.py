@@ -29,10 +29,9 @@ from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.ledger import NO_CAPS, Ledger
-from merge_runner.llm.limiter import Limiter, Pause
+from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import is_known
-from merge_runner.llm.shared_limits import WINDOW_S, SharedLimits, limits_file
 from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
 from merge_runner.llm.transport import SealedTransport
 from merge_runner.run.estimate import trial_costs
@@ -114,30 +113,13 @@ def open_services(
         model = plan.registered[name]
         if model not in by_model:
             rpm, tpm = options.rates(entry)
+            window_s = WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S
             pause = pauses[plan.endpoints[name]]
-            if plan.is_rehearsal:
-                by_model[model] = Limiter(rpm=rpm, tpm=tpm, pause=pause, window_s=WINDOW_S / SPEED)
-            else:
-                shared = _shared_limits(name, entry, rpm, tpm, stack)
-                by_model[model] = Limiter(rpm=rpm, tpm=tpm, pause=pause, shared=shared)
+            by_model[model] = Limiter(rpm=rpm, tpm=tpm, pause=pause, window_s=window_s)
         limiters[name] = by_model[model]
     costs = trial_costs(plan, measured, batch=options.batch)
     budget = Budget(ledger, options.caps, costs)
     return LocalServices(limiters=limiters, budget=budget)
-
-
-def _shared_limits(
-    name: str, entry: ModelEntry, rpm: int | None, tpm: int | None, stack: AsyncExitStack
-) -> SharedLimits | None:
-    """The limits that all of this user's sweeps with the same key share; our emulator has none."""
-    own_emulator = entry.provider == "emulator" and running_emulator_url() is None
-    if own_emulator or (rpm is None and tpm is None):
-        return None
-    endpoint = resolve_endpoint(name, entry)
-    file = limits_file(endpoint.base_url, entry.id, endpoint.auth_headers)
-    shared = SharedLimits(file, rpm=rpm, tpm=tpm)
-    stack.callback(shared.close)
-    return shared
 
 
 async def start_endpoints(plan: Plan, options: Options, stack: AsyncExitStack) -> dict[str, str]:
