@@ -11,7 +11,7 @@ import asyncio
 import sys
 import threading
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
@@ -20,7 +20,7 @@ from merge_runner.config import resolve_endpoint
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, Program
-from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 from merge_runner.registry import Registry
 from merge_runner.run import summary
@@ -239,14 +239,10 @@ class Study:
     async def _run(self, plan: Plan, *, yes: bool, **how: Unpack[RunOptions]) -> StudyOutcome:
         """Play what is not stored yet of a plan; ``yes`` lets it spend money."""
         options = self._options(plan, **how)
-        prepared = Sweep(plan, options, say=_say)
-        if prepared.trials_to_play:
-            try:
+        with closing(Sweep(plan, options, say=_say)) as prepared:
+            if prepared.trials_to_play:
                 await _check(plan, prepared, may_spend=yes)
-            except MergeRunnerError:
-                prepared.close()
-                raise
-        return await _played(prepared, options)
+            return await _played(prepared, options)
 
     def _options(self, plan: Plan, **how: Unpack[RunOptions]) -> Options:
         return plan.within_budget(Options(self.db, self.cache, **how))

@@ -34,8 +34,8 @@ from merge_runner.llm.shared_services import CachePort
 from merge_runner.llm.trial_costs import TrialCosts
 from merge_runner.records import Attempt
 
-# An older trial that has money kept for it may wait for another process that waits for us: after
-# this long, with nothing in flight, it is no longer counted on.
+# An older trial that has money kept for it may wait for a call of a younger one, which waits for
+# money: after this long, with nothing in flight, it is no longer counted on.
 PATIENCE_S = 90.0
 NOTHING_EXPECTED = TrialCosts(str, {}, {})
 
@@ -374,8 +374,8 @@ class Budget:
 
 async def _told(place: _Place) -> float:
     """Wait for a change, for a while only; returns for how long in s."""
-    # For ever it could be that another process holds a claim that a trial of ours waits for, and
-    # waits for one of ours.
+    # For ever it could be that an older trial waits for a call of ours, or that the run of another
+    # model, which spends under the same cap, frees money.
     loop = asyncio.get_running_loop()
     began = loop.time()
     place.told.clear()

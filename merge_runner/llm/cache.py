@@ -29,8 +29,8 @@ from merge_runner.llm.cache_db import (
     open_read_only,
     set_format,
 )
-from merge_runner.llm.claims import Claims
 from merge_runner.llm.content_hashes import manner, without_prompt
+from merge_runner.llm.model_lock import ModelLocks
 from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.llm.write_batcher import BatchWriter, Operation, ResultT
 from merge_runner.records import Attempt, ChatRequest, is_scripted
@@ -160,7 +160,8 @@ class KnownCall:
 class ResponseCache:
     """The cache folder. Reads are direct; writes are batched in a thread and awaited.
 
-    Whoever makes a call has claimed it, so that no other process makes it too.
+    Whoever makes a call has claimed it, so that no other trial or worker of its run makes it too.
+    ``locks`` keep other live runs from asking the same model.
     """
 
     def __init__(
@@ -176,7 +177,8 @@ class ResponseCache:
         in the folder, which must be there.
         """
         self.folder = folder
-        self.claims = Claims(folder)
+        self.locks = ModelLocks(folder)
+        self._claimed: set[str] = set()
         self._read_overlay = overlay
         self._disk = open_read_only(folder) if read_only else open_disk(folder)
         self._writer = BatchWriter(self.run_now)
@@ -197,13 +199,10 @@ class ResponseCache:
 
         What is damaged is set aside.
         """
-        if not self.claims.take(key):
+        if key in self._claimed:
             return None
-        # Read after the lock is taken, or a call could be made between the two.
-        with contextlib.ExitStack() as claimed:
-            claimed.callback(self.release, key)
-            known = self._known(key)
-            claimed.pop_all()  # what cannot be read is not claimed
+        known = self._known(key)  # what cannot be read is not claimed
+        self._claimed.add(key)
         return known
 
     def _known(self, key: str) -> KnownCall:
@@ -215,12 +214,12 @@ class ResponseCache:
 
     def release(self, key: str) -> None:
         """Give a claim up."""
-        self.claims.release(key)
+        self._claimed.discard(key)
 
     async def put(self, entry: CachedCall, also: Operation | None = None) -> CachedCall:
         """Keep an entry; returns the one that is kept when it is durable.
 
-        That is another one where another process was first: a kept reply is never replaced.
+        That is another one where an import was first: a kept reply is never replaced.
         ``also`` runs in the same transaction.
         """
 
@@ -258,7 +257,7 @@ class ResponseCache:
             return [name for name, check in checks.items() if _is_damaged(check, key)]
 
         def operation() -> list[str]:
-            found = damaged()  # again: another process may have moved it since
+            found = damaged()  # again: an import may have moved it since
             for name in found:
                 self._disk.set_aside(name, _DAMAGED + name)
             return found
@@ -381,8 +380,8 @@ class ResponseCache:
         return sum(self.stats(model).cost_usd for model in models)
 
     def close(self) -> None:
-        """Close the folder, and give all claims up."""
-        self.claims.close()
+        """Close the folder, and free its locks."""
+        self.locks.close()
         self._disk.close()
 
     def _keep(self, entry: CachedCall) -> CachedCall:

@@ -62,7 +62,7 @@ from merge_runner.records import (
 )
 from merge_runner.served_model import is_other_model
 
-# Kernel locks cannot be awaited; beside a call that takes seconds this delay is nothing.
+# Beside a call that takes seconds this delay is nothing.
 CLAIM_POLL_S = 0.1
 # A call whose lines failed so often is asked singly.
 MOST_LINES = 3
@@ -209,7 +209,7 @@ class LlmClient:
 
     async def _in_turn(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
-        # Both before the claim: else another process would wait for a call that waits here.
+        # Both before the claim: else another worker would wait for a call that waits here.
         opened = self.batches is not None and self.batches.takes_up(call)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
@@ -464,7 +464,7 @@ class LlmClient:
         )
 
     def _answer(self, call: Call, kept: CachedCall, outcome: AttemptOutcome) -> ChatReply:
-        if kept.attempts[-1] != call.attempts[-1]:  # another process was first
+        if kept.attempts[-1] != call.attempts[-1]:  # an import was first
             return self._read(kept, call.earlier)
         text = outcome.reading.text
         return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)

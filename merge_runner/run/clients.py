@@ -87,9 +87,8 @@ def open_services(
     cache: ResponseCache,
     ledger: Ledger,
     measured: Mapping[str, CallTotals],
-    stack: AsyncExitStack,
 ) -> LocalServices:
-    """The services of a run; closing ``stack`` gives up its claims.
+    """The services of a run.
 
     ``measured`` is what the cache knows about each model's earlier answers to similar requests.
     Raises UsageError where a spending cap could not be enforced.
@@ -102,8 +101,6 @@ def open_services(
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
-    cache.claims.open()  # a folder without locks must fail now, not in the middle of the run
-    stack.callback(cache.claims.close)
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
     # An account's limits are those of a model, with whatever parameters it is asked.

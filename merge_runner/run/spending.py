@@ -73,7 +73,7 @@ def release(folder: Path, sweep: str) -> Account:
     """Stop counting what is set aside for a sweep. Raises UsageError while a run is asking."""
     account(folder, sweep)
     with _opened(folder) as cache:
-        if not cache.claims.take_all():
+        if not cache.locks.take_all():
             raise UsageError(
                 f"another merge-runner works with {folder}: what it has in flight cannot be "
                 "released; try again when it has ended"

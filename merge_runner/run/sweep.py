@@ -104,7 +104,7 @@ class Sweep:
     """One run of a plan.
 
     Making it opens the cache, and the database unless it is a replay; it asks a server of one's
-    own what its model is called, and does nothing else.
+    own what its model is called, locks the models that a live run is to ask, and does nothing else.
     """
 
     def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
@@ -142,6 +142,9 @@ class Sweep:
             ledger=self._ledger,
             cap_usd=options.max_cost_usd,
         )
+        if self._is_live:
+            entries = plan.entries.items()
+            self._cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in entries})
 
     def _less_what_is_spent(self, options: Options) -> Options:
         """The options with a cap that is lower by what other ledgers of this study hold.
@@ -343,12 +346,12 @@ class Sweep:
     async def _runner(self, stack: AsyncExitStack) -> TrialRunner:
         """What plays the trials: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
-        if options.replay or not self._todo or not plan.entries:
+        if not self._is_live:
             clients = sealed_clients(plan, self._cache)
             # Recorded replies come at once: more trials in flight would only wait for each other.
             in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
             return LocalRunner(plan, clients, in_flight)
-        services = open_services(plan, options, self._cache, self._ledger, self._measured(), stack)
+        services = open_services(plan, options, self._cache, self._ledger, self._measured())
         urls = await start_endpoints(plan, options, stack)
         known = frozenset(
             name
@@ -521,6 +524,11 @@ class Sweep:
             model = arms[spec].asked[side]
             if model in self._plan.entries:
                 first.add_stored(model, valid, invalid, failure, rationale)
+
+    @property
+    def _is_live(self) -> bool:
+        """Whether there are trials to play for which a model may be asked."""
+        return bool(self._todo and self._plan.entries) and not self._is_silent
 
     @property
     def _is_silent(self) -> bool:

@@ -1,4 +1,4 @@
-"""Cache, ledger and claims in any order of calls, kills, damage and second processes.
+"""Cache and ledger in any order of calls, kills, damage and second processes.
 
 `HYPOTHESIS_EXAMPLES=2000 pytest -n0 tests/reliability/test_cache_machine.py` plays many more.
 """
@@ -50,7 +50,6 @@ REQUESTS = [
     for number in range(QUESTIONS)
 ]
 questions = st.integers(0, QUESTIONS - 1)
-processes = st.integers(0, PROCESSES - 1)
 costs = st.integers(0, WORST_USD)
 
 
@@ -101,18 +100,18 @@ class CacheMachine(RuleBasedStateMachine):
             self.running[number] = Process(self.place, self.cap_usd)
         return self.running[number]
 
-    def claimed(self, number: int, question: int) -> bool:
-        """POSIX locks are those of a process, and both are played in this one."""
-        return not any(question in each.in_flight_calls for each in self.running.values())
+    @rule(question=questions)
+    def ask(self, question):
+        """Begin an attempt, where no entry is kept, it is not asked already, and the cap allows it.
 
-    @rule(number=processes, question=questions)
-    def ask(self, number, question):
-        """Begin an attempt, where no entry is kept, nobody else asks, and the cap allows it."""
-        process = self.process(number)
-        if not self.claimed(number, question):
-            return
+        Each process has a model, and its questions, of its own: others may not ask it meanwhile.
+        """
+        process = self.process(question % PROCESSES)
         key = REQUESTS[question].key
         known = self.wait(process.cache.claim(key))
+        if question in process.in_flight_calls:
+            assert known is None
+            return
         if question in self.answered:
             assert known.entry == self.answered[question], "what is answered is not asked again"
             process.cache.release(key)

@@ -204,13 +204,21 @@ async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, experiments)
     assert run.summary["calls_of_unknown_cost"] == server.requests
 
 
-async def test_two_runs_under_one_cap_never_pass_it_and_both_end(merge_runner):
+async def test_runs_of_two_models_under_one_cap_never_pass_it_and_both_end(
+    merge_runner, experiments
+):
+    (experiments / "baseline.toml").write_text(f"[budget]\ntotal_usd = 7\n{SHORT}")
+    with (experiments / "models.toml").open("a") as registry:
+        registry.write(
+            '[twin]\nprovider = "openai"\nformat = "openai-chat"\nid = "o3-twin"\n'
+            'max_output_tokens = 16000\nprice = { input = 2.0, output = 8.0, source = "here" }\n'
+        )
     bill = Bill()
     async with watched(bill.middle) as server:
         env = account(server)
-        sweep = (*SWEEP, "--reps", 3, "--yes", *FAST, "--max-cost", 7)
+        sweep = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--reps", 3, "--yes")
         runs = await asyncio.gather(
-            *(merge_runner(*sweep, "--order-seed", seed, **env) for seed in (1, 2))
+            *(merge_runner(*sweep, *FAST, "--model", model, **env) for model in ("o3", "twin"))
         )
     assert {run.code for run in runs} <= {0, 3}, [run.err for run in runs]
     assert 0 < bill.usd <= 7

@@ -15,7 +15,6 @@ import pytest
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.cache_import import import_folder
-from merge_runner.llm.claims import Claims
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.records import Attempt, Slot
 
@@ -157,13 +156,6 @@ def test_a_link_in_the_folder_is_not_followed(folder, victim, tmp_path, name):
             ResponseCache(folder)
         (folder / name).unlink()
     assert not (tmp_path / "nothing").exists()
-
-
-def test_a_file_of_locks_that_leads_elsewhere_makes_none_there(folder, tmp_path):
-    (folder / "claims.lock").symlink_to(tmp_path / "made")
-    with pytest.raises(UsageError, match="cannot be locked"):
-        Claims(folder).open()
-    assert not (tmp_path / "made").exists()
 
 
 def test_a_pipe_in_place_of_the_file_is_not_waited_for(tmp_path):
