@@ -173,7 +173,7 @@ async def test_a_mistyped_name_is_answered_with_the_nearest(merge_runner):
     ("arguments", "says"),
     [
         (["swep"], "Did you mean 'sweep'?"),
-        (["sweep"], "Missing argument 'NAME'"),
+        (["sweep"], "Missing argument 'NAME...'"),
         (["sweep", "baseline", "--reps", "x"], "--reps"),
         (["sweep", "baseline", "--reps", "0"], "--reps is a whole number from 1"),
         (["sweep", "nope"], "valid: ablations, baseline"),

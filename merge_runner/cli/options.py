@@ -15,8 +15,16 @@ from merge_runner.paths import home_of
 def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> Path:
     """Put a default beside the study's file, from wherever it is started."""
     source = ctx.get_parameter_source(str(param.name))
-    study = next(filter(None, map(ctx.params.get, ("name", "study", "study_file"))), "")
-    return home_of(study) / path if source is not None and source.name == "DEFAULT" else path
+    if source is None or source.name != "DEFAULT":
+        return path
+    study = next(filter(None, map(ctx.params.get, ("studies", "name", "study", "study_file"))), "")
+    homes = {home_of(each) for each in ([study] if isinstance(study, str) else study)}
+    if len(homes) > 1:
+        raise UsageError(
+            f"{', '.join(study)} have their results in different folders: play them one at a time, "
+            "or name one place for all with --db and --cache"
+        )
+    return homes.pop() / path
 
 
 DbOption = Annotated[
@@ -165,10 +173,12 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JS
 QuietOption = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
 
 
-NameArgument = Annotated[
-    str,
+StudiesArgument = Annotated[
+    list[str],
     typer.Argument(
-        metavar="NAME", autocompletion=_studies, help="experiments/NAME.toml, or a path."
+        metavar="NAME...",
+        autocompletion=_studies,
+        help="experiments/NAME.toml, or a path. Several are played one after the other.",
     ),
 ]
 

@@ -32,10 +32,10 @@ def check_money_and_replay(
 
 def play(
     plan: Plan, options: Options, *, whole: bool, dry_run: bool, yes: bool, as_json: bool
-) -> None:
-    """Play a plan, or say what that would take; a replay that is not ``whole`` plays what it can.
+) -> int:
+    """Play a plan, or print what that would take; return the exit code.
 
-    Ends the program, but for an estimate, with the exit code of what happened.
+    A replay that is not ``whole`` plays what it can.
     """
     import asyncio
 
@@ -57,11 +57,11 @@ def play(
             say(note)
     if dry_run:
         _print_estimate(asyncio.run(unsent(plan, options, say=say)), as_json=as_json)
-    else:
-        _run(plan, options, yes=yes, as_json=as_json)
+        return 0
+    return _run(plan, options, yes=yes, as_json=as_json)
 
 
-def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> None:
+def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> int:
     import asyncio
 
     from merge_runner.run import summary
@@ -75,7 +75,7 @@ def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> None:
         outcome = asyncio.run(prepared.run())
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
-        sys.exit(INTERRUPTED)
+        return INTERRUPTED
     if as_json:
         whole = summary.as_dict(outcome, options, expected)
         print_out(json.dumps(whole, ensure_ascii=False))
@@ -84,7 +84,7 @@ def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> None:
             print_out(line)
     for message in outcome.messages:
         say(f"error: {message}")
-    sys.exit(outcome.exit_code)
+    return outcome.exit_code
 
 
 def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated
 
 import typer
@@ -128,4 +129,4 @@ def first(
     )
     whole = any(part is not None for part in (samples, grid, conditions, variants))
     plan = first_situations(plan)
-    play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json)
+    sys.exit(play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))

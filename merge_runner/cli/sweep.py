@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
+import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,7 +22,6 @@ from merge_runner.cli.options import (
     MaxCostOption,
     MirrorOption,
     ModelOption,
-    NameArgument,
     OnlyOption,
     QuietOption,
     RecordingOption,
@@ -29,6 +30,7 @@ from merge_runner.cli.options import (
     RpmOption,
     SampleSetOption,
     StrictModelOption,
+    StudiesArgument,
     TpmOption,
     TrustOption,
     VariantsOption,
@@ -41,6 +43,12 @@ from merge_runner.cli.playing import check_money_and_replay, play
 from merge_runner.cli.stand_in import emulator_options, faults_of
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
+
+if TYPE_CHECKING:
+    from merge_runner.run.plan import Plan
+
+# Trials that failed, or are not recorded, are no reason to leave the next sweep out.
+GOES_ON = (0, 1, 4)
 
 
 def init(
@@ -55,7 +63,7 @@ def init(
 
 
 def sweep(
-    name: NameArgument,
+    studies: StudiesArgument,
     model: ModelOption = None,
     only: OnlyOption = None,
     mirror: MirrorOption = False,
@@ -106,7 +114,7 @@ def sweep(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Play all trials of a sweep that are not stored yet."""
+    """Play all trials of one or more sweeps that are not stored yet."""
     from merge_runner.run.plan import Options, make_plan
 
     check_money_and_replay(max_cost, recording, replay=replay)
@@ -129,31 +137,46 @@ def sweep(
         dask=dask,
         batch=batch,
     )
-    plan = make_plan(
-        name,
-        model or (),
-        reps,
-        listed(conditions),
-        listed(variants),
-        sample_set=sample_set,
-        order_seed=order_seed,
-        only=levels(only or (), "--only"),
-        mirror=mirror,
-        db=db,
-        trust=trust,
-    )
-    if rehearse:
-        from merge_runner.run.rehearsal import rehearsed
 
-        plan, options = rehearsed(plan, options, home_of(name))
-    if dask is not None and plan.replays_humans:
-        raise UsageError("human-replay is played in this process: leave --dask out")
+    def planned(name: str) -> Plan:
+        plan = make_plan(
+            name,
+            model or (),
+            reps,
+            listed(conditions),
+            listed(variants),
+            sample_set=sample_set,
+            order_seed=order_seed,
+            only=levels(only or (), "--only"),
+            mirror=mirror,
+            db=db,
+            trust=trust,
+        )
+        if dask is not None and plan.replays_humans:
+            raise UsageError("human-replay is played in this process: leave --dask out")
+        return plan
+
+    if len(studies) > 1:  # all are looked at before the first one is played
+        ledgers = [planned(name).ledger for name in studies]
+        options = replace(options, ledgers=() if max_cost is None else ledgers)
     whole = any(part is not None for part in (reps, conditions, variants))
-    play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json)
+    codes = []
+    for name in studies:
+        if len(studies) > 1:
+            say(f"{name}:")
+        plan, own = planned(name), options
+        if rehearse:
+            from merge_runner.run.rehearsal import rehearsed
+
+            plan, own = rehearsed(plan, options, home_of(name))
+        codes.append(play(plan, own, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
+        if codes[-1] not in GOES_ON:
+            break
+    sys.exit(next(filter(None, codes), 0))
 
 
 def replay(
-    name: NameArgument,
+    studies: StudiesArgument,
     model: ModelOption = None,
     only: OnlyOption = None,
     mirror: MirrorOption = False,
@@ -171,7 +194,7 @@ def replay(
 ) -> None:
     """Play a sweep from recorded replies alone: no key, no network."""
     sweep(
-        name=name,
+        studies=studies,
         model=model,
         only=only,
         mirror=mirror,

@@ -62,7 +62,8 @@ DRIVERS_SHOWN = 3
 class Options:
     """How a sweep runs; nothing here changes a result.
 
-    ``rpm`` and ``tpm`` override the registry's. ``split_usd`` caps what single models cost.
+    ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
+    those of other sweeps. ``split_usd`` caps what single models cost.
     ``dask`` names the cluster that plays the trials; if None, this process plays them.
     ``faults_identity`` keeps the answers of an emulator that was told to misbehave apart from those
     of the usual one. A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that
@@ -76,6 +77,7 @@ class Options:
     rpm: int | None = None
     tpm: int | None = None
     max_cost_usd: float | None = None
+    ledgers: Sequence[str] = ()
     split_usd: Mapping[str, float] = field(default_factory=dict)
     replay: bool = False
     recordings: Sequence[Path] = ()

@@ -147,15 +147,17 @@ class Sweep:
             self._cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in entries})
 
     def _less_what_is_spent(self, options: Options) -> Options:
-        """The options with a cap that is lower by what other ledgers of this study hold.
+        """The options with a cap that is lower by what other ledgers under it hold.
 
-        There are some where a study was run before its file had a budget, or has none any more.
+        They are those of sweeps that share the cap, and others of this study: it was run before its
+        file had a budget, or has none any more.
         """
         own, name = self._plan.ledger, self._plan.study.name
         others = [
             scope
             for scope in scopes(self._cache)
             if (scope.startswith(f"{name}/") if own == name else scope == name)
+            or (scope in options.ledgers and scope != own)
         ]
         spent_usd = sum(Ledger(self._cache, scope).read().committed_usd for scope in others)
         if options.max_cost_usd is None or not spent_usd or self._is_silent:

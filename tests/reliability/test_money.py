@@ -97,6 +97,20 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
     assert whole["usd"] == pytest.approx(bill.usd)
 
 
+async def test_one_cap_holds_over_several_sweeps(merge_runner, experiments):
+    (experiments / "baseline.toml").write_text(SHORT.replace("18", "2"))
+    (experiments / "other.toml").write_text(SHORT.replace("baseline", "A1"))
+    bill = Bill()
+    async with watched(bill.middle) as server:
+        sweep = ("sweep", "baseline", "other", *SWEEP[2:], "--yes", *FAST)
+        run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **account(server))
+    first, other = (json.loads(line) for line in run.out.splitlines())
+    assert (run.code, first["trials"]["suspended"]) == (3, 0), run.err
+    assert other["trials"]["suspended"] > 0
+    assert other["sweep_cost_usd"] < bill.usd <= ROOM_FOR_SOME
+    assert "USD of baseline/o3/set0 count against the budget, too" in run.err
+
+
 @pytest.mark.long
 async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(merge_runner):
     numbers = itertools.count()

@@ -47,6 +47,25 @@ async def test_a_sweep_stores_every_trial_and_prints_outcomes_and_the_database(m
     assert "11/11 ended" in run.err
 
 
+@pytest.mark.slow
+async def test_several_sweeps_are_played_one_after_the_other(merge_runner):
+    names = ("baseline", "ablations", "--variants", "baseline", "--reps", 1, "--json", *TWO)
+    run = await merge_runner("sweep", *names)
+    assert run.code == 0, run.err
+    summaries = [json.loads(line) for line in run.out.splitlines()]
+    assert [each["trials"]["stored_before"] for each in summaries] == [0, 2]
+    again = await merge_runner("replay", *names, "--db", "replayed.duckdb")
+    assert (again.code, len(again.out.splitlines())) == (0, 2), again.err
+
+
+async def test_of_several_sweeps_all_are_looked_at_before_the_first_is_played(merge_runner):
+    run = await merge_runner("sweep", "baseline", "ablation", "--reps", 1)
+    assert (run.code, run.out) == (2, "")
+    assert "ablations" in run.err
+    apart = await merge_runner("sweep", "one/study.toml", "two/study.toml")
+    assert (apart.code, "--db and --cache" in apart.err) == (2, True)
+
+
 async def test_what_is_recorded_is_not_asked_again_and_what_is_new_is(merge_runner, tmp_path):
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
