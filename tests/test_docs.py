@@ -27,7 +27,12 @@ TUTORIAL = DOCS / "tutorial.md"
 # Pages of users, in the order in which their commands are run.
 # Its sweep would be the newest one of the pages that follow.
 LAST = DOCS / "how-to/local-models.md"
-PAGES = [PROJECT / "README.md", *sorted(set(DOCS.rglob("*.md")) - {TUTORIAL, LAST}), LAST]
+PAGES = [
+    PROJECT / "README.md",
+    *sorted(PROJECT.glob("plugins/*/README.md")),
+    *sorted(set(DOCS.rglob("*.md")) - {TUTORIAL, LAST}),
+    LAST,
+]
 LINKING = [
     *PAGES,
     TUTORIAL,

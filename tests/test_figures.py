@@ -6,8 +6,6 @@ import csv
 import io
 import json
 import re
-import subprocess
-import sys
 from collections import Counter
 from importlib import metadata
 
@@ -17,7 +15,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tests.explorer.serving import served
-from tests.harness import PROJECT, environment
+from tests.harness import PROJECT
 from tests.test_installed import built, checkout_in
 
 pytestmark = pytest.mark.long
@@ -102,26 +100,6 @@ async def test_what_990_trials_of_the_drivers_with_chance_come_to(merge_runner):
             *terms("quantal/baseline", table, names),
             *terms("human", table, names),
         )
-
-
-@pytest.mark.parametrize(
-    ("column", "command"),
-    [(3, ["K0"]), (4, ["F1"]), (5, ["drag-free"]), (6, ["K0", "--tunnel"])],
-)
-def test_what_the_driver_cei_comes_to(column, command):
-    program = [sys.executable, "-m", "analysis.calibration.cei", "check", *command]
-    done = subprocess.run(
-        program, cwd=PROJECT, env=environment(), capture_output=True, text=True, check=True
-    )
-    # Each line ends with the mean, its spread, the tolerance and by how many of these it is off.
-    found = [tuple(map(float, line.split()[-4:-2])) for line in done.stdout.splitlines()[1:]]
-    text = (DOCS / "reference/cei.md").read_text(encoding="utf-8").replace("\N{MINUS SIGN}", "-")
-    rows = re.findall(r"^\| (?:collisions|time-outs|who|gap|largest|conflict|first).*", text, re.M)
-    cells = [re.split(r"(?<!\\)\|", row)[column].replace("*", "") for row in rows]
-    shown = [tuple(map(float, re.findall(NUMBER, cell))) for cell in cells]
-    # Counts are shown with one decimal of two.
-    assert shown[:2] == [pytest.approx(pair, abs=0.051) for pair in found[:2]]
-    assert shown[2:] == found[2:]
 
 
 async def test_how_the_driver_cei_collides(merge_runner, tmp_path):

@@ -96,8 +96,8 @@ def checkout_in(folder: Path) -> Path:
     checkout = folder / "checkout"
     checkout.mkdir()
     tracked = subprocess.run(
-        ["git", "ls-files", "merge_runner", "analysis", "experiments", "cache", "pyproject.toml",
-         "README.md", "LICENSE"],
+        ["git", "ls-files", "merge_runner", "analysis", "merge_runner_cei", "plugins",
+         "experiments", "cache", "pyproject.toml", "README.md", "LICENSE"],
         cwd=PROJECT, capture_output=True, text=True, check=True,
     ).stdout.split()  # fmt: skip
     run(PROJECT, "cp", "--parents", "--no-dereference", *tracked, checkout)
@@ -121,7 +121,8 @@ def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the
         for link, folder in (("experiments", "experiments"), ("recordings", "cache/recordings"))
         for file in (PROJECT / folder).iterdir()
     }
-    assert {"merge_runner/py.typed", "analysis/py.typed", *shipped} <= from_checkout
+    shipped |= {"merge_runner/py.typed", "analysis/py.typed", "merge_runner_cei/driver.py"}
+    assert shipped <= from_checkout
     assert not {name for name in from_checkout if name.startswith(("tests", "benchmarks"))}
 
 

@@ -35,8 +35,7 @@ from analysis.data.load import (
 )
 from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
 from analysis.data.studies import Order, Studies, read_studies, study_name
-from merge_runner.drivers.human_replay import unresponsive
-from merge_runner.drivers.registry import has_chance, language_models, stand_in
+from merge_runner.drivers.registry import has_chance, language_models, stand_in, unresponsive
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.content_hashes import canonical_json, spec_hash
 from merge_runner.paths import DEFAULT_DB

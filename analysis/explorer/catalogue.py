@@ -19,8 +19,7 @@ from analysis.explorer.details import scenario_of
 from analysis.explorer.query_worker import csv_cell
 from analysis.explorer.reading import PATIENCE_S, Row, reading, records
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.human_replay import HUMAN_REPLAY, unresponsive
-from merge_runner.drivers.registry import language_models, stand_in
+from merge_runner.drivers.registry import language_models, stand_in, unresponsive
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, more_memory, schema_sql
@@ -211,7 +210,8 @@ FROM listed LEFT JOIN specs USING (spec_hash) WHERE scripted AND stand_in IS NUL
 # The specs of trials with a human who may be replayed, without a note on it yet.
 UNCAUTIONED = """
 SELECT spec_hash, spec::VARCHAR FROM specs
-SEMI JOIN (FROM listed WHERE caution IS NULL) USING (spec_hash) WHERE contains(spec::VARCHAR, ?)
+SEMI JOIN (FROM listed WHERE caution IS NULL) USING (spec_hash)
+WHERE contains(spec::VARCHAR, '"data":')
 """
 # Before the name of a factor: its facet.
 FACTOR = "factor."
@@ -554,7 +554,7 @@ class Catalogue:
 
     def _name_replayed(self) -> None:
         """Note for each trial with a replayed human that this one does not react."""
-        for spec_hash, spec in self._memory.execute(UNCAUTIONED, [HUMAN_REPLAY]).fetchall():
+        for spec_hash, spec in self._memory.execute(UNCAUTIONED).fetchall():
             self._memory.execute(
                 "UPDATE listed SET caution = ? WHERE spec_hash = ?",
                 [unresponsive(json.loads(spec)), spec_hash],

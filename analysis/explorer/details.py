@@ -11,8 +11,8 @@ from typing import Any
 from analysis.explorer.prompts import Part, parts_of
 from analysis.explorer.reading import Row, reading, records
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.human_replay import unresponsive
 from merge_runner.drivers.pace import Pace, pace_of
+from merge_runner.drivers.registry import unresponsive
 from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.geometry import Track, track_of
 

@@ -25,14 +25,14 @@ from merge_runner.audit.replies import (
 )
 from merge_runner.audit.slots import check_slots
 from merge_runner.audit.traces import GAPS, check_traces, reach_m
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreError, UsageError, unknown_name
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.records import SIDES
 from merge_runner.results.database import append, by_name, read_database, room_for_texts
-from merge_runner.results.human_trials import read_human_trials
 from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.served_model import other_models
-from merge_runner.study.parts import adopt_declared, adopt_humans, adopted
+from merge_runner.study.parts import adopt_declared, adopted
 from merge_runner.text_safety import first_line
 
 TABLES = """
@@ -177,7 +177,9 @@ def _audit(
     audit.notes += _not_judged(connection)
     if derive and config is not None:
         if any("data" in spec.driver(side) for spec in specs.values() for side in SIDES):
-            adopt_humans(read_human_trials(connection))
+            for program in PROGRAMS.values():
+                if program.data is not None:
+                    program.data.read(connection)
         _adopt_stored(config)
         check_derived(connection, specs, config, audit)
     audit.findings = [replace(finding, sweep=sweep_id) for finding in audit.findings]

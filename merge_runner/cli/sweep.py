@@ -153,7 +153,7 @@ def sweep(
             trust=trust,
         )
         if dask is not None and plan.replays_humans:
-            raise UsageError("human-replay is played in this process: leave --dask out")
+            raise UsageError("human trials are replayed in this process: leave --dask out")
         return plan
 
     if len(studies) > 1:  # all are looked at before the first one is played

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from math import inf, isfinite
 from pkgutil import iter_modules
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from merge_runner import drivers
 from merge_runner.config import ScenarioConfig
@@ -21,6 +21,9 @@ from merge_runner.records import SIDES, Side, TrialSpec, other_side
 from merge_runner.registry import Registry, require
 from merge_runner.source import source_digest
 
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
+
 EMULATOR = "emulator"
 MOCKS = frozenset({EMULATOR, "random"})
 """The models of our own, under whose names no other is expected to answer."""
@@ -28,12 +31,19 @@ SET = "set"  # the parameter that names a set of others
 RESERVED = ("program", "clock")  # what a study says of a driver beside its parameters
 
 
-class Data(Protocol):
-    """What a program drives by beside its source and its parameters."""
+class HumanTrials(Protocol):
+    """Imported human trials that a program drives again; ``digest`` is their hash."""
 
-    @property
-    def digest(self) -> str:
-        """Its hash."""
+    digest: str
+
+    def read(self, connection: DuckDBPyConnection | None) -> None:
+        """Take the human trials of a database; None: there is no database yet."""
+        ...
+
+    def check(
+        self, program: Program, config: ScenarioConfig, condition: str, repetitions: int
+    ) -> None:
+        """Raise UsageError where a program has too few trials of a condition to replay."""
         ...
 
 
@@ -46,7 +56,8 @@ class Program:
     program reads its parameters from its seat, so that a study can set them. ``sets`` are named
     sets of further parameters, of which the parameter ``set`` chooses one. ``check`` raises
     UsageError for parameters that cannot be, ``check_clock`` for a clock in s (the time between two
-    decisions) that cannot be beside them. ``data`` is what else it drives by. ``chance`` declares
+    decisions) that cannot be beside them. ``data`` are human trials that it
+    replays. ``chance`` declares
     that it draws by the seed of its seat: the analysis counts equal trials of drivers that do not
     once. ``based_on`` names the program that a study has given other parameters or another clock.
     """
@@ -59,7 +70,7 @@ class Program:
     sets: Mapping[str, Mapping[str, Parameter]] = field(default_factory=dict)
     check: Callable[[Mapping[str, Parameter]], None] | None = None
     check_clock: Callable[[Mapping[str, Parameter], float], None] | None = None
-    data: Data | None = None
+    data: HumanTrials | None = None
     chance: bool = False
     based_on: str = ""
 
@@ -219,6 +230,14 @@ def has_chance(spec: Mapping[str, Any], sides: Collection[Side] = SIDES) -> bool
     return any("program" not in driver or driver.get("chance") for driver in drivers) or any(
         scenario.perception(side).is_random for side in sides
     )
+
+
+def unresponsive(spec: Mapping[str, Any]) -> str:
+    """Return what to say wherever trials of a spec are shown; empty where no human is replayed."""
+    sides = [side for side in SIDES if "data" in (spec.get(side) or {})]
+    if len(sides) == len(SIDES):
+        return "both humans are replayed and do not react"
+    return f"the human on the {sides[0]} is replayed and does not react" if sides else ""
 
 
 def stand_in(models: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -18,9 +19,8 @@ from merge_runner.config import (
     endpoint_identity,
     pair_name,
 )
-from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials, require_trials
 from merge_runner.drivers.pace import model_pace
-from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.drivers.registry import PROGRAMS, HumanTrials, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
@@ -28,7 +28,7 @@ from merge_runner.llm.ledger import Caps
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import SIDES, Side, TrialSpec
-from merge_runner.results.human_trials import human_trials
+from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS, MEAN_SPEED_MPS
 from merge_runner.scenarios.registry import SCENARIOS, new_world, task_of
 from merge_runner.study.crossing import (
@@ -50,7 +50,7 @@ from merge_runner.study.file import (
     StudyFile,
     StudySource,
 )
-from merge_runner.study.parts import adopt_humans, load_study
+from merge_runner.study.parts import load_study
 from merge_runner.text_safety import in_a_name
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
@@ -195,7 +195,7 @@ class Plan:
     @property
     def replays_humans(self) -> bool:
         """Whether imported human trials are replayed, which only this process has read."""
-        return any(map(_replaying, self.arms))
+        return any(map(_replayed, self.arms))
 
     @property
     def driver(self) -> str:
@@ -437,13 +437,13 @@ def make_plan(
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
     drivers = chosen_models(study.file, asked)
-    if db is not None and _replays_humans(study.file, drivers):
-        adopt_humans(human_trials(db))
     wanted = _repetitions(study, variants, repetitions)
     names = _conditions(study.file, conditions)
     arms = cross(
         study.file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
     )
+    if db is not None:
+        _read_humans(arms, db)
     _check_conditions(names, arms)
     entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
     return Plan(
@@ -460,16 +460,18 @@ def make_plan(
     )
 
 
-def _replays_humans(file: StudyFile, drivers: Sequence[str]) -> bool:
-    """Whether a driver of a study may replay imported human trials."""
-    names = driver_names(file, drivers)
-    return HUMAN_REPLAY in {*names, *(driver.program for driver in file.drivers.values())}
+def _replayed(arm: Arm) -> list[tuple[Program, HumanTrials]]:
+    """Return the programs of an arm that replay human trials, with these."""
+    programs = (PROGRAMS[name] for name in {*arm.asked.values()} - {*arm.entries})
+    return [(program, program.data) for program in programs if program.data is not None]
 
 
-def _replaying(arm: Arm) -> list[Program]:
-    """The programs of an arm that replay humans."""
-    programs = [PROGRAMS[name] for name in {*arm.asked.values()} - {*arm.entries}]
-    return [program for program in programs if isinstance(program.data, HumanTrials)]
+def _read_humans(arms: Iterable[Arm], db: Path) -> None:
+    """Read the human trials of a database where a program replays them."""
+    if replayed := [humans for arm in arms for _, humans in _replayed(arm)]:
+        with read_database(db) if db.is_file() else nullcontext() as connection:
+            for humans in replayed:
+                humans.read(connection)
 
 
 def _conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
@@ -493,8 +495,8 @@ def _check_conditions(conditions: Sequence[str], arms: Sequence[Arm]) -> None:
     for name in conditions:
         for arm in arms:
             new_world(arm.scenario, name)
-            for program in _replaying(arm):
-                require_trials(program, arm.scenario, name, arm.repetitions)
+            for program, humans in _replayed(arm):
+                humans.check(program, arm.scenario, name, arm.repetitions)
 
 
 def _repetitions(

@@ -15,7 +15,6 @@ from traceback import extract_tb
 from types import CodeType, ModuleType
 
 from merge_runner.config import validated
-from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import (
@@ -85,15 +84,6 @@ def adopt(study: StudySource) -> None:
         _register(study.file)
         note_study([study.text, *study.plugins.values()])
         _adopted.append((study, changes()))
-
-
-def adopt_humans(trials: HumanTrials) -> None:
-    """Have these trials replayed by human-replay, and by what the study adopted makes of it."""
-    program = PROGRAMS[HUMAN_REPLAY]
-    if program.data != trials:
-        PROGRAMS.replace(HUMAN_REPLAY, replace(program, data=trials))
-        if (study := adopted()) is not None:
-            adopt(study)
 
 
 def adopted() -> StudySource | None:

@@ -254,9 +254,6 @@ async def test_a_clock_changes_no_more_than_when_a_program_decides(name):
         ("human-odds", {"gap_sd_m": -1}, "gap_sd_m of human-odds cannot be below 0"),
         ("quantal", {"precision": -1}, "precision of quantal cannot be below 0"),
         ("quantal", {"horizon_s": 0.5}, "horizon_s of quantal is at least its clock, 1 s"),
-        ("cei", {"set": "K0", "lower_mean": -5}, "lower_mean of cei is a risk: from 0 to 1"),
-        ("cei", {"set": "F1", "upper_mean": 1.5}, "upper_mean of cei is a risk: from 0 to 1"),
-        ("cei", {"set": "F1", "upper_spread": -0.1}, "upper_spread of cei is a risk: from 0 to 1"),
     ],
 )
 def test_parameters_that_cannot_be_are_refused(name, parameters, said):

@@ -84,7 +84,8 @@ def test_programs_have_a_source_of_their_own_and_share_what_both_rest_on(monkeyp
     source_digest.cache_clear()
     after = {name: program.source for name, program in PROGRAMS.items()}
     source_digest.cache_clear()
-    assert all(before[name] != after[name] for name in PROGRAMS)
+    own = [n for n, one in PROGRAMS.items() if one.driver.__module__.startswith("merge_runner.")]
+    assert all(before[name] != after[name] for name in own)
 
 
 @pytest.mark.parametrize("model", ["constant", "projected-order", "emulator+constant"])

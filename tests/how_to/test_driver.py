@@ -85,7 +85,7 @@ def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
     assert audit.code == 0
     notes = [note for one in json.loads(audit.out)["audits"] for note in one["notes"]]
     assert any(
-        "the decisions of 'impulsive', which is no driver here; valid: cei, constant, " in note
+        "the decisions of 'impulsive', which is no driver here; valid: constant, " in note
         and "(install the package that registers it, or name the study: --study FILE)" in note
         for note in notes
     ), notes

@@ -130,7 +130,7 @@ async def test_a_clock_holds_each_action(plan_of):
             '[drivers.mine]\nprogram = "quantal"\nclock = 2.0\nhorizon_s = 1.5\n',
             r"\[drivers\.mine\]: horizon_s of quantal is at least its clock, 2 s",
         ),
-        ('[drivers.mine]\nprogram = "brake"\n', "unknown driver 'brake'; valid: cei, constant, "),
+        ('[drivers.mine]\nprogram = "brake"\n', "unknown driver 'brake'; valid: constant, "),
         ('[drivers.braking]\nprogram = "constant"\n', "there is a driver 'braking' already"),
         ('[drivers.o3]\nprogram = "constant"\n', "needs another name: there is a model o3"),
         (

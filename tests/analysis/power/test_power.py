@@ -11,16 +11,15 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from analysis.power.cei import GAP, SAMPLE_SETS, trials
 from analysis.power.questions import BESIDE_HUMANS, OF_AN_ARM, OF_TWO_ARMS
 from analysis.power.samples import Conditions
 from analysis.power.search import Arms, Search, beside_humans
 from analysis.power.shown import table
 from analysis.power.study import power
-from analysis.power.truths import SPEED, cei, human, planted, without_relative_speed
+from analysis.power.truths import SPEED, human, planted, without_relative_speed
 from analysis.stats.ceiling import ceiling, published_humans
 from analysis.stats.indicators import ROBUST, judged
-from analysis.stats.regressions import gap_ols, who_first_firth, who_first_logit
+from analysis.stats.regressions import who_first_firth
 from analysis.table_format import TableFormat
 from analysis.tables.formats import render
 from merge_runner.config import ScenarioConfig
@@ -220,19 +219,6 @@ async def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(
     assert found["costs_usd"] == [None] * 3
     assert {each["trials"] for each in found["chances"]} == {44}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["experiments"]
-
-
-@pytest.mark.slow
-def test_the_shipped_outcomes_of_cei_are_those_of_its_trials():
-    """If the thresholds of cei have changed: python -m analysis.power.cei."""
-    played = trials(SAMPLE_SETS[:1], each=3)
-    logit, gap = who_first_logit(played), gap_ols(played, GAP)
-    shipped = cei()
-    for values, fit in ((shipped.who_first, logit), (shipped.gap, gap)):
-        for value, term in zip(values, fit.terms.values(), strict=True):
-            assert abs(value - term.b) < 3 * term.se
-    low, high = stats.binom.interval(0.99, len(played), shipped.collided)
-    assert low <= (played["status"] == "collided").sum() <= high
 
 
 def test_the_odds_of_the_emulator_are_those_that_the_humans_are_supposed_to_have():

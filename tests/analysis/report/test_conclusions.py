@@ -176,7 +176,7 @@ def test_failed_trials_alone_show_nothing(tmp_path):
     assert shown(study) == ["o3: no trial ended (2 failed)."]
 
 
-REPLAYED = {"program": "human-replay"}
+REPLAYED = {"program": "human-replay", "data": "a hash"}
 
 
 def test_a_human_who_is_replayed_is_not_judged(tmp_path):

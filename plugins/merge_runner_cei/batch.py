@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_runner.drivers.cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
-from merge_runner.drivers.cei.motion import Array, Mask, Task, move
-from merge_runner.drivers.cei.parameters import CRUISE_DAMPING, CRUISE_GAIN, TICK_S, Base
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
+from merge_runner_cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
+from merge_runner_cei.motion import Array, Mask, Task, move
+from merge_runner_cei.parameters import CRUISE_DAMPING, CRUISE_GAIN, TICK_S, Base
 
 RUNNING = ""
 NOBODY = Base(1.0, 1.0)

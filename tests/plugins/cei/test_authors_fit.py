@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from analysis.calibration import cei
-from analysis.calibration.authors_fit import GRID, REACTIONS, estimated, grid_speeds
 from analysis.data.load import load
-from merge_runner.drivers.cei.parameters import OFFSETS, SETS, Base
 from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
-from tests.analysis.calibration.synthetic import write_humans
+from merge_runner_cei.calibration import __main__ as calibration
+from merge_runner_cei.calibration.authors_fit import GRID, REACTIONS, estimated, grid_speeds
+from merge_runner_cei.parameters import OFFSETS, SETS, Base
+from tests.plugins.cei.synthetic import write_humans
 
 pytestmark = pytest.mark.long
 
@@ -25,9 +25,9 @@ def humans(tmp_path_factory):
 @pytest.fixture
 def command(monkeypatch, capsys):
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["cei", *map(str, arguments)])
+        monkeypatch.setattr(sys, "argv", ["calibration", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
-            cei.main()
+            calibration.main()
         return ended.value.code, capsys.readouterr()
 
     return run

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.cei.collision_interval import CollisionInterval, collision_interval
-from merge_runner.drivers.cei.parameters import NODE_S, NODES
 from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import net_acceleration
+from merge_runner_cei.collision_interval import CollisionInterval, collision_interval
+from merge_runner_cei.parameters import NODE_S, NODES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -13,11 +13,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from analysis.stats.regressions import gap_ols, who_first_logit
-from merge_runner.drivers.cei.batch import Traces, Trial
-from merge_runner.drivers.cei.collision_interval import exact_bounds
-from merge_runner.drivers.cei.motion import Task
-from merge_runner.drivers.cei.parameters import TICK_S
 from merge_runner.records import SIDES
+from merge_runner_cei.batch import Traces, Trial
+from merge_runner_cei.collision_interval import exact_bounds
+from merge_runner_cei.motion import Task
+from merge_runner_cei.parameters import TICK_S
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from analysis.calibration.design import experiment
-from analysis.calibration.search import Generation, search, targets
 from merge_runner.config import Resistance
-from merge_runner.drivers.cei.parameters import ThresholdSet
+from merge_runner_cei.calibration.design import experiment
+from merge_runner_cei.calibration.search import Generation, search, targets
+from merge_runner_cei.parameters import ThresholdSet
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""``python -m analysis.calibration.cei``: finds thresholds, and shows what they come to."""
+"""Find thresholds, and show what they come to: ``python -m merge_runner_cei.calibration``."""
 
 from __future__ import annotations
 
@@ -12,19 +12,17 @@ import typer
 from merge_runner.cli.options import DbOption
 from merge_runner.cli.output import print_out, say
 from merge_runner.config import Resistance
-from merge_runner.drivers.cei.parameters import SETS, ThresholdSet
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
+from merge_runner_cei.parameters import SETS, ThresholdSet
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from analysis.calibration.authors_fit import Fit
+    from merge_runner_cei.calibration.authors_fit import Fit
 
-app = typer.Typer(
-    help="Thresholds of the driver cei; see docs/reference/cei.md.", no_args_is_help=True
-)
+app = typer.Typer(help="Thresholds of the driver cei.", no_args_is_help=True)
 SetArgument = Annotated[str, typer.Argument(metavar="SET", help=f"{', '.join(SETS)}.")]
 ResistanceOption = Annotated[
     Resistance | None,
@@ -42,9 +40,9 @@ def check(
     ] = False,
 ) -> None:
     """Simulate 990 trials of each sample set from 0 on, and compare with what is published."""
-    from analysis.calibration.design import experiment
-    from analysis.calibration.search import compared, numbers_of
-    from analysis.calibration.searches import SEARCHES
+    from merge_runner_cei.calibration.design import experiment
+    from merge_runner_cei.calibration.search import compared, numbers_of
+    from merge_runner_cei.calibration.searches import SEARCHES
 
     thresholds = require(SETS, "set", name)
     scenario = experiment(resistance or SEARCHES[name].resistance)
@@ -64,7 +62,7 @@ def search(
     seed: int | None = None,
 ) -> None:
     """Search for a set anew, from where its search began; with other numbers, for a better one."""
-    from analysis.calibration.searches import SEARCHES
+    from merge_runner_cei.calibration.searches import SEARCHES
 
     changes = {
         "generations": generations,
@@ -81,7 +79,7 @@ def search(
 @app.command()
 def fit(db: DbOption = DEFAULT_DB) -> None:
     """Fit thresholds to the imported humans, as the model's authors did."""
-    from analysis.calibration.authors_fit import fit_thresholds, threshold_set
+    from merge_runner_cei.calibration.authors_fit import fit_thresholds, threshold_set
 
     fits = fit_thresholds(Path(db))
     for name, one in zip(("lower", "upper"), fits, strict=True):
@@ -90,6 +88,16 @@ def fit(db: DbOption = DEFAULT_DB) -> None:
         )
     print_out(f'\n[drivers.fitted]\nprogram = "cei"\nset = "{next(iter(SETS))}"')
     print_out(_line(threshold_set(*fits), "\n"))
+
+
+@app.command()
+def outcomes() -> None:
+    """Print analysis/data/cei_outcomes.csv anew: what `merge-runner power` supposes of cei."""
+    from merge_runner_cei.calibration.shipped import SAMPLE_SETS, rows, trials
+
+    print_out("measure,term,value")
+    for measure, term, value in rows(trials(SAMPLE_SETS)):
+        print_out(f"{measure},{term},{value:.4f}")
 
 
 def _line(thresholds: ThresholdSet, between: str = ", ") -> str:

@@ -14,14 +14,13 @@ from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
 from analysis.human.load import import_trials, sort_files
 from merge_runner.audit.sweeps import audit_database
-from merge_runner.drivers.human_replay import HUMAN_REPLAY, HumanTrials
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.store import Store, query
 from merge_runner.run.plan import make_plan
-from merge_runner.study.parts import adopt_humans
 from merge_runner.trial import play_trial
+from merge_runner_cei.human_replay import HUMAN_REPLAY, HUMANS
 from tests.analysis.recordings import drive, file
 
 HUMAN = '\nrepetitions = 1\nconditions = ["L_4_0"]\n[scenario]\nresistance = "human"\n'
@@ -40,7 +39,7 @@ def db(tmp_path):
     download = sort_files(file(name, trial.csv()) for name, trial in FILES.items())
     assert import_trials(download.trials, Store(path)).added == 4
     yield path
-    adopt_humans(HumanTrials())
+    HUMANS.keep(())
     make_plan("baseline", "constant")
 
 
@@ -131,7 +130,7 @@ async def test_the_pairs_take_turns_and_a_trial_that_collided_is_left_out(db, pl
 async def test_a_human_keeps_its_speed_once_its_trace_has_ended(plan_of):
     text = HUMAN + '[drivers.weak]\nprogram = "idm"\ndesired_speed_factor = 0.5\n'
     trial = await played(plan_of("weak+human-replay", text))
-    traced = PROGRAMS[HUMAN_REPLAY].data.trials[0].speeds_mps["right"]
+    traced = HUMANS.trials[0].speeds_mps["right"]
     after = [row for row in trial.states if row.side == "right"][len(traced) :]
     assert len(after) > 20
     assert {round(row.velocity_mps, 6) for row in after} == {round(traced[-1], 6)}
@@ -163,14 +162,14 @@ async def test_a_study_names_the_pair(db, plan_of):
 
 def test_a_trial_that_was_imported_in_two_ways_is_replayed_once(db, plan_of):
     plan_of(HUMAN_REPLAY)
-    once = PROGRAMS[HUMAN_REPLAY].data
+    once = HUMANS.trials
     with duckdb.connect(str(db)) as connection:
         for table in ("trials", "states"):
             connection.execute(
                 f"INSERT INTO {table} SELECT * REPLACE ('another' AS spec_hash) FROM {table}"
             )
     plan_of(HUMAN_REPLAY)
-    assert PROGRAMS[HUMAN_REPLAY].data == once
+    assert HUMANS.trials == once
 
 
 def test_without_an_import_it_says_what_to_type(tmp_path, plan_of):
@@ -180,13 +179,13 @@ def test_without_an_import_it_says_what_to_type(tmp_path, plan_of):
 
 def test_what_a_vehicle_cannot_do_is_not_replayed(db, plan_of):
     plan_of(HUMAN_REPLAY)
-    trials = PROGRAMS[HUMAN_REPLAY].data
     config = plan_of(HUMAN_REPLAY).arms[0].scenario
     weak = config.model_copy(update={"max_acceleration_mps2": 1.0})
-    assert trials.usable(config, "L_4_0", "all")
-    assert not trials.usable(weak, "L_4_0", "all")
-    other = replace(trials.trials[0], pair="pair9")
-    assert HumanTrials((other,)).digest != HumanTrials(trials.trials[:1]).digest
+    assert HUMANS.usable(config, "L_4_0", "all")
+    assert not HUMANS.usable(weak, "L_4_0", "all")
+    (first, *_), before = HUMANS.trials, HUMANS.digest
+    HUMANS.keep((replace(first, pair="pair9"), *HUMANS.trials[1:]))
+    assert HUMANS.digest != before
 
 
 async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(

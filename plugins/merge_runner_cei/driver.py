@@ -7,14 +7,14 @@ from dataclasses import asdict, fields
 from typing import TYPE_CHECKING
 
 from merge_runner.config import Resistance, whole_steps
-from merge_runner.drivers.cei.parameters import OFFSETS, RISKS, SETS, TICK_S, ThresholdSet
 from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, SET, Program
 from merge_runner.errors import UsageError
 from merge_runner.records import Decision, Observation
+from merge_runner_cei.parameters import OFFSETS, RISKS, SETS, TICK_S, ThresholdSet
 
 if TYPE_CHECKING:
-    from merge_runner.drivers.cei.seated import Seated
+    from merge_runner_cei.seated import Seated
 
 BY_RESISTANCE = "by-resistance"
 USUAL_SETS: dict[Resistance, str] = {"human": "K0", "none": "drag-free"}
@@ -31,7 +31,7 @@ class CeiDriver:
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Hold the input of the present plan, which stays until there is a reason for another."""
-        from merge_runner.drivers.cei.seated import Seated
+        from merge_runner_cei.seated import Seated
 
         if self._seated is None:
             self._seated = Seated(self.seat, thresholds_of(self.seat), observation)

@@ -4,12 +4,12 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from analysis.calibration.design import design, experiment
-from analysis.calibration.search import MISSING, cost, search, targets
-from analysis.calibration.searches import SEARCHES
-from merge_runner.drivers.cei.driver import check
-from merge_runner.drivers.cei.parameters import SETS
-from tests.drivers.cei.trials import scenario, simulated
+from merge_runner_cei.calibration.design import design, experiment
+from merge_runner_cei.calibration.search import MISSING, cost, search, targets
+from merge_runner_cei.calibration.searches import SEARCHES
+from merge_runner_cei.driver import check
+from merge_runner_cei.parameters import SETS
+from tests.plugins.cei.trials import scenario, simulated
 
 pytestmark = pytest.mark.long
 

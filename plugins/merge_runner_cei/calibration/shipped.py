@@ -1,4 +1,4 @@
-"""What the driver ``cei`` comes to; ``python -m analysis.power.cei`` prints the shipped file."""
+"""What the driver ``cei`` comes to: the numbers of ``analysis/data/cei_outcomes.csv``."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 import pandas as pd
 
-from analysis.calibration.design import TRIALS_OF_A_PAIR, design, experiment, model_of
-from analysis.calibration.outcomes import measured
 from analysis.stats.regressions import gap_data, gap_ols, who_first_logit
-from merge_runner.cli.output import print_out
-from merge_runner.drivers.cei.batch import simulate
-from merge_runner.drivers.cei.driver import USUAL_SETS
-from merge_runner.drivers.cei.parameters import SETS
+from merge_runner_cei.batch import simulate
+from merge_runner_cei.calibration.design import TRIALS_OF_A_PAIR, design, experiment, model_of
+from merge_runner_cei.calibration.outcomes import measured
+from merge_runner_cei.driver import USUAL_SETS
+from merge_runner_cei.parameters import SETS
 
 SAMPLE_SETS = (0, 1)
 GAP = "gap_mean100_m"
@@ -27,8 +26,8 @@ def trials(sample_sets: Iterable[int], each: int = TRIALS_OF_A_PAIR) -> pd.DataF
     return measured(model.task, drawn, simulate(model, drawn))
 
 
-def outcomes(played: pd.DataFrame) -> Iterator[tuple[str, str, float]]:
-    """The rows of the file: measure, term, value."""
+def rows(played: pd.DataFrame) -> Iterator[tuple[str, str, float]]:
+    """Yield the rows of the file: measure, term, value."""
     yield "collided", "share", float((played["status"] == "collided").mean())
     for measure, fit in (("who_first", who_first_logit(played)), ("gap", gap_ols(played, GAP))):
         yield from ((measure, name, term.b) for name, term in fit.terms.items())
@@ -36,9 +35,3 @@ def outcomes(played: pd.DataFrame) -> Iterator[tuple[str, str, float]]:
     left_over = gap_m - x @ np.linalg.lstsq(x, gap_m, rcond=None)[0]
     freedom = len(gap_m) - x.shape[1]
     yield "gap", "residual_sd", float(np.sqrt((left_over**2).sum() / freedom))
-
-
-if __name__ == "__main__":
-    print_out("measure,term,value")
-    for measure, term, value in outcomes(trials(SAMPLE_SETS)):
-        print_out(f"{measure},{term},{value:.4f}")

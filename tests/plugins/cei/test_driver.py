@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from merge_runner.config import Perception
-from merge_runner.drivers.cei.agents import Vehicles, set_speeds, start, tunnel_ticks
-from merge_runner.drivers.cei.collision_interval import collision_interval, exact_bounds
-from merge_runner.drivers.cei.driver import USUAL_SETS, thresholds_of
-from merge_runner.drivers.cei.motion import course
-from merge_runner.drivers.cei.parameters import OFFSETS, SETS, Base, Habits, offsets_of
 from merge_runner.errors import UsageError
 from merge_runner.records import FAR_BEHIND_M, SIDES, Observation
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration
-from tests.drivers.cei.trials import cei, model, played, scenario, spec
+from merge_runner_cei.agents import Vehicles, set_speeds, start, tunnel_ticks
+from merge_runner_cei.collision_interval import collision_interval, exact_bounds
+from merge_runner_cei.driver import USUAL_SETS, thresholds_of
+from merge_runner_cei.motion import course
+from merge_runner_cei.parameters import OFFSETS, SETS, Base, Habits, offsets_of
+from tests.plugins.cei.trials import cei, model, played, scenario, spec
 
 BOXES = (4.5, 1.8)
 
@@ -127,6 +127,9 @@ async def test_at_the_clock_of_a_language_model_an_input_is_held_for_a_second():
         ({"pair": 1.5}, "no pair 1.5"),
         ({"set": "K9"}, "K0"),
         ({"set": "K0", "upper_men": 0.5}, "upper_mean"),
+        ({"set": "K0", "lower_mean": -5}, "lower_mean of cei is a risk: from 0 to 1"),
+        ({"set": "F1", "upper_mean": 1.5}, "upper_mean of cei is a risk: from 0 to 1"),
+        ({"set": "F1", "upper_spread": -0.1}, "upper_spread of cei is a risk: from 0 to 1"),
     ],
 )
 def test_what_cannot_be_set_is_refused_with_what_can(changes, said):

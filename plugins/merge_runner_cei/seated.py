@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from merge_runner.drivers.cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
-from merge_runner.drivers.cei.motion import Array, task_of
-from merge_runner.drivers.cei.parameters import TICK_S, Habits, ThresholdSet, offsets_of
 from merge_runner.drivers.program_seat import ProgramSeat
 from merge_runner.records import SIDES, Observation
 from merge_runner.scenarios.registry import SCENARIOS
+from merge_runner_cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
+from merge_runner_cei.motion import Array, task_of
+from merge_runner_cei.parameters import TICK_S, Habits, ThresholdSet, offsets_of
 
 
 class Seated:

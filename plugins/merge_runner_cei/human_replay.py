@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
-from itertools import pairwise
-from typing import Any
+from itertools import islice, pairwise
+from typing import TYPE_CHECKING
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.program_seat import ProgramSeat
@@ -16,10 +15,21 @@ from merge_runner.errors import UsageError, unknown_name
 from merge_runner.records import SIDES, Decision, Observation, Side
 from merge_runner.scenarios.merge.vehicle import net_acceleration
 
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
+
 HUMAN_REPLAY = "human-replay"
 EVERY_PAIR = "all"
 SAMPLE_S = 0.05  # the recorder's clock
 ROUNDING = 1e-6
+TRACES = """
+SELECT pair, rep, condition, spec_hash, side, list(position_m ORDER BY step),
+    list(velocity_mps ORDER BY step), max(time_s)
+FROM trials JOIN states USING (trial_id, spec_hash)
+WHERE source = 'human' AND status = 'finished' AND step >= 0
+GROUP BY ALL ORDER BY pair, rep, condition, spec_hash, side
+"""
+_Samples = dict[Side, tuple[tuple[float, ...], tuple[float, ...]]]
 NOT_IMPORTED = (
     f"{HUMAN_REPLAY} drives imported human trials, and the database holds none: merge-runner human "
     "import PATH adds them (name the same --db)"
@@ -50,20 +60,24 @@ class HumanTrial:
         return [(after - before) / SAMPLE_S for before, after in pairwise(self.speeds_mps[side])]
 
 
-@dataclass(frozen=True)
-class HumanTrials:
-    """The finished human trials of a database; ``digest`` is their hash."""
+class ImportedHumans:
+    """The finished human trials of the database that was read last, and their hash ``digest``."""
 
-    trials: tuple[HumanTrial, ...] = ()
-    _usable: dict[tuple[object, ...], list[HumanTrial]] = field(default_factory=dict, compare=False)
+    def __init__(self) -> None:
+        self.keep(())
 
-    @cached_property
-    def digest(self) -> str:
-        """The hash of all trials."""
-        return hashlib.sha256(repr(self.trials).encode()).hexdigest()
+    def keep(self, trials: tuple[HumanTrial, ...]) -> None:
+        """Replay these trials in place of those that were there."""
+        self.trials = trials
+        self.digest = hashlib.sha256(repr(trials).encode()).hexdigest()
+        self._usable: dict[tuple[object, ...], list[HumanTrial]] = {}
+
+    def read(self, connection: DuckDBPyConnection | None) -> None:
+        """Replay the trials of a database; None: there is no database yet."""
+        self.keep(() if connection is None else imported_trials(connection))
 
     def usable(self, config: ScenarioConfig, condition: str, pair: str) -> list[HumanTrial]:
-        """Those of a condition that the scenario's vehicles can drive, the pairs taking turns."""
+        """Return those of a condition that the scenario's vehicles can drive, pairs in turn."""
         key = (condition, pair, config.resistance, config.max_acceleration_mps2)
         if key not in self._usable:
             chosen = [
@@ -81,44 +95,53 @@ class HumanTrials:
             self._usable[key] = [trial for *_, trial in sorted(order, key=lambda one: one[:2])]
         return self._usable[key]
 
-
-def require_trials(
-    program: Program, config: ScenarioConfig, condition: str, repetitions: int
-) -> None:
-    """Raise UsageError unless a program that replays has a trial for each repetition."""
-    trials, pair = program.data, str(program.values["pair"])
-    assert isinstance(trials, HumanTrials)
-    if not trials.trials:
-        raise UsageError(NOT_IMPORTED)
-    if program.rate_hz != 1 / SAMPLE_S:
-        raise UsageError(f"{HUMAN_REPLAY} takes no clock: what a human did stays as it was")
-    pairs = sorted({trial.pair for trial in trials.trials})
-    if pair not in (EVERY_PAIR, *pairs):
-        raise unknown_name(f"pair of {HUMAN_REPLAY}", pair, (EVERY_PAIR, *pairs))
-    if (config.step_s, config.control_start) != (SAMPLE_S, "both_exits"):
-        raise UsageError(
-            f"{HUMAN_REPLAY} needs a world of step_s = {SAMPLE_S} and control_start = "
-            '"both_exits": set them under [scenario] of the sweep\'s file'
-        )
-    there = len(trials.usable(config, condition, pair))
-    if repetitions > there:
-        raise UsageError(
-            f"{HUMAN_REPLAY} has {there} trials of {condition} to replay, and {repetitions} "
-            "repetitions are asked for: choose fewer by --reps, or other --conditions"
-        )
+    def check(
+        self, program: Program, config: ScenarioConfig, condition: str, repetitions: int
+    ) -> None:
+        """Raise UsageError unless a program has a trial of a condition for each repetition."""
+        pair = str(program.values["pair"])
+        if not self.trials:
+            raise UsageError(NOT_IMPORTED)
+        if program.rate_hz != 1 / SAMPLE_S:
+            raise UsageError(f"{HUMAN_REPLAY} takes no clock: what a human did stays as it was")
+        pairs = sorted({trial.pair for trial in self.trials})
+        if pair not in (EVERY_PAIR, *pairs):
+            raise unknown_name(f"pair of {HUMAN_REPLAY}", pair, (EVERY_PAIR, *pairs))
+        if (config.step_s, config.control_start) != (SAMPLE_S, "both_exits"):
+            raise UsageError(
+                f"{HUMAN_REPLAY} needs a world of step_s = {SAMPLE_S} and control_start = "
+                '"both_exits": set them under [scenario] of the sweep\'s file'
+            )
+        there = len(self.usable(config, condition, pair))
+        if repetitions > there:
+            raise UsageError(
+                f"{HUMAN_REPLAY} has {there} trials of {condition} to replay, and {repetitions} "
+                "repetitions are asked for: choose fewer by --reps, or other --conditions"
+            )
 
 
-def unresponsive(spec: Mapping[str, Any]) -> str:
-    """What is to be said wherever trials of a spec are shown; empty where no human is replayed."""
-    told = {side: spec.get(side) or {} for side in SIDES}
-    sides = [
-        side
-        for side, driver in told.items()
-        if HUMAN_REPLAY in (driver.get("program"), driver.get("based_on"))
-    ]
-    if len(sides) == len(SIDES):
-        return "both humans are replayed and do not react"
-    return f"the human on the {sides[0]} is replayed and does not react" if sides else ""
+HUMANS = ImportedHumans()
+
+
+def imported_trials(connection: DuckDBPyConnection) -> tuple[HumanTrial, ...]:
+    """Return the finished human trials of a database, each once however often it was imported.
+
+    One of another clock than the recorder's is left out.
+    """
+    ways: dict[tuple[str, int, str], dict[str, _Samples]] = {}
+    for row in connection.execute(TRACES).fetchall():
+        pair, number, condition, way, side, positions_m, speeds_mps, end_s = row
+        if abs(end_s - SAMPLE_S * (len(speeds_mps) - 1)) < SAMPLE_S / 2:
+            samples = ways.setdefault((pair, number, condition), {}).setdefault(way, {})
+            samples[side] = tuple(positions_m), tuple(speeds_mps)
+    trials = []
+    for key, imported in ways.items():
+        whole = (samples for samples in imported.values() if len(samples) == len(SIDES))
+        for samples in islice(whole, 1):
+            positions = {side: positions_m for side, (positions_m, _) in samples.items()}
+            speeds = {side: speeds_mps for side, (_, speeds_mps) in samples.items()}
+            trials.append(HumanTrial(*key, positions, speeds))
+    return tuple(trials)
 
 
 def _can_be_driven(config: ScenarioConfig, trial: HumanTrial) -> bool:
@@ -141,9 +164,8 @@ class HumanReplayDriver:
 
     def __post_init__(self) -> None:
         """Raises UsageError where there is no such trial."""
-        seat, trials = self.seat, self.seat.data
-        assert isinstance(trials, HumanTrials)
-        usable = trials.usable(seat.scenario, seat.condition, str(seat.parameters["pair"]))
+        seat = self.seat
+        usable = HUMANS.usable(seat.scenario, seat.condition, str(seat.parameters["pair"]))
         if len(usable) < seat.repetition:
             raise UsageError(NOT_IMPORTED)
         self.trial = usable[seat.repetition - 1]
@@ -162,8 +184,7 @@ class HumanReplayDriver:
         return self.seat.accelerating(0.0, observation.own_speed_mps)
 
 
-# Replaced once trials are imported (``study.parts.adopt_humans``).
-PROGRAMS.replace(
+PROGRAMS.register(
     HUMAN_REPLAY,
     Program(
         HumanReplayDriver,
@@ -171,6 +192,6 @@ PROGRAMS.replace(
         {"pair": EVERY_PAIR},
         1 / SAMPLE_S,
         settable=True,
-        data=HumanTrials(),
+        data=HUMANS,
     ),
 )

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.cei.agents import Model
-from merge_runner.drivers.cei.batch import Trial
-from merge_runner.drivers.cei.motion import task_of
-from merge_runner.drivers.cei.parameters import SETS, Habits, offsets_of
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.records import SIDES, TrialRecord, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.trial import play_trial
+from merge_runner_cei.agents import Model
+from merge_runner_cei.batch import Trial
+from merge_runner_cei.motion import task_of
+from merge_runner_cei.parameters import SETS, Habits, offsets_of
 
 
 def scenario(**changes) -> ScenarioConfig:

@@ -5,12 +5,12 @@ import asyncio
 import numpy as np
 import pytest
 
-from analysis.calibration.outcomes import measured, summary
 from analysis.data.load import load
-from merge_runner.drivers.cei.batch import simulate
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.results.store import Store
-from tests.drivers.cei.trials import cei, model, played, scenario, simulated
+from merge_runner_cei.batch import simulate
+from merge_runner_cei.calibration.outcomes import measured, summary
+from tests.plugins.cei.trials import cei, model, played, scenario, simulated
 
 pytestmark = pytest.mark.long
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from merge_runner.drivers.cei.motion import Array, Mask, Task, course
-from merge_runner.drivers.cei.parameters import (
+from merge_runner_cei.motion import Array, Mask, Task, course
+from merge_runner_cei.parameters import (
     BROADER,
     CRUISE_GAIN,
     HIGHEST_THRESHOLD,

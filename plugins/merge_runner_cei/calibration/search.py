@@ -8,12 +8,12 @@ from dataclasses import astuple, dataclass
 import numpy as np
 import pandas as pd
 
-from analysis.calibration.design import TRIALS_OF_A_PAIR, design, model_of
-from analysis.calibration.outcomes import measured, summary
 from analysis.data.reference_data import published
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.cei.batch import simulate
-from merge_runner.drivers.cei.parameters import RISKS, ThresholdSet
+from merge_runner_cei.batch import simulate
+from merge_runner_cei.calibration.design import TRIALS_OF_A_PAIR, design, model_of
+from merge_runner_cei.calibration.outcomes import measured, summary
+from merge_runner_cei.parameters import RISKS, ThresholdSet
 
 # How far the first candidates are from the start: one standard deviation of each number.
 STEPS = ThresholdSet(

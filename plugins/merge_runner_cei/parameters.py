@@ -102,8 +102,8 @@ class ThresholdSet:
 RISKS = ("lower_mean", "upper_mean", "lower_spread", "upper_spread")
 """The first numbers of a set: each is a risk, from 0 to 1."""
 
-# `python -m analysis.calibration.cei search` finds them again: K0 and drag-free for the published
-# outcomes and the humans' first action, F1 for the outcomes alone.
+# `python -m merge_runner_cei.calibration search` finds them again: K0 and drag-free for the
+# published outcomes and the humans' first action, F1 for the outcomes alone.
 SETS: dict[str, ThresholdSet] = {
     "K0": ThresholdSet(
         *(0.4218, 0.3586, 0.1412, 0.0076),

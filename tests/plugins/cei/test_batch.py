@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from merge_runner.drivers.cei.batch import Trial, simulate
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import Condition
-from tests.drivers.cei.trials import cei, model, played, scenario, simulated
+from merge_runner_cei.batch import Trial, simulate
+from tests.plugins.cei.trials import cei, model, played, scenario, simulated
 
 TRIALS = [("N_0_0", 1), ("L_0_-8", 4), ("R_-4_8", 9), ("L_4_8", 12)]
 
