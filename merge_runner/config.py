@@ -39,7 +39,6 @@ LONGEST_URL, LONGEST_HOST = 2000, 253
 # A shorter key is a dummy, and may occur in any text.
 SHORTEST_SECRET = 8
 _LABEL = re.compile(r"[a-z0-9_-]{1,63}", re.I)
-USUAL_SCENARIO = "merge"
 UNNAMED = "default"
 # What stands for the emulator where it takes the place of a provider.
 REHEARSAL = "rehearsal://localhost"
@@ -63,7 +62,6 @@ Deviation = Annotated[NotNegative, Field(le=1e6)]
 VehicleSize = Annotated[Positive, Field(le=100)]
 Count = Annotated[int, Field(gt=0, strict=True)]
 Json = Annotated[JsonValue, AfterValidator(_finite)]
-CollisionRule = Literal["euclid2d", "rectangle", "shared_lane"]
 Resistance = Literal["none", "human"]
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -134,8 +132,6 @@ PERFECT = Perception()
 class ScenarioConfig(Frozen):
     """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
-    ``name``: a registered scenario. ``merge`` is left out of a spec, as it was before there were
-    others, so that specs keep their hashes.
     ``collision_rule``: ``euclid2d`` (centres closer than a vehicle length), ``rectangle`` (the
     vehicles' oriented boxes overlap, as in the human experiment) or ``shared_lane``
     (|s_L - s_R| below a vehicle length once either has passed the merge point).
@@ -157,7 +153,6 @@ class ScenarioConfig(Frozen):
         f"perception_{side}": Perception for side in SIDES
     }
 
-    name: str = Field(default=USUAL_SCENARIO, exclude_if=lambda name: name == USUAL_SCENARIO)
     horizon_s: Positive = 4.0
     step_s: Positive = 0.2
     # Left out where it is not given, so that specs from before it keep their hashes.
@@ -168,7 +163,7 @@ class ScenarioConfig(Frozen):
     vehicle_length_m: VehicleSize = 4.5
     vehicle_width_m: VehicleSize = 1.8
     timeout_s: Positive = 30.0
-    collision_rule: CollisionRule = "euclid2d"
+    collision_rule: Literal["euclid2d", "rectangle", "shared_lane"] = "euclid2d"
     control_start: Literal["both_exits", "own_exit"] = "both_exits"
     resistance: Resistance = "none"
     history_start: Literal["cruise", "empty"] = "cruise"

@@ -1,4 +1,4 @@
-"""The hash of the source of what may be edited: a driver, or the world of a scenario."""
+"""The hash of the source of a driver, which may be edited."""
 
 from __future__ import annotations
 

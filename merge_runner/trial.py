@@ -21,9 +21,9 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
-from merge_runner.scenarios.base import World
-from merge_runner.scenarios.merge.world import Starts
-from merge_runner.scenarios.registry import new_world
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import Starts, World
 
 
 async def play_trial(
@@ -37,7 +37,9 @@ async def play_trial(
 
     Drivers are asked at once, or ``in_turn`` where their answers are there already.
     """
-    world = new_world(scenario, spec.condition, _starts(drivers))
+    world = World(scenario, CONDITIONS.require(spec.condition), TRACK)
+    if starts := _starts(drivers):
+        world.start_at(starts)
     seats = {side: _seated(drivers[side], world) for side in SIDES}
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}

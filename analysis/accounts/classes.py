@@ -33,9 +33,8 @@ WHEN status IN ('finished', 'timeout')
 """
 ALONE = """
 SELECT trial_id, spec_hash,
-    min((coalesce(merge_point_m, merge_point_m()) - position_m) / nullif(velocity_mps, 0))
-        AS alone_s
-FROM states LEFT JOIN geometry USING (spec_hash) WHERE step = 0 GROUP BY ALL
+    min((merge_point_m() - position_m) / nullif(velocity_mps, 0)) AS alone_s
+FROM states WHERE step = 0 GROUP BY ALL
 """
 
 Decided = Sequence[Mapping[str, Any]]

@@ -17,7 +17,7 @@ import pandas as pd
 from analysis.data.load import load_each, load_specs
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided, rectangles_overlap
-from merge_runner.scenarios.merge.geometry import TRACK, Track, track_of
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance
 from merge_runner.text_safety import quoted
 
@@ -34,17 +34,10 @@ FROM (
         if(left_past_m < 0, cosine * left_past_m, left_past_m)
             - if(right_past_m < 0, cosine * right_past_m, right_past_m) AS along_m,
         {step_s} * (abs(left_mps - right_mps) + sine * (left_mps + right_mps)) AS nearer_m
-    FROM vehicle_pairs JOIN (VALUES {tracks}) AS tracks (spec_hash, merge_m, sine, cosine)
-        USING (spec_hash)
+    FROM (SELECT *, merge_point_m() AS merge_m, branch_sine() AS sine, sqrt(1 - sine ** 2) AS cosine
+        FROM vehicle_pairs WHERE spec_hash IN ({specs}))
 ) WHERE across_m ** 2 + along_m ** 2 < ({reach_m} + nearer_m) ** 2 GROUP BY ALL
 """
-
-
-class Task(NamedTuple):
-    """What a trial is driven by and judged by."""
-
-    config: ScenarioConfig
-    track: Track
 
 
 class Sample(NamedTuple):
@@ -90,28 +83,22 @@ def judged(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def _near(tasks: Mapping[str, Task]) -> str:
+def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
     """The query of the samples at or next to which vehicles can collide."""
-    every = [ScenarioConfig(), *(task.config for task in tasks.values())]
-    tracks = {spec_hash: task.track for spec_hash, task in tasks.items()} or {"": TRACK}
+    every = [ScenarioConfig(), *tasks.values()]
     step_s = max(one.step_s for one in every)
     # What accelerations against each other, and a resistance, add to the way within a step.
     added_m = 2 * (max(one.max_acceleration_mps2 for one in every) + 2) * step_s**2
     reach_m = max(hypot(one.vehicle_length_m, one.vehicle_width_m) for one in every)
     return NEAR.format(
-        tracks=", ".join(
-            f"({quoted(spec_hash)}, {t.merge_point_m!r}::DOUBLE, {t.branch_sine!r}::DOUBLE, "
-            f"{t.branch_cosine!r}::DOUBLE)"
-            for spec_hash, t in tracks.items()
-        ),
+        specs=", ".join(map(quoted, tasks)) or "NULL",
         step_s=step_s,
         reach_m=reach_m + added_m + 0.01,
     )
 
 
-def seen(task: Task, samples: Sequence[Sample], *, boxes: bool) -> bool:
+def seen(config: ScenarioConfig, samples: Sequence[Sample], *, boxes: bool) -> bool:
     """Whether a collision is seen: of ``boxes`` at 20 Hz, else by the paper's rule at the steps."""
-    config, track = task
     size = (config.vehicle_length_m, config.vehicle_width_m)
     looks = (
         (sample.left_m, sample.right_m)
@@ -119,14 +106,14 @@ def seen(task: Task, samples: Sequence[Sample], *, boxes: bool) -> bool:
         if _is_multiple(sample.time_s, config.step_s)
     )
     if not boxes:
-        return any(collided(config, track, *look) for look in looks)
+        return any(collided(config, TRACK, *look) for look in looks)
     between = (
         look
         for before, now in pairwise(samples)
         if now.step == before.step + 1
         for look in _looks_between(before, now)
     )
-    return any(rectangles_overlap(track, *look, *size) for look in chain(looks, between))
+    return any(rectangles_overlap(TRACK, *look, *size) for look in chain(looks, between))
 
 
 def _looks_between(before: Sample, now: Sample) -> Iterator[tuple[float, float]]:
@@ -156,7 +143,7 @@ def _is_multiple(time_s: float, step_s: float) -> bool:
     return isclose(time_s / step_s, round(time_s / step_s), abs_tol=1e-6)
 
 
-def _task(spec: Mapping[str, Any]) -> Task:
-    """The task of a spec, with the paper's rule; that of humans is the default one."""
+def _task(spec: Mapping[str, Any]) -> ScenarioConfig:
+    """Return the scenario of a spec with the paper's rule; that of humans is the default one."""
     scenario = {**spec.get("scenario", {}), "collision_rule": "euclid2d"}
-    return Task(ScenarioConfig.model_validate(scenario), track_of(spec))
+    return ScenarioConfig.model_validate(scenario)

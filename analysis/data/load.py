@@ -20,7 +20,6 @@ from merge_runner.paths import DEFAULT_DB
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.scenarios.merge.geometry import TRACK, Track
 from merge_runner.served_model import ALIASES, PAIRS, Pair, others_among
 from merge_runner.text_safety import quoted
 
@@ -188,7 +187,6 @@ class _Spec(BaseModel):
     """What is read of a spec; that of humans says none of this."""
 
     scenario: ScenarioConfig = ScenarioConfig()
-    track: Track = TRACK
     left: _Driver = _Driver()
     right: _Driver = _Driver()
 

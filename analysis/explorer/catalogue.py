@@ -24,7 +24,7 @@ from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, more_memory, schema_sql
 from merge_runner.results.levels import LEVELS
-from merge_runner.scenarios.merge.geometry import Track, track_of
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer, quoted
 
@@ -577,12 +577,12 @@ class Catalogue:
 def _how(crash: Row) -> str | None:
     """The class of a collision; None where its spec cannot be read, which the audit tells."""
     try:
-        scenario, track = _task(crash["source"], crash["spec"] or "{}")
-    except (ValidationError, UsageError):
+        scenario = _task(crash["source"], crash["spec"] or "{}")
+    except ValidationError:
         return None
     course = Course(
         scenario,
-        track,
+        TRACK,
         crash["times_s"],
         {side: crash[f"{side}_m"] for side in SIDES},
         {side: crash[f"{side}_mps"] for side in SIDES},
@@ -591,10 +591,9 @@ def _how(crash: Row) -> str | None:
 
 
 @lru_cache
-def _task(source: str, spec: str) -> tuple[ScenarioConfig, Track]:
+def _task(source: str, spec: str) -> ScenarioConfig:
     """What the trials of a spec were driven by: there are few specs, and many trials."""
-    told = json.loads(spec)
-    return scenario_of(source, told.get("scenario")), track_of(told)
+    return scenario_of(source, json.loads(spec).get("scenario"))
 
 
 def order_by(sort: str) -> str:

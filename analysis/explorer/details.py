@@ -14,7 +14,6 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.drivers.registry import unresponsive
 from merge_runner.records import SIDES, Side
-from merge_runner.scenarios.merge.geometry import Track, track_of
 
 # One trial, or all of some lists, of a table; by the numbers of their rows, since else what is long
 # is read of all, to find a few.
@@ -68,7 +67,6 @@ class Trial:
     trial_id: str
     spec_hash: str
     scenario: ScenarioConfig
-    track: Track
     paces: dict[Side, Pace]
     states: dict[Side, Row]
     decisions: list[Row]
@@ -141,7 +139,6 @@ def _trial(task: Row, states: list[Row], decisions: list[Row]) -> Trial:
         task["trial_id"],
         task["spec_hash"],
         scenario,
-        track_of(told),
         {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
         {side: samples[side] for side in SIDES if side in samples},
         decisions,

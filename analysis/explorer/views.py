@@ -16,7 +16,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
 from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.collision import collided
-from merge_runner.scenarios.merge.geometry import Track
+from merge_runner.scenarios.merge.geometry import TRACK
 
 # Vehicles touch up to some 13 m apart: halved so often, that is less than a millimetre.
 BISECTIONS = 14
@@ -111,10 +111,10 @@ def judged_text(scenario: ScenarioConfig) -> str:
     }[scenario.collision_rule]
 
 
-def view_box(track: Track) -> str:
-    """The part of the plane that a picture of the track shows: x, y, width, height in m."""
-    half = track.start_distance_m / 2 + BESIDE_M
-    width = track.end_y_m + BEFORE_M + BEYOND_M
+def view_box() -> str:
+    """Return the part of the plane that a picture of the track shows: x, y, width, height in m."""
+    half = TRACK.start_distance_m / 2 + BESIDE_M
+    width = TRACK.end_y_m + BEFORE_M + BEYOND_M
     return f"{-BEFORE_M:g} {-half:g} {width:.1f} {2 * half:g}"
 
 
@@ -179,10 +179,10 @@ def controlled(samples: Row, name: str) -> list[float]:
 
 def actions(trial: Trial) -> dict[Side, str]:
     """How each driver first acted, and when it was at the merge point: all that humans tell."""
-    return {side: _action(samples, trial.track) for side, samples in trial.states.items()}
+    return {side: _action(samples) for side, samples in trial.states.items()}
 
 
-def _action(samples: Row, track: Track) -> str:
+def _action(samples: Row) -> str:
     times, speeds = controlled(samples, "time_s"), controlled(samples, "velocity_mps")
     said = f"it kept its speed to within {ACTED_MPS:g} m/s"
     for time_s, speed_mps in zip(times, speeds, strict=True):
@@ -190,7 +190,7 @@ def _action(samples: Row, track: Track) -> str:
             compared = "faster" if speed_mps > speeds[0] else "slower"
             said = f"after {time_s:.1f} s it was {ACTED_MPS:g} m/s {compared} than at the start"
             break
-    merges_s = reaches_s(samples, track.merge_point_m)
+    merges_s = reaches_s(samples, TRACK.merge_point_m)
     merged = "it never merged" if merges_s is None else f"it merged after {merges_s:.1f} s"
     return f"{said}; {merged}"
 
@@ -203,7 +203,7 @@ def account_of(row: Row, trial: Trial) -> Account | None:
         {side: controlled(samples, name) for side, samples in trial.states.items()}
         for name in ("time_s", "position_m", "velocity_mps")
     )
-    course = Course(trial.scenario, trial.track, times["left"], places, speeds)
+    course = Course(trial.scenario, TRACK, times["left"], places, speeds)
     return account(course, trial.decisions, row)
 
 
@@ -223,11 +223,11 @@ def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, An
         "bounds": collision_bounds(trial),
         "marks": marks(row, trial, account),
         "track": {
-            "tunnel": trial.track.tunnel_exit_m,
-            "merge": trial.track.merge_point_m,
-            "end": trial.track.end_m,
-            "lateral": trial.track.branch_sine,
-            "forward": trial.track.branch_cosine,
+            "tunnel": TRACK.tunnel_exit_m,
+            "merge": TRACK.merge_point_m,
+            "end": TRACK.end_m,
+            "lateral": TRACK.branch_sine,
+            "forward": TRACK.branch_cosine,
             "length": trial.scenario.vehicle_length_m,
             "width": trial.scenario.vehicle_width_m,
             "rule": trial.scenario.collision_rule,
@@ -241,7 +241,7 @@ def marks(row: Row, trial: Trial, account: Account | None) -> list[dict[str, Any
     found = [
         {"t": round(reached_s, 3), "side": side, "kind": "merge", "text": f"{side} merges"}
         for side, samples in trial.states.items()
-        if (reached_s := reaches_s(samples, trial.track.merge_point_m)) is not None
+        if (reached_s := reaches_s(samples, TRACK.merge_point_m)) is not None
     ]
     if row["status"] == "collided":
         found.append({"t": round(trial.end_s, 3), "side": "", "kind": "collision",
@@ -276,29 +276,29 @@ def collision_bounds(trial: Trial) -> list[float | None]:
     left, right = trial.states.get("left"), trial.states.get("right")
     if left is None or right is None:
         return []
-    scenario, track = trial.scenario, trial.track
+    scenario = trial.scenario
     pairs = list(zip(left["position_m"], right["position_m"], strict=False))
     if scenario.collision_rule == "shared_lane":
         length_m = scenario.vehicle_length_m
-        return [length_m if max(pair) >= track.merge_point_m else None for pair in pairs]
+        return [length_m if max(pair) >= TRACK.merge_point_m else None for pair in pairs]
     # From there on the road is straight, and the bound stays the same.
-    straight_m = track.merge_point_m + scenario.vehicle_length_m + scenario.vehicle_width_m
+    straight_m = TRACK.merge_point_m + scenario.vehicle_length_m + scenario.vehicle_width_m
     means = [min((a + b) / 2, straight_m) for a, b in pairs]
-    bounds = {mean_m: _bound(scenario, track, mean_m) for mean_m in {*means}}
+    bounds = {mean_m: _bound(scenario, mean_m) for mean_m in {*means}}
     return [bounds[mean_m] for mean_m in means]
 
 
-def _bound(scenario: ScenarioConfig, track: Track, mean_m: float) -> float | None:
+def _bound(scenario: ScenarioConfig, mean_m: float) -> float | None:
     """At the vehicles' mean position; by bisection.
 
     The further apart two vehicles are along the road, the less they overlap.
     """
-    if not collided(scenario, track, mean_m, mean_m):
+    if not collided(scenario, TRACK, mean_m, mean_m):
         return None
     low, high = 0.0, 2 * (scenario.vehicle_length_m + scenario.vehicle_width_m)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        if collided(scenario, track, mean_m + middle / 2, mean_m - middle / 2):
+        if collided(scenario, TRACK, mean_m + middle / 2, mean_m - middle / 2):
             low = middle
         else:
             high = middle
@@ -393,7 +393,7 @@ def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:
                     "from_mps": samples["velocity_mps"][first],
                     "to_mps": samples["velocity_mps"][last],
                     "moved_m": samples["position_m"][last] - samples["position_m"][first],
-                    "to_merge_m": trial.track.merge_point_m - samples["position_m"][last],
+                    "to_merge_m": TRACK.merge_point_m - samples["position_m"][last],
                 }
             )
     return sorted(found, key=lambda vehicle: not vehicle["own"])

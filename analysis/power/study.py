@@ -9,8 +9,7 @@ from analysis.power.questions import BESIDE_HUMANS, OF_AN_ARM, OF_TWO_ARMS, Ques
 from analysis.power.samples import Conditions
 from analysis.power.search import Arms, Search, beside_humans, difference
 from analysis.power.truths import Truth, planted, supposed
-from merge_runner.config import USUAL_SCENARIO, validated
-from merge_runner.errors import UsageError
+from merge_runner.config import validated
 from merge_runner.planted_effect import PlantedEffect, planted_fields
 from merge_runner.run.estimate import Estimate, typical_prompt
 from merge_runner.run.plan import Plan
@@ -164,8 +163,6 @@ def _times(value: float | None, factor: float) -> float | None:
 
 
 def _conditions(plan: Plan) -> Conditions:
-    if {arm.scenario.name for arm in plan.arms} != {USUAL_SCENARIO}:
-        raise UsageError(f"power knows how trials of the scenario {USUAL_SCENARIO} may go, alone")
     drawn = [CONDITIONS[name] for name in plan.conditions]
     return Conditions(
         tuple(each.projected_headway_m for each in drawn),

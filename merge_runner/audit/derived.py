@@ -54,7 +54,6 @@ from merge_runner.results.comparison import (
 )
 from merge_runner.results.rows import rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.registry import SCENARIOS
 from merge_runner.trial import play_trial
 
 TOLERANCE = 1e-9
@@ -78,7 +77,7 @@ CALLS = f"trial_id, spec_hash, {', '.join(COLUMNS)}, sha256(request::VARCHAR) AS
 # What could not be derived, in a reader's words.
 OTHER_RULES = "anything, since another version of the program made them by other rules"
 OTHER_PROMPTS = "the prompts, made of other texts than this version has"
-NOT_INSTALLED = "anything, since their condition or their scenario is not installed"
+NOT_INSTALLED = "anything, since their condition is not installed"
 OTHER_DATA = "anything, since what a program drives by is not here, as human trials to replay"
 OTHER_PROGRAM = "the decisions of a program that is not as it was"
 
@@ -231,8 +230,7 @@ def _trials(
         (row,) = tables["trials"].named(key)
         if spec is None or spec.scenario is None:
             continue
-        scenario = SCENARIOS.get(spec.scenario.name)
-        if scenario is None or row["condition"] not in CONDITIONS:
+        if row["condition"] not in CONDITIONS:
             left_out[NOT_INSTALLED] += 1
             continue
         if not all(map(_is_here, map(spec.driver, SIDES))):
@@ -245,11 +243,7 @@ def _trials(
         wires = _wires(config, arm)
         known = all(side in wires for side in SIDES if spec.asks(side))
         same_rules = spec.content.get("spec_version") == SPEC_VERSION
-        same_world = (spec.track, spec.content.get("world_source")) == (
-            scenario.track,
-            scenario.source,
-        )
-        if not (same_rules and known and same_world):
+        if not (same_rules and known):
             left_out[OTHER_RULES] += 1
             continue
         calls, decisions = tables["calls"].named(key), tables["decisions"].named(key)

@@ -15,7 +15,6 @@ from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import between_body_and_slot
 from merge_runner.records import SIDES
-from merge_runner.scenarios.merge.geometry import Track, track_of
 from merge_runner.text_safety import in_a_name
 
 
@@ -161,14 +160,6 @@ class Spec:
                 {name: fields[name] for name in ScenarioConfig.model_fields if name in fields}
             )
         except ValidationError:
-            return None
-
-    @cached_property
-    def track(self) -> Track | None:
-        """The track, None where it cannot be read."""
-        try:
-            return track_of(self.content)
-        except UsageError:
             return None
 
     def driver(self, side: str) -> dict[str, Any]:

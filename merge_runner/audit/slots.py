@@ -101,7 +101,7 @@ def _spec_problems(
         return
     if spec_hash(spec.text) != name:
         yield f"the spec stored as {name} has the hash {spec_hash(spec.text)}"
-    if spec.scenario is None or spec.track is None:
+    if spec.scenario is None:
         yield f"the scenario of the spec {name} cannot be read: its trials are not checked"
     elif None in map(spec.pace, SIDES):
         yield f"the rates of the spec {name} cannot be read: its decisions are not checked"

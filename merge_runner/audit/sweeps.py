@@ -31,6 +31,7 @@ from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.records import SIDES
 from merge_runner.results.database import append, by_name, read_database, room_for_texts
 from merge_runner.results.validity import ASKED_DECISIONS, not_judged
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import other_models
 from merge_runner.study.parts import adopt_declared, adopted
 from merge_runner.text_safety import first_line
@@ -268,14 +269,14 @@ def _prepare(connection: duckdb.DuckDBPyConnection) -> dict[str, Spec]:
                 scenario.timeout_steps,
                 scenario.fallback == "restart",
                 reach_m(scenario),
-                track.tunnel_exit_m,
-                track.merge_point_m,
-                track.end_m,
-                track.branch_sine,
-                track.branch_cosine,
+                TRACK.tunnel_exit_m,
+                TRACK.merge_point_m,
+                TRACK.end_m,
+                TRACK.branch_sine,
+                TRACK.branch_cosine,
             )
             for spec in specs.values()
-            if (scenario := spec.scenario) is not None and (track := spec.track) is not None
+            if (scenario := spec.scenario) is not None
         ),
     )
     append(

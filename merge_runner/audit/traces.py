@@ -12,7 +12,7 @@ from merge_runner.audit.findings import Finding
 from merge_runner.config import ScenarioConfig
 from merge_runner.results.comparison import same_value
 from merge_runner.scenarios.merge.collision import collided
-from merge_runner.scenarios.merge.geometry import Track
+from merge_runner.scenarios.merge.geometry import TRACK
 
 TOLERANCE_M = 1e-6
 GAPS = "CREATE OR REPLACE TEMP TABLE gaps AS SELECT trial_id, spec_hash, gap_m FROM trial_metrics"
@@ -53,14 +53,13 @@ def check_traces(
     """Judge the audited trials anew, each by the rule and the vehicles of its own spec."""
     for row in connection.execute(TRACES).fetchall():
         trial_id, spec_hash, status, last_step, close, before_m, after_m, gap_m = row
-        scenario, track = specs[spec_hash].scenario, specs[spec_hash].track
+        scenario = specs[spec_hash].scenario
         assert scenario is not None  # a row of rules stands for it
-        assert track is not None
-        text = _collision(scenario, track, status, last_step, close)
+        text = _collision(scenario, status, last_step, close)
         if text is not None:
             yield Finding("outcome", text, trial=trial_id)
         finished = status == "finished" and before_m is not None and after_m is not None
-        found_m = _gap_m(before_m, after_m, scenario, track) if finished else None
+        found_m = _gap_m(before_m, after_m, scenario) if finished else None
         if not same_value(gap_m, found_m, TOLERANCE_M):
             text = f"it is {_metres(gap_m)} in trial_metrics, and by its states {_metres(found_m)}"
             yield Finding("gap", text, trial=trial_id)
@@ -68,13 +67,12 @@ def check_traces(
 
 def _collision(
     scenario: ScenarioConfig,
-    track: Track,
     status: str,
     last_step: int,
     close: Iterable[tuple[int, float, float]],
 ) -> str | None:
     """What contradicts the status; a trial ends with its first collision."""
-    first = next((step for step, *both in close if collided(scenario, track, *both)), None)
+    first = next((step for step, *both in close if collided(scenario, TRACK, *both)), None)
     if first is None and status == "collided":
         return f"it is collided, and its states never are by the rule {scenario.collision_rule}"
     if first is not None and (status != "collided" or first < last_step):
@@ -82,15 +80,13 @@ def _collision(
     return None
 
 
-def _gap_m(
-    before_m: Sequence[float], after_m: Sequence[float], scenario: ScenarioConfig, track: Track
-) -> float:
+def _gap_m(before_m: Sequence[float], after_m: Sequence[float], scenario: ScenarioConfig) -> float:
     """The net gap at the first arrival at the merge point (arXiv 2604.09609, Table IV).
 
     Positions are linear within the step.
     """
     steps = list(zip(before_m, after_m, strict=True))
-    shares = ((track.merge_point_m - a) / (b - a) for a, b in steps if b >= track.merge_point_m)
+    shares = ((TRACK.merge_point_m - a) / (b - a) for a, b in steps if b >= TRACK.merge_point_m)
     share = min(shares, default=nan)  # DuckDB takes what is no number for the largest
     left_m, right_m = (a + share * (b - a) for a, b in steps)
     return abs(left_m - right_m) - scenario.vehicle_length_m

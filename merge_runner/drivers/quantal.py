@@ -12,9 +12,8 @@ from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.records import Decision, Observation
 from merge_runner.scenarios.merge.collision import collided
-from merge_runner.scenarios.merge.geometry import Track
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance
-from merge_runner.scenarios.registry import SCENARIOS
 
 NODE_S = 0.2
 SLOWEST_MPS = 0.5
@@ -59,7 +58,7 @@ class QuantalDriver:
         assert self._desired_mps is not None
         number, held_s = self.seat.number, self.seat.interval_s
         ahead_m, speed_mps = advance(0.0, seen.own_speed_mps, action_mps2, held_s)
-        rest_m = max(0.0, self._track.end_m - seen.own_position_m - ahead_m)
+        rest_m = max(0.0, TRACK.end_m - seen.own_position_m - ahead_m)
         needed_s = held_s + rest_m / max(speed_mps, SLOWEST_MPS)
         lost_s = max(0.0, needed_s - (ahead_m + rest_m) / self._desired_mps)
         return (
@@ -86,11 +85,7 @@ class QuantalDriver:
 
     def _collided(self, own_m: float, other_m: float) -> bool:
         places = (own_m, other_m) if self.seat.side == "left" else (other_m, own_m)
-        return collided(self.seat.scenario, self._track, *places)
-
-    @property
-    def _track(self) -> Track:
-        return SCENARIOS[self.seat.scenario.name].track
+        return collided(self.seat.scenario, TRACK, *places)
 
 
 def _check(parameters: Mapping[str, Parameter]) -> None:

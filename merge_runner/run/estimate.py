@@ -16,7 +16,9 @@ from merge_runner.llm.trial_costs import Answers, TrialCalls, TrialCosts
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage
 from merge_runner.run.plan import Options, Plan, most_prompts, usual_prompts
-from merge_runner.scenarios.registry import new_world
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import World
 from merge_runner.study.crossing import Arm
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
@@ -337,6 +339,6 @@ def _limited_s(options: Options, calls: _Calls) -> float:
 def typical_prompt(plan: Plan, arm: Arm) -> str:
     """An arm's prompt in the middle of an approach."""
     scenario = arm.scenario
-    world = new_world(scenario, plan.conditions[0])
+    world = World(scenario, CONDITIONS[plan.conditions[0]], TRACK)
     rest = (0.25,) * (scenario.plan_actions - scenario.executed_actions)
     return render_prompt(world.observe("left"), rest, variant=arm.variant, scenario=scenario)

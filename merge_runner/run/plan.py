@@ -29,8 +29,13 @@ from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import SIDES, Side, TrialSpec
 from merge_runner.results.database import read_database
-from merge_runner.scenarios.merge.conditions import CONDITIONS, MEAN_SPEED_MPS
-from merge_runner.scenarios.registry import SCENARIOS, new_world, task_of
+from merge_runner.scenarios.merge.conditions import (
+    CONDITIONS,
+    HUMAN_CONDITIONS,
+    MEAN_SPEED_MPS,
+)
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import World
 from merge_runner.study.crossing import (
     OPPONENT,
     PERCEPTION,
@@ -274,7 +279,7 @@ class Plan:
         return canonical_json(
             {
                 "spec_version": SPEC_VERSION,
-                **task_of(arm.scenario),
+                "scenario": arm.scenario.model_dump(),
                 "prompt_blocks": block_digests(arm.variant) if arm.entries else {},
                 "left": self._driver(arm, "left"),
                 "right": self._driver(arm, "right"),
@@ -475,14 +480,13 @@ def _read_humans(arms: Iterable[Arm], db: Path) -> None:
 
 
 def _conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
-    scenario = SCENARIOS.require(file.scenario.name)
     listed = None if file.conditions is None else [each.name for each in file.conditions]
-    wanted = next(c for c in (chosen, listed, scenario.conditions) if c is not None)
+    wanted = next(c for c in (chosen, listed, HUMAN_CONDITIONS) if c is not None)
     conditions = tuple(
         dict.fromkeys(
             name
             for each in wanted
-            for name in (scenario.conditions if each == EVERY_CONDITION else (each,))
+            for name in (HUMAN_CONDITIONS if each == EVERY_CONDITION else (each,))
         )
     )
     if not conditions:
@@ -494,7 +498,7 @@ def _check_conditions(conditions: Sequence[str], arms: Sequence[Arm]) -> None:
     """Raise UsageError for a condition that an arm cannot be played in."""
     for name in conditions:
         for arm in arms:
-            new_world(arm.scenario, name)
+            World(arm.scenario, CONDITIONS.require(name), TRACK)
             for program, humans in _replayed(arm):
                 humans.check(program, arm.scenario, name, arm.repetitions)
 

@@ -1,1 +1,1 @@
-"""The driving tasks: what a scenario is, and one folder for each."""
+"""The driving task: the simplified merge."""

@@ -20,7 +20,6 @@ from merge_runner.llm.formats.parameters import known_parameters, with_parameter
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES, Side, other_side
 from merge_runner.registry import require
-from merge_runner.scenarios.registry import SCENARIOS
 from merge_runner.study.file import BASELINE, EVERY_PROMPT, StudyFile
 from merge_runner.study.world_step import with_world_step
 
@@ -370,11 +369,7 @@ def _refuse_parameters(program: str, parameters: Levels) -> None:
 
 def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
     fields = ScenarioConfig.model_fields.keys() - SET_BY.keys()
-    made = _switched(file.scenario, {name: levels[name] for name in levels if name in fields})
-    rules = SCENARIOS.require(made.name).collision_rules
-    if made.collision_rule not in rules:
-        raise unknown_name(f"collision_rule of {made.name}", made.collision_rule, rules)
-    return made
+    return _switched(file.scenario, {name: levels[name] for name in levels if name in fields})
 
 
 def _perceived(file: StudyFile, scenario: ScenarioConfig, levels: Levels) -> ScenarioConfig:

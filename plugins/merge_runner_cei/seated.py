@@ -6,7 +6,7 @@ import numpy as np
 
 from merge_runner.drivers.program_seat import ProgramSeat
 from merge_runner.records import SIDES, Observation
-from merge_runner.scenarios.registry import SCENARIOS
+from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
 from merge_runner_cei.motion import Array, task_of
 from merge_runner_cei.parameters import TICK_S, Habits, ThresholdSet, offsets_of
@@ -20,8 +20,7 @@ class Seated:
     """
 
     def __init__(self, seat: ProgramSeat, thresholds: ThresholdSet, seen: Observation) -> None:
-        track = SCENARIOS[seat.scenario.name].track
-        self._model = Model(task_of(seat.scenario, track), thresholds, Habits())
+        self._model = Model(task_of(seat.scenario, TRACK), thresholds, Habits())
         self._random = np.random.default_rng(seat.seed)
         own, other = _vehicles(seen)
         offsets = offsets_of(int(seat.number("pair")), seat.repetition)

@@ -98,7 +98,6 @@ def test_what_is_stored_later_has_its_account_too(db, tmp_path):
         "DELETE FROM states WHERE side = 'left'",
         "DELETE FROM states WHERE side = 'right' AND step = 3",
         'UPDATE specs SET spec = \'{"scenario": {"step_s": -1}}\'',
-        "UPDATE specs SET spec = '{\"track\": 7}'",
     ],
 )
 def test_a_collision_that_cannot_be_judged_is_listed_without_an_account(tmp_path, damage):

@@ -16,7 +16,6 @@ from analysis.explorer.catalogue import Filter
 from analysis.explorer.pages.comparing import offered
 from analysis.explorer.site import Site
 from tests.analysis.studies import Drive, as_humans, write_study
-from tests.explorer.serving import served
 
 HOST = "127.0.0.1:8700"
 TRIAL = "emulator/baseline/N_0_0/rep01"
@@ -60,22 +59,7 @@ def test_the_nearest_human_is_the_one_with_the_closest_headway_and_not_one_who_e
     assert ask(client, "human/near/N_0_0/rep01", offer="nearest human") == "human/far/N_0_0/rep01"
 
 
-@pytest.mark.parametrize(
-    "other_task",
-    [
-        {"track": {"tunnel_exit_m": 30, "merge_point_m": 60, "end_m": 110, "start_distance_m": 20}},
-        {
-            "track": {
-                "tunnel_exit_m": 50,
-                "merge_point_m": 100,
-                "end_m": 180,
-                "start_distance_m": 25,
-            }
-        },
-        {"mean_speed_mps": 15},
-    ],
-)
-def test_only_a_human_with_the_same_task_is_near(db, tmp_path, other_task):
+def test_only_a_human_at_the_same_speeds_is_near(db, tmp_path):
     path = shutil.copy(db, tmp_path / "t.duckdb")
     human = "(SELECT spec_hash FROM trials WHERE source = 'human')"
 
@@ -84,29 +68,13 @@ def test_only_a_human_with_the_same_task_is_near(db, tmp_path, other_task):
             connection.execute(
                 "UPDATE specs SET spec = json_merge_patch(spec, ?) "
                 f"WHERE spec_hash {which} {human}",
-                [json.dumps(other_task)],
+                [json.dumps({"mean_speed_mps": 15})],
             )
         client = TestClient(explorer(Site(path)), base_url=f"http://{HOST}")
         return ask(client, "o3/baseline/N_0_0/rep01", offer="nearest human")
 
     assert nearest("NOT IN") is None
     assert nearest("IN") == "human/near/N_0_0/rep01"
-
-
-def test_a_human_is_compared_until_the_first_vehicle_is_at_the_merge_point_of_its_own_track(
-    db, tmp_path
-):
-    path = shutil.copy(db, tmp_path / "t.duckdb")
-    near = {"tunnel_exit_m": 50, "merge_point_m": 70, "end_m": 150, "start_distance_m": 20}
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE specs SET spec = json_merge_patch(spec, ?)", [json.dumps({"track": near})]
-        )
-    client = TestClient(explorer(Site(path)), base_url=f"http://{HOST}")
-    # It ended before the other merge point alone.
-    assert ask(client, "o3/baseline/N_0_0/rep01", offer="nearest human") == (
-        "human/short/N_0_0/rep01"
-    )
 
 
 def test_the_next_repetition_goes_round(client):
@@ -247,25 +215,3 @@ def test_where_nobody_answers_nothing_is_said_of_what_there_is(browser, site):
     expect(page.locator("#ghost-key")).to_contain_text("rep 2")
     expect(page.locator("#lost")).to_be_hidden()
     context.close()
-
-
-@pytest.mark.long
-def test_a_trial_on_another_track_is_said_to_be_and_no_human_is_near_it(page, db, tmp_path):
-    path = shutil.copy(db, tmp_path / "t.duckdb")
-    track = {"tunnel_exit_m": 50, "merge_point_m": 90, "end_m": 150, "start_distance_m": 25}
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE specs SET spec = json_merge_patch(spec, ?) WHERE spec_hash IN "
-            "(SELECT spec_hash FROM trials WHERE trial_id LIKE 'o4/A1/%')",
-            [json.dumps({"track": track})],
-        )
-    with served(path) as address:
-        page.goto(f"{address}/trials/o3/A1/N_0_0/rep01?compare=o4/A1/N_0_0/rep01")
-        expect(page.locator("#ghost-key")).to_contain_text("It drove on another track")
-        page.goto(f"{address}/trials/o3/A1/N_0_0/rep01?compare=o4/baseline/N_0_0/rep02")
-        expect(page.locator("#ghost-key")).to_contain_text("dashed")
-        expect(page.locator("#ghost-key")).not_to_contain_text("another track")
-        page.goto(f"{address}/trials/o4/A1/N_0_0/rep01")
-        page.get_by_role("button", name="nearest human").click()
-        expect(page.locator("#ghost-key")).to_contain_text("none here. It would be the human trial")
-        page.goto("about:blank")

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 from html import unescape
-from math import sqrt
 from urllib.parse import parse_qs, urlsplit
 
 import duckdb
@@ -35,7 +34,7 @@ from analysis.tables import make_tables
 from analysis.tables.formats import render
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided
-from merge_runner.scenarios.merge.geometry import TRACK, Track
+from merge_runner.scenarios.merge.geometry import TRACK
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import served
 from tests.explorer.test_charts import import_some
@@ -266,39 +265,33 @@ def test_the_picture_of_the_task_shows_a_moment_before_the_merge(own):
     assert not collided(ScenarioConfig(), TRACK, left["x"], right["x"])
 
 
-def on_a_longer_track(db, folder, whose):
-    """The study with these trials on another track, of longer vehicles."""
-    changed = {"track": asdict(Track(60, 120, 170, 40)), "scenario": {"vehicle_length_m": 6}}
+def of_longer_vehicles(db, folder, whose):
+    """The study with longer vehicles in these trials."""
     with duckdb.connect(shutil.copy(db, folder / "longer.duckdb")) as connection:
         connection.execute(
             f"UPDATE specs SET spec = json_merge_patch(spec, ?) WHERE {whose}",
-            [json.dumps(changed)],
+            [json.dumps({"scenario": {"vehicle_length_m": 6}})],
         )
     site = Site(folder / "longer.duckdb")
     site.computing = Computing(site.db, Never)
     return site
 
 
-def test_the_picture_shows_the_studys_own_track(db, tmp_path):
-    site = on_a_longer_track(db, tmp_path, "true")
+def test_the_picture_shows_the_studys_own_vehicles(db, tmp_path):
+    site = of_longer_vehicles(db, tmp_path, "true")
     text = client_of(site).get("/").text
-    task = task_picture(site.catalogue)
-    assert f'x1="{120 * sqrt(1 - (20 / 120) ** 2):.2f}"' in text
-    assert "60 m before the merge point" in text
-    assert task["length_m"] == 6
+    assert "50 m before the merge point" in text
+    assert task_picture(site.catalogue)["length_m"] == 6
     assert text.count('width="6.0" height="1.8"') == 2
     assert "the commonest" not in text
     site.close()
 
 
-def test_of_several_tracks_the_commonest_is_shown_and_the_page_says_so(db, tmp_path):
-    site = on_a_longer_track(db, tmp_path, "spec_hash LIKE '%A1'")
+def test_of_several_sizes_the_commonest_is_shown_and_the_page_says_so(db, tmp_path):
+    site = of_longer_vehicles(db, tmp_path, "spec_hash LIKE '%A1'")
     text = client_of(site).get("/").text
-    assert "50 m before the merge point" in text
-    assert (
-        "It is the commonest of 2 geometries (tracks, or sizes of vehicles), that of 33 of 44"
-        in text
-    )
+    assert text.count('width="4.5" height="1.8"') == 2
+    assert "The vehicles have the commonest of 2 sizes, that of 33 of 44" in text
     site.close()
 
 

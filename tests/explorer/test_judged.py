@@ -18,6 +18,7 @@ from analysis.human.load import import_trials, sort_files
 from merge_runner.config import ScenarioConfig
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.collision import collided
+from merge_runner.scenarios.merge.geometry import TRACK
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import Drive, write_study
 from tests.explorer.serving import served
@@ -81,12 +82,10 @@ def test_the_band_of_the_chart_holds_the_headways_that_collide(study_of, rule):
     places = zip(*(samples["position_m"] for samples in trial.states.values()), strict=True)
     for bound, (left, right) in zip(bounds, places, strict=True):
         mean = (left + right) / 2
-        assert collided(trial.scenario, trial.track, left, right) == (
-            abs(left - right) < (bound or 0)
-        )
+        assert collided(trial.scenario, TRACK, left, right) == (abs(left - right) < (bound or 0))
         if rule != "shared_lane":
             assert bound is None or collided(
-                trial.scenario, trial.track, mean + bound / 2 - 0.01, mean - bound / 2 + 0.01
+                trial.scenario, TRACK, mean + bound / 2 - 0.01, mean - bound / 2 + 0.01
             )
     assert max(filter(None, bounds)) == pytest.approx(6, abs=0.2)
 

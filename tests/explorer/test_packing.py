@@ -57,7 +57,7 @@ def test_many_trials_are_read_as_each_alone(exporting):
     assert len(keys) > 5
     for key, (trial, decisions) in zip(keys, read_whole(site.db, keys), strict=True):
         alone = read_trial(site.db, *key)
-        assert (trial.states, trial.paces, trial.track) == (alone.states, alone.paces, alone.track)
+        assert (trial.states, trial.paces) == (alone.states, alone.paces)
         assert [(d["side"], d["decision"]) for d in alone.decisions] == list(decisions)
         for row, listed in zip(alone.decisions, trial.decisions, strict=True):
             assert row == {name: listed[name] for name in row}

@@ -1,4 +1,4 @@
-"""One of each kind, from six packages at once: the house takes them together."""
+"""One of each kind, from five packages at once: the house takes them together."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import pytest
 from tests.harness import Run, how_to, plugin
 from tests.how_to.test_wire_format import KEY, MODELS, Talker, listening
 
-KINDS = ("condition", "driver", "metric", "prompt-block", "scenario", "wire-format")
+KINDS = ("condition", "driver", "metric", "prompt-block", "wire-format")
 FILE = """
 conditions = ["far", "fast-tie", "N_0_0"]
 [repetitions]
 baseline = 1
 A8 = 1
 [scenario]
-name = "long-merge"
 step_s = 0.05
 plan_step_s = 0.2
 """

@@ -102,7 +102,7 @@ def test_the_spec_hash_of_the_baseline_is_pinned():
         ("[repetitions]", "has no variant"),
         ("conditions = []\n[repetitions]\nbaseline = 1", "no condition is left"),
         ("repetition = 3", "unknown key 'repetition'; valid: description, models, rep"),
-        ("[repetitions]\nbaseline = 1\n[scenario]\nstep = 1", "valid: name, horizon_s"),
+        ("[repetitions]\nbaseline = 1\n[scenario]\nstep = 1", "valid: horizon_s"),
         ("[repetitions]\nbaseline = 1\n[scenario]\nstep_s = 0.3", "no whole number"),
         ("conditions = ['L_9_9']\n[repetitions]\nbaseline = 1", "unknown condition 'L_9_9'"),
         ("[repetitions", "Expected ']'"),

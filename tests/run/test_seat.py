@@ -11,16 +11,12 @@ from dataclasses import replace
 import pytest
 from aiohttp import web
 
-from merge_runner.config import USUAL_SCENARIO
 from merge_runner.errors import UsageError
 from merge_runner.records import SLOT_HEADER
-from merge_runner.registry import unregister
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import make_plan
 from merge_runner.run.seat import USUAL_GRID, first_situations, grid_conditions
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.world import World
-from merge_runner.scenarios.registry import SCENARIOS
 from tests.harness import FAST, RECORDING, watched
 
 DB = "results/merge.duckdb"
@@ -316,26 +312,6 @@ def test_vehicles_that_collide_at_once_are_no_situation():
     arms = (replace(plan.arms[0], scenario=wide),)
     with pytest.raises(UsageError, match="collide before both are driven"):
         first_situations(replace(plan, arms=arms))
-
-
-class Endless(World):
-    """A world that has no timeout."""
-
-    def _end(self):
-        found = super()._end()
-        return None if found == "timeout" else found
-
-
-def test_a_scenario_whose_trials_do_not_end_in_time_is_refused(tmp_path):
-    usual = SCENARIOS[USUAL_SCENARIO]
-    SCENARIOS.replace("endless", replace(usual, make_world=Endless))
-    (tmp_path / "mine.toml").write_text('repetitions = 1\n[scenario]\nname = "endless"\n')
-    try:
-        plan = make_plan(str(tmp_path / "mine.toml"), "emulator")
-        with pytest.raises(UsageError, match="go on after timeout_s"):
-            first_situations(plan)
-    finally:
-        unregister("scenario endless")
 
 
 @pytest.mark.slow

@@ -11,7 +11,9 @@ from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import block_digests, blocks_of
 from merge_runner.prompts.render import render_prompt
 from merge_runner.run.plan import make_plan
-from merge_runner.scenarios.registry import new_world
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import World
 from tests.harness import how_to
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
@@ -44,7 +46,7 @@ def plan_of(tmp_path):
 
 
 def prompt(variant):
-    world = new_world(ScenarioConfig(), "N_0_0")
+    world = World(ScenarioConfig(), CONDITIONS["N_0_0"], TRACK)
     scenario = ScenarioConfig()
     return render_prompt(world.observe("left"), None, variant=variant, scenario=scenario)
 
@@ -142,7 +144,7 @@ def test_an_own_condition_is_played_and_another_mean_speed_is_another_spec(plan_
     specs = []
     for speed in (10.0, 12.0):
         specs += plan_of(OWN.format(speed=speed), conditions=False).trial_specs()
-        assert new_world(ScenarioConfig(), "X").observe("left").own_speed_mps == speed + 0.25
+        assert CONDITIONS["X"].speeds_mps[0] == speed + 0.25
     assert len({spec.spec_hash for spec in specs}) == 2
     plain = make_plan("baseline", "emulator").trial_specs()[0].spec_hash
     assert specs[0].spec_hash == plain  # its headway and velocity stand in the trial's row

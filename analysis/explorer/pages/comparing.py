@@ -45,21 +45,20 @@ WHERE one.number <> two.number AND one.wanted
 NEAREST = f"""
 WITH near AS (
     SELECT row_number() OVER (ORDER BY trial_id, spec_hash) AS number, trial_id, spec_hash,
-        source = 'human' AS human, coalesce(merge_point_m, merge_point_m()) AS merge_m,
-        dense_rank() OVER (ORDER BY projected_headway_m, relative_velocity_mps, merge_m,
-            coalesce(end_m, track_end_m()),
+        source = 'human' AS human,
+        dense_rank() OVER (ORDER BY projected_headway_m, relative_velocity_mps,
             coalesce((spec->>'$.mean_speed_mps')::DOUBLE, mean_speed_mps())) AS task,
         (trial_id, spec_hash) IN (SELECT unnest($trials), unnest($specs)) AS wanted
-    FROM trials LEFT JOIN specs USING (spec_hash) LEFT JOIN geometry USING (spec_hash)
+    FROM trials LEFT JOIN specs USING (spec_hash)
     WHERE condition = $condition AND (human OR wanted)
 ), told AS (
-    SELECT number, human, task, merge_m, wanted, round(1000 * time_s)::INTEGER AS ms,
+    SELECT number, human, task, wanted, round(1000 * time_s)::INTEGER AS ms,
         sum(if(side = 'left', position_m, -position_m)) AS headway_m, max(position_m) AS first_m
     FROM states JOIN near USING (trial_id, spec_hash)
     WHERE time_s >= 0 GROUP BY ALL HAVING count(*) = 2
 ), one AS (
     SELECT *, max(ms) OVER (PARTITION BY number) AS last_ms FROM told
-    WHERE wanted AND first_m < merge_m
+    WHERE wanted AND first_m < merge_point_m()
 ), other AS (SELECT *, max(ms) OVER (PARTITION BY number) AS last_ms FROM told WHERE human),
 nearest AS (
     SELECT one.number AS number, other.number AS other FROM one JOIN other

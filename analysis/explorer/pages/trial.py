@@ -22,7 +22,7 @@ from merge_runner.records import SIDES
 # What is offered to lay beside a trial, and by what rule.
 HUMAN, REPETITION, DRIVER = "nearest human", "next repetition", "other driver"
 OFFERS = {
-    HUMAN: "the human trial of this condition, on such a track and at such speeds, whose headway "
+    HUMAN: "the human trial of this condition, at such speeds, whose headway "
     "stays closest to this one's until its first vehicle has merged (root mean square)",
     REPETITION: "the next repetition with the same driver, prompt and condition",
     DRIVER: "the same condition, and if possible the same prompt and repetition, with the next "
@@ -57,7 +57,7 @@ def shown(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
         "outcome": views.outcome_text(row, trial.scenario),
         "facts": [*views.facts(row), *([f"Note: {trial.caution}."] if trial.caution else [])],
         "judged": views.judged_text(trial.scenario),
-        "view_box": views.view_box(trial.track),
+        "view_box": views.view_box(),
         "data": embedded(replayed(site, row, trial, account)) if trial.states else None,
         "account": account,
         "lines": views.summary(row, trial),

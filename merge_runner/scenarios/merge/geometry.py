@@ -6,13 +6,10 @@ branch leaves the centreline at the angle whose sine is half their distance over
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
-from typing import Any
 
-from merge_runner.errors import UsageError
 from merge_runner.records import Side
 
 
@@ -21,19 +18,13 @@ class Track:
     """Where a run leads, in m; the defaults are the human experiment's.
 
     ``tunnel_exit_m``, ``merge_point_m`` and ``end_m`` are travelled distances. The measures in SQL
-    know no other numbers (measures.sql), and a spec holds those of every scenario but ``merge``.
+    know no other numbers (measures.sql).
     """
 
     tunnel_exit_m: float = 50.0
     merge_point_m: float = 100.0
     end_m: float = 150.0
     start_distance_m: float = 25.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.tunnel_exit_m < self.merge_point_m < self.end_m < float("inf"):
-            raise ValueError("a track leads from its tunnels to the merge point and to its end")
-        if not 0 < self.start_distance_m < 2 * self.merge_point_m:
-            raise ValueError("the start points of a track are less than both branches apart")
 
     @cached_property
     def branch_sine(self) -> float:
@@ -71,25 +62,3 @@ class Track:
 
 TRACK = Track()
 """The human experiment's."""
-
-
-def track_of(spec: Mapping[str, Any]) -> Track:
-    """The track of a stored spec, the human experiment's where it tells none.
-
-    Raises UsageError, which names the field that is odd.
-    """
-    if "track" not in spec:
-        return TRACK
-    told = spec["track"] if isinstance(spec["track"], dict) else {}
-    names = [field.name for field in fields(Track)]
-    for name in (*names, *told):
-        number = told.get(name)
-        if name not in names or isinstance(number, bool) or not isinstance(number, int | float):
-            raise UsageError(
-                f"a stored spec has no track: track.{name} is {number!r}, and its numbers are "
-                + ", ".join(names)
-            )
-    try:
-        return Track(**{name: float(number) for name, number in told.items()})
-    except (ValueError, OverflowError) as exc:
-        raise UsageError(f"a stored spec has no track: {exc}") from exc

@@ -1,9 +1,9 @@
--- The measures of a trial. The numbers of the human experiment, for specs that tell no others, are
--- macros such as merge_point_m(), which measures.py writes before this.
+-- The measures of a trial. The numbers of the human experiment are macros such as merge_point_m(),
+-- which measures.py writes before this.
 
--- One row a spec: its vehicles' size and its track, in a human recording those of the experiment,
--- and where the vehicles' boxes overlap (collision.py). With half lengths l, half widths w and each branch at the angle phi
--- from the centreline, the four separating axes are along and across either vehicle. Two vehicles
+-- One row a spec: its vehicles' size, in a human recording that of the experiment, and where the
+-- vehicles' boxes overlap (collision.py). With half lengths l, half widths w and each branch at the
+-- angle phi from the centreline, the four separating axes are along and across either vehicle. Two vehicles
 -- u and v before the merge point are apart in their sums
 --     |v - u cos 2phi|, |u - v cos 2phi| < along2 = l (1 + cos 2phi) + w sin 2phi
 --     u sin 2phi, v sin 2phi < across2 = w (1 + cos 2phi) + l sin 2phi
@@ -15,10 +15,9 @@ WITH sizes AS (
     SELECT spec_hash,
         coalesce((spec->>'$.scenario.vehicle_length_m')::DOUBLE, usual_length_m()) AS length_m,
         coalesce((spec->>'$.scenario.vehicle_width_m')::DOUBLE, usual_width_m()) AS width_m,
-        coalesce((spec->>'$.track.merge_point_m')::DOUBLE, merge_point_m()) AS merge_point_m,
-        coalesce((spec->>'$.track.end_m')::DOUBLE, track_end_m()) AS end_m,
-        coalesce((spec->>'$.track.start_distance_m')::DOUBLE / 2 / merge_point_m,
-            branch_sine()) AS sin1
+        merge_point_m() AS merge_point_m,
+        track_end_m() AS end_m,
+        branch_sine() AS sin1
     FROM specs
 ), angles AS (
     SELECT *,
@@ -94,14 +93,13 @@ SELECT *,
     CASE WHEN left_s IS NOT NULL AND right_s IS NOT NULL THEN greatest(left_s, right_s) END
         AS both_s
 FROM (SELECT trial_id, spec_hash,
-    min(passing_s(point_m, left_before_m, left_m, time_before_s, time_s)) AS left_s,
-    min(passing_s(point_m, right_before_m, right_m, time_before_s, time_s)) AS right_s,
+    min(passing_s(merge_point_m(), left_before_m, left_m, time_before_s, time_s)) AS left_s,
+    min(passing_s(merge_point_m(), right_before_m, right_m, time_before_s, time_s)) AS right_s,
     min(passing_s(front_m, left_before_m, left_m, time_before_s, time_s)) AS left_front_s,
     min(passing_s(front_m, right_before_m, right_m, time_before_s, time_s)) AS right_front_s,
     min(passing_s(rear_m, left_before_m, left_m, time_before_s, time_s)) AS left_rear_s,
     min(passing_s(rear_m, right_before_m, right_m, time_before_s, time_s)) AS right_rear_s
-FROM (SELECT *, coalesce(merge_point_m, merge_point_m()) AS point_m
-    FROM query_table(pairs) LEFT JOIN geometry USING (spec_hash)) GROUP BY ALL);
+FROM query_table(pairs) LEFT JOIN geometry USING (spec_hash) GROUP BY ALL);
 
 -- When each vehicle's centre reaches the merge point, when its front does, and when its rear has
 -- left it; NULL: never.
@@ -155,12 +153,11 @@ distances AS (
 ), sampled_distances AS (
     SELECT trial_id, spec_hash,
         arg_min(abs(left_m - right_m), step)
-            FILTER (greatest(left_m, right_m) >= point_m) AS first_sample_m,
+            FILTER (greatest(left_m, right_m) >= merge_point_m()) AS first_sample_m,
         arg_min(abs(left_m - right_m), step)
-            FILTER (left_m + right_m >= 2 * point_m) AS mean_at_merge_m,
+            FILTER (left_m + right_m >= 2 * merge_point_m()) AS mean_at_merge_m,
         max(hardest_mps2) FILTER (time_s > 0) AS max_acceleration_mps2
-    FROM (SELECT *, coalesce(merge_point_m, merge_point_m()) AS point_m
-        FROM pairs LEFT JOIN geometry USING (spec_hash)) GROUP BY ALL
+    FROM pairs GROUP BY ALL
 ), collision_times AS (
     SELECT trial_id, spec_hash, min((abs(left_m - right_m) - length_m) / closing_mps) AS min_ttc_s
     FROM (

@@ -268,7 +268,6 @@ def test_answers_that_are_word_for_word_as_before_are_told_in_the_report(tmp_pat
         ("[]", "Input should be a valid dictionary"),
         ('{"scenario": {"odd": 1}}', "scenario.odd: Extra inputs are not permitted"),
         ('{"scenario": {"step_s": 0}}', "scenario.step_s: Input should be greater than 0"),
-        ('{"track": {"end_m": 9}}', "track: Value error, a track leads from its tunnels"),
         ('{"left": {"body": 3}}', "left.body: Input should be a valid dictionary"),
     ],
 )

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-from dataclasses import asdict
 
 import duckdb
 import pytest
@@ -12,11 +10,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.errors import UsageError
 from merge_runner.results.database import schema_sql
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
-from merge_runner.scenarios.merge.geometry import TRACK, track_of
+from merge_runner.scenarios.merge.geometry import TRACK
 
 HAIR_M = 1e-6
 
@@ -65,30 +62,6 @@ def test_the_bounds_of_the_experiments_vehicles_are_the_known_ones(database):
         "merge_high_m": 104.5949,
     }
     assert {name: round(found[name], 4) for name in expected} == expected
-
-
-@pytest.mark.parametrize(
-    ("told", "says"),
-    [
-        ({"merge_point_m": "120"}, "track.merge_point_m is '120'"),
-        ({"end_m": None}, "track.end_m is None"),
-        ({"merge_point": 120.0}, "track.merge_point is 120.0"),
-        ({"tunnel_exit_m": True}, "track.tunnel_exit_m is True"),
-        ({"end_m": 10**400}, "too large"),
-        ({"merge_point_m": 200.0}, "leads from its tunnels to the merge point"),
-    ],
-)
-def test_an_odd_track_is_refused_in_one_line_with_its_field(told, says):
-    with pytest.raises(UsageError, match=re.escape(says)) as caught:
-        track_of({"track": asdict(TRACK) | told})
-    assert "\n" not in str(caught.value)
-
-
-def test_a_track_is_whole_or_not_told_at_all():
-    assert track_of({}) == track_of({"track": asdict(TRACK)}) == TRACK
-    for odd in ({"end_m": 170.0}, [50.0, 100.0], None):
-        with pytest.raises(UsageError, match=r"track\.tunnel_exit_m is None"):
-            track_of({"track": odd})
 
 
 @given(st.floats(0.5, 30), st.floats(0.2, 6))

@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import duckdb
 import pytest
 
+from merge_runner.results.store import Store, query
 from merge_runner.scenarios.merge import measures
 
 
@@ -36,3 +38,20 @@ def test_no_mean_depends_on_the_order_in_which_threads_add():
     sums = re.findall(rf"\b(?:avg|sum){nested}", text)
     assert len(sums) == 2
     assert all("ORDER BY step" in each for each in sums)
+
+
+async def test_older_measures_are_told_to_a_reader_and_replaced_when_the_database_is_written_to(
+    merge_runner, tmp_path
+):
+    path = tmp_path / "t.duckdb"
+    Store(path)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("CREATE OR REPLACE VIEW trial_metrics AS SELECT 1 AS old")
+    asked = ("sql", "FROM trial_metrics", "--db", path)
+    told = await merge_runner(*asked)
+    assert (told.code, told.out.split()[0]) == (0, "old")
+    assert told.err.count("another version of the program defined the measures") == 1
+    assert "`merge-runner sweep` into it brings them up to date" in told.err
+    Store(path)
+    assert "gap_m" in query(path, "FROM trial_metrics")[0]
+    assert (await merge_runner(*asked)).err == ""

@@ -7,10 +7,8 @@ replay.comparison = (scene, { changed }) => {
     at("ghost-key").hidden = words.length === 0;
     at("ghost-key").replaceChildren(...words);
   };
-  const elsewhere = () => ["merge", "end", "lateral"].some((name) => scene.ghost.track[name] !== scene.trial.track[name]);
   const described = () => [
     "dashed: ", replay.element("a", { href: scene.ghost.page }, scene.ghost.label), `. ${scene.ghost.outcome}`,
-    elsewhere() ? " It drove on another track, and is drawn on this one." : "",
   ];
   // An address names a trial by its name alone, or as NAME@SPEC.
   const lay = async (key, push) => {
