@@ -4,37 +4,71 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec, resolve_name
-from typing import Any
+from io import StringIO
+from tokenize import COMMENT, NL, generate_tokens
 
 from merge_runner.errors import UsageError
 
+SHARED = "merge_runner.drivers"
+# It makes no decision.
+WITHOUT = f"{SHARED}.registry"
+
 
 @cache
-def source_digest(made: Callable[..., Any], ours: str = "", without: str = "") -> str:
-    """SHA-256 of the source of the module of a class or function, and of all that it imports.
+def source_digest(driver: type) -> str:
+    """Return the SHA-256 of the source of a class's module and of all that it imports.
 
-    What it imports counts as far as it belongs to the same package: to ``ours``, a part of this
-    program, or else to the top-level package of somebody else. The module ``without`` never does.
-    A change of the layout alone is a change, too. Raises UsageError where there is no source to
-    read.
+    What it imports counts as far as it belongs to the same top-level package, or to what all
+    drivers share; of this program, that alone. Comments, docstrings and blank lines do not count.
+    Raises UsageError where there is no source to read.
     """
-    top = made.__module__.partition(".")[0]
-    package = ours if ours.startswith(f"{top}.") else top
+    top = driver.__module__.partition(".")[0]
+    packages = (f"{SHARED}.",) if SHARED.startswith(f"{top}.") else (f"{SHARED}.", f"{top}.")
     sources: dict[str, str] = {}
-    waiting = [made.__module__]
+    waiting = [driver.__module__]
     while waiting:
         name = waiting.pop()
-        if name not in {*sources, without} and f"{name}.".startswith(f"{package}."):
+        if name not in {*sources, WITHOUT} and f"{name}.".startswith(packages):
             source = _source(name)
             if source is not None:
                 sources[name] = source
                 waiting += _imported(name, source)
-    if made.__module__ not in sources:
-        raise UsageError(f"{made.__qualname__} is in no module of its own")
-    return hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()
+    if driver.__module__ not in sources:
+        raise UsageError(f"{driver.__qualname__} is in no module of its own")
+    code = [(name, code_of(source)) for name, source in sorted(sources.items())]
+    return hashlib.sha256(repr(code).encode()).hexdigest()
+
+
+@cache
+def code_of(source: str) -> tuple[str, ...]:
+    """Return the lines of a source without comments, docstrings and blank lines.
+
+    Only positions are taken from the parser, since its trees differ between versions of Python.
+    """
+    text = StringIO(source, newline=None).read()
+    lines = text.split("\n")
+    dropped = set()
+    for token in generate_tokens(StringIO(text).readline):
+        row, column = token.start
+        if token.type == COMMENT:
+            lines[row - 1] = lines[row - 1][:column].rstrip()
+        elif token.type == NL and not lines[row - 1].strip():
+            dropped.add(row)
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and _is_text(node.value):
+            first, last = node.lineno, node.end_lineno or node.lineno
+            before = lines[first - 1].encode()[: node.col_offset]
+            after = lines[last - 1].encode()[node.end_col_offset :]
+            if not (before + after).strip():
+                dropped.update(range(first, last + 1))
+    return tuple(line for row, line in enumerate(lines, 1) if row not in dropped)
+
+
+def _is_text(value: ast.expr) -> bool:
+    return isinstance(value, ast.Constant) and isinstance(value.value, str)
 
 
 def _source(name: str) -> str | None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
-from merge_runner.drivers.program_seat import StartsElsewhere
 from merge_runner.errors import CallFailed, ReplayMiss, UsageError
 from merge_runner.perception import Eyes
 from merge_runner.records import (
@@ -80,14 +79,17 @@ async def play_trial(
 
 
 def _starts(drivers: Mapping[Side, Driver]) -> Starts | None:
-    """Where the vehicles start, unless as the condition says; each driver knows best of its own."""
-    known = {
-        side: driver for side, driver in drivers.items() if isinstance(driver, StartsElsewhere)
+    """Return where the vehicles start; None where no driver has ``starts`` of both sides.
+
+    Each side starts as its own driver says, or else as the other's does.
+    """
+    known: dict[Side, Starts] = {
+        side: driver.starts for side, driver in drivers.items() if hasattr(driver, "starts")
     }
     if not known:
         return None
     (some, *_) = known.values()
-    return {side: known.get(side, some).starts[side] for side in SIDES}
+    return {side: known.get(side, some)[side] for side in SIDES}
 
 
 @dataclass(slots=True)

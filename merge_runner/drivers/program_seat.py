@@ -4,23 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 from merge_runner.drivers.base import Seat
-from merge_runner.records import Decision, Side
+from merge_runner.records import Decision
 from merge_runner.scenarios.merge.vehicle import net_acceleration
 
 Parameter = float | str
-
-
-@runtime_checkable
-class StartsElsewhere(Protocol):
-    """A driver whose trial starts elsewhere than its condition says."""
-
-    @property
-    def starts(self) -> Mapping[Side, tuple[float, float]]:
-        """Travelled distance in m and speed in m/s of both sides."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +18,13 @@ class ProgramSeat(Seat):
 
     ``condition`` and ``repetition`` (from 1) are those of the trial. ``other_seed`` is the ``seed``
     of the other side: whatever both sides draw from both seeds, they agree on. ``parameters`` are
-    those of the program, as a study may have set them, and ``data`` is what else it drives by.
+    those of the program, as a study may have set them.
     """
 
     condition: str
     repetition: int
     other_seed: int
     parameters: Mapping[str, Parameter]
-    data: object = None
 
     @property
     def interval_s(self) -> float:

@@ -143,14 +143,15 @@ class Program:
 
     @property
     def source(self) -> str:
-        """The hash of its source, without this module, which makes no decision.
+        """The hash of its source, as ``source_digest`` says.
 
         The world and the records, which it shares with language models, are covered by the version
         of the spec.
         """
         if self.main_source:
             return hashlib.sha256(repr(sorted(self.main_source.items())).encode()).hexdigest()
-        return source_digest(self.driver, __package__, without=__name__)
+        assert isinstance(self.driver, type)
+        return source_digest(self.driver)
 
     @property
     def main_source(self) -> dict[str, str]:
@@ -175,7 +176,6 @@ class Program:
             repetition=spec.repetition,
             other_seed=seeds[other_side(side)],
             parameters=self.values,
-            data=self.data,
         )
 
     def in_spec(self, name: str) -> dict[str, object]:

@@ -1,16 +1,19 @@
 """An edited driver is another driver: no row that it stored before is taken for its own."""
 
 import importlib
+import os
 import shutil
+import subprocess
 import sys
 from importlib.machinery import SourceFileLoader
+from pathlib import Path
 
 import pytest
 
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.run.plan import make_plan
-from merge_runner.source import source_digest
+from merge_runner.source import code_of, source_digest
 from tests.harness import PROJECT
 
 PACKAGE = {
@@ -29,6 +32,20 @@ class Mine:
     "late.py": "LATER = 1\n",
     "unused.py": "nothing = 0\n",
 }
+
+SPEC_HASHES = PROJECT / "tests/golden/reference-spec-hashes.csv"
+PYENV = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
+PYTHONS = [Path(sys.executable), *sorted(PYENV.glob("versions/3.1[1-9].*/bin/python"))]
+# The packages that drivers need are not in every Python: none of ours is imported for its path.
+HASHED = """
+import sys
+from types import ModuleType
+drivers = sys.modules["merge_runner.drivers"] = ModuleType("merge_runner.drivers")
+drivers.__path__ = [sys.argv[1]]
+from merge_runner.source import source_digest
+for module in sys.argv[2:]:
+    print(source_digest(type("Driver", (), {"__module__": module})))
+"""
 
 
 @pytest.fixture
@@ -55,13 +72,51 @@ def test_a_change_of_a_driver_or_of_what_it_rests_on_is_another_driver(digest):
     same = {digest(), digest(), digest(unused="nothing = 1\n")}
     assert len(same) == 1
     changes = {
-        digest(driver=PACKAGE["driver.py"] + "# a remark\n"),
+        digest(driver=PACKAGE["driver.py"] + "REMARK = '# no comment'\n"),
         digest(params="GAP_M = 5.0\n"),
         digest(late="LATER = 2\n"),
         digest(__init__="import plugged.unused\n"),
     }
     assert len(changes) == 4
     assert not same & changes
+
+
+def test_another_wording_of_comments_and_docstrings_is_no_other_driver(digest):
+    named = "class Mine:  # of gaps\n    'A driver.'\n"
+    worded = '"""One."""\n# Two\n' + PACKAGE["driver.py"].replace("class Mine:\n", named)
+    assert digest() == digest(driver=worded, params="\n\nGAP_M = 4.0  # m\n")
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        'X = "# no comment"\n',
+        'X = """a\n\n# no comment\n"""\n',
+        "def f(): 'no line of its own'; g()\n",
+        "X = [\n    'a text'\n]\n",
+        "f'{no} docstring'\n",
+    ],
+)
+def test_code_stays_as_it_is(source):
+    assert "\n".join(code_of(source)) == source
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_what_is_cut_out_are_comments_docstrings_and_blank_lines(end):
+    source = [
+        *('"""Of the', 'module."""', "", "# why", "X = 1  # m", '"""What X is."""'),
+        *("class Ä:", '    "Ä."', "", "    def f(self):", "        '''Does it.'''  # yes"),
+        *("        return (", "            # inside", "", "            1", "        )", ""),
+    ]
+    code = (
+        "X = 1",
+        "class Ä:",
+        "    def f(self):",
+        "        return (",
+        "            1",
+        "        )",
+    )
+    assert code_of(end.join(source)) == (*code, "")
 
 
 def test_a_driver_without_its_source_is_refused(digest, monkeypatch):
@@ -78,14 +133,31 @@ def test_programs_have_a_source_of_their_own_and_share_what_both_rest_on(monkeyp
     read = SourceFileLoader.get_source
 
     def edited(self, name):
-        return read(self, name) + "# edited\n" * (name == "merge_runner.drivers.base")
+        return read(self, name) + "EDITED = 1\n" * (name == "merge_runner.drivers.base")
 
     monkeypatch.setattr(SourceFileLoader, "get_source", edited)
     source_digest.cache_clear()
     after = {name: program.source for name, program in PROGRAMS.items()}
     source_digest.cache_clear()
-    own = [n for n, one in PROGRAMS.items() if one.driver.__module__.startswith("merge_runner.")]
-    assert all(before[name] != after[name] for name in own)
+    assert all(before[name] != after[name] for name in PROGRAMS)
+
+
+def test_the_spec_hashes_of_the_reference_drivers_are_the_committed_ones():
+    """They change with the code of a driver alone: say in the commit why it does."""
+    specs = make_plan("reference", repetitions=1).trial_specs()
+    found = sorted({f"{one.model_left},{one.spec_hash}" for one in specs})
+    assert found == SPEC_HASHES.read_text().splitlines()[1:]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("python", PYTHONS, ids=lambda python: python.parents[1].name)
+def test_the_sources_have_the_same_hash_on_every_python(python):
+    modules = {name: program.driver.__module__ for name, program in PROGRAMS.items()}
+    command = [python, "-c", HASHED, PROJECT / "merge_runner/drivers", *modules.values()]
+    done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True)
+    assert dict(zip(modules, done.stdout.split(), strict=True)) == {
+        name: program.source for name, program in PROGRAMS.items()
+    }
 
 
 @pytest.mark.parametrize("model", ["constant", "projected-order", "emulator+constant"])

@@ -180,18 +180,6 @@ def test_a_world_is_as_fine_as_its_drivers_need_and_otherwise_as_it_was(plan_of)
     assert next(plan.notes()) == note
 
 
-@pytest.mark.parametrize(
-    ("model", "spec_hash"),
-    [
-        ("constant", "16d39b26a2c1fa23"),
-        ("projected-order", "ac229326cf25778d"),
-        ("emulator+constant", "c03416351efdf87b"),
-    ],
-)
-def test_trials_that_were_played_before_programs_had_settable_parameters_stay(model, spec_hash):
-    assert make_plan("baseline", model).trial_specs()[0].spec_hash == spec_hash
-
-
 def test_what_a_sweep_stores_of_its_world_is_what_its_trials_are_played_in(plan_of):
     plan = plan_of("", "braking")
     assert plan.config()["scenario"] == specs(plan)[0]["scenario"]
