@@ -21,7 +21,7 @@ from merge_runner.errors import StoreError, StoreLocked, UsageError
 from merge_runner.scenarios.merge.measures import measures_sql, measures_version
 from merge_runner.text_safety import first_line, quoted
 
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 SCHEMA = Path(__file__).with_name("schema.sql")
 """The tables; see ``schema_sql`` for all that a database has."""
 LOCK_RETRY_S = 0.05
@@ -65,11 +65,7 @@ def update_measures(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def _has_these_measures(connection: duckdb.DuckDBPyConnection) -> bool:
-    found = connection.execute(
-        "SELECT comment FROM duckdb_views() WHERE view_name = 'trial_metrics' "
-        "AND database_name = current_database()"
-    ).fetchall()
-    return found == [(measures_version(),)]
+    return connection.execute("SELECT measures_version()").fetchone() == (measures_version(),)
 
 
 @cache  # warns once per file, which a page may read a hundred times

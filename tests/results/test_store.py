@@ -213,6 +213,18 @@ def test_another_program_s_database_and_a_broken_one_are_refused(tmp_path):
         Store(broken)
 
 
+def test_the_file_itself_says_what_its_columns_mean(store, path):
+    with duckdb.connect(str(path), read_only=True) as connection:
+        said = connection.execute(
+            "SELECT comment FROM duckdb_columns() WHERE (table_name, column_name) IN "
+            "(('trials', 'status'), ('trial_metrics', 'joint')) ORDER BY ALL"
+        ).fetchall()
+    assert said == [
+        ("finished, collided, timeout, failed",),
+        ("whether both are at least 0.5 m/s",),
+    ]
+
+
 @pytest.fixture
 def holder(path):
     """Another process that holds the database until its standard input closes."""

@@ -15,14 +15,17 @@ NO_CONFLICT_MPS = 0.01
 
 
 def measures_sql() -> str:
-    """Definitions that replace older ones, and note in a comment which version they are."""
-    return f"{_definitions()}\nCOMMENT ON VIEW trial_metrics IS '{measures_version()}';\n"
+    """Definitions that replace older ones, and a macro that says which version they are."""
+    version = f"CREATE OR REPLACE MACRO measures_version() AS '{measures_version()}';"
+    return f"{_definitions()}\n{version}\n"
 
 
 def measures_version() -> str:
-    """A hash of the definitions: a database has it as the comment on ``trial_metrics``."""
+    """A hash of the definitions without their comments."""
     lines = (line for line in _definitions().splitlines() if not line.lstrip().startswith("--"))
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+    statements = "\n".join(lines).split(";\n")
+    defined = [text for text in statements if not text.lstrip().startswith("COMMENT ON")]
+    return hashlib.sha256("\n".join(defined).encode()).hexdigest()
 
 
 @cache

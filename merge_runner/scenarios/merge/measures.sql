@@ -1,10 +1,9 @@
 -- The measures of a trial. The numbers of the human experiment are macros such as merge_point_m(),
 -- which measures.py writes before this.
 
--- One row a spec: its vehicles' size, in a human recording that of the experiment, and where the
--- vehicles' boxes overlap (collision.py). With half lengths l, half widths w and each branch at the
--- angle phi from the centreline, the four separating axes are along and across either vehicle. Two vehicles
--- u and v before the merge point are apart in their sums
+-- Where boxes overlap: with half lengths l, half widths w and each branch at the angle phi from the
+-- centreline, the four separating axes are along and across either vehicle. Two vehicles u and v
+-- before the merge point are apart in their sums
 --     |v - u cos 2phi|, |u - v cos 2phi| < along2 = l (1 + cos 2phi) + w sin 2phi
 --     u sin 2phi, v sin 2phi < across2 = w (1 + cos 2phi) + l sin 2phi
 -- and one u before it, the other d behind it, with along and across likewise of phi, in
@@ -34,26 +33,28 @@ WITH sizes AS (
 )
 SELECT
     spec_hash,
-    -- of both vehicles
     length_m,
-    -- of both vehicles
     width_m,
-    -- where the branches meet, along either
     merge_point_m,
-    -- where the track ends
     end_m,
-    -- where a vehicle's centre is when its front reaches the merge point
     merge_point_m - length_m / 2 AS front_m,
-    -- where a vehicle's centre is when its rear has left the merge point
     merge_point_m + length_m / 2 AS rear_m,
-    -- A vehicle at contact_m overlaps the other from there to contact_high_m, one at the merge point
-    -- from merge_low_m to merge_high_m.
     merge_point_m - contact AS contact_m,
     CASE WHEN contact < along THEN merge_point_m + (along - contact) / cos1
         ELSE contact_m + length_m END AS contact_high_m,
     merge_point_m - least(along2, contact) AS merge_low_m,
     merge_point_m + least(along, across / sin1) AS merge_high_m
 FROM reaches;
+COMMENT ON VIEW geometry IS 'One row a spec: its vehicles'' size, in a human recording that of the '
+    'experiment, and where the vehicles'' boxes overlap (collision.py).';
+COMMENT ON COLUMN geometry.length_m IS 'of both vehicles';
+COMMENT ON COLUMN geometry.width_m IS 'of both vehicles';
+COMMENT ON COLUMN geometry.merge_point_m IS 'where the branches meet, along either';
+COMMENT ON COLUMN geometry.end_m IS 'where the track ends';
+COMMENT ON COLUMN geometry.front_m IS 'where a vehicle''s centre is when its front reaches the merge point';
+COMMENT ON COLUMN geometry.rear_m IS 'where a vehicle''s centre is when its rear has left the merge point';
+COMMENT ON COLUMN geometry.contact_m IS 'A vehicle at contact_m overlaps the other from there to '
+    'contact_high_m, one at the merge point from merge_low_m to merge_high_m.';
 
 -- On a collision course for a point: when a vehicle will be there at its present speed, the other
 -- will be within the bounds in which their boxes overlap (Siebinga et al., conflict_signal.py).
@@ -66,7 +67,6 @@ CREATE OR REPLACE MACRO passing_s(level_m, before_m, now_m, before_s, now_s) AS
     CASE WHEN before_m < level_m AND now_m >= level_m
     THEN before_s + (now_s - before_s) * (level_m - before_m) / (now_m - before_m) END;
 
--- One row a sample, both vehicles side by side, the sample before, and the speeds of the first.
 CREATE OR REPLACE VIEW vehicle_pairs AS
 WITH pairs AS (
     SELECT trial_id, spec_hash, step, time_s,
@@ -84,6 +84,8 @@ SELECT *,
     first_value(left_mps) OVER trial AS left_first_mps,
     first_value(right_mps) OVER trial AS right_first_mps
 FROM pairs WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step);
+COMMENT ON VIEW vehicle_pairs IS 'One row a sample, both vehicles side by side, the sample before, '
+    'and the speeds of the first.';
 
 -- What takes the name of samples or times: trial_metrics makes its samples once, as that is most of its
 -- work.
@@ -101,9 +103,9 @@ FROM (SELECT trial_id, spec_hash,
     min(passing_s(rear_m, right_before_m, right_m, time_before_s, time_s)) AS right_rear_s
 FROM query_table(pairs) LEFT JOIN geometry USING (spec_hash) GROUP BY ALL);
 
--- When each vehicle's centre reaches the merge point, when its front does, and when its rear has
--- left it; NULL: never.
 CREATE OR REPLACE VIEW merge_times AS FROM merge_times_in('vehicle_pairs');
+COMMENT ON VIEW merge_times IS 'When each vehicle''s centre reaches the merge point, when its front '
+    'does, and when its rear has left it; NULL: never.';
 
 -- Squares are added in the order of time: threads would add them in any, and round differently.
 CREATE OR REPLACE MACRO speed_deviations_in(pairs, times) AS TABLE
@@ -129,16 +131,14 @@ WHERE status = 'finished' AND CASE time_window
     ELSE true END
 GROUP BY ALL);
 
--- RMSE of each vehicle's speed from its initial speed, over four readings of "the interaction
--- window": from the start of control to the first vehicle's merge, to the second's, to the end,
--- and the whole trial with the tunnel where it was recorded. A window ends with the first sample
--- at which it is over. A human's speed is compared with that of the condition, which the
--- simulator gave the vehicle; a recording begins up to a step later.
 CREATE OR REPLACE VIEW speed_deviations AS
 FROM speed_deviations_in('vehicle_pairs', 'merge_times');
+COMMENT ON VIEW speed_deviations IS 'RMSE of each vehicle''s speed from its initial speed, over '
+    'four readings of "the interaction window": from the start of control to the first vehicle''s '
+    'merge, to the second''s, to the end, and the whole trial with the tunnel where it was recorded. '
+    'A window ends with the first sample at which it is over. A human''s speed is compared with that '
+    'of the condition, which the simulator gave the vehicle; a recording begins up to a step later.';
 
--- One row a trial. What a trial has no value for is NULL: gaps, speed deviations and joint are
--- those of finished trials (arXiv 2604.09609, sec. II-G).
 CREATE OR REPLACE VIEW trial_metrics AS
 WITH pairs AS MATERIALIZED (FROM vehicle_pairs),
 -- Were these kept as well, the samples of all trials would be read for one of them.
@@ -187,36 +187,19 @@ distances AS (
 SELECT
     trials.trial_id,
     trials.spec_hash,
-    -- net gap, |s_left - s_right| less the vehicle length of the trial's spec, when the first vehicle
-    -- reaches the merge point, interpolated linearly within the step; finished trials
     CASE WHEN finished THEN merge_m - length_m END AS gap_m,
-    -- the same at the first sample at or after that instant
     CASE WHEN finished THEN first_sample_m - length_m END AS gap_first_sample_m,
-    -- the same at the first sample at which the mean position has reached the merge point (Siebinga et
-    -- al.; 100 m in the human experiment)
     CASE WHEN finished THEN mean_at_merge_m - length_m END AS gap_mean100_m,
-    -- RMSE of the left vehicle's speed from its initial speed, from the start of control to the first
-    -- sample after the first merge
     rmse_left_mps,
-    -- the same of the right vehicle
     rmse_right_mps,
-    -- the mean of both
     rmse_mps,
-    -- whether both are at least 0.5 m/s
     joint,
-    -- when the first vehicle reaches the merge point
     first_s AS time_to_merge_s,
-    -- between the two vehicles' arrivals there
     CASE WHEN finished THEN abs(left_s - right_s) END AS merge_interval_s,
-    -- from when the first vehicle's rear has left the merge point to when the second's front is there
     CASE WHEN finished AND left_s < right_s THEN right_front_s - left_rear_s
         WHEN finished THEN left_front_s - right_rear_s END AS post_encroachment_s,
-    -- smallest time to collision once a vehicle is past the merge point; NULL if they never close in
-    -- faster than 0.01 m/s: no conflict
     min_ttc_s,
-    -- largest absolute acceleration of either vehicle under the drivers' control
     max_acceleration_mps2,
-    -- when the vehicles are first off a collision course; NULL after a collision
     CASE WHEN status <> 'collided' THEN conflict_resolution_s END AS conflict_resolution_s
 FROM (SELECT *, status = 'finished' AS finished FROM trials) AS trials
 LEFT JOIN times USING (trial_id, spec_hash)
@@ -227,3 +210,26 @@ LEFT JOIN (FROM speed_deviations_in('pairs', 'times') WHERE time_window = 'first
     USING (trial_id, spec_hash)
 LEFT JOIN collision_times USING (trial_id, spec_hash)
 LEFT JOIN resolutions USING (trial_id, spec_hash);
+COMMENT ON VIEW trial_metrics IS 'One row a trial. What a trial has no value for is NULL: gaps, '
+    'speed deviations and joint are those of finished trials (arXiv 2604.09609, sec. II-G).';
+COMMENT ON COLUMN trial_metrics.gap_m IS 'net gap, |s_left - s_right| less the vehicle length of '
+    'the trial''s spec, when the first vehicle reaches the merge point, interpolated linearly within '
+    'the step; finished trials';
+COMMENT ON COLUMN trial_metrics.gap_first_sample_m IS 'the same at the first sample at or after that instant';
+COMMENT ON COLUMN trial_metrics.gap_mean100_m IS 'the same at the first sample at which the mean '
+    'position has reached the merge point (Siebinga et al.; 100 m in the human experiment)';
+COMMENT ON COLUMN trial_metrics.rmse_left_mps IS 'RMSE of the left vehicle''s speed from its '
+    'initial speed, from the start of control to the first sample after the first merge';
+COMMENT ON COLUMN trial_metrics.rmse_right_mps IS 'the same of the right vehicle';
+COMMENT ON COLUMN trial_metrics.rmse_mps IS 'the mean of both';
+COMMENT ON COLUMN trial_metrics.joint IS 'whether both are at least 0.5 m/s';
+COMMENT ON COLUMN trial_metrics.time_to_merge_s IS 'when the first vehicle reaches the merge point';
+COMMENT ON COLUMN trial_metrics.merge_interval_s IS 'between the two vehicles'' arrivals there';
+COMMENT ON COLUMN trial_metrics.post_encroachment_s IS 'from when the first vehicle''s rear has '
+    'left the merge point to when the second''s front is there';
+COMMENT ON COLUMN trial_metrics.min_ttc_s IS 'smallest time to collision once a vehicle is past the '
+    'merge point; NULL if they never close in faster than 0.01 m/s: no conflict';
+COMMENT ON COLUMN trial_metrics.max_acceleration_mps2 IS 'largest absolute acceleration of either '
+    'vehicle under the drivers'' control';
+COMMENT ON COLUMN trial_metrics.conflict_resolution_s IS 'when the vehicles are first off a '
+    'collision course; NULL after a collision';

@@ -28,6 +28,7 @@ def version(monkeypatch):
 
 def test_a_remark_is_no_other_version_of_the_measures_and_a_definition_is(version):
     assert version("") == version("-- A remark.\n") == version("    -- Another one.\n")
+    assert version("") == version("COMMENT ON VIEW trial_metrics IS 'what it means';\n")
     assert version("") != version("SELECT 1;\n")
 
 
@@ -47,6 +48,7 @@ async def test_older_measures_are_told_to_a_reader_and_replaced_when_the_databas
     Store(path)
     with duckdb.connect(str(path)) as connection:
         connection.execute("CREATE OR REPLACE VIEW trial_metrics AS SELECT 1 AS old")
+        connection.execute("CREATE OR REPLACE MACRO measures_version() AS 'another'")
     asked = ("sql", "FROM trial_metrics", "--db", path)
     told = await merge_runner(*asked)
     assert (told.code, told.out.split()[0]) == (0, "old")
