@@ -1,4 +1,4 @@
-"""Caps on what sweeps spend, over all their runs, that hold whatever happens.
+"""A cap on what a sweep spends, over all its runs, that holds whatever happens.
 
 The worst case of an attempt is set aside when it queues for its turn, and durably, in the ledger,
 right before it is sent. ``async with budget.attempt(...)`` surrounds all that; PaidAttempt says
@@ -22,14 +22,13 @@ import asyncio
 import bisect
 import contextlib
 import itertools
-from collections import defaultdict
-from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.cache import CachedCall
-from merge_runner.llm.ledger import NO_CAPS, TOLERANCE_USD, Asked, Caps, Ledger, Spending
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger, Spending
 from merge_runner.llm.shared_services import CachePort
 from merge_runner.llm.trial_costs import TrialCosts
 from merge_runner.records import Attempt
@@ -38,6 +37,13 @@ from merge_runner.records import Attempt
 # money: after this long, with nothing in flight, it is no longer counted on.
 PATIENCE_S = 90.0
 NOTHING_EXPECTED = TrialCosts(str, {}, {})
+
+
+@dataclass(slots=True)
+class TrialAccount:
+    """What a trial that has begun was charged in USD, with what is set aside for its attempts."""
+
+    charged_usd: float = 0.0
 
 
 @dataclass(slots=True)
@@ -62,8 +68,8 @@ class PaidAttempt:
     asked: Asked
     aside_usd: float = 0.0
     queued: bool = True
-    # What its trial was charged, by model; a trial that begins anew has another account.
-    account: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    # That of its trial; a trial that begins anew has another one.
+    account: TrialAccount = field(default_factory=TrialAccount)
     _cost_usd: float | None = None
 
     @property
@@ -78,9 +84,9 @@ class PaidAttempt:
         await self.budget.make_durable(self, attempts)
 
     def set_aside(self, attempts: Sequence[Attempt]) -> bool:
-        """An operation on the cache: the durable part of ``begin``; False if a cap is used up."""
+        """An operation on the cache: the durable part of ``begin``; False if the cap is used up."""
         return self.ledger.set_aside(
-            self.key, attempts, self.aside_usd, self.budget.caps, self.asked
+            self.key, attempts, self.aside_usd, self.budget.cap_usd, self.asked
         )
 
     def begun(self) -> None:
@@ -105,39 +111,6 @@ class PaidAttempt:
         self.budget.end(self)
 
 
-@dataclass(slots=True)
-class Pot:
-    """The money under one cap, in USD: that of one model, or of all (None).
-
-    ``queued_usd`` is set aside in this process alone; ``in_flight`` counts the attempts with money
-    of this pot, and ``largest_usd`` is the most that was set aside for one.
-    """
-
-    model: str | None
-    cap_usd: float
-    in_flight: int = 0
-    queued_usd: float = 0.0
-    largest_usd: float = 0.0
-
-    def pays(self, models: Collection[str]) -> bool:
-        """Whether it pays for any of these models."""
-        return self.model is None or self.model in models
-
-    def part(self, by_model: Mapping[str, float]) -> float:
-        """The part of such a sum that it pays."""
-        return sum(by_model.values()) if self.model is None else by_model.get(self.model, 0.0)
-
-    def left_usd(self, spending: Spending) -> float:
-        """What is neither spent nor set aside."""
-        return self.cap_usd - spending.committed_for(self.model) - self.queued_usd
-
-    def twice_usd(self, aside_usd: float) -> float:
-        """What must be left beside an attempt so that all in flight may cost twice as much."""
-        # A server that ignores the output cap is known only by its first dear reply, when the
-        # others are sent already.
-        return (self.in_flight + 1) * max(aside_usd, self.largest_usd) if self.in_flight else 0.0
-
-
 @dataclass(slots=True, eq=False)
 class _Place:
     """A place in a line, that of the oldest trial first."""
@@ -148,40 +121,45 @@ class _Place:
 
 
 class Budget:
-    """Spending under the caps in USD; without a cap nothing is refused, and all of it recorded.
+    """Spending under a cap in USD; without one nothing is refused, and all of it recorded.
 
-    A trial is named by its order in the sweep.
+    A trial is named by its order in the sweep. ``in_flight`` counts the attempts that have money,
+    ``queued_usd`` is set aside in this process alone, and ``largest_usd`` is the most that was set
+    aside for one attempt.
     """
 
     def __init__(
-        self, ledger: Ledger, caps: Caps = NO_CAPS, costs: TrialCosts = NOTHING_EXPECTED
+        self,
+        ledger: Ledger,
+        cap_usd: float | None = None,
+        costs: TrialCosts = NOTHING_EXPECTED,
     ) -> None:
         self.ledger = ledger
-        self.caps = caps
+        self.cap_usd = cap_usd
         self.costs = costs
-        self._pots = [Pot(model, cap_usd) for model, cap_usd in caps]
-        # What each trial that has begun was charged, and has set aside, by model.
-        self._begun: dict[int, defaultdict[str, float]] = {}
+        self.in_flight = 0
+        self.queued_usd = 0.0
+        self._largest_usd = 0.0
+        self._spent_before = ledger.spending.committed_usd > 0
+        self._asked: set[str] = set()
+        self._begun: dict[int, TrialAccount] = {}
         self._left: set[int] = set()
-        # Trials at the door by the models that they ask, attempts by their model: where one cap is
-        # used up, what other caps pay for goes on.
-        self._door: defaultdict[frozenset[str], list[_Place]] = defaultdict(list)
-        self._attempts: defaultdict[str, list[_Place]] = defaultdict(list)
+        self._door: list[_Place] = []
+        self._attempts: list[_Place] = []
         self._numbers = itertools.count()
 
     async def admit(self, trial: int) -> None:
         """Wait until a trial may begin; raises TrialSuspended when no trial's end can let it."""
-        if not self._pots or trial in self._begun:
+        if self.cap_usd is None or trial in self._begun:
             return
         if trial in self._left:
             raise TrialSuspended("its trial is suspended")
-        line = self._door[frozenset(self.costs.of(trial))]
-        await self._in_line(line, trial, lambda first, _: self._begins(trial, first))
+        await self._in_line(self._door, trial, lambda first, _: self._begins(trial, first))
 
     def begin_anew(self, trial: int) -> None:
         """The trial goes on where an earlier run has asked for it, so that it waits for nothing."""
-        if self._pots and trial not in self._left:
-            self._begun.setdefault(trial, defaultdict(float))
+        if self.cap_usd is not None and trial not in self._left:
+            self._begun.setdefault(trial, TrialAccount())
 
     def leave(self, trial: int) -> None:
         """The trial has ended or is suspended, and needs no more money."""
@@ -212,12 +190,11 @@ class Budget:
         caller closes what is returned; ``attempt`` does so by itself.
         """
         paid = PaidAttempt(self, self.ledger, trial, key, asked)
-        if not self._pots:
-            paid.aside_usd = self._expected_usd(asked)
+        if self.cap_usd is None:
+            self._take(paid, self._expected_usd(asked))
         else:
-            line = self._attempts[asked.model]
             await self._in_line(
-                line, trial, lambda first, waited_s: first and self._taken(paid, waited_s)
+                self._attempts, trial, lambda first, waited_s: first and self._taken(paid, waited_s)
             )
         return paid
 
@@ -228,10 +205,9 @@ class Budget:
         """The money of an attempt that an earlier run has begun, under the ledger of this name."""
         ledger = self.ledger.other(scope)
         paid = PaidAttempt(self, ledger, trial, key, asked, ledger.aside_usd(key), queued=False)
-        for pot in self._pots_of(asked):
-            pot.in_flight += 1
+        self.in_flight += 1
         paid.account = self._begun.get(trial, paid.account)
-        paid.account[asked.model] += paid.aside_usd
+        paid.account.charged_usd += paid.aside_usd
         try:
             yield paid
         finally:
@@ -239,15 +215,16 @@ class Budget:
 
     async def make_durable(self, paid: PaidAttempt, attempts: Sequence[Attempt]) -> None:
         """Move what is set aside for an attempt to the ledger; raises TrialSuspended."""
-        if not await self.ledger.reserve(paid.key, attempts, paid.aside_usd, self.caps, paid.asked):
+        if not await self.ledger.reserve(
+            paid.key, attempts, paid.aside_usd, self.cap_usd, paid.asked
+        ):
             raise TrialSuspended("another run spends from the same cap, and has used it up")
         self.unqueue(paid)
 
     def end(self, paid: PaidAttempt) -> None:
         """An attempt has ended."""
-        for pot in self._pots_of(paid.asked):
-            pot.in_flight -= 1
-        paid.account[paid.asked.model] += paid.charged_usd - paid.aside_usd
+        self.in_flight -= 1
+        paid.account.charged_usd += paid.charged_usd - paid.aside_usd
         if paid.queued:
             self.unqueue(paid)
         self._tell()
@@ -255,8 +232,7 @@ class Budget:
     def unqueue(self, paid: PaidAttempt) -> None:
         """What is set aside for an attempt lies in the ledger now, or is given back."""
         paid.queued = False
-        for pot in self._pots_of(paid.asked):
-            pot.queued_usd -= paid.aside_usd
+        self.queued_usd -= paid.aside_usd
 
     def _begins(self, trial: int, first: bool) -> bool:
         """Whether a trial may begin: there is money for it beside all that have begun."""
@@ -264,67 +240,58 @@ class Budget:
             return True
         if not first:
             return False
-        needed, spending = self.costs.of(trial), self.ledger.read()
-        for pot in self._pots:
-            if not pot.pays(needed):
-                continue
-            begun = [other for other in self._begun if pot.pays(self.costs.of(other))]
-            beside_usd = self._needed_usd(pot, begun) + self._before_usd(pot, trial)
-            left_usd = pot.left_usd(spending) - pot.part(needed) + TOLERANCE_USD
-            if left_usd < 0 and not begun and not pot.in_flight:
-                if not any(map(spending.committed_for, needed)):
-                    continue  # the first one shows what a trial costs; each attempt must still fit
-                raise self._suspended(
-                    f"a whole trial may cost {pot.part(needed):.2f} USD", pot, spending
-                )
-            if left_usd < beside_usd:
-                return False
-        self._begun[trial] = defaultdict(float)
+        needed_usd, spending = self.costs.usd(trial), self.ledger.read()
+        left_usd = self._left_usd(spending) - needed_usd + TOLERANCE_USD
+        if left_usd < 0 and not self._begun and not self.in_flight:
+            if self._spent_before or not self._asked.isdisjoint(self.costs.models(trial)):
+                raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD", spending)
+            # The first one of a model shows what a trial costs; each attempt must still fit.
+        elif left_usd < self._needed_usd(self._begun):
+            return False
+        self._begun[trial] = TrialAccount()
         return True
 
     def _taken(self, paid: PaidAttempt, waited_s: float) -> bool:
         """Whether there is money for an attempt, which is taken."""
         aside_usd, spending = self._expected_usd(paid.asked), self.ledger.read()
-        pots = self._pots_of(paid.asked)
-        for pot in pots:
-            left_usd = pot.left_usd(spending) - aside_usd + TOLERANCE_USD
-            if left_usd < 0 and not pot.in_flight:
-                raise self._suspended(f"the next call may cost {aside_usd:.4f} USD", pot, spending)
-            counted_on = pot.in_flight or waited_s < PATIENCE_S
-            older = (trial for trial in self._begun if trial < paid.trial and counted_on)
-            older_usd = self._needed_usd(pot, older)
-            if left_usd < max(older_usd, pot.twice_usd(aside_usd)):
-                return False
-        for pot in pots:
-            pot.in_flight += 1
-            pot.queued_usd += aside_usd
-            pot.largest_usd = max(pot.largest_usd, aside_usd)
+        left_usd = self._left_usd(spending) - aside_usd + TOLERANCE_USD
+        if left_usd < 0 and not self.in_flight:
+            raise self._suspended(f"the next call may cost {aside_usd:.4f} USD", spending)
+        counted_on = self.in_flight or waited_s < PATIENCE_S
+        older = (trial for trial in self._begun if trial < paid.trial and counted_on)
+        if left_usd < max(self._needed_usd(older), self._twice_usd(aside_usd)):
+            return False
+        self._take(paid, aside_usd)
+        return True
+
+    def _take(self, paid: PaidAttempt, aside_usd: float) -> None:
+        self.in_flight += 1
+        self.queued_usd += aside_usd
+        self._largest_usd = max(self._largest_usd, aside_usd)
+        self._asked.add(paid.asked.model)
         paid.aside_usd = aside_usd
         paid.account = self._begun.get(paid.trial, paid.account)
-        paid.account[paid.asked.model] += aside_usd
-        return True
+        paid.account.charged_usd += aside_usd
 
     def _expected_usd(self, asked: Asked) -> float:
         """The worst case, as many times as this driver's dearest reply has cost it."""
         return asked.honest_usd * self.ledger.spending.times(asked.driver)
 
-    def _pots_of(self, asked: Asked) -> list[Pot]:
-        return [pot for pot in self._pots if pot.pays((asked.model,))]
+    def _left_usd(self, spending: Spending) -> float:
+        """What is neither spent nor set aside."""
+        assert self.cap_usd is not None
+        return self.cap_usd - spending.committed_usd - self.queued_usd
 
-    def _needed_usd(self, pot: Pot, trials: Iterable[int]) -> float:
-        """What these begun trials are still expected to cost a pot."""
-        return sum(max(0.0, self._rest_usd(pot, trial)) for trial in trials)
+    def _twice_usd(self, aside_usd: float) -> float:
+        """What must be left beside an attempt so that all in flight may cost twice as much."""
+        # A server that ignores the output cap is known only by its first dear reply, when the
+        # others are sent already.
+        return (self.in_flight + 1) * max(aside_usd, self._largest_usd) if self.in_flight else 0.0
 
-    def _rest_usd(self, pot: Pot, trial: int) -> float:
-        return pot.part(self.costs.of(trial)) - pot.part(self._begun[trial])
-
-    def _before_usd(self, pot: Pot, trial: int) -> float:
-        """What older trials will take that are the first of other lines at the door."""
-        first = (places[0].trial for places in self._door.values() if places)
+    def _needed_usd(self, trials: Iterable[int]) -> float:
+        """What these begun trials are still expected to cost."""
         return sum(
-            pot.part(self.costs.of(older))
-            for older in first
-            if older < trial and older not in self._begun
+            max(0.0, self.costs.usd(trial) - self._begun[trial].charged_usd) for trial in trials
         )
 
     async def _in_line(
@@ -345,22 +312,18 @@ class Budget:
 
     def _tell(self) -> None:
         """Something has changed for those who are first in their lines, or may go on anyway."""
-        for line in (*self._door.values(), *self._attempts.values()):
-            for place in line[:1]:
-                place.told.set()
-        for place in itertools.chain.from_iterable(self._door.values()):
+        for place in (*self._door[:1], *self._attempts[:1]):
+            place.told.set()
+        for place in self._door:
             if place.trial in self._begun:
                 place.told.set()
 
-    def _suspended(self, what: str, pot: Pot, spending: Spending) -> TrialSuspended:
-        sums = spending.part(pot.model) if pot.model else spending
-        aside_usd = sums.reserved_usd + pot.queued_usd
-        committed_usd = pot.cap_usd - pot.left_usd(spending)
-        kept_usd = self._needed_usd(pot, self._begun)
+    def _suspended(self, what: str, spending: Spending) -> TrialSuspended:
+        aside_usd = spending.reserved_usd + self.queued_usd
+        kept_usd = self._needed_usd(self._begun)
         return TrialSuspended(
-            f"{what}, and {committed_usd:.4f} of {pot.cap_usd:g} USD"
-            + (f" for {pot.model}" if pot.model else "")
-            + f" are spent or set aside ({sums.spent_usd:.4f} spent"
+            f"{what}, and {spending.spent_usd + aside_usd:.4f} of {self.cap_usd:g} USD are spent "
+            f"or set aside ({spending.spent_usd:.4f} spent"
             + (
                 f", {aside_usd:.4f} set aside for {spending.open_attempts} attempts whose cost is "
                 "not known: `merge-runner ledger`"

@@ -8,7 +8,7 @@ case until a user releases it, and stands in the call's list of attempts with an
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
@@ -83,25 +83,11 @@ class Release:
 
 
 @dataclass(slots=True)
-class Part:
-    """What attempts at one model cost in USD, and what is set aside for others."""
-
-    spent_usd: float = 0.0
-    reserved_usd: float = 0.0
-
-    @property
-    def committed_usd(self) -> float:
-        """What may have been spent, at worst."""
-        return self.spent_usd + self.reserved_usd
-
-
-@dataclass(slots=True)
 class Spending:
     """In USD: what attempts cost, and what is set aside for those whose cost is not known.
 
     ``open_attempts`` are in flight, or nobody knows what became of them. ``overrun_usd`` is by how
     much replies cost more than their worst case, ``overruns`` the largest such ratio by driver.
-    ``by_model`` splits the sums; what earlier versions noted is in none of its parts.
     """
 
     spent_usd: float = 0.0
@@ -110,24 +96,11 @@ class Spending:
     overrun_usd: float = 0.0
     overruns: dict[str, float] = field(default_factory=dict)
     releases: list[Release] = field(default_factory=list)
-    by_model: dict[str, Part] = field(default_factory=dict)
 
     @property
     def committed_usd(self) -> float:
         """What may have been spent, at worst."""
         return self.spent_usd + self.reserved_usd
-
-    def committed_for(self, model: str | None) -> float:
-        """What may have been spent on a model, at worst; None: on all of them."""
-        if model is None:
-            return self.committed_usd
-        named = {name: part.committed_usd for name, part in self.by_model.items() if name}
-        unnamed_usd = max(0.0, self.committed_usd - sum(named.values()))
-        return named.get(model, 0.0) + unnamed_usd
-
-    def part(self, model: str) -> Part:
-        """The part of a model."""
-        return self.by_model.setdefault(model, Part())
 
     def times(self, driver: str) -> float:
         """How often the worst case is set aside: more than once where a server ignores the cap."""
@@ -140,57 +113,6 @@ class Spending:
         return ", ".join(f"{driver} up to {ratio:.2f} times as much" for driver, ratio in ratios)
 
 
-@dataclass(frozen=True, slots=True)
-class Caps:
-    """The most that may be spent under one ledger in USD: on all models, and on single ones.
-
-    ``by_model`` names models of the registry. What is None or not named has no cap of its own.
-    """
-
-    total_usd: float | None = None
-    by_model: Mapping[str, float] = field(default_factory=dict)
-
-    def __iter__(self) -> Iterator[tuple[str | None, float]]:
-        """Each cap with its model, None for that of all."""
-        if self.total_usd is not None:
-            yield None, self.total_usd
-        yield from self.by_model.items()
-
-    def pays(self, usd: float, model: str, spending: Spending) -> bool:
-        """Whether so much more may be spent on a model."""
-        return all(
-            spending.committed_for(name) + usd <= cap_usd + TOLERANCE_USD
-            for name, cap_usd in self
-            if name in (None, model)
-        )
-
-    def check(self, paid: Collection[str], named: Collection[str] = ()) -> None:
-        """Raise UsageError where a split does not suit the paid models of a study.
-
-        ``named`` are others that its file names, of which this run asks none.
-        """
-        if not self.by_model:
-            return
-        names = ", ".join(sorted(paid))
-        if missing := sorted({*paid} - {*self.by_model}):
-            raise UsageError(
-                f"the budget is split by model, and {', '.join(missing)} has no part: give one to "
-                f"each of {names}"
-            )
-        if unknown := sorted({*self.by_model} - {*paid, *named}):
-            raise UsageError(
-                f"the budget has a part for {', '.join(unknown)}, which the study does not pay "
-                f"for; valid: {names or 'none'}"
-            )
-        parts_usd = sum(self.by_model.values())
-        if self.total_usd is not None and parts_usd > self.total_usd + TOLERANCE_USD:
-            raise UsageError(
-                f"the parts of the budget sum up to {parts_usd:g} USD, and the total is "
-                f"{self.total_usd:g}: lower the parts or raise the total"
-            )
-
-
-NO_CAPS = Caps()
 _SPENDING = TypeAdapter(Spending)
 _SET_ASIDE = TypeAdapter(list[SetAside])
 
@@ -221,12 +143,12 @@ class Ledger:
         key: str,
         attempts: Sequence[Attempt],
         worst_usd: float,
-        caps: Caps,
+        cap_usd: float | None,
         asked: Asked,
     ) -> bool:
-        """Set the worst case of a call's next attempt aside; False if that exceeds a cap."""
+        """Set the worst case of a call's next attempt aside; False if that exceeds the cap."""
         return await self._cache.write(
-            lambda: self.set_aside(key, attempts, worst_usd, caps, asked)
+            lambda: self.set_aside(key, attempts, worst_usd, cap_usd, asked)
         )
 
     def set_aside(
@@ -234,16 +156,16 @@ class Ledger:
         key: str,
         attempts: Sequence[Attempt],
         worst_usd: float,
-        caps: Caps,
+        cap_usd: float | None,
         asked: Asked,
     ) -> bool:
         """An operation on the cache: what ``reserve`` does."""
         # Read within the transaction: another process may have spent since.
         spending = self.read()
-        if not caps.pays(worst_usd, asked.model, spending):
+        committed_usd = spending.committed_usd + worst_usd
+        if cap_usd is not None and committed_usd > cap_usd + TOLERANCE_USD:
             return False
         spending.reserved_usd += worst_usd
-        spending.part(asked.model).reserved_usd += worst_usd
         spending.open_attempts += 1
         self._write(spending)
         self._write_open(key, [*self._opened(key), SetAside(worst_usd, asked, _now())])
@@ -298,8 +220,7 @@ class Ledger:
             spending = self.read()
             reasons = tuple(self.reasons())
             released = Release(_now(), spending.reserved_usd, spending.open_attempts, reasons)
-            spending.open_attempts = 0
-            _nothing_aside(spending)
+            spending.open_attempts, spending.reserved_usd = 0, 0.0
             spending.releases.append(released)
             self._write(spending)
             for name in self._cache.names(self._open):
@@ -323,13 +244,12 @@ class Ledger:
             return  # it stays set aside: it may have been charged
         self._write_open(key, earlier)
         spending = self.read()
-        for sums in (spending, spending.part(one.asked.model)):
-            sums.spent_usd += actual_usd
-            sums.reserved_usd = max(0.0, sums.reserved_usd - worst_usd)
+        spending.spent_usd += actual_usd
+        spending.reserved_usd = max(0.0, spending.reserved_usd - worst_usd)
         if not released:
             spending.open_attempts -= 1
         if not spending.open_attempts:
-            _nothing_aside(spending)  # what is left is rounding
+            spending.reserved_usd = 0.0  # what is left is rounding
         if not released and actual_usd > worst_usd + TOLERANCE_USD:
             spending.overrun_usd += actual_usd - worst_usd
             driver, honest_usd = one.asked.driver, one.asked.honest_usd or worst_usd
@@ -371,12 +291,6 @@ class Ledger:
     def _write(self, spending: Spending) -> None:
         self.spending = spending
         self._cache.replace_twice(self._name, _SPENDING.dump_json(spending).decode())
-
-
-def _nothing_aside(spending: Spending) -> None:
-    spending.reserved_usd = 0.0
-    for part in spending.by_model.values():
-        part.reserved_usd = 0.0
 
 
 def _begun(number: int) -> Attempt:

@@ -7,7 +7,7 @@ aside. Before anything is measured a trial is expected to cost as much as it can
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 # Trials that turn out longer, and attempts that are charged but bring no answer.
@@ -63,15 +63,19 @@ class TrialCosts:
         self._calls = calls
         self._by_model = defaultdict(Answers, earlier)
         self._by_cell: defaultdict[tuple[str, str], Answers] = defaultdict(Answers)
-        self._expected: dict[str, Mapping[str, float]] = {}
+        self._expected: dict[str, float] = {}
 
-    def of(self, trial: int) -> Mapping[str, float]:
-        """What the trial is expected to cost in USD, by model."""
+    def usd(self, trial: int) -> float:
+        """What the trial is expected to cost in USD."""
         cell = self._cell_of(trial)
         if cell not in self._expected:
             calls = self._calls.get(cell, {})
-            self._expected[cell] = {model: self._usd(cell, model) for model in calls}
+            self._expected[cell] = sum(self._usd(cell, model) for model in calls)
         return self._expected[cell]
+
+    def models(self, trial: int) -> Collection[str]:
+        """The models that the trial asks."""
+        return self._calls.get(self._cell_of(trial), {})
 
     def learn(self, trial: int, model: str, usd: float) -> None:
         """An answer to a call of this trial cost so much."""

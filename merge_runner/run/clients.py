@@ -28,7 +28,7 @@ from merge_runner.llm.budget import Budget, Unpaid
 from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
-from merge_runner.llm.ledger import NO_CAPS, Ledger
+from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import is_known
@@ -91,10 +91,10 @@ def open_services(
     """The services of a run.
 
     ``measured`` is what the cache knows about each model's earlier answers to similar requests.
-    Raises UsageError where a spending cap could not be enforced.
+    Raises UsageError where a cap could not be enforced.
     """
     for name, entry in plan.entries.items():
-        if options.caps != NO_CAPS and not is_known(entry):
+        if options.max_cost_usd is not None and not is_known(entry):
             raise UsageError(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
@@ -115,7 +115,7 @@ def open_services(
             by_model[model] = Limiter(rpm=rpm, tpm=tpm, pause=pause, window_s=window_s)
         limiters[name] = by_model[model]
     costs = trial_costs(plan, measured, batch=options.batch)
-    budget = Budget(ledger, options.caps, costs)
+    budget = Budget(ledger, options.max_cost_usd, costs)
     return LocalServices(limiters=limiters, budget=budget)
 
 

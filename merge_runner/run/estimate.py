@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from merge_runner.config import ModelEntry, driver_name
 from merge_runner.llm.batch.modes import batch_terms
 from merge_runner.llm.cache import CallTotals
-from merge_runner.llm.ledger import NO_CAPS, Caps, Spending
+from merge_runner.llm.ledger import Spending
 from merge_runner.llm.prices import cost_usd
 from merge_runner.llm.trial_costs import Answers, TrialCalls, TrialCosts
 from merge_runner.prompts.render import render_prompt
@@ -150,7 +150,8 @@ def estimate(
     }
     whole = [made for cell in calls.values() for made in cell]
     shares = {
-        label: _share_within(options.caps, spending, cell, whole) for label, cell in calls.items()
+        label: _share_within(options.max_cost_usd, spending, cell, whole)
+        for label, cell in calls.items()
     }
     cells = tuple(
         CellEstimate(
@@ -227,25 +228,21 @@ def _sums(calls: Sequence[_Calls]) -> tuple[int, int, int, float | None]:
 
 
 def _share_within(
-    caps: Caps, spending: Spending, calls: Sequence[_Calls], whole: Sequence[_Calls]
+    cap_usd: float | None, spending: Spending, calls: Sequence[_Calls], whole: Sequence[_Calls]
 ) -> float | None:
-    """The part of a cell's calls that the money left buys; None without a cap or a price.
+    """Return the part of a cell's calls that the money left buys; None without a cap or a price.
 
-    Each cap is spread evenly over what draws on it in the ``whole`` run.
+    The money is spread evenly over what the ``whole`` run costs.
     """
-    if caps == NO_CAPS or any(each.cost_usd is None for each in whole):
+    if cap_usd is None or any(each.cost_usd is None for each in whole):
         return None
-    shares = [1.0]
-    for model, cap_usd in caps:
-        if _usd(calls, model):
-            left_usd = cap_usd - spending.committed_for(model)
-            shares.append(left_usd / _usd(whole, model))
-    return max(0.0, min(shares))
+    if not _usd(calls):
+        return 1.0
+    return max(0.0, min(1.0, (cap_usd - spending.committed_usd) / _usd(whole)))
 
 
-def _usd(calls: Sequence[_Calls], model: str | None) -> float:
-    """What calls cost a cap: that of one model, or None, that of all."""
-    return sum(each.paid_usd or 0.0 for each in calls if model in (None, each.model))
+def _usd(calls: Sequence[_Calls]) -> float:
+    return sum(each.paid_usd or 0.0 for each in calls)
 
 
 def _within(shares: Mapping[str, float | None], todo: Mapping[str, Todo]) -> int | None:

@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -24,7 +24,6 @@ from merge_runner.drivers.registry import PROGRAMS, HumanTrials, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.ledger import Caps
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
 from merge_runner.records import SIDES, Side, TrialSpec
@@ -44,7 +43,6 @@ from merge_runner.study.crossing import (
     Arm,
     chosen_models,
     cross,
-    driver_names,
     file_prompts,
     listed_levels,
 )
@@ -68,7 +66,7 @@ class Options:
     """How a sweep runs; nothing here changes a result.
 
     ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
-    those of other sweeps. ``split_usd`` caps what single models cost.
+    those of other sweeps.
     ``dask`` names the cluster that plays the trials; if None, this process plays them.
     ``faults_identity`` keeps the answers of an emulator that was told to misbehave apart from those
     of the usual one. A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that
@@ -83,7 +81,6 @@ class Options:
     tpm: int | None = None
     max_cost_usd: float | None = None
     ledgers: Sequence[str] = ()
-    split_usd: Mapping[str, float] = field(default_factory=dict)
     replay: bool = False
     recordings: Sequence[Path] = ()
     emulator_options: Sequence[str] = ()
@@ -94,11 +91,6 @@ class Options:
     dask: str | None = None
     dry_run: bool = False
     batch: bool = False
-
-    @property
-    def caps(self) -> Caps:
-        """What may be spent over all runs."""
-        return Caps(self.max_cost_usd, self.split_usd)
 
     @property
     def connections(self) -> int:
@@ -211,16 +203,10 @@ class Plan:
         return ", ".join(names[:DRIVERS_SHOWN]) + more
 
     def within_budget(self, options: Options) -> Options:
-        """The options with the caps of the study's budget; ``--max-cost`` goes before its total.
-
-        Raises UsageError where a split does not suit the models.
-        """
-        budget = self.study.file.budget
-        total_usd = budget.total_usd if options.max_cost_usd is None else options.max_cost_usd
-        paid = {self.registered[n] for n, entry in self.entries.items() if entry.price != "free"}
-        named = driver_names(self.study.file, self.study.file.models)
-        Caps(budget.total_usd, budget.split).check(paid, named | {*self.registered.values()})
-        return replace(options, max_cost_usd=total_usd, split_usd=budget.split)
+        """Return the options with the cap of the study's budget; ``--max-cost`` goes before it."""
+        if options.max_cost_usd is not None:
+            return options
+        return replace(options, max_cost_usd=self.study.file.budget.total_usd)
 
     def notes(self) -> Iterator[str]:
         """What a user may have meant otherwise."""

@@ -38,12 +38,6 @@ class Account:
             f"{self.sweep}: {spending.spent_usd:.4f} USD spent, {spending.reserved_usd:.4f} set "
             f"aside for {spending.open_attempts} attempts whose cost is not known"
         )
-        if len(spending.by_model) > 1:
-            for model, part in spending.by_model.items():
-                yield (
-                    f"  {model or 'of unknown models'}: {part.spent_usd:.4f} USD spent, "
-                    f"{part.reserved_usd:.4f} set aside"
-                )
         for reason in self.reasons:
             yield f"  {reason.usd:.4f} USD for {_reason_text(reason)}"
         if spending.overrun_usd:

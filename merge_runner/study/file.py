@@ -119,10 +119,9 @@ class StudyCondition(Frozen):
 
 
 class BudgetTerms(Frozen):
-    """What a study may cost, in USD over all models, runs and days; ``split`` caps models."""
+    """What a study may cost, in USD over all models, runs and days."""
 
     total_usd: NotNegative | None = None
-    split: dict[str, NotNegative] = Field(default_factory=dict)
 
 
 class StudyDriver(Frozen):

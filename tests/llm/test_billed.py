@@ -26,7 +26,7 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.ledger import Caps, Ledger
+from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Slot, Usage
@@ -166,7 +166,7 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
         worst = cost_usd(entry, client._worst_case(client._request(PROMPT, slot(0))))
         client.first = first or client.first
         ledger = Ledger(cache, name)
-        client.budget = Budget(ledger, Caps(cap * worst), each(worst, "my-model"))
+        client.budget = Budget(ledger, cap * worst, each(worst, "my-model"))
 
         async def ask(number):
             try:

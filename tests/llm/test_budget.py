@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from merge_runner.errors import TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.ledger import NO_CAPS, Asked, Caps, Ledger
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.trial_costs import TrialCalls, TrialCosts
 from merge_runner.records import Attempt, ChatRequest, Slot
 from tests.harness import each
 
-CAP, PART = 100, 60
+CAP = 100
 KEYS = itertools.count()
 calls = st.lists(
     st.tuples(
@@ -79,13 +79,12 @@ async def soon(job):
 @given(calls, st.integers(0, 60))
 def test_what_is_spent_and_set_aside_never_exceeds_the_cap(plan, trial_usd):
     async def all_calls(ledger):
-        budget = Budget(ledger, Caps(CAP, {"m": PART}), each(trial_usd))
+        budget = Budget(ledger, CAP, each(trial_usd))
         reserve = ledger.reserve
 
         async def watched(*arguments):
             begun = await reserve(*arguments)
             assert ledger.spending.committed_usd <= CAP + 1e-6
-            assert ledger.spending.committed_for("m") <= PART + 1e-6
             return begun
 
         ledger.reserve = watched
@@ -114,15 +113,15 @@ def test_what_is_spent_and_set_aside_never_exceeds_the_cap(plan, trial_usd):
 
 
 async def test_spending_is_that_of_all_runs(ledger, cache):
-    await attempt(Budget(ledger, Caps(1.0)), 1, 0.5, 0.4)
-    again = Budget(Ledger(cache, ledger._name.removeprefix("spent ")), Caps(1.0))
+    await attempt(Budget(ledger, 1.0), 1, 0.5, 0.4)
+    again = Budget(Ledger(cache, ledger._name.removeprefix("spent ")), 1.0)
     with pytest.raises(TrialSuspended, match=r"0\.4000 of 1 USD"):
         await attempt(again, 1, 0.7, 0.7)
     await attempt(again, 1, 0.6, 0.6)
 
 
 async def test_an_attempt_of_unknown_cost_counts_with_its_worst_case_for_ever(ledger):
-    budget = Budget(ledger, Caps(1.0))
+    budget = Budget(ledger, 1.0)
     await attempt(budget, 1, 0.75, None)
     with pytest.raises(TrialSuspended):
         await attempt(budget, 1, 0.5, 0.5)
@@ -131,16 +130,16 @@ async def test_an_attempt_of_unknown_cost_counts_with_its_worst_case_for_ever(le
 
 
 async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
-    dead = Budget(ledger, Caps(1.0))
+    dead = Budget(ledger, 1.0)
     paid = await set_aside(dead, 1, 0.75)
     await paid.begin([])
     assert [a.outcome for a in cache.unanswered("key 1")] == ["unknown"]
     with pytest.raises(TrialSuspended):
-        await set_aside(Budget(ledger, Caps(1.0)), 1, 0.5)
+        await set_aside(Budget(ledger, 1.0), 1, 0.5)
 
 
 async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, cache):
-    both = [Budget(Ledger(cache, "shared"), Caps(1.0)) for _ in range(2)]
+    both = [Budget(Ledger(cache, "shared"), 1.0) for _ in range(2)]
     # Neither knows of the other's yet.
     paid = [await set_aside(budget, trial, 0.75) for trial, budget in enumerate(both)]
     await paid[0].begin([])
@@ -150,7 +149,7 @@ async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, ca
 
 
 async def test_a_reservation_waits_for_what_is_in_flight(ledger):
-    budget = Budget(ledger, Caps(1.0))
+    budget = Budget(ledger, 1.0)
     paid = await set_aside(budget, 1, 0.75)
     waiting = await soon(set_aside(budget, 2, 0.5))
     assert not waiting.done()
@@ -159,7 +158,7 @@ async def test_a_reservation_waits_for_what_is_in_flight(ledger):
 
 
 async def test_a_trial_begins_only_where_it_could_end_within_the_cap(ledger):
-    budget = Budget(ledger, Caps(10.0), each(4.0))
+    budget = Budget(ledger, 10.0, each(4.0))
     for trial in (1, 2):
         await attempt(budget, trial, 1.0, 0.5)
     third = await soon(attempt(budget, 3, 1.0, 0.5))
@@ -173,7 +172,7 @@ async def test_a_trial_begins_only_where_it_could_end_within_the_cap(ledger):
 
 
 async def test_attempts_that_cost_nothing_do_not_use_up_an_allowance(ledger):
-    budget = Budget(ledger, Caps(5.0), each(4.0))
+    budget = Budget(ledger, 5.0, each(4.0))
     for _ in range(10):
         await attempt(budget, 1, 1.0, 0.0)
     other = await soon(budget.admit(2))
@@ -203,7 +202,7 @@ def costs(**models):
 
 
 async def test_once_answers_are_cheap_trials_begin_that_their_worst_case_kept_waiting(ledger):
-    budget = Budget(ledger, Caps(50.0), costs(m=1.0))
+    budget = Budget(ledger, 50.0, costs(m=1.0))
     await budget.admit(1)
     others = [await soon(budget.admit(trial)) for trial in range(2, 7)]
     assert not any(other.done() for other in others)
@@ -216,7 +215,7 @@ async def test_once_answers_are_cheap_trials_begin_that_their_worst_case_kept_wa
 
 
 async def test_the_oldest_trial_may_spend_what_is_kept_for_younger_ones(ledger):
-    budget = Budget(ledger, Caps(6.0), each(2.0))
+    budget = Budget(ledger, 6.0, each(2.0))
     for trial in (1, 2, 3):
         await budget.admit(trial)
     for _ in range(5):
@@ -232,66 +231,27 @@ async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_fo
     ledger, monkeypatch
 ):
     monkeypatch.setattr("merge_runner.llm.budget.PATIENCE_S", 0.01)
-    budget = Budget(ledger, Caps(4.0), each(2.0))
+    budget = Budget(ledger, 4.0, each(2.0))
     await budget.admit(1)
     await budget.admit(2)
     await attempt(budget, 2, 3.0, 3.0)
 
 
-async def test_where_the_part_of_one_model_is_used_up_the_others_go_on(ledger):
-    budget = Budget(ledger, Caps(10.0, {"m": 1.0}), costs(m=0.02, n=0.02))
-    await attempt(budget, 1, 1.0, 1.0)
-    with pytest.raises(TrialSuspended, match=r"1\.0000 of 1 USD for m are spent"):
-        await set_aside(budget, 1, 0.5)
-    await attempt(budget, 1, 1.0, 1.0, model="n")
-    spent = {model: part.spent_usd for model, part in ledger.read().by_model.items()}
-    assert spent == {"m": 1.0, "n": 1.0}
-
-
-async def test_a_trial_that_waits_for_the_part_of_its_model_holds_up_no_other(ledger):
-    by_trial = {1: "dear", 2: "dear", 3: "cheap"}
-    cells = {"dear": {"m": TrialCalls(1, 1, 4.0)}, "cheap": {"n": TrialCalls(1, 1, 1.0)}}
-    budget = Budget(ledger, Caps(10.0, {"m": 5.0}), TrialCosts(by_trial.__getitem__, cells, {}))
-    await budget.admit(1)
-    second = await soon(budget.admit(2))
-    await asyncio.wait_for(budget.admit(3), 1)
-    assert not second.done()
+async def test_the_first_trial_of_a_model_begins_though_another_model_has_spent(ledger):
+    by_trial = {1: "asked", 2: "new", 3: "new"}
+    cells = {"asked": {"m": TrialCalls(1, 1, 1.0)}, "new": {"n": TrialCalls(20, 40, 1.0)}}
+    budget = Budget(ledger, 10.0, TrialCosts(by_trial.__getitem__, cells, {}))
+    await answer(budget, 1, 0.5)
     budget.leave(1)
-    await second
-
-
-async def test_what_an_earlier_version_spent_counts_for_every_model(ledger, cache):
-    text = '{"spent_usd":0.75,"reserved_usd":0.0,"open_attempts":0}'
-    await cache.write(lambda: cache.replace_twice(ledger._name, text))
-    budget = Budget(ledger, Caps(None, {"m": 1.0, "n": 1.0}))
-    with pytest.raises(TrialSuspended):
-        await attempt(budget, 1, 0.5, 0.5)
-    await attempt(budget, 1, 0.25, 0.25, model="n")
-
-
-@pytest.mark.parametrize(
-    ("caps", "told"),
-    [
-        (
-            Caps(50, {"o3": 30}),
-            "gemini-2.5-pro has no part: give one to each of gemini-2.5-pro, o3",
-        ),
-        (Caps(50, {"o3": 9, "gemini-2.5-pro": 9, "o4": 1}), "a part for o4, .* valid: gemini-2"),
-        (Caps(50, {"o3": 30, "gemini-2.5-pro": 25}), "sum up to 55 USD, and the total is 50"),
-    ],
-)
-def test_a_split_that_does_not_suit_the_study_is_refused(caps, told):
-    with pytest.raises(UsageError, match=told):
-        caps.check(["o3", "gemini-2.5-pro"])
-
-
-def test_a_split_may_use_up_the_total_or_have_none():
-    for total in (50, None):
-        Caps(total, {"o3": 30, "gemini-2.5-pro": 20}).check(["o3", "gemini-2.5-pro"])
+    await asyncio.wait_for(budget.admit(2), 1)  # or it would never be known that it costs less
+    await attempt(budget, 2, 1.0, None, model="n")
+    budget.leave(2)
+    with pytest.raises(TrialSuspended, match=r"a whole trial may cost 40\.00 USD"):
+        await budget.admit(3)
 
 
 async def test_trials_begin_in_their_order_and_the_first_is_never_overtaken(ledger):
-    budget = Budget(ledger, Caps(5.0), each(4.0))
+    budget = Budget(ledger, 5.0, each(4.0))
     begun = []
 
     async def trial(order):
@@ -308,7 +268,7 @@ async def test_trials_begin_in_their_order_and_the_first_is_never_overtaken(ledg
 
 
 async def test_without_money_for_a_whole_trial_the_first_one_alone_begins(ledger):
-    budget = Budget(ledger, Caps(3.0), each(4.0))
+    budget = Budget(ledger, 3.0, each(4.0))
     await budget.admit(1)  # or it would never be known that a trial costs less
     other = await soon(budget.admit(2))
     assert not other.done()
@@ -319,7 +279,7 @@ async def test_without_money_for_a_whole_trial_the_first_one_alone_begins(ledger
 
 
 async def test_a_begun_trial_is_paid_before_another_begins(ledger):
-    budget = Budget(ledger, Caps(5.0), each(4.0))
+    budget = Budget(ledger, 5.0, each(4.0))
     await budget.admit(1)
     other = await soon(set_aside(budget, 2, 2.0))  # 4 of 5 USD are the first trial's
     assert not other.done()
@@ -330,7 +290,7 @@ async def test_a_begun_trial_is_paid_before_another_begins(ledger):
 
 
 async def test_a_trial_that_needs_more_than_its_allowance_is_suspended_at_the_cap(ledger):
-    budget = Budget(ledger, Caps(4.0), each(3.0))
+    budget = Budget(ledger, 4.0, each(3.0))
     for _ in range(4):
         await attempt(budget, 1, 1.0, 1.0)
     with pytest.raises(TrialSuspended):
@@ -345,7 +305,7 @@ async def test_without_a_cap_everything_passes_and_is_recorded(ledger):
 
 
 async def test_a_call_that_goes_on_after_its_trial_gets_no_money(ledger):
-    budget = Budget(ledger, Caps(5.0), each(4.0))
+    budget = Budget(ledger, 5.0, each(4.0))
     await budget.admit(1)
     budget.leave(1)
     with pytest.raises(TrialSuspended):
@@ -377,10 +337,10 @@ O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
 
 async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
     for key, outcome in (("a", "timeout"), ("b", "timeout"), ("c", "server_error")):
-        await ledger.reserve(key, [], 0.25, NO_CAPS, O3)
+        await ledger.reserve(key, [], 0.25, None, O3)
         await ledger.settle(key, tried(None, outcome), 0.25, Asked())
-    await ledger.reserve("d", [], 0.125, NO_CAPS, O3)
-    await ledger.reserve("paid", [], 0.25, NO_CAPS, O3)
+    await ledger.reserve("d", [], 0.125, None, O3)
+    await ledger.reserve("paid", [], 0.25, None, O3)
     await ledger.settle("paid", tried(0.1), 0.25, Asked())
     reasons = ledger.reasons()
     assert [(r.outcome, r.attempts, r.usd) for r in reasons] == [
@@ -396,7 +356,7 @@ async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
 async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
     for number, outcome in enumerate(("timeout", "connection_lost", "bad_body"), 1):
         attempts = [Attempt(n, "x") for n in range(1, number)]
-        await ledger.reserve("key", attempts, 0.25, NO_CAPS, O3)
+        await ledger.reserve("key", attempts, 0.25, None, O3)
         actual = 0.0 if outcome == "connection_lost" else None
         last = Attempt(number, outcome, cost_usd=actual)
         await ledger.settle("key", [*attempts, last], 0.25, Asked())
@@ -404,15 +364,15 @@ async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
 
 
 async def test_what_is_released_counts_no_longer_and_stays_visible(ledger, cache):
-    await attempt(Budget(ledger, Caps(1.0)), 1, 0.75, None)
+    await attempt(Budget(ledger, 1.0), 1, 0.75, None)
     with pytest.raises(TrialSuspended):
-        await set_aside(Budget(ledger, Caps(1.0)), 1, 0.5)
+        await set_aside(Budget(ledger, 1.0), 1, 0.5)
     released = ledger.release()
     assert (released.usd, released.attempts) == (0.75, 1)
     again = Ledger(cache, ledger._name.removeprefix("spent "))
     assert (again.spending.committed_usd, again.reasons()) == (0, [])
     assert again.spending.releases == [released]
-    await set_aside(Budget(again, Caps(1.0)), 1, 0.5)
+    await set_aside(Budget(again, 1.0), 1, 0.5)
 
 
 async def test_a_ledger_of_an_earlier_version_is_read_and_says_that_it_noted_no_reason(
@@ -423,7 +383,7 @@ async def test_a_ledger_of_an_earlier_version_is_read_and_says_that_it_noted_no_
     assert ledger.read().committed_usd == 0.75
     (reason,) = ledger.reasons()
     assert (reason.outcome, reason.attempts, reason.usd) == ("not recorded", 2, 0.25)
-    await ledger.reserve("key", [], 0.25, NO_CAPS, O3)
+    await ledger.reserve("key", [], 0.25, None, O3)
     assert {r.outcome: r.attempts for r in ledger.reasons()} == {"not recorded": 2, "in flight": 1}
 
 
@@ -437,13 +397,13 @@ async def test_a_damaged_reason_changes_no_sum(ledger, cache):
 
 
 async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
-    budget = Budget(ledger, Caps(10.0))
+    budget = Budget(ledger, 10.0)
     async with budget.attempt(1, "key", O3) as paid:
         await paid.begin([])
         await paid.settle(tried(0.75))
     assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
     assert ledger.spending.dearest == "o3 at gateway up to 3.00 times as much"
-    next_run = Budget(Ledger(cache, ledger._name.removeprefix("spent ")), Caps(10.0))
+    next_run = Budget(Ledger(cache, ledger._name.removeprefix("spent ")), 10.0)
     assert (await set_aside(next_run, 2, 0.25, "another driver")).aside_usd == 0.25
     async with next_run.attempt(1, "other", O3) as paid:
         assert paid.aside_usd == 0.75
@@ -454,7 +414,7 @@ async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_a
 
 
 async def test_several_are_in_flight_only_while_twice_their_worst_cases_fit(ledger):
-    budget = Budget(ledger, Caps(1.0))
+    budget = Budget(ledger, 1.0)
     paid = await set_aside(budget, 1, 0.25)
     await set_aside(budget, 2, 0.25)  # 2 x 0.5 fit
     third = await soon(set_aside(budget, 3, 0.25))
@@ -465,7 +425,7 @@ async def test_several_are_in_flight_only_while_twice_their_worst_cases_fit(ledg
 
 
 async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):
-    budget = Budget(ledger, Caps(5.0), each(2.0))
+    budget = Budget(ledger, 5.0, each(2.0))
     await attempt(budget, 1, 1.0, 0.5)
     await attempt(budget, 1, 0.5, None)
     await budget.admit(2)
@@ -493,7 +453,7 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
     ledger, begun, attempts, error, money
 ):
     """``money``: what is allowed to the trial, set aside for ever, and spent."""
-    budget = Budget(ledger, Caps(1.0), each(1.0))
+    budget = Budget(ledger, 1.0, each(1.0))
     await budget.admit(1)
 
     async def ended():
@@ -507,7 +467,6 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
     with pytest.raises(error):
         await ended()
     spending = budget.ledger.read()
-    (pot,) = budget._pots
-    allowed_usd = pot.part(budget.costs.of(1)) - sum(budget._begun[1].values())
+    allowed_usd = budget.costs.usd(1) - budget._begun[1].charged_usd
     assert (allowed_usd, spending.reserved_usd, spending.spent_usd) == money
-    assert (pot.in_flight, pot.queued_usd) == (0, 0)
+    assert (budget.in_flight, budget.queued_usd) == (0, 0)

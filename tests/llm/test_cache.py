@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, CallTotals, ResponseCache
 from merge_runner.llm.content_hashes import make_request, manner
-from merge_runner.llm.ledger import NO_CAPS, Asked, Ledger
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage
 
 
@@ -497,7 +497,7 @@ def model_folder(tmp_path_factory):
     cache.put_now(FULL)
     cache.run_now([lambda: cache.keep_unanswered(entry(9).request.key, entry(9).attempts)])
     ledger = Ledger(cache, "s")
-    asyncio.run(ledger.reserve("0" * 64, [], 3.0, NO_CAPS, Asked()))
+    asyncio.run(ledger.reserve("0" * 64, [], 3.0, None, Asked()))
     cache.close()
     gc.collect()  # the connections of other threads, or their files go while they are copied
     return folder

@@ -19,7 +19,7 @@ from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.ledger import Asked, Caps, Ledger
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.meter import Meter
 from merge_runner.llm.transport import SealedTransport, TransportFailure
@@ -117,7 +117,7 @@ def make(cache):
             cache=cache,
             transport=transport or Server(*replies),
             limiter=limiter or Limiter(),
-            budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), Caps(cap)),
+            budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), cap),
         )
 
     return make

@@ -18,37 +18,37 @@ def trial_costs(earlier=None):
 
 
 def test_before_any_answer_a_trial_is_expected_to_cost_as_much_as_it_can():
-    assert trial_costs().of(1) == {"o3": 60.0}
+    assert trial_costs().usd(1) == 60.0
 
 
 def test_many_answers_tell_the_cost_but_for_the_margin_and_one_worst_case():
     costs = trial_costs()
     for _ in range(5_000):
         costs.learn(1, "o3", 0.1)
-    assert costs.of(1)["o3"] == pytest.approx(MARGIN * 20 * 0.1 + 1.0, rel=0.01)
+    assert costs.usd(1) == pytest.approx(MARGIN * 20 * 0.1 + 1.0, rel=0.01)
 
 
 def test_one_cheap_answer_proves_little():
     costs = trial_costs()
     costs.learn(1, "o3", 0.0)
-    assert costs.of(1)["o3"] == pytest.approx(MARGIN * 20 * 0.5 + 1.0)
+    assert costs.usd(1) == pytest.approx(MARGIN * 20 * 0.5 + 1.0)
 
 
 def test_a_cell_borrows_from_the_others_until_it_has_enough_answers_of_its_own():
     costs = trial_costs()
     for _ in range(ENOUGH):
         costs.learn(1, "o3", 0.1)
-    assert costs.of(2) == costs.of(1)
+    assert costs.usd(2) == costs.usd(1)
     for _ in range(ENOUGH):
         costs.learn(2, "o3", 0.3)
     alone = trial_costs()
     for _ in range(ENOUGH):
         alone.learn(2, "o3", 0.3)
-    assert costs.of(2)["o3"] == pytest.approx(alone.of(2)["o3"])
+    assert costs.usd(2) == pytest.approx(alone.usd(2))
 
 
 def test_answers_of_earlier_runs_count_from_the_start():
-    assert trial_costs(Answers(1_000, 100.0)).of(1)["o3"] < 6
+    assert trial_costs(Answers(1_000, 100.0)).usd(1) < 6
 
 
 @given(st.lists(st.floats(0, 1), max_size=40))
@@ -56,4 +56,4 @@ def test_no_trial_is_expected_to_cost_more_than_it_can_or_less_than_one_call(ans
     costs = trial_costs()
     for usd in answers:
         costs.learn(1, "o3", usd)
-    assert CALLS.worst_usd <= costs.of(1)["o3"] <= CALLS.most * CALLS.worst_usd
+    assert CALLS.worst_usd <= costs.usd(1) <= CALLS.most * CALLS.worst_usd

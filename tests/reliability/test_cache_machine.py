@@ -28,7 +28,7 @@ from merge_runner.errors import TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request
-from merge_runner.llm.ledger import Asked, Caps, Ledger
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, Slot
 
 QUESTIONS = 4
@@ -58,7 +58,7 @@ class Process:
 
     def __init__(self, folder: Path, cap_usd: float) -> None:
         self.cache = ResponseCache(folder)
-        self.budget = Budget(Ledger(self.cache, "s"), Caps(cap_usd))
+        self.budget = Budget(Ledger(self.cache, "s"), cap_usd)
         self.in_flight_calls: dict[int, tuple[PaidAttempt, list[Attempt]]] = {}
 
     def die(self) -> None:

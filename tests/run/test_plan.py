@@ -173,9 +173,6 @@ def test_the_estimate_tells_each_variant_and_what_the_cap_buys():
     # 5.46 of 10.92 USD are left: every second trial of either variant.
     assert [cell.trials_within_cap for cell in expected.cells] == [5, 15]
     assert expected.trials_within_cap == 20
-    split = replace(options, max_cost_usd=None, split_usd={"o3": 1.7})
-    (few, _) = estimate(plan, split, todo=todo, facts={"o3": facts}, spending=spent).cells
-    assert few.trials_within_cap == 1
     tight = replace(options, max_cost_usd=0.54 + 10.92 / 40)
     poor = estimate(plan, tight, todo=todo, facts={"o3": facts}, spending=spent)
     # One trial of 40, though neither variant's part of it is a whole one.

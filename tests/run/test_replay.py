@@ -111,16 +111,6 @@ async def test_the_first_screen_of_the_readme_shows_what_is_printed(merge_runner
 
 
 @pytest.mark.slow
-async def test_a_replay_asks_nothing_about_money(merge_runner, tmp_path):
-    budget = "[budget]\nsplit = { o3 = 1 }\n"
-    text = 'repetitions = 1\nconditions = ["N_0_0"]\n' + budget
-    (tmp_path / "mine.toml").write_text(text)
-    refused = await merge_runner("sweep", "mine.toml")
-    assert (refused.code, "has a part for o3" in refused.err) == (2, True)
-    assert (await merge_runner("replay", "mine.toml", "--recording", RECORDING)).code == 0
-
-
-@pytest.mark.slow
 async def test_without_replies_of_its_own_a_replay_takes_the_recording_that_ships(
     merge_runner, tmp_path
 ):

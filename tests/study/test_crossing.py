@@ -7,7 +7,7 @@ import json
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.plan import make_plan
 
 HEAD = 'description = "x"\nrepetitions = 2\nconditions = ["N_0_0"]\n'
 
@@ -160,17 +160,6 @@ def test_effort_is_translated_for_a_model_that_has_no_parameter_of_this_name(pla
         "o3 reasoning_effort=low": "low",
         "o3 reasoning_effort=high": "high",
     }
-
-
-def test_a_split_budget_suits_a_part_of_the_study(plan_of, tmp_path):
-    text = (
-        'models = ["o3", "gemini-2.5-pro"]\n[factors]\ntemperature = [1.0]\n'
-        '[budget]\ntotal_usd = 5\nsplit = { o3 = 3, "gemini-2.5-pro" = 2 }\n'
-    )
-    options = Options(tmp_path / "m.duckdb", tmp_path / "cache")
-    for only in (None, {"model": ["o3"]}):
-        caps = plan_of(text, only=only).within_budget(options).caps
-        assert (caps.total_usd, caps.by_model["o3"]) == (5, 3)
 
 
 def test_a_prompt_that_is_not_played_is_noted(plan_of):

@@ -12,7 +12,7 @@ from distributed.comm import connect, listen
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import CachedCall, KnownCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request
-from merge_runner.llm.ledger import Asked, Caps, Ledger
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, Slot
 from merge_runner.run.clients import LocalServices
 from merge_runner.run.cluster.link import Link, LinkLost
@@ -33,7 +33,7 @@ def cache(tmp_path):
 
 @pytest.fixture
 def budget(cache):
-    return Budget(Ledger(cache, "sweep"), Caps(1.0), each(1.0, "o3"))
+    return Budget(Ledger(cache, "sweep"), 1.0, each(1.0, "o3"))
 
 
 @pytest.fixture
@@ -66,13 +66,7 @@ async def worker(cache, budget):
 def money(budget):
     """What is held in memory, set aside in the ledger, and spent."""
     spending = budget.ledger.read()
-    (pot,) = budget._pots
-    return pot.queued_usd, spending.reserved_usd, spending.spent_usd
-
-
-def in_flight(budget):
-    (pot,) = budget._pots
-    return pot.in_flight
+    return budget.queued_usd, spending.reserved_usd, spending.spent_usd
 
 
 async def test_a_worker_that_dies_before_it_sends_gives_its_money_back(worker, budget):
@@ -81,7 +75,7 @@ async def test_a_worker_that_dies_before_it_sends_gives_its_money_back(worker, b
         await worker.dies()
         with pytest.raises(LinkLost):
             await paid.begin([])
-    assert (in_flight(budget), money(budget)) == (0, (0, 0, 0))
+    assert (budget.in_flight, money(budget)) == (0, (0, 0, 0))
 
 
 async def test_what_a_dead_worker_had_in_flight_stays_set_aside(worker, budget):
@@ -91,7 +85,7 @@ async def test_what_a_dead_worker_had_in_flight_stays_set_aside(worker, budget):
         await worker.dies()
         with pytest.raises(LinkLost):
             await paid.settle([Attempt(1, "timeout")])
-    assert (in_flight(budget), money(budget)) == (0, (0, 0.5, 0))
+    assert (budget.in_flight, money(budget)) == (0, (0, 0.5, 0))
 
 
 async def test_who_gives_up_waiting_for_money_holds_none(worker, budget):
@@ -107,7 +101,7 @@ async def test_who_gives_up_waiting_for_money_holds_none(worker, budget):
         await asyncio.gather(waiting, return_exceptions=True)
         assert waiting.cancelled()
     await worker.link.ask("leave", TRIAL)  # all that was told before it has been heard
-    assert (in_flight(budget), money(budget)) == (0, (0, 0, 0))
+    assert (budget.in_flight, money(budget)) == (0, (0, 0, 0))
 
 
 async def test_who_gives_up_when_the_answer_is_under_way_holds_no_money(worker, budget):
@@ -122,7 +116,7 @@ async def test_who_gives_up_when_the_answer_is_under_way_holds_no_money(worker, 
         asking.cancel()
         await asyncio.gather(asking, return_exceptions=True)
     await worker.link.ask("leave", TRIAL)  # all that was told before it has been heard
-    assert (in_flight(budget), money(budget)) == (0, (0, 0, 0))
+    assert (budget.in_flight, money(budget)) == (0, (0, 0, 0))
 
 
 def answered(reply):
